@@ -1,0 +1,29 @@
+# make run    the paper's case I, from a fresh clone to a picture
+# make test   the whole test suite
+PYTHON ?= python3
+PY := .venv/bin/python
+
+.PHONY: run test lint bench clean
+
+run: .venv/ready
+	$(PY) -m sim.run --case I
+
+test: .venv/ready
+	$(PY) -m pytest
+
+lint: .venv/ready
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m pyright
+
+bench: .venv/ready
+	$(PY) -m pytest tests/benchmarks --benchmark-only -s
+
+.venv/ready: pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; assert sys.version_info >= (3, 11), "Python 3.11 or newer is needed: make PYTHON=python3.11"'
+	$(PYTHON) -m venv .venv
+	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@
+
+clean:
+	rm -rf .venv out build *.egg-info .pytest_cache .ruff_cache .hypothesis

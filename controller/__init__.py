@@ -1,0 +1,1 @@
+"""The discrete world: what runs every T seconds. It knows neither MuJoCo nor the human."""

@@ -1,0 +1,130 @@
+"""Virtual environments: spring-damper-mass networks, discretised by backward Euler.
+
+Nodes are contacts (whose displacements the devices impose), internal nodes (free) and the ground.
+With Z(s) = M s^2 + D s + K the dynamic stiffness of the network, the map from contact displacements
+to the forces that the devices feel (with a minus sign) is Z_cc - Z_ci Z_ii^-1 Z_ic, at s = (z-1)/(Tz).
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from controller.lti import Array, Lti
+
+GROUND = "ground"
+
+
+def _check_amount(what: str, value: float) -> None:
+    if not 0 <= value < np.inf:
+        raise ValueError(f"{what} is {value}, expected a finite number >= 0 (a passive network)")
+
+
+class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A spring and a damper in parallel between two nodes."""
+
+    between: tuple[str, str]
+    stiffness: float  # [N/m]
+    damping: float = 0.0  # [N s/m]
+
+    def __post_init__(self) -> None:
+        for name in ("stiffness", "damping"):
+            _check_amount(f"{name} between {' and '.join(self.between)}", getattr(self, name))
+        if self.between[0] == self.between[1]:
+            raise ValueError(f"between joins {self.between[0]!r} to itself; name two different nodes")
+
+
+class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A passive mechanical network seen at its contacts, in the order of the channels."""
+
+    contacts: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
+    springs: tuple[Spring, ...] = ()
+    masses: dict[str, float] = {}  # [kg], by node; nodes that are not named have none
+
+    def __post_init__(self) -> None:
+        if len(set(self.contacts)) < len(self.contacts) or GROUND in self.contacts:
+            raise ValueError(f"contacts must be different names other than {GROUND!r}, got {list(self.contacts)}")
+        nodes = self.nodes()
+        for name, mass in self.masses.items():
+            _check_amount(f"mass of {name!r}", mass)
+            if name not in nodes:
+                raise ValueError(f"masses names {name!r}, which no spring reaches; nodes: {', '.join(nodes)}")
+        loose = [n for n in self.contacts if all(n not in s.between for s in self.springs) and n not in self.masses]
+        if loose:
+            raise ValueError(f"contact {loose[0]!r} has neither spring nor mass, so it can render no force")
+
+    def nodes(self) -> list[str]:
+        """Contacts first, then internal nodes in the order of their first mention."""
+        ends = (node for spring in self.springs for node in spring.between if node != GROUND)
+        return list(dict.fromkeys((*self.contacts, *ends)))
+
+    def matrices(self) -> tuple[Array, Array, Array]:
+        """Mass [kg], damping [N s/m] and stiffness [N/m] over `nodes()`, each (nodes, nodes)."""
+        index = {name: i for i, name in enumerate(self.nodes())}
+        M = np.diag([self.masses.get(name, 0.0) for name in index])
+        D, K = np.zeros_like(M), np.zeros_like(M)
+        for spring in self.springs:
+            across = np.zeros(len(index))
+            for node, sign in zip(spring.between, (1.0, -1.0), strict=True):
+                if node != GROUND:
+                    across[index[node]] = sign
+            D += spring.damping * np.outer(across, across)
+            K += spring.stiffness * np.outer(across, across)
+        return M, D, K
+
+
+#: Figure 4 as we read it: contact 1 -(K1, B1)- M -(K2, B2)- contact 2, the mass free.
+FIGURE_4 = Network(
+    contacts=("contact 1", "contact 2"),
+    springs=(
+        Spring(("contact 1", "mass"), stiffness=800.0, damping=1.0),
+        Spring(("mass", "contact 2"), stiffness=700.0, damping=1.0),
+    ),
+    masses={"mass": 1.0},
+)
+
+
+def environment(network: Network, T: float) -> Lti:
+    """E(z), contact displacements [m] to forces [N], by backward Euler s -> (z-1)/(Tz).
+
+    Internal nodes obey M (v - v-)/T + D v + K q + (coupling to the contacts) = 0 with q = q- + T v, solved
+    for v at every tick. The states are q- and v- of the internal nodes, and what the contact dampers and
+    masses need of the past. Raises ValueError if an internal node is held by nothing.
+    """
+    M, D, K = network.matrices()
+    c = len(network.contacts)
+    free = network.nodes()[c:]
+    cc, ci, ic, ii = _quarters(c)
+    implicit = M[ii] / T + D[ii] + T * K[ii]
+    if free and np.linalg.cond(implicit) > 1e14:
+        raise ValueError(f"an internal node among {', '.join(free)} has no mass and nothing that holds it")
+    solve = np.linalg.inv(implicit)
+
+    # every signal is a row of coefficients over [x; q-; v-; x-; vx-]
+    n = len(free)
+    signals = np.eye(3 * c + 2 * n)
+    x, q_old, v_old, x_old, vx_old = np.split(signals, np.cumsum([c, n, n, c]))
+    vx = (x - x_old) / T
+    v = solve @ (M[ii] / T @ v_old - K[ii] @ q_old - D[ic] @ vx - K[ic] @ x)
+    q = q_old + T * v
+    force = M[cc] @ (vx - vx_old) / T + D[cc] @ vx + K[cc] @ x + D[ci] @ v + K[ci] @ q
+
+    after = np.vstack([q, v, x, vx])
+    keep = _remembered(after, force, c)
+    return Lti(after[keep][:, c:][:, keep], after[keep][:, :c], force[:, c:][:, keep], force[:, :c], T)
+
+
+def _quarters(c: int) -> tuple[tuple[slice, slice], ...]:
+    contact, inner = slice(None, c), slice(c, None)
+    return (contact, contact), (contact, inner), (inner, contact), (inner, inner)
+
+
+def _remembered(after: Array, force: Array, c: int) -> Array:
+    """Indices of the states that reach the force now or later: the others need not be stored."""
+    reads = after[:, c:] != 0
+    used = (force[:, c:] != 0).any(axis=0)
+    for _ in range(used.size):
+        used = used | reads[used].any(axis=0)
+    return np.flatnonzero(used)

@@ -1,0 +1,115 @@
+"""What the computer does every T seconds, and when.
+
+        tick k, at time kT
+          1  x = encoder positions, sampled                (the plant's state just before kT)
+          2  u = x - V f_e ;  f_e = Psi E u                (the algebraic loop was solved at construction)
+          3  f = clip(Theta f_e, +-force_limit)
+          4  hold -f on the actuators, advance the plant by T
+          5  commit the discrete states                    (the plant's state just after kT)
+
+With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later.
+Steps 2, 3 (without the limit) and 5 are linear: they are ONE state-space block, and a tick is one matrix
+product [f; z+] = [C D; A B] [z; x] for any number of simulations at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.coupling import Coupling
+from controller.delay import delay
+from controller.lti import Array, Lti, frozen
+
+
+def force_map(environment: Lti, coupling: Coupling, theta: Sequence[int], psi: Sequence[int]) -> Lti:
+    """F = Theta (I + Psi E V)^-1 Psi E (6): displacements to forces, as the devices see them."""
+    delayed = delay(psi, environment.T) @ environment
+    return delay(theta, environment.T) @ coupling.around(delayed)
+
+
+@dataclass(frozen=True, eq=False)
+class Process:
+    """The linear block F with what wraps around it: force limits and encoder steps."""
+
+    F: Lti
+    force_limit: Array  # (m,) [N], inf where there is none
+    encoder_step: Array  # (m,) [m], 0 for an ideal encoder
+
+    def __post_init__(self) -> None:
+        for name in ("force_limit", "encoder_step"):
+            value = frozen(getattr(self, name), 1)
+            object.__setattr__(self, name, value)
+            if value.shape != (self.F.inputs,):
+                raise ValueError(f"{name} has {value.size} entries for {self.F.inputs} channels")
+        if not (self.force_limit > 0).all():
+            raise ValueError(f"force_limit is {self.force_limit.tolist()}, expected positive forces in N")
+        if not ((self.encoder_step >= 0) & (self.encoder_step < np.inf)).all():
+            raise ValueError(f"encoder_step is {self.encoder_step.tolist()}, expected steps >= 0 in m")
+
+    @property
+    def channels(self) -> int:
+        return self.F.inputs
+
+
+class Tape:
+    """The record of a stretch of ticks, laid out so that the loop writes it without copying.
+
+    A row holds [z, s, w, f] of one tick for all simulations: process state, plant state (whose first
+    `channels` entries are the measured positions x), outside forces, and forces fed back; the next row
+    begins with z+. So [z, x] is the tick's input, [f, z+] its output and [w, f] the plant's input, each one
+    contiguous slab of memory.
+    """
+
+    def __init__(self, process: Process, ticks: int, plant_states: int, outside: int = 0, nsim: int = 1) -> None:
+        nz, m = process.F.order, process.channels
+        if plant_states < m:
+            raise ValueError(f"plant_states is {plant_states}, but the first {m} entries must be the positions")
+        self.ticks = ticks
+        self.process = process
+        width = nz + plant_states + outside + m
+        self._memory = np.zeros(((ticks + 1) * width, nsim))
+        rows = self._memory.reshape(ticks + 1, width, nsim)
+        #: (ticks + 1, entries, nsim): the last row holds only what the last tick left behind
+        self.z, self.s, self.w, self.f = np.split(rows, np.cumsum([nz, plant_states, outside]), axis=1)
+        self.x = self.s[:, :m]
+
+        # views are made once: making one costs as much as a small product
+        def slabs(first: int, size: int) -> list[Array]:
+            starts = range(first, first + ticks * width, width)
+            return [self._memory[start : start + size] for start in starts]
+
+        self.plant_state = [*slabs(nz, plant_states), self._memory[ticks * width + nz :][:plant_states]]
+        self.plant_input = slabs(nz + plant_states, outside + m)
+        self._input = slabs(0, nz + m)
+        self._output = slabs(width - m, m + nz)
+        self._measured = slabs(nz, m)
+        self._force = slabs(width - m, m)
+        F = process.F
+        self._matrix = np.block([[F.C, F.D], [F.A, F.B]])
+        self._high = process.force_limit[:, None]
+        self._low = -self._high
+        self._step = np.where(process.encoder_step > 0, process.encoder_step, np.inf)[:, None]
+        self._quantised = bool((process.encoder_step > 0).any())
+
+    def tick(self, k: int) -> None:
+        """Steps 1, 2, 3 and 5 for row k, whose plant state has been written: f[k] and z[k + 1]."""
+        if self._quantised:
+            self._quantise(self._measured[k])
+        np.dot(self._matrix, self._input[k], self._output[k])
+        force = self._force[k]
+        np.minimum(force, self._high, force)
+        np.maximum(force, self._low, force)
+
+    def rewind(self) -> None:
+        """Start a new stretch where this one ended."""
+        self.z[0] = self.z[-1]
+        self.s[0] = self.s[-1]
+
+    def _quantise(self, x: Array) -> None:
+        """Round to whole encoder steps, in place; an ideal channel (step inf) is left as it is."""
+        coarse = np.isfinite(self._step[:, 0])
+        step = self._step[coarse]
+        x[coarse] = np.round(x[coarse] / step) * step

@@ -1,0 +1,126 @@
+"""How much device damping a coupling needs, by both conditions, without a solver.
+
+closed-loop: with F what the devices see and every human passive, the loop is stable if
+    He[F(z)/(z-1)] > -Delta_D / T   on |z| = 1,   F stable, F(1) symmetric positive semidefinite.
+theorem4: Lemma 4 of the paper for Psi = I and any passive environment under backward Euler:
+    He[(z-1) V/(Tz)] >= diag((1 - cos n_i w) / (2 delta_i)),   n_i = theta_i + 1.
+
+The required damping is s Delta_D with the least s for which s Delta_D satisfies the condition. Both
+conditions lose their singular point at z = 1 when G/(z-1) is split into G(1)/(z-1), whose Hermitian part on
+the circle is -G(1)/2, and the regular quotient (G(z) - G(1))/(z - 1).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.lti import Array, Lti
+from design.sweep import frequencies, hermitian, on_circle, supremum
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """The damping that a condition asks of the devices, against what they have."""
+
+    condition: str  # "closed-loop" | "theorem4"
+    ratio: float  # s: required / available; inf when no damping helps
+    available: tuple[float, ...]  # (m,) [N s/m]
+    frequency_hz: float | None  # where it binds
+    reason: str | None = None  # why the figure is infinite or unknown
+    proof: str = "sampled"
+
+    @property
+    def required(self) -> tuple[float, ...]:
+        """(m,) [N s/m]."""
+        return tuple(self.ratio * delta for delta in self.available)
+
+    @property
+    def certified(self) -> bool:
+        return self.ratio < 1
+
+
+def closed_loop(F: Lti, delta: Sequence[float]) -> Requirement:
+    """The closed-loop condition for the force map F and device dampings `delta` [N s/m]."""
+    available = _dampings(delta, F.inputs)
+
+    def refused(reason: str) -> Requirement:
+        return Requirement("closed-loop", np.inf, available, None, reason)
+
+    radius = float(np.abs(F.poles()).max(initial=0.0))
+    if radius >= 1:
+        return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
+    F1 = F.dc()
+    scale = max(float(np.abs(F1).max()), 1e-12)
+    if np.abs(F1 - F1.T).max() > 1e-9 * scale:
+        return refused("the static stiffness F(1) is not symmetric: a slow closed path could extract energy")
+    if np.linalg.eigvalsh((F1 + F1.T) / 2).min() < -1e-9 * scale:
+        return refused("the static stiffness F(1) has a negative direction: it pushes outwards")
+
+    regular = F.quotient_at_one()
+    weight = np.sqrt(F.T / np.asarray(available))
+
+    def needed(w: Array) -> Array:
+        H = F1 / 2 - hermitian(regular.at(on_circle(w)))
+        return np.linalg.eigvalsh(weight[:, None] * H * weight)[:, -1]
+
+    grid = np.concatenate([[0.0], frequencies(F)])
+    ratio, w = supremum(needed, grid)
+    return Requirement("closed-loop", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
+
+
+def theorem4(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Requirement:
+    """Theorem 4 for psi = 0 and the coupling V, whatever passive environment stands behind it.
+
+    Dividing by |1 - 1/z|^2 it reads (V(1)/2 - He[(V - V(1))/(z - 1)]) / T >= diag(|vt_i|^2 / (4 s delta_i)), with
+    vt_i = 1 + 1/z + ... + z^-theta_i, so s is a generalised eigenvalue per frequency.
+    """
+    available = _dampings(delta, V.inputs)
+    if len(theta) != V.inputs:
+        raise ValueError(f"theta has {len(theta)} entries for {V.inputs} channels")
+
+    def refused(reason: str) -> Requirement:
+        return Requirement("theorem4", np.inf, available, None, reason)
+
+    if not V.is_stable():
+        return refused("the coupling V has a pole on or outside the unit circle")
+    V1 = V.dc()
+    if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
+        return refused("the static compliance V(1) is not symmetric")
+    regular = V.quotient_at_one()
+
+    def passivity(w: Array) -> Array:
+        return (V1 / 2 - hermitian(regular.at(on_circle(w)))) / V.T
+
+    def window(w: Array) -> Array:
+        """|vt_i|^2 / (4 delta_i), shape (k, m)."""
+        vt = [np.exp(-1j * np.outer(w, np.arange(n + 1))).sum(axis=1) for n in theta]
+        return np.abs(np.stack(vt, axis=1)) ** 2 / (4 * np.asarray(available))
+
+    def needed(w: Array) -> Array:
+        eigenvalues, basis = np.linalg.eigh(passivity(w))
+        floor = 1e-13 * np.abs(eigenvalues).max(axis=1, keepdims=True)
+        whitened = np.conj(np.swapaxes(basis, 1, 2)) / np.sqrt(np.maximum(eigenvalues, floor))[:, :, None]
+        H = whitened @ (window(w)[:, :, None] * np.conj(np.swapaxes(whitened, 1, 2)))
+        return np.where(eigenvalues[:, 0] > floor[:, 0], np.linalg.eigvalsh(H)[:, -1], np.inf)
+
+    ratio, w = supremum(needed, np.concatenate([[0.0], frequencies(V)]))
+    if np.isinf(ratio):
+        return refused(f"V is not passive enough at {w / (2 * np.pi * V.T):.4g} Hz: its damping vanishes there")
+    return Requirement("theorem4", ratio, available, w / (2 * np.pi * V.T))
+
+
+def per_channel(V: Sequence[Lti], theta: Sequence[int], delta: Sequence[float]) -> tuple[Requirement, ...]:
+    """Theorem 4 channel by channel, for a diagonal coupling: each device's own figure."""
+    return tuple(theorem4(v, [n], [d]) for v, n, d in zip(V, theta, delta, strict=True))
+
+
+def _dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
+    values = tuple(float(d) for d in delta)
+    if len(values) != channels:
+        raise ValueError(f"delta has {len(values)} entries for {channels} channels")
+    if not all(0 < d < np.inf for d in values):
+        raise ValueError(f"delta is {list(values)}, expected positive dampings in N s/m")
+    return values

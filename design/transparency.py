@@ -1,0 +1,88 @@
+"""How close what the devices see comes to the environment: the mismatch (8) and its figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.delay import delay
+from controller.lti import Array, Lti
+from design.sweep import frequencies, on_circle, supremum
+
+BAND_HZ = (0.5, 80.0)
+
+
+@dataclass(frozen=True)
+class Transparency:
+    """Figures of the mismatch M = F - Lambda E; ratios, not decibels."""
+
+    tau: float  # (25): sup sigma_max(M) / inf sigma_min(E) up to band_hz[1]
+    relative_mismatch: float  # sup over the band of sigma_max(M) / sigma_max(E)
+    rms_mismatch: float  # rms over log frequency in the band of ||M||_F / ||E||_F
+    dc_ratio: float  # sigma_max F(1) / sigma_max E(1): the share of the static stiffness that is felt
+    high_frequency_gain: float  # sup above 100 Hz of sigma_max(F) / sigma_max(E)
+    band_hz: tuple[float, float]
+
+
+def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
+    """The figures for the force map F against Lambda E."""
+    target = delay(lam, F.T) @ environment
+    per_hz = 2 * np.pi * F.T
+    low, high = band_hz[0] * per_hz, min(band_hz[1] * per_hz, np.pi)
+
+    def sigma(G: Lti, w: Array, which: int) -> Array:
+        return np.linalg.svd(G.at(on_circle(w)), compute_uv=False)[:, which]
+
+    def mismatch(w: Array) -> Array:
+        z = on_circle(w)
+        return F.at(z) - target.at(z)
+
+    def relative(w: Array) -> Array:
+        return np.linalg.norm(mismatch(w), 2, axis=(1, 2)) / sigma(environment, w, 0)
+
+    grid = frequencies(F, environment, low=low, high=high)
+    full = frequencies(F, environment, low=low * 1e-3, high=high)
+    peak, _ = supremum(lambda w: np.linalg.norm(mismatch(w), 2, axis=(1, 2)), full)
+    least, _ = supremum(lambda w: -sigma(environment, w, -1), full)
+    static = np.linalg.svd(environment.dc(), compute_uv=False)
+    least = 0.0 if static[-1] < 1e-9 * static[0] else min(-least, float(static[-1]))
+    return Transparency(
+        tau=_ratio(peak, least),
+        relative_mismatch=supremum(relative, grid)[0],
+        rms_mismatch=_rms(mismatch, environment, grid),
+        dc_ratio=_ratio(float(np.linalg.norm(F.dc(), 2)), float(static[0])),
+        high_frequency_gain=_high_frequency_gain(F, environment, 100.0 * per_hz),
+        band_hz=band_hz,
+    )
+
+
+def decibels(ratio: float) -> float:
+    """20 log10(ratio); -inf for 0."""
+    return 20 * np.log10(ratio) if ratio > 0 else -np.inf
+
+
+def _ratio(numerator: float, denominator: float) -> float:
+    if denominator > 0:
+        return numerator / denominator
+    return np.inf if numerator > 0 else np.nan
+
+
+def _rms(mismatch, environment: Lti, grid: Array) -> float:
+    """sqrt of the mean over log frequency, by the trapezoidal rule on the pole-dense grid."""
+    E = environment.at(on_circle(grid))
+    square = (np.abs(mismatch(grid)) ** 2).sum(axis=(1, 2)) / (np.abs(E) ** 2).sum(axis=(1, 2))
+    logarithm = np.log(grid)
+    return float(np.sqrt(np.trapezoid(square, logarithm) / (logarithm[-1] - logarithm[0])))
+
+
+def _high_frequency_gain(F: Lti, environment: Lti, above: float) -> float:
+    if above >= np.pi:
+        return np.nan
+
+    def gain(w: Array) -> Array:
+        z = on_circle(w)
+        return np.linalg.norm(F.at(z), 2, axis=(1, 2)) / np.linalg.norm(environment.at(z), 2, axis=(1, 2))
+
+    return supremum(gain, frequencies(F, environment, low=above))[0]
