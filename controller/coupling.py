@@ -47,9 +47,13 @@ class SpringDamper:
         if not (np.isfinite(self.B).all() and (self.B >= 0).all()):
             raise ValueError(f"B is {self.B.tolist()}, expected dampings >= 0 in N s/m")
 
+    def channels(self, T: float) -> list[Lti]:
+        """V_i(z): y = (f + (B/T) y-) / (K + B/T), with a state only where there is a damper."""
+        return [_spring_damper(k, b, T) for k, b in zip(self.K, self.B, strict=True)]
+
     def compliance(self, T: float) -> Lti:
-        """V(z): y = (f + (B/T) y-) / (K + B/T), with a state only where there is a damper."""
-        return Lti.diag(*(_spring_damper(k, b, T) for k, b in zip(self.K, self.B, strict=True)))
+        """V(z), diagonal."""
+        return Lti.diag(*self.channels(T))
 
     def around(self, environment: Lti) -> Lti:
         return Compliance(self.compliance(environment.T)).around(environment)

@@ -3,13 +3,13 @@
         tick k, at time kT
           1  x = encoder positions, sampled                (the plant's state just before kT)
           2  u = x - V f_e ;  f_e = Psi E u                (the algebraic loop was solved at construction)
-          3  f = clip(Theta f_e, +-force_limit)
-          4  hold -f on the actuators, advance the plant by T
+          3  f = Theta f_e
+          4  hold -clip(f, +-force_limit) on the actuators, advance the plant by T
           5  commit the discrete states                    (the plant's state just after kT)
 
 With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later.
-Steps 2, 3 (without the limit) and 5 are linear: they are ONE state-space block, and a tick is one matrix
-product [f; z+] = [C D; A B] [z; x] for any number of simulations at once.
+Steps 2, 3 and 5 are linear: they are ONE state-space block, and a tick is one matrix product
+[f; z+] = [C D; A B] [z; x] for any number of simulations at once. Saturation is what the actuators do.
 """
 
 from __future__ import annotations
@@ -83,14 +83,13 @@ class Tape:
 
         self.plant_state = [*slabs(nz, plant_states), self._memory[ticks * width + nz :][:plant_states]]
         self.plant_input = slabs(nz + plant_states, outside + m)
+        self.force = slabs(width - m, m)
+        self.plant_row = slabs(nz, plant_states + outside + m)
         self._input = slabs(0, nz + m)
         self._output = slabs(width - m, m + nz)
         self._measured = slabs(nz, m)
-        self._force = slabs(width - m, m)
         F = process.F
-        self._matrix = np.block([[F.C, F.D], [F.A, F.B]])
-        self._high = process.force_limit[:, None]
-        self._low = -self._high
+        self._product = np.block([[F.C, F.D], [F.A, F.B]]).dot
         self._step = np.where(process.encoder_step > 0, process.encoder_step, np.inf)[:, None]
         self._quantised = bool((process.encoder_step > 0).any())
 
@@ -98,15 +97,17 @@ class Tape:
         """Steps 1, 2, 3 and 5 for row k, whose plant state has been written: f[k] and z[k + 1]."""
         if self._quantised:
             self._quantise(self._measured[k])
-        np.dot(self._matrix, self._input[k], self._output[k])
-        force = self._force[k]
-        np.minimum(force, self._high, force)
-        np.maximum(force, self._low, force)
+        self._product(self._input[k], self._output[k])
 
-    def rewind(self) -> None:
-        """Start a new stretch where this one ended."""
-        self.z[0] = self.z[-1]
-        self.s[0] = self.s[-1]
+    def saturate(self, ticks: int) -> None:
+        """Turn the forces of the first `ticks` rows from asked for into applied, as the actuators did."""
+        limit = self.process.force_limit[:, None]
+        np.clip(self.f[:ticks], -limit, limit, out=self.f[:ticks])
+
+    def rewind(self, ticks: int) -> None:
+        """Start a new stretch where this one stood after `ticks` ticks."""
+        self.z[0] = self.z[ticks]
+        self.s[0] = self.s[ticks]
 
     def _quantise(self, x: Array) -> None:
         """Round to whole encoder steps, in place; an ideal channel (step inf) is left as it is."""

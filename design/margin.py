@@ -26,16 +26,17 @@ class Requirement:
     """The damping that a condition asks of the devices, against what they have."""
 
     condition: str  # "closed-loop" | "theorem4"
-    ratio: float  # s: required / available; inf when no damping helps
+    required: tuple[float, ...]  # (m,) [N s/m]; inf when no damping helps
     available: tuple[float, ...]  # (m,) [N s/m]
     frequency_hz: float | None  # where it binds
-    reason: str | None = None  # why the figure is infinite or unknown
+    reason: str | None = None  # why the figure is infinite
     proof: str = "sampled"
 
     @property
-    def required(self) -> tuple[float, ...]:
-        """(m,) [N s/m]."""
-        return tuple(self.ratio * delta for delta in self.available)
+    def ratio(self) -> float:
+        """s: required / available on the worst channel."""
+        pairs = zip(self.required, self.available, strict=True)
+        return max(need / have if have > 0 else np.inf for need, have in pairs)
 
     @property
     def certified(self) -> bool:
@@ -47,8 +48,10 @@ def closed_loop(F: Lti, delta: Sequence[float]) -> Requirement:
     available = _dampings(delta, F.inputs)
 
     def refused(reason: str) -> Requirement:
-        return Requirement("closed-loop", np.inf, available, None, reason)
+        return _refused("closed-loop", available, reason)
 
+    if min(available) == 0:
+        return refused("a device guarantees no damping, so no coupling is safe for every passive human")
     radius = float(np.abs(F.poles()).max(initial=0.0))
     if radius >= 1:
         return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
@@ -68,7 +71,7 @@ def closed_loop(F: Lti, delta: Sequence[float]) -> Requirement:
 
     grid = np.concatenate([[0.0], frequencies(F)])
     ratio, w = supremum(needed, grid)
-    return Requirement("closed-loop", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
+    return _requirement("closed-loop", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
 
 
 def theorem4(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Requirement:
@@ -82,8 +85,10 @@ def theorem4(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Requiremen
         raise ValueError(f"theta has {len(theta)} entries for {V.inputs} channels")
 
     def refused(reason: str) -> Requirement:
-        return Requirement("theorem4", np.inf, available, None, reason)
+        return _refused("theorem4", available, reason)
 
+    if min(available) == 0:
+        return refused("a device guarantees no damping, so no coupling is safe for every passive human")
     if not V.is_stable():
         return refused("the coupling V has a pole on or outside the unit circle")
     V1 = V.dc()
@@ -109,18 +114,30 @@ def theorem4(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Requiremen
     ratio, w = supremum(needed, np.concatenate([[0.0], frequencies(V)]))
     if np.isinf(ratio):
         return refused(f"V is not passive enough at {w / (2 * np.pi * V.T):.4g} Hz: its damping vanishes there")
-    return Requirement("theorem4", ratio, available, w / (2 * np.pi * V.T))
+    return _requirement("theorem4", ratio, available, w / (2 * np.pi * V.T))
 
 
-def per_channel(V: Sequence[Lti], theta: Sequence[int], delta: Sequence[float]) -> tuple[Requirement, ...]:
-    """Theorem 4 channel by channel, for a diagonal coupling: each device's own figure."""
-    return tuple(theorem4(v, [n], [d]) for v, n, d in zip(V, theta, delta, strict=True))
+def theorem4_per_channel(V: Sequence[Lti], theta: Sequence[int], delta: Sequence[float]) -> Requirement:
+    """Theorem 4 for a diagonal coupling, given its channels: each device's own figure."""
+    each = [theorem4(v, [n], [d]) for v, n, d in zip(V, theta, delta, strict=True)]
+    worst = max(each, key=lambda r: r.ratio)
+    required = tuple(r.required[0] for r in each)
+    available = tuple(r.available[0] for r in each)
+    return Requirement("theorem4", required, available, worst.frequency_hz, worst.reason)
+
+
+def _requirement(condition: str, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement:
+    return Requirement(condition, tuple(ratio * delta for delta in available), available, frequency_hz)
+
+
+def _refused(condition: str, available: tuple[float, ...], reason: str) -> Requirement:
+    return Requirement(condition, (np.inf,) * len(available), available, None, reason)
 
 
 def _dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
     values = tuple(float(d) for d in delta)
     if len(values) != channels:
         raise ValueError(f"delta has {len(values)} entries for {channels} channels")
-    if not all(0 < d < np.inf for d in values):
-        raise ValueError(f"delta is {list(values)}, expected positive dampings in N s/m")
+    if not all(0 <= d < np.inf for d in values):
+        raise ValueError(f"delta is {list(values)}, expected dampings >= 0 in N s/m")
     return values

@@ -60,7 +60,7 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
 
 def decibels(ratio: float) -> float:
     """20 log10(ratio); -inf for 0."""
-    return 20 * np.log10(ratio) if ratio > 0 else -np.inf
+    return float(20 * np.log10(ratio)) if ratio > 0 else -np.inf
 
 
 def _ratio(numerator: float, denominator: float) -> float:

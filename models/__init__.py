@@ -1,0 +1,1 @@
+"""The continuous, physical world: devices and human hands as one MuJoCo scene. It knows nothing of control."""

@@ -1,0 +1,65 @@
+"""Force-feedback devices clamped to one axis, and the guaranteed damping that all certificates rest on."""
+
+from __future__ import annotations
+
+import msgspec
+
+from models.quantity import require
+
+
+class CompliantDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="compliant", tag_field="kind"):
+    """A motor with encoder, joined to the handle by a transmission spring.
+
+    Whatever hangs on the transmission, the port at motor and encoder dissipates at least `damping`: it is the
+    output-strict-passivity level of the device.
+    """
+
+    motor_mass: float = 0.06  # [kg] assumed, with handle_mass: 0.25 kg in total
+    damping: float = 1.37  # [N s/m] the paper's section 6, from a first-order model identified on an Omega
+    handle_mass: float = 0.19  # [kg] assumed
+    transmission_stiffness: float = 14500.0  # [N/m] assumed: puts the structural mode near 90 Hz
+    transmission_damping: float = 0.0  # [N s/m] assumed
+    force_limit: float = 12.0  # [N] omega.3 in CHAI3D's device table
+    encoder_step: float = 0.0  # [m] assumed 0: an ideal encoder
+    delta: float | None = None  # [N s/m] guaranteed damping; `damping` unless an identification bounds it lower
+
+    def __post_init__(self) -> None:
+        _check_common(self, ("motor_mass", "handle_mass"))
+        require("transmission_stiffness", self.transmission_stiffness, 1.0, 1e9, "N/m")
+        require("transmission_damping", self.transmission_damping, 0.0, 1e5, "N s/m")
+
+
+class RigidDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="rigid", tag_field="kind"):
+    """Motor, encoder and handle as one body."""
+
+    mass: float = 0.25  # [kg] assumed
+    damping: float = 1.37  # [N s/m] the paper's section 6
+    force_limit: float = 12.0  # [N] omega.3 in CHAI3D's device table
+    encoder_step: float = 0.0  # [m] assumed 0: an ideal encoder
+    delta: float | None = None  # [N s/m] guaranteed damping
+
+    def __post_init__(self) -> None:
+        _check_common(self, ("mass",))
+
+
+Device = CompliantDevice | RigidDevice
+
+
+def passivity_level(device: Device) -> float:
+    """delta [N s/m]: the damping that the device guarantees to the design."""
+    return device.damping if device.delta is None else device.delta
+
+
+def with_damping(device: Device, damping: float) -> Device:
+    """The same device with another motor damping, all of it guaranteed."""
+    return msgspec.structs.replace(device, damping=damping, delta=None)
+
+
+def _check_common(device: Device, masses: tuple[str, ...]) -> None:
+    for name in masses:
+        require(name, getattr(device, name), 1e-6, 1e3, "kg")
+    require("damping", device.damping, 0.0, 1e4, "N s/m")
+    require("force_limit", device.force_limit, 1e-3, 1e6, "N")
+    require("encoder_step", device.encoder_step, 0.0, 1e-2, "m")
+    if device.delta is not None and not 0 < device.delta <= device.damping:
+        raise ValueError(f"delta is {device.delta:g} N s/m, allowed are values in (0, damping = {device.damping:g}]")

@@ -1,0 +1,174 @@
+"""Devices and humans as one MuJoCo model, and the same plant as matrices, read from that model.
+
+The only place that knows joint names. Every body slides along x. Joints come in the order motors, handles
+(of compliant devices), further masses of the humans, so that the first m positions are the encoders':
+
+    actuator (-f) -> motor_i ==transmission== handle_i (with the human's first mass) ==link== human_i_2 == ...
+
+Gravity, contacts and constraints are off. Inputs are MuJoCo actuators: first the outside forces (voluntary
+motion and taps), then one motor per device with gear -1, because the device feels -f.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from models.device import CompliantDevice, Device
+from models.human import Human
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A compiled model and where the loop's signals are in it."""
+
+    model: mujoco.MjModel
+    xml: str
+    handles: tuple[int, ...]  # (m,) joint of each handle
+    pushed: tuple[int, ...]  # (m,) outside input that reaches the end of each human (voluntary force)
+    tapped: tuple[int, ...]  # (m,) outside input that reaches each handle
+
+    @property
+    def channels(self) -> int:
+        return len(self.handles)
+
+    @property
+    def outside(self) -> int:
+        """Number of outside inputs: the actuators before the motors."""
+        return int(self.model.nu) - self.channels
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """x' = A x + B u, y = C x with x = [positions; velocities], u = [outside forces; f], y = encoder positions."""
+
+    A: Array  # (2n, 2n)
+    B: Array  # (2n, outside + m)
+    C: Array  # (m, 2n)
+
+
+def build(devices: Sequence[Device], humans: Sequence[Human]) -> Scene:
+    """One scene of devices, each held by its human. Raises ValueError where their numbers differ."""
+    if len(devices) != len(humans) or not devices:
+        raise ValueError(f"{len(devices)} devices and {len(humans)} humans: each device needs one human")
+    spec = mujoco.MjSpec()
+    spec.modelname = "haptic loop"
+    _only_what_the_loop_needs(spec)
+    last = _add_masses(spec, devices, humans)
+    for i, (device, human) in enumerate(zip(devices, humans, strict=True), start=1):
+        _add_springs(spec, i, device, human)
+
+    handles = [_handle(i, device) for i, device in enumerate(devices, start=1)]
+    reached = list(dict.fromkeys((*handles, *last)))
+    for joint in reached:
+        _add_motor(spec, f"push_{joint}", joint, gear=1.0)
+    for i, device in enumerate(devices, start=1):
+        _add_motor(spec, f"force_{i}", f"motor_{i}", gear=-1.0, limit=device.force_limit)
+    model = spec.compile()
+    return Scene(
+        model=model,
+        xml=spec.to_xml(),
+        handles=tuple(model.joint(name).id for name in handles),
+        pushed=tuple(reached.index(name) for name in last),
+        tapped=tuple(reached.index(name) for name in handles),
+    )
+
+
+def plant(model: mujoco.MjModel) -> Plant:
+    """The linear plant that `model` simulates: its mass, damping, stiffness and actuation matrices."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    n, m = model.nv, _motors(model)
+    mass = np.zeros((n, n))
+    mujoco.mj_fullM(model, data, mass)
+    inverse = np.linalg.inv(mass)
+    stiffness, damping = np.diag(model.jnt_stiffness.astype(float)), np.diag(model.dof_damping)
+    for t in range(model.ntendon):
+        across = _tendon_jacobian(model, t)
+        stiffness = stiffness + model.tendon_stiffness[t] * np.outer(across, across)
+        damping = damping + model.tendon_damping[t] * np.outer(across, across)
+    actuation = np.zeros((n, model.nu))
+    for a in range(model.nu):
+        actuation[model.actuator_trnid[a, 0], a] = model.actuator_gear[a, 0] * model.actuator_gainprm[a, 0]
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ stiffness, -inverse @ damping]])
+    B = np.vstack([np.zeros_like(actuation), inverse @ actuation])
+    return Plant(A, B, np.eye(m, 2 * n))
+
+
+def _only_what_the_loop_needs(spec: mujoco.MjSpec) -> None:
+    off = mujoco.mjtDisableBit
+    disabled = (off.mjDSBL_CONTACT, off.mjDSBL_CONSTRAINT, off.mjDSBL_AUTORESET, off.mjDSBL_SENSOR)
+    spec.option.gravity = [0, 0, 0]
+    spec.option.disableflags = sum(int(flag) for flag in disabled)
+
+
+def _handle(i: int, device: Device) -> str:
+    return f"handle_{i}" if isinstance(device, CompliantDevice) else f"motor_{i}"
+
+
+def _add_masses(spec: mujoco.MjSpec, devices: Sequence[Device], humans: Sequence[Human]) -> list[str]:
+    """Bodies in the order motors, handles, human masses. Returns the joint at the end of each human."""
+    motors, handles, arms, last = [], [], [], []
+    for i, (device, human) in enumerate(zip(devices, humans, strict=True), start=1):
+        held = human.links[0].mass
+        if isinstance(device, CompliantDevice):
+            motors.append((f"motor_{i}", device.motor_mass, device.damping))
+            handles.append((f"handle_{i}", device.handle_mass + held, 0.0))
+        else:
+            motors.append((f"motor_{i}", device.mass + held, device.damping))
+        arms += [(f"human_{i}_{j}", link.mass, 0.0) for j, link in enumerate(human.links[1:], start=2)]
+        last.append(f"human_{i}_{len(human.links)}" if len(human.links) > 1 else _handle(i, device))
+    end = {name: human.links[-1] for name, human in zip(last, humans, strict=True)}
+    for name, mass, damping in (*motors, *handles, *arms):
+        body = spec.worldbody.add_body(name=name, mass=mass, ipos=[0, 0, 0], inertia=[1e-3] * 3, explicitinertial=True)
+        joint = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
+        joint.damping[0] = damping
+        if name in end:
+            joint.damping[0] += end[name].damping
+            joint.stiffness[0] = end[name].stiffness
+    return last
+
+
+def _add_springs(spec: mujoco.MjSpec, i: int, device: Device, human: Human) -> None:
+    """The transmission and the links between the masses of one human, as fixed tendons."""
+    if isinstance(device, CompliantDevice):
+        stiffness, damping = device.transmission_stiffness, device.transmission_damping
+        _add_spring(spec, f"transmission_{i}", f"motor_{i}", f"handle_{i}", stiffness, damping)
+    joints = [_handle(i, device), *(f"human_{i}_{j}" for j in range(2, len(human.links) + 1))]
+    for j, link in enumerate(human.links[:-1]):
+        _add_spring(spec, f"link_{i}_{j + 1}", joints[j], joints[j + 1], link.stiffness, link.damping)
+
+
+def _add_spring(spec: mujoco.MjSpec, name: str, a: str, b: str, stiffness: float, damping: float) -> None:
+    tendon = spec.add_tendon(name=name)
+    # entry 0 is the linear term; MuJoCo also knows two nonlinear ones
+    tendon.stiffness[0], tendon.damping[0] = stiffness, damping
+    tendon.springlength = [0, 0]
+    tendon.wrap_joint(b, 1.0)
+    tendon.wrap_joint(a, -1.0)
+
+
+def _add_motor(spec: mujoco.MjSpec, name: str, joint: str, gear: float, limit: float | None = None) -> None:
+    motor = spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    motor.set_to_motor()
+    motor.gear = [gear, 0, 0, 0, 0, 0]
+    if limit is not None:
+        motor.ctrllimited, motor.ctrlrange = True, [-limit, limit]
+
+
+def _motors(model: mujoco.MjModel) -> int:
+    return sum(model.actuator(a).name.startswith("force_") for a in range(model.nu))
+
+
+def _tendon_jacobian(model: mujoco.MjModel, t: int) -> Array:
+    row = np.zeros(model.nv)
+    first, count = int(model.tendon_adr[t]), int(model.tendon_num[t])
+    for wrap in range(first, first + count):
+        row[model.wrap_objid[wrap]] += model.wrap_prm[wrap]
+    return row

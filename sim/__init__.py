@@ -1,0 +1,1 @@
+"""Where the two worlds meet: scenarios, engines, the loop, and what a run is worth."""

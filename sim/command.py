@@ -1,0 +1,128 @@
+"""What every command shares: its options, its exit codes, one line for bad input."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn, TypeVar
+
+from rich.console import Console
+from rich.progress import Progress
+
+from controller.lti import SingularLoop
+from sim.files import folder
+from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
+
+DONE, DOES_NOT_HOLD, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+Number = TypeVar("Number", int, float)
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse with one-line errors and the example at the end of --help."""
+
+    def __init__(self, prog: str, description: str, example: str) -> None:
+        super().__init__(
+            prog=f"python -m {prog}",
+            description=description,
+            epilog=f"example:\n  {example}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(f"{message} (--help lists the options)")
+
+
+def add_loop_options(parser: argparse.ArgumentParser) -> None:
+    """The options that describe a loop, which every command takes."""
+    loop = parser.add_argument_group("the loop")
+    loop.add_argument("--case", choices=CASES, default="I", help="none, I (Lambda = Theta Psi) or II (Lambda = I)")
+    names = ", ".join(built_in())
+    loop.add_argument("--scenario", default=DEFAULT, metavar="FILE.toml", help=f"or one of: {names}")
+    for name, what in (("theta", "transmission"), ("psi", "environment"), ("lam", "reference")):
+        loop.add_argument(f"--{name}", metavar="N,N,..", help=f"{what} delay per channel [samples]; one is for all")
+    loop.add_argument("--delta", metavar="D,D,..", help="damping of each device [N s/m]; one is for all")
+    loop.add_argument("--T", metavar="SECONDS", help="sampling period [s]")
+
+
+def add_output_options(parser: argparse.ArgumentParser) -> None:
+    """Where results go, and the seed."""
+    output = parser.add_argument_group("output")
+    output.add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
+    output.add_argument("--out", metavar="DIR", help="folder for files (default out/<command>-<case>)")
+    output.add_argument("--seed", metavar="N", default="0", help="for everything that is drawn at random (default 0)")
+
+
+def scenario_from(args: argparse.Namespace) -> Scenario:
+    """The scenario that the loop options describe. Raises InputError."""
+    scenario = load(args.scenario)
+    changes = {}
+    for name in ("theta", "psi", "lam"):
+        if getattr(args, name) is not None:
+            changes[name] = numbers(f"--{name}", getattr(args, name), int, scenario.channels)
+    if args.T is not None:
+        changes["T"] = numbers("--T", args.T, float, 1)[0]
+    delta = None if args.delta is None else numbers("--delta", args.delta, float, scenario.channels)
+    return scenario.replace(delta, **changes) if changes or delta else scenario
+
+
+def numbers(option: str, text: str, kind: Callable[[str], Number], count: int) -> tuple[Number, ...]:
+    """'1,2' as `count` numbers; a single one serves all channels. Raises InputError."""
+    try:
+        values = tuple(kind(part) for part in text.split(","))
+    except ValueError:
+        what = "whole number" if kind is int else "number"
+        what = f"a {what}" if count == 1 else f"{what}s separated by commas"
+        raise InputError(f"{option} is {text!r}, expected {what}") from None
+    if len(values) == 1:
+        values *= count
+    if len(values) != count:
+        raise InputError(f"{option} has {len(values)} entries, expected {count} (one per channel) or 1")
+    return values
+
+
+def seed_from(args: argparse.Namespace) -> int:
+    """The seed, checked. Raises InputError."""
+    (seed,) = numbers("--seed", args.seed, int, 1)
+    if seed < 0:
+        raise InputError(f"--seed is {seed}, allowed are whole numbers from 0")
+    return seed
+
+
+def out_folder(args: argparse.Namespace, command: str) -> Path:
+    """The folder for the files of a command, made before any work is done. Raises InputError."""
+    if args.json and args.json != "-" and not Path(args.json).parent.is_dir():
+        raise InputError(f"--json {args.json}: the folder {Path(args.json).parent} does not exist")
+    return folder(Path(args.out or f"out/{command}-{args.case}"))
+
+
+def console(args: argparse.Namespace) -> Console:
+    """Where tables go: standard error when standard output is taken by --json -."""
+    return Console(stderr=args.json == "-", highlight=False)
+
+
+def progress_bar(description: str) -> tuple[Progress, Callable[[int, int], None]]:
+    """A bar on standard error that shows only on a terminal, and the function that moves it."""
+    bar = Progress(transient=True, console=Console(stderr=True))
+    task = bar.add_task(description, total=None)
+    return bar, lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def execute(main: Callable[[list[str]], int]) -> NoReturn:
+    """Run a command and leave with its exit code; bad input is one line on standard error."""
+    try:
+        code = main(sys.argv[1:])
+        sys.stdout.flush()
+    except (InputError, SingularLoop) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        code = BAD_INPUT
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        code = INTERRUPTED
+    except BrokenPipeError:
+        sys.stderr.close()
+        code = DONE
+    sys.exit(code)

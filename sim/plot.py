@@ -1,0 +1,75 @@
+"""Pictures of runs, as in Figures 5 and 6: readable in black and white and by the colour-blind."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import BinaryIO
+
+import matplotlib as mpl
+import numpy as np
+
+from controller.lti import Array
+from sim.files import write
+from sim.result import Result
+
+mpl.use("Agg")
+
+#: Okabe and Ito's palette, with a line style each
+STYLES = (
+    {"color": "#0072B2", "linestyle": "-"},
+    {"color": "#D55E00", "linestyle": "--"},
+    {"color": "#009E73", "linestyle": ":"},
+    {"color": "#CC79A7", "linestyle": "-."},
+    {"color": "#56B4E9", "linestyle": (0, (5, 1, 1, 1, 1, 1))},
+    {"color": "#E69F00", "linestyle": (0, (1, 2))},
+)
+
+
+def plot_run(result: Result, path: Path, title: str, frequency_hz: float) -> Path:
+    """Displacements and forces over the whole run, and six periods of `frequency_hz` where it is strongest."""
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, 2, figsize=(11, 6), layout="constrained", width_ratios=(2, 1), sharex="col")
+    near = _zoom(result, frequency_hz)
+    for row, (values, label) in enumerate(((1e3 * result.x, "displacement [mm]"), (result.f, "force fed back [N]"))):
+        for column, part in enumerate((slice(None), near)):
+            for i in _calmest_last(values):
+                style = STYLES[i % len(STYLES)]
+                width = 0.9 if column == 0 else 1.4
+                axes[row, column].plot(
+                    result.t[part], values[part, i], label=f"device {i + 1}", linewidth=width, **style
+                )
+            axes[row, column].grid(alpha=0.3)
+        axes[row, 0].set_ylabel(label)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    order = np.argsort(labels)
+    figure.legend([handles[i] for i in order], [labels[i] for i in order], loc="outside lower center", ncols=6)
+    axes[0, 1].set_title("zoom: where the forces change fastest", fontsize=10)
+    for column in range(2):
+        axes[1, column].set_xlabel("time [s]")
+        axes[1, column].margins(x=0.01)
+    figure.suptitle(title)
+
+    def content(file: BinaryIO) -> None:
+        figure.savefig(file, format="png", dpi=130)
+
+    try:
+        return write(path, content)
+    finally:
+        plt.close(figure)
+
+
+def _calmest_last(values: Array) -> list[int]:
+    """Channels by their sample-to-sample change, so that a calm curve stays visible on an agitated one."""
+    return list(np.argsort(-np.square(np.diff(values, axis=0)).sum(axis=0)))
+
+
+def _zoom(result: Result, frequency_hz: float) -> slice:
+    """The stretch in which the force changes fastest from sample to sample."""
+    n = result.t.size
+    T = result.t[1] - result.t[0] if n > 1 else 1.0
+    width = min(n, max(60, round(6 / (max(frequency_hz, 1.0) * T))))
+    agitation = np.concatenate([[0.0], (np.diff(result.f, axis=0) ** 2).sum(axis=1)])
+    total = np.concatenate([[0.0], np.cumsum(agitation)])
+    first = int(np.argmax(total[width:] - total[:-width])) if n > width else 0
+    return slice(first, first + width)

@@ -1,0 +1,217 @@
+"""What a run was worth: one dictionary for machines, and the same as tables for people."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from controller.coupling import SpringDamper
+from controller.lti import Array
+from design.margin import Requirement
+from design.transparency import decibels, transparency
+from sim.couplings import Chosen
+from sim.loop import Record
+from sim.simulate import Assembly
+from sim.stability import clipped_ticks, close, dominant_mode, measured_growth, verdict
+
+#: what no certificate covers
+CAVEATS = (
+    "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted), "
+    "not for contacts that make and break, jitter of T, quantisation, velocity filters or friction compensation."
+)
+
+
+def finite(value: float) -> float | None:
+    """JSON knows neither infinity nor not-a-number."""
+    return float(value) if math.isfinite(value) else None
+
+
+def coupling_part(chosen: Chosen, assembly: Assembly) -> dict[str, Any]:
+    """Kind, gains and order of the coupling."""
+    coupling = chosen.coupling
+    part: dict[str, Any] = {"kind": chosen.kind, "K": None, "B": None, "order": 0}
+    if isinstance(coupling, SpringDamper):
+        part |= {"K": coupling.K.tolist(), "B": coupling.B.tolist()}
+        part["order"] = coupling.compliance(assembly.scenario.T).order
+    return part
+
+
+def certificate_part(requirement: Requirement) -> dict[str, Any]:
+    """Required against available damping."""
+    part = {
+        "condition": requirement.condition,
+        "required_damping": [finite(b) for b in requirement.required],
+        "available_damping": list(requirement.available),
+        "margin": finite(1 / requirement.ratio) if requirement.ratio > 0 else None,
+        "binding_frequency_hz": requirement.frequency_hz,
+        "certified": requirement.certified,
+        "proof": requirement.proof,
+    }
+    return part | ({"reason": requirement.reason} if requirement.reason else {})
+
+
+def transparency_part(assembly: Assembly, case: str) -> dict[str, Any]:
+    """The figures of the mismatch, in decibels, with a reason where one is infinite."""
+    figures = transparency(assembly.F, assembly.environment, assembly.scenario.reference_delays(case))
+    part: dict[str, Any] = {
+        "tau_db": finite(decibels(figures.tau)),
+        "relative_mismatch_db": finite(decibels(figures.relative_mismatch)),
+        "rms_mismatch_db": finite(decibels(figures.rms_mismatch)),
+        "dc_ratio": finite(figures.dc_ratio),
+        "high_frequency_gain": finite(figures.high_frequency_gain),
+        "band_hz": list(figures.band_hz),
+    }
+    if figures.relative_mismatch == 0:
+        part["reason"] = "the devices see the reference exactly: the mismatch is zero, minus infinity in dB"
+    elif math.isinf(figures.tau):
+        part["reason"] = "tau (25) divides by inf sigma_min(E), which is 0: some motion costs no static force"
+    return part
+
+
+def stability_part(assembly: Assembly, record: Record) -> dict[str, Any]:
+    """Measured on the trace, and from the eigenvalues of the exact loop."""
+    loop = close(assembly.plant, assembly.F)
+    mode = dominant_mode(loop)
+    limit = assembly.process.force_limit
+    growth, reason = measured_growth(loop, mode, record, limit)
+    if record.diverged:
+        reason = "the simulation left the range of finite numbers: reported as unstable"
+    part: dict[str, Any] = {
+        "verdict": "unstable" if record.diverged else None if growth is None else verdict(growth),
+        "clipped_ticks": int(clipped_ticks(record, limit).sum()),
+        "growth_rate_per_s": growth,
+        "frequency_hz": _dominant_frequency(record, assembly.scenario.T),
+        "exact_verdict": mode.verdict,
+        "exact_growth_rate_per_s": finite(mode.growth),
+        "exact_frequency_hz": mode.frequency_hz,
+        "spectral_radius": mode.spectral_radius,
+    }
+    return part | ({"reason": reason} if reason else {})
+
+
+def error_part(record: Record, exact: Record, assembly: Assembly) -> dict[str, Any]:
+    """Device positions against the exact engine's closed loop."""
+    limit, m = assembly.process.force_limit, assembly.process.channels
+    n = min(record.s.shape[0], exact.s.shape[0])
+    clipped = clipped_ticks(exact, limit)[:n] | clipped_ticks(record, limit)[:n]
+    unstable = dominant_mode(close(assembly.plant, assembly.F)).verdict == "unstable"
+    linear = int(np.argmax(clipped)) if unstable and clipped.any() else n
+    relative, largest = _distance(record.s[:linear, :m], exact.s[:linear, :m])
+    if linear == n:
+        return {"position_relative_rms": relative, "position_max_m": largest}
+    until = f"the unstable run first clips at t = {linear * assembly.scenario.T:.3f} s"
+    reason = f"{until}; up to there the relative rms is {relative:.1e}, and its growth multiplies any difference"
+    return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
+
+
+def promise(certificates: dict[str, Any]) -> str | None:
+    """For which environments the coupling is certified."""
+    if certificates["theorem4"]["certified"]:
+        return "any passive environment"
+    return "this environment" if certificates["closed-loop"]["certified"] else None
+
+
+def remarks(outcome: dict[str, Any]) -> list[str]:
+    """What a reader must know to read the figures rightly."""
+    lines = []
+    for part in (outcome["certificates"]["theorem4"], outcome["certificates"]["closed-loop"]):
+        if part["certified"] or "reason" in part:
+            continue
+        worst = max(n / a for n, a in zip(part["required_damping"], part["available_damping"], strict=True))
+        name = (
+            "the paper's own condition (Theorem 4)" if part["condition"] == "theorem4" else "the closed-loop condition"
+        )
+        lines.append(f"These gains fail {name}: they need {worst:.3g} times the damping that the devices guarantee.")
+    for name in ("stability", "error", "transparency"):
+        if "reason" in outcome[name]:
+            lines.append(f"{name}: {outcome[name]['reason']}.")
+    for part in outcome["certificates"].values():
+        if "reason" in part:
+            lines.append(f"{part['condition']}: {part['reason']}.")
+    return [*lines, CAVEATS]
+
+
+def _distance(a: Array, b: Array) -> tuple[float | None, float | None]:
+    size = float(np.sqrt(np.mean(b**2))) if b.size else 0.0
+    if size == 0:
+        return None, None
+    return float(np.sqrt(np.mean((a - b) ** 2))) / size, float(np.abs(a - b).max())
+
+
+def _dominant_frequency(record: Record, T: float) -> float | None:
+    """The strongest line above 10 Hz in the last quarter of the forces: what one hears and feels."""
+    tail = record.f[-(record.f.shape[0] // 4) :, :, 0]
+    if tail.shape[0] < 64:
+        return None
+    window = np.hanning(tail.shape[0])[:, None]
+    spectrum = np.abs(np.fft.rfft((tail - tail.mean(axis=0)) * window, axis=0)).sum(axis=1)
+    frequency = np.fft.rfftfreq(tail.shape[0], T)
+    spectrum[frequency < 10.0] = 0.0
+    return float(frequency[np.argmax(spectrum)]) if spectrum.any() else None
+
+
+def print_report(report: dict[str, Any], console: Console) -> None:
+    """The report as tables."""
+    table = Table(title=f"case {report['case']} · {report['scenario']} · coupling {report['coupling']['kind']}")
+    table.add_column("")
+    table.add_column("")
+    for name, value in _rows(report):
+        table.add_row(name, value)
+    console.print(table)
+    for remark in report["remarks"]:
+        console.print(f"[dim]·[/] {remark}", soft_wrap=False)
+
+
+def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
+    coupling, stability, transparent = report["coupling"], report["stability"], report["transparency"]
+    rows = []
+    if coupling["K"]:
+        rows.append(("coupling K / B", f"{_list(coupling['K'])} N/m / {_list(coupling['B'])} N s/m"))
+    for part in report["certificates"].values():
+        word = "[green]certified[/]" if part["certified"] else "[red]not certified[/]"
+        need = _list(part["required_damping"])
+        rows.append(
+            (f"damping, {part['condition']}", f"needs {need} of {_list(part['available_damping'])} N s/m: {word}")
+        )
+    rows.append(
+        ("relative mismatch", f"{_db(transparent['relative_mismatch_db'])} (rms {_db(transparent['rms_mismatch_db'])})")
+    )
+    rows.append(("static stiffness felt", f"{100 * transparent['dc_ratio']:.1f} %" if transparent["dc_ratio"] else "-"))
+    exact = f"{stability['exact_growth_rate_per_s']:+.4f} 1/s at {stability['exact_frequency_hz']:.2f} Hz"
+    rows.append(("growth, eigenvalues", f"{exact}: {_verdict(stability['exact_verdict'])}"))
+    growth = stability["growth_rate_per_s"]
+    measured = "-" if growth is None else f"{growth:+.4f} 1/s"
+    rows.append(("growth, simulated trace", f"{measured}: {_verdict(stability['verdict'])}"))
+    run = report["run"]
+    rows.append(("clipped ticks", f"{stability['clipped_ticks']} of {run['samples']}"))
+    engine = run["engine"] + (f" {run['integrator']} x {run['substeps']}" if run["integrator"] else "")
+    rows.append(
+        (
+            "speed",
+            f"{run['wall_s']:.2f} s for {run['duration_s']:g} s: {run['real_time_factor']:.0f} x real time ({engine})",
+        )
+    )
+    rms = report["error"]["position_relative_rms"]
+    rows.append(
+        (
+            "position error",
+            "-" if rms is None else f"{rms:.1e} relative rms, {report['error']['position_max_m']:.1e} m at most",
+        )
+    )
+    return rows
+
+
+def _verdict(word: str | None) -> str:
+    return {"stable": "[green]stable[/]", "unstable": "[red]unstable[/]"}.get(word or "", "not decided")
+
+
+def _list(values: list[float | None]) -> str:
+    return ", ".join("inf" if v is None else f"{v:.5g}" for v in values)
+
+
+def _db(value: float | None) -> str:
+    return "zero" if value is None else f"{value:.2f} dB"

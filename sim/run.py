@@ -1,0 +1,146 @@
+"""python -m sim.run: close the loop once and say what happened, with figures and a picture.
+
+scenario -> environment -> coupling -> certificates -> loop -> result -> report
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import Any
+
+from sim import report
+from sim.command import (
+    DONE,
+    INTERRUPTED,
+    Parser,
+    add_loop_options,
+    add_output_options,
+    console,
+    execute,
+    numbers,
+    out_folder,
+    progress_bar,
+    scenario_from,
+    seed_from,
+)
+from sim.couplings import CONDITIONS, KINDS, Chosen, choose, requirements
+from sim.files import write, write_json
+from sim.loop import Record
+from sim.mujoco_engine import INTEGRATORS
+from sim.result import Result
+from sim.scenario import InputError
+from sim.simulate import ENGINES, Assembly, assemble, simulate
+
+
+def main(argv: list[str]) -> int:
+    args = _parser().parse_args(argv)
+    scenario = scenario_from(args)
+    if args.duration is not None:
+        scenario = scenario.replace(duration=numbers("--duration", args.duration, float, 1)[0])
+    substeps, seed, out = _substeps(args), seed_from(args), out_folder(args, "run")
+    chosen = choose(scenario, args.case, args.coupling, args.condition)
+    assembly = assemble(scenario, chosen.coupling)
+
+    with (bar := progress_bar("simulating"))[0]:
+        begin = time.perf_counter()
+        record = simulate(assembly, args.engine, args.integrator, substeps, progress=bar[1])
+        wall = time.perf_counter() - begin
+    exact = record if args.engine == "exact" else simulate(assembly, "exact")
+
+    outcome = _outcome(args, chosen, assembly, record, exact, wall)
+    outcome["run"]["seed"] = seed
+    outcome["files"] = [str(p) for p in _save(args, out, assembly, record, outcome)]
+    report.print_report(outcome, console(args))
+    if args.json:
+        write_json(args.json, outcome)
+    return INTERRUPTED if record.interrupted else DONE
+
+
+def _parser() -> Parser:
+    parser = Parser(
+        "sim.run", "Close the loop once and report stability, transparency and error.", "python -m sim.run --case none"
+    )
+    add_loop_options(parser)
+    parser.add_argument("--coupling", choices=KINDS, help="default: the case's own")
+    parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
+    parser.add_argument("--engine", choices=ENGINES, default="mujoco")
+    parser.add_argument("--integrator", choices=tuple(INTEGRATORS), default="RK4", help="MuJoCo's (default RK4)")
+    parser.add_argument("--substeps", default="4", metavar="N", help="MuJoCo steps per period (default 4)")
+    parser.add_argument("--duration", metavar="SECONDS", help="default: the scenario's")
+    parser.add_argument("--no-plot", action="store_true", help="write no picture")
+    add_output_options(parser)
+    return parser
+
+
+def _substeps(args: argparse.Namespace) -> int:
+    (substeps,) = numbers("--substeps", args.substeps, int, 1)
+    if not 1 <= substeps <= 10_000:
+        raise InputError(f"--substeps is {substeps}, allowed are 1 to 10000")
+    return substeps
+
+
+def _outcome(
+    args: argparse.Namespace, chosen: Chosen, assembly: Assembly, record: Record, exact: Record, wall: float
+) -> dict[str, Any]:
+    scenario, samples = assembly.scenario, record.s.shape[0]
+    certificates = {
+        name: report.certificate_part(requirement)
+        for name, requirement in requirements(assembly, chosen.coupling).items()
+    }
+    simulated = samples * scenario.T
+    mujoco = args.engine == "mujoco"
+    outcome = {
+        "case": args.case,
+        "scenario": scenario.name,
+        "coupling": report.coupling_part(chosen, assembly),
+        "certificate": certificates[chosen.condition],
+        "certificates": certificates,
+        "promise": report.promise(certificates),
+        "transparency": report.transparency_part(assembly, args.case),
+        "stability": report.stability_part(assembly, record),
+        "run": {
+            "engine": args.engine,
+            "integrator": args.integrator if mujoco else None,
+            "substeps": int(args.substeps) if mujoco else None,
+            "duration_s": simulated,
+            "samples": samples,
+            "wall_s": wall,
+            "real_time_factor": simulated / wall,
+            "theta": list(scenario.theta),
+            "psi": list(scenario.psi),
+            "lam": list(scenario.reference_delays(args.case)),
+            "T_s": scenario.T,
+            "interrupted": record.interrupted,
+            "scenario_digest": scenario.digest,
+        },
+        "error": report.error_part(record, exact, assembly),
+    }
+    return outcome | {"remarks": report.remarks(outcome)}
+
+
+def _save(
+    args: argparse.Namespace, out: Path, assembly: Assembly, record: Record, outcome: dict[str, Any]
+) -> list[Path]:
+    result = Result.from_record(assembly, record, outcome)
+    files = [
+        result.save_npz(out / "trace.npz"),
+        result.save_csv(out / "trace.csv"),
+        write(out / "scene.xml", assembly.scene.xml),
+    ]
+    if not args.no_plot and result.t.size:
+        from sim.plot import plot_run
+
+        stability = outcome["stability"]
+        with_what = "no virtual coupling" if args.case == "none" else f"{outcome['coupling']['kind']} coupling"
+        growth = f"growth {stability['exact_growth_rate_per_s']:+.3f} 1/s at {stability['exact_frequency_hz']:.1f} Hz"
+        title = f"{outcome['scenario']}, case {args.case}, {with_what}: {growth}"
+        files.append(plot_run(result, out / "figure.png", title, stability["exact_frequency_hz"]))
+    files.append(out / "report.json")
+    write_json(files[-1], outcome | {"files": [str(p) for p in files]})
+    return files
+
+
+if __name__ == "__main__":
+    execute(main)

@@ -1,0 +1,181 @@
+"""What a run is made of, read strictly from TOML: an unknown key or an impossible number never passes."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import re
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Self, get_args
+
+import msgspec
+
+from controller.environment import Network, Spring, environment
+from controller.lti import Lti
+from models.device import Device, passivity_level, with_damping
+from models.human import Human, Link, Population, Voluntary
+from models.quantity import require
+
+CASES = ("none", "I", "II")
+SCENARIOS = Path(__file__).parent / "scenarios"
+DEFAULT = "omega-pair"
+
+Delays = tuple[Annotated[int, msgspec.Meta(ge=0, le=10_000)], ...]
+
+
+class InputError(ValueError):
+    """Something that the user gave and can put right: one line, naming the field."""
+
+
+class Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A short constant force on one handle."""
+
+    channel: int  # counted from 1
+    force: float  # [N]
+    start: float  # [s]
+    duration: float  # [s]
+
+    def __post_init__(self) -> None:
+        require("force", self.force, -1e4, 1e4, "N")
+        require("start", self.start, 0.0, 1e6, "s")
+        require("duration", self.duration, 0.0, 1e6, "s")
+
+
+class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Devices, humans, environment, delays and timing of one loop; every list has one entry per channel."""
+
+    name: str
+    T: float  # sampling period [s]
+    theta: Delays  # transmission delays [samples] (4)
+    psi: Delays  # environment delays [samples] (5)
+    device: tuple[Device, ...]
+    human: tuple[Human, ...]
+    environment: Network
+    lam: Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
+    tap: Tap | None = None
+    duration: float = 15.0  # [s]
+    population: Population = Population()  # who `validate` draws
+
+    def __post_init__(self) -> None:
+        require("T", self.T, 1e-6, 0.1, "s")
+        require("duration", self.duration, self.T, 1e6, "s")
+        for name in ("theta", "psi", "device", "human", "lam"):
+            value = getattr(self, name)
+            if value is not None and len(value) != self.channels:
+                contacts = f"the environment has {self.channels} contacts ({', '.join(self.environment.contacts)})"
+                raise ValueError(f"{name} has {len(value)} entries, but {contacts}")
+        for i, lam in enumerate(self.lam or ()):
+            if lam > self.theta[i] + self.psi[i]:
+                total = self.theta[i] + self.psi[i]
+                raise ValueError(f"lam[{i}] is {lam}, allowed are 0 to theta + psi = {total} samples")
+        if self.tap and not 1 <= self.tap.channel <= self.channels:
+            raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
+
+    @property
+    def channels(self) -> int:
+        return len(self.environment.contacts)
+
+    @property
+    def delta(self) -> tuple[float, ...]:
+        """The guaranteed damping of each device [N s/m]: all that certificates know of it."""
+        return tuple(passivity_level(d) for d in self.device)
+
+    @property
+    def samples(self) -> int:
+        return max(1, round(self.duration / self.T))
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over the scenario's contents."""
+        return hashlib.sha256(msgspec.json.encode(self, order="sorted")).hexdigest()
+
+    def reference_delays(self, case: str) -> tuple[int, ...]:
+        """Lambda of a case: what `lam` says, else 0 in case II and theta + psi otherwise."""
+        if self.lam is not None:
+            return self.lam
+        if case == "II":
+            return (0,) * self.channels
+        return tuple(t + p for t, p in zip(self.theta, self.psi, strict=True))
+
+    def discrete_environment(self) -> Lti:
+        """E(z)."""
+        return environment(self.environment, self.T)
+
+    def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
+        """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping."""
+        if delta is not None and len(delta) != self.channels:
+            raise InputError(f"delta has {len(delta)} entries for {self.channels} channels")
+        try:
+            if delta is not None:
+                changes["device"] = tuple(with_damping(d, b) for d, b in zip(self.device, delta, strict=True))
+            return msgspec.structs.replace(self, **changes)
+        except ValueError as error:
+            raise InputError(str(error)) from None
+
+
+def load(source: str | Path = DEFAULT) -> Scenario:
+    """A scenario from a TOML file, or one of the built-in ones by name. Raises InputError."""
+    path = SCENARIOS / f"{source}.toml" if str(source) in built_in() else Path(source)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        names = ", ".join(built_in())
+        raise InputError(f"scenario {source}: {error.strerror}; give a TOML file or one of: {names}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"scenario {source}: not a text file in UTF-8") from None
+    return parse(text, str(source))
+
+
+def parse(text: str, source: str = "scenario") -> Scenario:
+    """A scenario from TOML text. Raises InputError, with the path of the field and the value that came."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{source}: not valid TOML: {error}") from None
+    try:
+        scenario = msgspec.convert(raw, Scenario)
+        scenario.discrete_environment()
+    except msgspec.ValidationError as error:
+        raise InputError(f"{source}: {_located(str(error), raw)}") from None
+    except ValueError as error:
+        raise InputError(f"{source}: environment: {error}") from None
+    return scenario
+
+
+def built_in() -> list[str]:
+    """Names of the scenarios that come with the program."""
+    return sorted(path.stem for path in SCENARIOS.glob("*.toml"))
+
+
+def _located(message: str, raw: dict[str, Any]) -> str:
+    """'Expected `int`, got `float` - at `$.theta[0]`' as 'theta[0] = 1.5: expected `int`, got `float`'."""
+    match = re.fullmatch(r"(.*?)(?: - at `(?:key in )?\$\.?(.*)`)?", message, flags=re.DOTALL)
+    assert match
+    what, path = match[1], match[2] or ""
+    what += _hint(what)
+    value: Any = raw
+    for key, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
+        try:
+            value = value[int(index)] if index else value[key]
+        except (KeyError, IndexError, TypeError):
+            value = None
+            break
+    shown = f" = {value!r}" if isinstance(value, int | float | str) else ""
+    return f"{path}{shown}: {what[0].lower()}{what[1:]}" if path else f"{what[0].lower()}{what[1:]}"
+
+
+def _hint(what: str) -> str:
+    """What would have been allowed, where the message does not say it."""
+    unknown = re.search(r"unknown field `(.*)`", what)
+    if unknown:
+        known = {name for struct in _STRUCTS for name in struct.__struct_fields__}
+        close = difflib.get_close_matches(unknown[1], sorted(known), n=1)
+        return f" (did you mean `{close[0]}`?)" if close else ""
+    if what.startswith("Invalid value"):
+        return f", allowed are {' and '.join(repr(d.__struct_config__.tag) for d in get_args(Device))}"
+    return ""
+
+
+_STRUCTS = (Scenario, Tap, Human, Link, Voluntary, Population, Network, Spring, *get_args(Device))

@@ -1,0 +1,74 @@
+"""From a scenario and a coupling to a trace: the joint where the two worlds meet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.coupling import Coupling
+from controller.lti import Array, Lti
+from controller.process import Process, force_map
+from models.device import Device
+from models.scene import Scene, build, plant
+from sim.engine import Engine, outside_forces
+from sim.exact_engine import ExactEngine, HeldPlant, hold
+from sim.loop import Progress, Record, run
+from sim.mujoco_engine import MujocoEngine, profiler_off
+from sim.scenario import Scenario
+
+ENGINES = ("mujoco", "exact")
+
+
+@dataclass(frozen=True, eq=False)
+class Assembly:
+    """A scenario with its coupling, ready to run."""
+
+    scenario: Scenario
+    environment: Lti  # E
+    F: Lti
+    process: Process
+    scene: Scene
+    plant: HeldPlant
+
+
+def assemble(scenario: Scenario, coupling: Coupling) -> Assembly:
+    """Build both worlds. Raises SingularLoop where the algebraic loop has no solution."""
+    environment = scenario.discrete_environment()
+    F = force_map(environment, coupling, scenario.theta, scenario.psi)
+    process = Process(F, _each(scenario.device, "force_limit"), _each(scenario.device, "encoder_step"))
+    scene = build(scenario.device, scenario.human)
+    return Assembly(scenario, environment, F, process, scene, hold(plant(scene.model), scenario.T))
+
+
+def simulate(
+    assembly: Assembly,
+    engine: str = "mujoco",
+    integrator: str = "RK4",
+    substeps: int = 4,
+    voluntary: bool = True,
+    progress: Progress = lambda done, ticks: None,
+) -> Record:
+    """The scenario's run, from rest."""
+    scenario, scene = assembly.scenario, assembly.scene
+
+    def outside(first: int, ticks: int) -> Array:
+        return outside_forces(scenario, scene, first, ticks, voluntary)
+
+    rest = np.zeros((assembly.plant.A.shape[0], 1))
+    with profiler_off():
+        plant_engine = make_engine(assembly, engine, integrator, substeps)
+        return run(assembly.process, plant_engine, outside, scenario.samples, rest, progress)
+
+
+def make_engine(assembly: Assembly, engine: str, integrator: str = "RK4", substeps: int = 4) -> Engine:
+    """The engine of that name for one simulation. Raises ValueError for a name that is none."""
+    if engine == "exact":
+        return ExactEngine(assembly.plant, assembly.process.force_limit)
+    if engine == "mujoco":
+        return MujocoEngine(assembly.scene, assembly.scenario.T, integrator, substeps)
+    raise ValueError(f"engine is {engine!r}, allowed are {', '.join(ENGINES)}")
+
+
+def _each(devices: tuple[Device, ...], name: str) -> Array:
+    return np.array([getattr(device, name) for device in devices])
