@@ -1,0 +1,89 @@
+"""Backward-Euler networks against closed forms, and the laws every passive network keeps."""
+
+import numpy as np
+import pytest
+
+from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+
+T = 1.2e-3
+W = np.geomspace(1e-3, np.pi, 80)
+Z = np.exp(1j * W)
+S = (Z - 1) / (T * Z)
+
+
+def test_figure_4_is_the_closed_form():
+    """E = Z - Z 1 1' Z / (M s^2 + 1' Z 1), Z = diag(K_i + B_i s)."""
+    spring = np.array([800 + S, 700 + S])
+    shared = spring[:, None] * spring[None, :] / (S**2 + spring.sum(axis=0))
+    expected = np.moveaxis(np.eye(2)[:, :, None] * spring - shared, -1, 0)
+    E = environment(FIGURE_4, T)
+    np.testing.assert_allclose(E.at(Z), expected, rtol=1e-9)
+    assert E.order == 4
+
+
+def test_static_stiffness_of_figure_4_has_rank_one():
+    stiffness = 800 * 700 / (800 + 700)
+    np.testing.assert_allclose(environment(FIGURE_4, T).dc(), stiffness * np.array([[1, -1], [-1, 1]]), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("network", "force"),
+    [
+        (Network(("a",), (Spring(("a", GROUND), 500.0, 2.0),)), 500 + 2 * S),
+        (Network(("a",), (Spring(("a", GROUND), 500.0),)), 500 + 0 * S),
+        (Network(("a",), masses={"a": 0.3}), 0.3 * S**2),
+        (Network(("a",), (Spring(("a", "b"), 300.0), Spring(("b", GROUND), 600.0))), 200 + 0 * S),
+        (Network(("a",), (Spring(("a", "b"), 300.0, 1.0),), {"b": 0.5}), 1 / (1 / (300 + S) + 1 / (0.5 * S**2))),
+    ],
+    ids=["wall", "spring", "held mass", "massless node", "mass on a spring"],
+)
+def test_small_networks_are_their_closed_forms(network, force):
+    np.testing.assert_allclose(environment(network, T).at(Z)[:, 0, 0], force, rtol=1e-7)
+
+
+def random_network(rng) -> Network:
+    contacts = [f"c{i}" for i in range(rng.integers(1, 4))]
+    inner = [f"n{i}" for i in range(rng.integers(0, 4))]
+    nodes = [*contacts, *inner, GROUND]
+    springs = [Spring((c, rng.choice([*inner, GROUND])), *np.exp(rng.uniform(-1, 7, 2)).tolist()) for c in contacts]
+    springs += [Spring((n, rng.choice([*contacts, GROUND])), float(np.exp(rng.uniform(0, 7)))) for n in inner]
+    for _ in range(rng.integers(0, 4)):
+        a, b = rng.choice(nodes, 2, replace=False)
+        springs.append(Spring((str(a), str(b)), float(rng.uniform(0, 900)), float(rng.uniform(0, 3))))
+    masses = {n: float(np.exp(rng.uniform(-4, 1))) for n in inner if rng.random() < 0.7}
+    return Network(tuple(contacts), tuple(springs), masses)
+
+
+@pytest.mark.parametrize("seed", range(25))
+def test_random_networks_dissipate(seed):
+    """T z/(z-1) E(z) is positive real on the circle, E is symmetric, and its poles are stable or at z = 1."""
+    network = random_network(np.random.default_rng(seed))
+    E = environment(network, T)
+    G = E.at(Z)
+    np.testing.assert_allclose(G, np.swapaxes(G, 1, 2), rtol=1e-6, atol=1e-7 * np.abs(G).max())
+    power = G * (T * Z / (Z - 1))[:, None, None]
+    least = np.linalg.eigvalsh(power + np.conj(np.swapaxes(power, 1, 2)))[:, 0]
+    assert (least >= -1e-9 * np.abs(power).max(axis=(1, 2))).all()
+    assert np.abs(E.poles()).max(initial=0.0) <= 1 + 1e-9
+    M, D, K = network.matrices()
+    c = len(network.contacts)
+    for k in (5, 40):
+        dynamic = M * S[k] ** 2 + D * S[k] + K
+        schur = dynamic[:c, :c] - dynamic[:c, c:] @ np.linalg.solve(dynamic[c:, c:], dynamic[c:, :c])
+        np.testing.assert_allclose(G[k], schur, rtol=1e-6, atol=1e-6 * np.abs(G).max())
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: Network(("a", "a")), "contacts must be different names"),
+        (lambda: Network(("a",), (Spring(("a", "b"), 1.0),), {"c": 1.0}), "masses names 'c'"),
+        (lambda: Network(("a", "b"), (Spring(("a", GROUND), 1.0),)), "contact 'b' has neither spring nor mass"),
+        (lambda: Spring(("a", "a"), 1.0), "to itself"),
+        (lambda: Spring(("a", "b"), -1.0), "stiffness between a and b is -1.0"),
+        (lambda: environment(Network(("a",), (Spring(("a", GROUND), 1.0), Spring(("b", "c"), 1.0))), T), "nothing"),
+    ],
+)
+def test_bad_networks_are_refused(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()

@@ -1,0 +1,87 @@
+"""Identities of the block algebra, against dense frequency responses and python-control."""
+
+import control
+import numpy as np
+import pytest
+
+from controller.delay import delay
+from controller.lti import Lti, SingularLoop
+
+Z = np.exp(1j * np.linspace(0.01, 3.1, 60))
+
+
+def random_lti(rng, order, inputs, outputs, T=1e-3):
+    A = rng.normal(size=(order, order))
+    A *= 0.9 / max(np.abs(np.linalg.eigvals(A)).max(), 1e-9) if order else 1.0
+    parts = rng.normal(size=(order, inputs)), rng.normal(size=(outputs, order)), rng.normal(size=(outputs, inputs))
+    return Lti(A, *parts, T)
+
+
+@pytest.fixture(params=range(5))
+def blocks(request):
+    rng = np.random.default_rng(request.param)
+    return tuple(random_lti(rng, order, 2, 2) for order in rng.integers(0, 6, size=2))
+
+
+def close(a, b):
+    np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * max(1.0, np.abs(b).max()))
+
+
+def test_response_is_the_definition(blocks):
+    G = blocks[0]
+    expected = [G.C @ np.linalg.solve(z * np.eye(G.order) - G.A, G.B) + G.D for z in Z]
+    close(G.at(Z), expected)
+
+
+def test_response_agrees_with_python_control(blocks):
+    G = blocks[0]
+    other = control.ss(G.A, G.B, G.C, G.D, G.T)
+    close(G.at(Z), np.moveaxis(other(Z), -1, 0))
+
+
+def test_algebra_is_pointwise(blocks):
+    G, H = blocks
+    g, h = G.at(Z), H.at(Z)
+    close((G @ H).at(Z), g @ h)
+    close((G + H).at(Z), g + h)
+    close((G - H).at(Z), g - h)
+    close(G.feedback(H).at(Z), np.linalg.solve(np.eye(2) + g @ h, g))
+    both = Lti.diag(G, H).at(Z)
+    close(both[:, :2, :2], g)
+    close(both[:, 2:, 2:], h)
+    assert not both[:, :2, 2:].any()
+
+
+def test_quotient_at_one(blocks):
+    G = blocks[0]
+    close(G.quotient_at_one().at(Z), (G.at(Z) - G.dc()) / (Z - 1)[:, None, None])
+
+
+@pytest.mark.parametrize("steps", [(0,), (3,), (1, 2), (0, 4, 50)])
+def test_a_delay_line_is_a_power_of_z(steps):
+    D = delay(steps, 1e-3)
+    assert D.order == sum(steps)
+    close(D.at(Z), np.array([np.diag([z ** -float(n) for n in steps]) for z in Z]))
+
+
+@pytest.mark.parametrize("steps", [(-1,), (1.5,)])
+def test_a_delay_is_a_whole_number(steps):
+    with pytest.raises(ValueError, match="whole number of samples"):
+        delay(steps, 1e-3)
+
+
+def test_singular_algebraic_loop_is_refused():
+    G, H = Lti.constant([[2.0]], 1e-3), Lti.constant([[-0.5]], 1e-3)
+    with pytest.raises(SingularLoop, match="algebraic loop"):
+        G.feedback(H)
+
+
+def test_blocks_prove_their_shapes():
+    with pytest.raises(ValueError, match=r"C has shape \(1, 3\), expected \(1, 2\)"):
+        Lti(np.eye(2), np.ones((2, 1)), np.ones((1, 3)), [[0.0]], 1e-3)
+    with pytest.raises(ValueError, match="not finite"):
+        Lti.constant([[np.nan]], 1e-3)
+    with pytest.raises(ValueError, match="different sampling periods"):
+        Lti.constant([[1.0]], 1e-3) @ Lti.constant([[1.0]], 2e-3)
+    with pytest.raises(ValueError, match="read-only"):
+        Lti.constant([[1.0]], 1e-3).D[0, 0] = 2.0

@@ -1,0 +1,144 @@
+"""The scene: the matrices read from MuJoCo are the physics, and the physics is passive."""
+
+import mujoco
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from models.device import CompliantDevice, RigidDevice, passivity_level, with_damping
+from models.human import Human, Link, Population, Voluntary
+from models.scene import build, plant
+
+HAND = Human((Link(0.3, 3.0, 200.0),))
+ARM = Human((Link(0.1, 5.0, 800.0), Link(1.0, 8.0, 150.0)))
+
+
+def test_compliant_device_with_a_hand_is_the_two_mass_oscillator():
+    d, h = CompliantDevice(transmission_damping=0.2), HAND.links[0]
+    got = plant(build([d], [HAND]).model)
+    M = np.diag([d.motor_mass, d.handle_mass + h.mass])
+    k, c = d.transmission_stiffness, d.transmission_damping
+    K = np.array([[k, -k], [-k, k + h.stiffness]])
+    D = np.array([[d.damping + c, -c], [-c, c + h.damping]])
+    np.testing.assert_allclose(got.A[2:, :2], -np.linalg.solve(M, K), rtol=1e-12)
+    np.testing.assert_allclose(got.A[2:, 2:], -np.linalg.solve(M, D), rtol=1e-12)
+    # the device feels -f; the outside force acts on the handle
+    np.testing.assert_allclose(got.B[2:], [[0, -1 / d.motor_mass], [1 / (d.handle_mass + h.mass), 0]], rtol=1e-12)
+    np.testing.assert_array_equal(got.C, [[1, 0, 0, 0]])
+
+
+def test_rigid_device_with_hand_on_an_arm():
+    d, (hand, arm) = RigidDevice(), ARM.links
+    got = plant(build([d], [ARM]).model)
+    M = np.diag([d.mass + hand.mass, arm.mass])
+    K = np.array([[hand.stiffness, -hand.stiffness], [-hand.stiffness, hand.stiffness + arm.stiffness]])
+    D = np.array([[d.damping + hand.damping, -hand.damping], [-hand.damping, hand.damping + arm.damping]])
+    np.testing.assert_allclose(got.A[2:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
+    np.testing.assert_allclose(got.B[2:], [[1 / M[0, 0], 0, -1 / M[0, 0]], [0, 1 / arm.mass, 0]], rtol=1e-12)
+
+
+def test_several_channels_do_not_touch_each_other():
+    devices, humans = [CompliantDevice(), RigidDevice(), CompliantDevice(motor_mass=0.1)], [HAND, ARM, HAND]
+    scene = build(devices, humans)
+    together = plant(scene.model)
+    names = [scene.model.joint(j).name for j in range(scene.model.njnt)]
+    assert names == ["motor_1", "motor_2", "motor_3", "handle_1", "handle_3", "human_2_2"]
+    n = len(names)
+    for i, (device, human) in enumerate(zip(devices, humans, strict=True), start=1):
+        mine = [j for j, name in enumerate(names) if name.split("_")[1] == str(i)]
+        alone = plant(build([device], [human]).model)
+        rows = [*mine, *(n + j for j in mine)]
+        np.testing.assert_allclose(together.A[np.ix_(rows, rows)], alone.A, rtol=1e-12)
+        others = [r for r in range(2 * n) if r not in rows]
+        assert not together.A[np.ix_(rows, others)].any()
+
+
+def test_mujoco_accelerates_as_the_matrices_say():
+    scene = build([CompliantDevice(), RigidDevice()], [ARM, HAND])
+    linear, model = plant(scene.model), scene.model
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(0)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = rng.normal(size=model.nq), rng.normal(size=model.nv), 1.0
+    mujoco.mj_forward(model, data)
+    expected = linear.A @ np.concatenate([data.qpos, data.qvel]) + linear.B @ data.ctrl
+    np.testing.assert_allclose(data.qacc, expected[model.nv :], rtol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_without_input_the_energy_never_increases(seed):
+    rng = np.random.default_rng(seed)
+    humans = Population(links=int(rng.integers(1, 4))).draw(rng, 2)
+    model = build([CompliantDevice(), RigidDevice()], humans).model
+    linear, n = plant(model), model.nv
+    mass = np.zeros((n, n))
+    mujoco.mj_fullM(model, _forward(model), mass)
+    stiffness = -mass @ linear.A[n:, :n]
+    step = expm(linear.A * 1e-3)
+    s = rng.normal(size=2 * n)
+    energies = []
+    for _ in range(200):
+        energies.append(s[n:] @ mass @ s[n:] / 2 + s[:n] @ stiffness @ s[:n] / 2)
+        s = step @ s
+    assert (np.diff(energies) <= 1e-12 * energies[0]).all()
+    assert np.linalg.eigvalsh(stiffness).min() >= -1e-9
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_port_at_motor_and_encoder_dissipates_its_damping(seed):
+    """Re Z >= damping at every frequency, whoever holds the handle: the OSP level of the compliant device."""
+    human = Population(links=2).draw(np.random.default_rng(seed), 1)
+    linear = plant(build([CompliantDevice()], human).model)
+    n = linear.A.shape[0] // 2
+    for w in np.geomspace(0.1, 1e4, 60):
+        response = np.linalg.solve(1j * w * np.eye(2 * n) - linear.A, -linear.B[:, -1:])
+        impedance = 1 / response[n, 0]
+        assert impedance.real >= 1.37 * (1 - 1e-9)
+
+
+def _forward(model):
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def test_guaranteed_damping_is_the_damping_unless_bounded():
+    assert passivity_level(CompliantDevice()) == 1.37
+    assert passivity_level(RigidDevice(damping=2.0, delta=1.5)) == 1.5
+    assert passivity_level(with_damping(RigidDevice(damping=2.0, delta=1.5), 0.7)) == 0.7
+
+
+def test_population_is_log_uniform_and_reproducible():
+    draw = Population().draw(np.random.default_rng(3), 4000)
+    assert draw == Population().draw(np.random.default_rng(3), 4000)
+    masses = np.log([h.links[0].mass for h in draw])
+    low, high = np.log([0.01, 3.0])
+    assert low <= masses.min()
+    assert masses.max() <= high
+    # mean and spread of a uniform distribution, five standard errors
+    assert abs(masses.mean() - (low + high) / 2) < 5 * (high - low) / np.sqrt(12 * 4000)
+    assert abs(masses.std() - (high - low) / np.sqrt(12)) < 0.05
+
+
+def test_voluntary_motion_is_smooth_and_its_velocity_its_derivative():
+    t = np.linspace(0, 3, 30001)
+    x, v = Voluntary(0.015, 0.6, 0.6, 1.0).motion(t)
+    np.testing.assert_allclose(np.gradient(x, t)[1:-1], v[1:-1], atol=2e-6)
+    assert (x[0], v[0]) == (0.0, 0.0)
+    np.testing.assert_allclose(np.abs(x).max(), 0.015, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: CompliantDevice(motor_mass=-1.0), "motor_mass is -1, allowed are 1e-06 to 1000 kg"),
+        (lambda: RigidDevice(mass=float("nan")), "mass is nan"),
+        (lambda: RigidDevice(delta=2.0), r"delta is 2 N s/m, allowed are values in \(0, damping = 1.37\]"),
+        (lambda: Link(0.1, -1.0, 1.0), "damping is -1"),
+        (lambda: Human((Link(0.1, 1.0, 1.0), Link(0.0, 1.0, 1.0))), r"links\[1\].mass is 0"),
+        (lambda: Population(mass=(1.0, 0.1)), r"mass\[1\] is 0.1, allowed are 1 to"),
+        (lambda: build([RigidDevice()], []), "1 devices and 0 humans"),
+    ],
+)
+def test_impossible_bodies_cannot_be_built(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
