@@ -106,7 +106,7 @@ def theorem4(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Requiremen
 
     def needed(w: Array) -> Array:
         eigenvalues, basis = np.linalg.eigh(passivity(w))
-        floor = 1e-13 * np.abs(eigenvalues).max(axis=1, keepdims=True)
+        floor = np.maximum(1e-13 * np.abs(eigenvalues).max(axis=1, keepdims=True), np.finfo(float).tiny)
         whitened = np.conj(np.swapaxes(basis, 1, 2)) / np.sqrt(np.maximum(eigenvalues, floor))[:, :, None]
         H = whitened @ (window(w)[:, :, None] * np.conj(np.swapaxes(whitened, 1, 2)))
         return np.where(eigenvalues[:, 0] > floor[:, 0], np.linalg.eigvalsh(H)[:, -1], np.inf)

@@ -25,7 +25,7 @@ class Record:
     s: Array  # (N, 2n, nsim) plant state: positions [m], velocities [m/s]
     w: Array  # (N, outside, nsim) outside forces [N]
     f: Array  # (N, m, nsim) forces fed back [N], within the limits
-    diverged: bool  # the engine gave up, or a number stopped being finite, right after the last tick
+    diverged: bool  # the engine gave up, or a number stopped being finite, within the last stretch
     interrupted: bool  # stopped from the keyboard
 
 
@@ -48,7 +48,8 @@ def run(
         count = min(tape.ticks, ticks - done)
         tape.w[:count] = outside(done, count)[:, :, None]
         try:
-            _stretch(tape, engine, count)
+            with np.errstate(over="ignore", invalid="ignore"):  # a diverging run is reported, not warned about
+                _stretch(tape, engine, count)
         except KeyboardInterrupt:
             interrupted = True
             break

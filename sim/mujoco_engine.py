@@ -114,6 +114,17 @@ def profiler_off() -> Iterator[bool]:
         pointer.value = saved
 
 
+@contextmanager
+def quiet_warnings() -> Iterator[None]:
+    """Keep MuJoCo from printing and logging its warnings: the engine counts and reports them."""
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(previous)
+
+
 def _profiler_clock() -> ctypes.c_void_p | None:
     folder = os.path.dirname(mujoco.__file__)
     for library in glob.glob(os.path.join(folder, "libmujoco*")):

@@ -14,7 +14,7 @@ from models.scene import Scene, build, plant
 from sim.engine import Engine, outside_forces
 from sim.exact_engine import ExactEngine, HeldPlant, hold
 from sim.loop import Progress, Record, run
-from sim.mujoco_engine import MujocoEngine, profiler_off
+from sim.mujoco_engine import MujocoEngine, profiler_off, quiet_warnings
 from sim.scenario import Scenario
 
 ENGINES = ("mujoco", "exact")
@@ -56,7 +56,7 @@ def simulate(
         return outside_forces(scenario, scene, first, ticks, voluntary)
 
     rest = np.zeros((assembly.plant.A.shape[0], 1))
-    with profiler_off():
+    with profiler_off(), quiet_warnings():
         plant_engine = make_engine(assembly, engine, integrator, substeps)
         return run(assembly.process, plant_engine, outside, scenario.samples, rest, progress)
 
