@@ -25,7 +25,7 @@ import scipy
 
 from controller import coupling as controller_coupling
 from controller.environment import environment
-from controller.lti import Lti, SingularLoop
+from controller.lti import SingularLoop
 from controller.process import force_map
 from design import exact, margin
 from design.exact import Exact
@@ -110,17 +110,14 @@ def required_damping(loop: Loop, coupling: CouplingData, condition: Condition) -
         return margin.closed_loop(F, loop.delta)
     if any(loop.psi):
         raise NotProved("theorem4 with psi >= 1 needs a multiplier Phi, which these certificates do not carry")
-    return margin.theorem4(_compliance(built, loop), loop.theta, loop.delta)
-
-
-def _compliance(built: controller_coupling.Coupling, loop: Loop) -> Lti:
     match built:
         case controller_coupling.SpringDamper():
-            return built.compliance(loop.T)
+            return margin.theorem4(built.compliance(loop.T), loop.theta, loop.delta)
         case controller_coupling.Compliance(V=V):
-            return V
-    m = len(loop.delta)
-    return Lti.constant(np.zeros((m, m)), loop.T)
+            return margin.theorem4(V, loop.theta, loop.delta)
+    return margin.Requirement(
+        "theorem4", np.inf, loop.delta, None, "theorem4 needs a coupling: V = 0 dissipates nothing"
+    )
 
 
 def _block(loop: Loop, coupling: CouplingData, condition: Condition) -> Exact:

@@ -14,7 +14,7 @@ from rich.table import Table
 from design.certificate import Verdict, verify
 from design.store import Stored, load
 
-EXAMPLE = "example:  python -m design.check coupling.json --json -"
+EXAMPLE = "example: python -m design.check coupling.json --json -"
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -9,7 +9,8 @@ because [(zI - A)^-1 B; I] maps the matrix of (KYP) to G + G* there. Both inequa
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import LinAlgError, solve_discrete_are, solve_discrete_lyapunov
+from numpy.typing import NDArray
+from scipy.linalg import LinAlgError, solve_discrete_are
 
 from controller.lti import Array, Lti
 from design.exact import Exact
@@ -120,15 +121,22 @@ def find_storage(G: Exact) -> tuple[Matrix | None, str | None]:
 
 
 def _scaled(G: Exact) -> tuple[Lti, Array]:
-    """G in floating point with states and channels of size one, and the factor that undoes the state scaling."""
+    """G in floating point with states and channels of size one, and the factor that undoes the state scaling.
+
+    The size of a state is the largest gain from the scaled inputs to it, over frequency.
+    """
     A, B, C, D = (m.floats() for m in (G.A, G.B, G.C, G.D))
     channel = 1 / np.sqrt(np.maximum(np.abs(np.diag(D)), 1e-300))
     B, C, D = B * channel, channel[:, None] * C, channel[:, None] * D * channel
-    size = np.ones(G.order)
-    if G.order and np.abs(np.linalg.eigvals(A)).max() < 1:
-        gramian = np.diag(solve_discrete_lyapunov(A, B @ B.T))
-        size = np.sqrt(np.where(gramian > 0, gramian, 1.0))
+    size = np.linalg.norm(_states(Lti(A, B, C, D, 1.0)), axis=2).max(axis=0)
+    size[size == 0] = 1.0
     return Lti(A * size / size[:, None], B / size[:, None], C * size, D, 1.0), 1 / size
+
+
+def _states(G: Lti) -> NDArray[np.complex128]:
+    """(zI - A)^-1 B on a pole-dense grid of the circle, shape (k, n, m)."""
+    n, m = G.B.shape
+    return Lti(G.A, G.B, np.eye(n), np.zeros((n, m)), G.T).at(on_circle(frequencies(G)))
 
 
 def _least_eigenvalue(G: Lti) -> tuple[float, float]:
@@ -141,8 +149,7 @@ def _least_eigenvalue(G: Lti) -> tuple[float, float]:
 
 def _riccati(G: Lti, margin: float, share: float) -> Array:
     n, m = G.B.shape
-    states = Lti(G.A, G.B, np.eye(n), np.zeros((n, m)), G.T)
-    gain = np.linalg.norm(states.at(on_circle(frequencies(G))), 2, axis=(1, 2)).max() ** 2
+    gain = np.linalg.norm(_states(G), 2, axis=(1, 2)).max() ** 2
     drive = (1 - share) * margin / max(gain, 1e-300)
     return -solve_discrete_are(G.A, G.B, -drive * np.eye(n), G.D + G.D.T - 2 * share * margin * np.eye(m), s=G.C.T)
 
