@@ -7,7 +7,8 @@ to the forces that the devices feel (with a minus sign) is Z_cc - Z_ci Z_ii^-1 Z
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Callable
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -60,18 +61,22 @@ class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ends = (node for spring in self.springs for node in spring.between if node != GROUND)
         return list(dict.fromkeys((*self.contacts, *ends)))
 
-    def matrices(self) -> tuple[Array, Array, Array]:
-        """Mass [kg], damping [N s/m] and stiffness [N/m] over `nodes()`, each (nodes, nodes)."""
+    def matrices(self, number: Callable[[float], Any] = float) -> tuple[Array, Array, Array]:
+        """Mass [kg], damping [N s/m] and stiffness [N/m] over `nodes()`, each (nodes, nodes).
+
+        `number` makes the entries: float, or an exact type such as Fraction.
+        """
         index = {name: i for i, name in enumerate(self.nodes())}
-        M = np.diag([self.masses.get(name, 0.0) for name in index])
+        M = np.diag([number(self.masses.get(name, 0.0)) for name in index])
         D, K = np.zeros_like(M), np.zeros_like(M)
         for spring in self.springs:
-            across = np.zeros(len(index))
-            for node, sign in zip(spring.between, (1.0, -1.0), strict=True):
+            across = np.zeros(len(index), dtype=int)
+            for node, sign in zip(spring.between, (1, -1), strict=True):
                 if node != GROUND:
                     across[index[node]] = sign
-            D += spring.damping * np.outer(across, across)
-            K += spring.stiffness * np.outer(across, across)
+            pattern = np.outer(across, across)
+            D += number(spring.damping) * pattern
+            K += number(spring.stiffness) * pattern
         return M, D, K
 
 
@@ -94,17 +99,25 @@ def environment(network: Network, T: float) -> Lti:
     masses need of the past. Raises ValueError if an internal node is held by nothing.
     """
     M, D, K = network.matrices()
-    c = len(network.contacts)
-    free = network.nodes()[c:]
-    cc, ci, ic, ii = _quarters(c)
-    implicit = M[ii] / T + D[ii] + T * K[ii]
-    if free and np.linalg.cond(implicit) > 1e14:
+    free = network.nodes()[len(network.contacts) :]
+    inner = slice(len(network.contacts), None)
+    if free and np.linalg.cond((M / T + D + T * K)[inner, inner]) > 1e14:
         raise ValueError(f"an internal node among {', '.join(free)} has no mass and nothing that holds it")
-    solve = np.linalg.inv(implicit)
+    return Lti(*realise((M, D, K), len(network.contacts), T, np.linalg.inv), T)
+
+
+def realise(matrices: tuple[Array, Array, Array], c: int, T: Any, inverse: Callable[[Array], Array]) -> list[Array]:
+    """A, B, C, D of the network (M, D, K) whose first `c` nodes are contacts; see `environment`.
+
+    The arithmetic is that of the entries: floating point, or exact with object arrays and an exact inverse.
+    """
+    M, D, K = matrices
+    cc, ci, ic, ii = _quarters(c)
+    solve = inverse(M[ii] / T + D[ii] + T * K[ii])
 
     # every signal is a row of coefficients over [x; q-; v-; x-; vx-]
-    n = len(free)
-    signals = np.eye(3 * c + 2 * n)
+    n = M.shape[0] - c
+    signals = np.eye(3 * c + 2 * n, dtype=M.dtype)
     x, q_old, v_old, x_old, vx_old = np.split(signals, np.cumsum([c, n, n, c]))
     vx = (x - x_old) / T
     v = solve @ (M[ii] / T @ v_old - K[ii] @ q_old - D[ic] @ vx - K[ic] @ x)
@@ -113,7 +126,7 @@ def environment(network: Network, T: float) -> Lti:
 
     after = np.vstack([q, v, x, vx])
     keep = _remembered(after, force, c)
-    return Lti(after[keep][:, c:][:, keep], after[keep][:, :c], force[:, c:][:, keep], force[:, :c], T)
+    return [after[keep][:, c:][:, keep], after[keep][:, :c], force[:, c:][:, keep], force[:, :c]]
 
 
 def _quarters(c: int) -> tuple[tuple[slice, slice], ...]:

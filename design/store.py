@@ -1,0 +1,175 @@
+"""The file in which a coupling is kept: the loop it was made for, its coefficients and its certificate, as JSON.
+
+Numbers are plain decimals, rationals are strings "p/q". Reading is strict: an unknown or ill-typed field is an
+error that names it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+
+from controller import coupling
+from controller.environment import Network, environment
+from controller.lti import Array, Lti
+
+Rows = tuple[tuple[float, ...], ...]
+Condition = Literal["closed-loop", "theorem4"]
+Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=100)], ...]
+Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=4000)]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class BadFile(ValueError):
+    """A file that is no stored coupling; the message is one line that names the field."""
+
+
+class Strict(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Immutable, and refuses fields that it does not know."""
+
+
+class Loop(Strict):
+    """All that enters a condition beside the coupling."""
+
+    T: Positive  # [s]
+    theta: Steps  # (m,) transmission delays [samples]
+    psi: Steps  # (m,) environment delays [samples]
+    lam: Steps  # (m,) delays of the reference [samples]; they matter to transparency only
+    delta: tuple[Positive, ...]  # (m,) damping that the devices guarantee [N s/m]
+    environment: Network
+
+    def __post_init__(self) -> None:
+        m = len(self.environment.contacts)
+        for name in ("theta", "psi", "lam", "delta"):
+            if len(getattr(self, name)) != m:
+                raise ValueError(f"{name} has {len(getattr(self, name))} entries, the environment has {m} contacts")
+        if any(n > t + p for n, t, p in zip(self.lam, self.theta, self.psi, strict=True)):
+            raise ValueError(f"lam is {list(self.lam)}, expected at most theta + psi on every channel")
+        environment(self.environment, self.T)  # raises ValueError if nothing holds an internal node
+
+
+class NoCoupling(Strict, tag_field="kind", tag="none"):
+    """V = 0."""
+
+    def build(self, T: float) -> coupling.Coupling:
+        return coupling.NoCoupling()
+
+
+class SpringDamper(Strict, tag_field="kind", tag="spring-damper"):
+    """One spring and damper per channel (26)."""
+
+    K: tuple[float, ...]  # (m,) [N/m]
+    B: tuple[float, ...]  # (m,) [N s/m]
+
+    def __post_init__(self) -> None:
+        coupling.SpringDamper(self.K, self.B)
+
+    def build(self, T: float) -> coupling.Coupling:
+        return coupling.SpringDamper(self.K, self.B)
+
+
+class Compliance(Strict, tag_field="kind", tag="compliance"):
+    """A general V(z), as the rows of its state-space matrices."""
+
+    A: Rows
+    B: Rows
+    C: Rows
+    D: Rows
+
+    def __post_init__(self) -> None:
+        self.build(1.0)
+
+    def build(self, T: float) -> coupling.Coupling:
+        D = _table("D", self.D, len(self.D), len(self.D[0]) if self.D else 0)
+        n = len(self.A)
+        tables = (_table("A", self.A, n, n), _table("B", self.B, n, D.shape[1]), _table("C", self.C, len(D), n))
+        return coupling.Compliance(Lti(*tables, D, T))
+
+
+def _table(name: str, rows: Rows, height: int, width: int) -> Array:
+    if len(rows) != height or any(len(row) != width for row in rows):
+        raise ValueError(f"{name} has rows of {[len(row) for row in rows]} entries, expected {height} x {width}")
+    return np.array(rows, dtype=float).reshape(height, width)
+
+
+CouplingData = NoCoupling | SpringDamper | Compliance
+
+
+class Certificate(Strict):
+    """What is claimed of a coupling in its loop, and what proves it."""
+
+    condition: Condition
+    required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep
+    available: tuple[float, ...]  # (m,) [N s/m], the damping for which it is proved
+    margin: float  # available / required
+    promise: Literal["any passive environment", "this environment"]
+    proof: Literal["sampled", "kyp", "rational"]
+    matrices: dict[str, tuple[tuple[Rational, ...], ...]]  # rationals "p/q"
+    scenario: str  # digest of the loop and the coupling
+    versions: dict[str, str]
+    seal: str = ""  # digest of all of the above
+
+
+class Stored(Strict):
+    """A coupling with its loop and, once it is proved, its certificate."""
+
+    loop: Loop
+    coupling: CouplingData
+    certificate: Certificate | None = None
+    version: Literal[1] = 1
+
+    def __post_init__(self) -> None:
+        m = len(self.loop.delta)
+        match self.coupling:
+            case SpringDamper(K=K) if len(K) != m:
+                raise ValueError(f"K has {len(K)} entries, the environment has {m} contacts")
+            case Compliance(D=D) if len(D) != m or len(D[0]) != m:
+                raise ValueError(f"D is {len(D)} x {len(D[0])}, the environment has {m} contacts")
+
+
+def data_of(built: coupling.Coupling) -> CouplingData:
+    """What is stored of a coupling. Raises TypeError for a kind that no file can hold."""
+    match built:
+        case coupling.NoCoupling():
+            return NoCoupling()
+        case coupling.SpringDamper(K=K, B=B):
+            return SpringDamper(tuple(K.tolist()), tuple(B.tolist()))
+        case coupling.Compliance(V=V):
+            return Compliance(*(tuple(map(tuple, getattr(V, name).tolist())) for name in "ABCD"))
+    raise TypeError(f"a {type(built).__name__} cannot be stored; known: NoCoupling, SpringDamper, Compliance")
+
+
+def digest(*parts: msgspec.Struct) -> str:
+    """sha256 over the canonical JSON (sorted keys, shortest decimals, 7 as 7.0 where it is a float) of the parts."""
+    read_back = [msgspec.json.decode(msgspec.json.encode(part), type=type(part)) for part in parts]
+    return hashlib.sha256(msgspec.json.encode(read_back, order="deterministic")).hexdigest()
+
+
+def sealed(certificate: Certificate) -> Certificate:
+    """The certificate with the digest of all its other fields."""
+    plain = msgspec.structs.replace(certificate, seal="")
+    return msgspec.structs.replace(certificate, seal=digest(plain))
+
+
+def load(path: str | Path) -> Stored:
+    """Read a stored coupling. Raises BadFile with one line that names the field, OSError if there is no file."""
+    try:
+        return msgspec.json.decode(Path(path).read_bytes(), type=Stored)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise BadFile(f"{path}: {' '.join(str(error).split())}") from None
+
+
+def save(stored: Stored, path: str | Path) -> None:
+    """Write through a temporary file beside `path`, so that a reader never sees half of it."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(stored), indent=1) + b"\n")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,145 @@
+"""Laws of the exact arithmetic: against numpy, against the floating-point blocks, and symmetry at z = 1."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from controller.coupling import Compliance, NoCoupling, SpringDamper
+from controller.delay import delay
+from controller.environment import FIGURE_4, Network, Spring, environment
+from controller.lti import Lti
+from controller.process import force_map
+from design import exact
+from design.positive_real import prove_positive_real, strictly_positive
+from design.rational import Matrix, SingularMatrix, block_diag, definiteness, rational
+
+T = 1.2e-3
+STAR = Network(
+    contacts=("a", "b", "c"),
+    springs=(
+        Spring(("a", "hub"), 613.7, 0.31),
+        Spring(("b", "hub"), 402.1, 1.7),
+        Spring(("c", "hub"), 877.3),
+        Spring(("hub", "ground"), 55.0, 0.2),
+        Spring(("a", "ground"), 12.5),
+    ),
+    masses={"hub": 0.7, "b": 0.05},
+)
+COUPLINGS = [
+    NoCoupling(),
+    SpringDamper([7806.0, 3137.0], [0.105, 0.0]),
+    Compliance(
+        Lti([[0.3, 0.1], [0.0, -0.2]], [[1.0, 0.2], [0.3, 1.0]], [[1e-4, 0.0], [0.0, 2e-4]], 1e-4 * np.eye(2), T)
+    ),
+]
+
+
+def at(G: exact.Exact, z: complex) -> np.ndarray:
+    return Lti(*(getattr(G, name).floats() for name in "ABCD"), T).at(z)
+
+
+def symmetric_integers(rng: np.random.Generator, n: int) -> np.ndarray:
+    S = rng.integers(-3, 4, (n, n))
+    return S + S.T + rng.integers(0, 4 * n) * np.eye(n, dtype=int)
+
+
+def test_a_stored_float_is_its_shortest_decimal():
+    assert rational(0.0012) == Fraction(12, 10000)
+    assert rational(np.float64(0.1)) == Fraction(1, 10)
+
+
+def test_definiteness_agrees_with_the_eigenvalues_of_random_integer_matrices():
+    rng = np.random.default_rng(1)
+    seen = set()
+    for _ in range(300):
+        S = symmetric_integers(rng, int(rng.integers(1, 7)))
+        least = np.linalg.eigvalsh(S)[0]
+        outcome = definiteness(Matrix.of(S.tolist()))
+        if abs(least) > 1e-9:  # a zero eigenvalue has a rounded sign
+            assert outcome.definite == (least > 0)
+            assert strictly_positive(Matrix.of(S.tolist())).definite == (least > 0)
+        assert outcome.semidefinite == (least > -1e-9)
+        seen.add(outcome.definite)
+        if not outcome.definite:
+            minor = round(np.linalg.det(S[: outcome.minor, : outcome.minor]))
+            assert np.sign(minor) == outcome.sign
+    assert seen == {True, False}
+
+
+def test_singular_matrices_are_semidefinite_only_without_a_negative_direction():
+    rng = np.random.default_rng(2)
+    for rank in range(1, 5):
+        half = rng.integers(-5, 6, (6, rank))
+        gram = Matrix.of((half @ half.T).tolist())
+        outcome = definiteness(gram)
+        assert outcome.semidefinite
+        assert not outcome.definite
+        assert not strictly_positive(gram).definite
+    assert not definiteness(Matrix.of([[0, 1], [1, 5]])).semidefinite
+    with pytest.raises(ValueError, match="not exactly symmetric"):
+        definiteness(Matrix.of([[1, 2], [3, 9]]))
+
+
+def test_a_matrix_definite_by_less_than_the_rounding_is_not_proved():
+    tiny = Fraction(1, 2**400)
+    S = Matrix.of([[Fraction(1), 1 - tiny], [1 - tiny, Fraction(1)]])
+    assert definiteness(S).definite
+    assert not strictly_positive(S).definite
+
+
+def test_the_exact_inverse_is_an_inverse():
+    rng = np.random.default_rng(3)
+    for n in range(1, 8):
+        S = Matrix.of(rng.integers(-9, 10, (n, n)).tolist()).scaled(Fraction(1, 7))
+        assert (S @ S.inverse()).equals(Matrix.eye(n))
+    with pytest.raises(SingularMatrix):
+        Matrix.of([[1, 2], [2, 4]]).inverse()
+    assert block_diag(Matrix.zeros(0, 0), Matrix.eye(2)).equals(Matrix.eye(2))
+
+
+@pytest.mark.parametrize("coupling", COUPLINGS, ids=lambda c: type(c).__name__)
+@pytest.mark.parametrize(("theta", "psi"), [((1, 2), (0, 0)), ((0, 3), (1, 0))])
+def test_the_exact_force_map_is_the_one_that_runs(coupling, theta, psi):
+    E = exact.environment(FIGURE_4, rational(T))
+    F = exact.force_map(E, exact.compliance(coupling, 2, rational(T)), theta, psi)
+    running = force_map(environment(FIGURE_4, T), coupling, theta, psi)
+    rng = np.random.default_rng(4)
+    for z in rng.uniform(0.7, 1.5, 5) * np.exp(1j * rng.uniform(0, np.pi, 5)):
+        # the frequency response of either block is good to 1e-9 near its resonance
+        np.testing.assert_allclose(at(F, z), running.at(z), rtol=1e-8, atol=1e-8)
+
+
+def test_the_static_stiffness_is_exactly_symmetric_and_semidefinite():
+    V = exact.compliance(SpringDamper([901.3, 512.9, 3000.1], [0.3, 0.0, 1.1]), 3, rational(0.001))
+    for coupling in (V, exact.compliance(NoCoupling(), 3, rational(0.001))):
+        F1, _ = exact.force_map(exact.environment(STAR, rational(0.001)), coupling, (0, 3, 1), (0, 0, 0)).split_at_one()
+        assert F1.equals(F1.T)
+        assert definiteness(F1).definite
+    F1, _ = exact.environment(FIGURE_4, rational(T)).split_at_one()
+    assert F1.fractions()[0, 0] == Fraction(800 * 700, 1500)
+    assert str(definiteness(F1)) == "the leading minor of order 2 is zero"
+
+
+def test_the_shifted_compliance_subtracts_the_moving_sum():
+    delta = [1.37, 0.8]
+    H = exact.shifted_compliance(
+        exact.compliance(NoCoupling(), 2, rational(T)), (0, 3), [rational(d) for d in delta], rational(T)
+    )
+    z = 1.1 * np.exp(0.4j)
+    window = [sum(z**-k for k in range(n + 1)) * T / (2 * d) for n, d in zip((0, 3), delta, strict=True)]
+    np.testing.assert_allclose(at(H, z), -np.diag(window), rtol=1e-12)
+    np.testing.assert_allclose(at(exact.delay((0, 3)), z), delay((0, 3), T).at(z), rtol=1e-12)
+
+
+def test_a_wrong_storage_matrix_proves_nothing():
+    # G = 1 + 0.5/(z - 0.5): He G >= 2/3 on the circle
+    G = exact.Exact(*(Matrix.of([[v]]) for v in (0.5, 1.0, 0.5, 1.0)))
+    assert prove_positive_real(G, Matrix.of([["1/2"]])) is None
+    assert "negative direction" in prove_positive_real(G, Matrix.of([[5]]))
+    # unstable: P < 0 may satisfy the second inequality alone, and only P > 0 refuses it
+    unstable = exact.Exact(*(Matrix.of([[v]]) for v in (2, 1, 0, 5)))
+    assert prove_positive_real(unstable, Matrix.of([[-1]])) == (
+        "P is not positive definite: the leading minor of order 1 is negative"
+    )
+    assert prove_positive_real(G, Matrix.eye(2)) == "P has shape (2, 2), the model has 1 states"
