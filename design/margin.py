@@ -44,7 +44,7 @@ class Requirement:
 
 def closed_loop(F: Lti, delta: Sequence[float]) -> Requirement:
     """The closed-loop condition for the force map F and device dampings `delta` [N s/m]."""
-    available = _dampings(delta, F.inputs)
+    available = dampings(delta, F.inputs)
 
     def refused(reason: str) -> Requirement:
         return Requirement("closed-loop", np.inf, available, None, reason)
@@ -77,7 +77,7 @@ def theorem4(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Requiremen
     Dividing by |1 - 1/z|^2 it reads (V(1)/2 - He[(V - V(1))/(z - 1)]) / T >= diag(|vt_i|^2 / (4 s delta_i)), with
     vt_i = 1 + 1/z + ... + z^-theta_i, so s is a generalised eigenvalue per frequency.
     """
-    available = _dampings(delta, V.inputs)
+    available = dampings(delta, V.inputs)
     if len(theta) != V.inputs:
         raise ValueError(f"theta has {len(theta)} entries for {V.inputs} channels")
 
@@ -117,7 +117,8 @@ def per_channel(V: Sequence[Lti], theta: Sequence[int], delta: Sequence[float]) 
     return tuple(theorem4(v, [n], [d]) for v, n, d in zip(V, theta, delta, strict=True))
 
 
-def _dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
+def dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
+    """`delta` as floats, one positive damping per channel [N s/m]."""
     values = tuple(float(d) for d in delta)
     if len(values) != channels:
         raise ValueError(f"delta has {len(values)} entries for {channels} channels")
