@@ -1,4 +1,4 @@
-"""Spring-damper couplings (26) under Theorem 4: the exact convex set of gains, and the objective (23) over it.
+"""Spring-damper couplings (26): the best under either condition, and the stiffest under Theorem 4.
 
 Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT/d, b = B/d (design.gain_set).
 """
@@ -6,18 +6,21 @@ Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import cvxpy as cp
 import numpy as np
 
 from controller.coupling import SpringDamper
 from controller.lti import Array
+from controller.process import force_map
+from design.convex_concave import step
 from design.delayed import theorem4_delayed
+from design.frozen_environment import least_rms
 from design.gain_set import gain_set, gain_sets
-from design.margin import Requirement, theorem4
+from design.margin import Requirement, closed_loop, theorem4
 from design.multiplier import shortage
 from design.result import Design
-from design.sampled import Complex, affine_lmis, gain_lmi
 from design.shaping import Shaping
 from design.solve import DesignFailed, Infeasible, solve
 from design.specification import RESERVE, Specification
@@ -27,13 +30,21 @@ SETTLED = 1e-6
 MOST_STEPS = 60
 
 
-def design(spec: Specification, start: SpringDamper | None = None) -> Design:
-    """The spring-damper that minimises ||W1 L W2||_inf (23) among those that satisfy Theorem 4.
+def design(spec: Specification, condition: str = "theorem4", starts: Sequence[SpringDamper] = ()) -> Design:
+    """The best spring-damper under `condition`; by default the starts are chosen, a start need not be feasible.
 
-    A convex-concave sequence from `start` (by default the stiffest gains): with g = k + b (1 - 1/z) the norm is
-    below mu iff (L g W2)* (L g W2) <= mu^2 g* g, and g* g is replaced by its tangent at the gains before, which
-    lies below. A few SDPs; the result does not depend on the start. Raises Infeasible if Theorem 4 admits no gains.
+    theorem4: minimises ||W1 L W2||_inf (23) over the exact set; the result does not depend on the start (the first
+    one is used). closed-loop: minimises the rms mismatch in this environment from every start, local optima only.
+    Raises Infeasible where the condition admits no gains (for closed-loop: where none were found).
     """
+    if condition == "theorem4":
+        return _for_any_environment(spec, starts[0] if starts else None)
+    if condition == "closed-loop":
+        return _for_this_environment(spec, starts)
+    raise ValueError(f"condition is {condition!r}, expected 'theorem4' or 'closed-loop'")
+
+
+def _for_any_environment(spec: Specification, start: SpringDamper | None) -> Design:
     started = time.perf_counter()
     phi = shortage(spec)
     sigma = _sigma(spec, phi)
@@ -42,16 +53,36 @@ def design(spec: Specification, start: SpringDamper | None = None) -> Design:
     norm, peak = shaping.norm(_coupling(spec, gains).compliance(spec.T))
     frequencies = [peak]
     for _ in range(MOST_STEPS):
-        gains, bound = _step(spec, sigma, shaping, gains, norm, np.array(frequencies))
+        gains, bound = step(spec, sigma, shaping, gains, norm, np.array(frequencies))
         sdps += 1
         before, (norm, peak) = norm, shaping.norm(_coupling(spec, gains).compliance(spec.T))
         frequencies.append(peak)
         if abs(before - norm) < SETTLED * norm and norm < (1 + SETTLED) * bound:
             break
     coupling = _coupling(spec, gains)
-    return Design(
-        coupling, "theorem4", "loop-norm", norm, verified(spec, coupling, phi), sdps, time.perf_counter() - started, phi
-    )
+    requirement = verified(spec, coupling, phi)
+    return Design(coupling, "theorem4", "loop-norm", norm, requirement, sdps, time.perf_counter() - started, phi)
+
+
+def _for_this_environment(spec: Specification, starts: Sequence[SpringDamper]) -> Design:
+    started = time.perf_counter()
+    coupling, rms, searches = least_rms(spec, starts or _default_starts(spec))
+    if coupling is None:
+        line = (
+            f"no spring-damper was found that the closed-loop condition certifies for theta = {spec.theta}, psi = "
+            f"{spec.psi}, delta = {spec.delta}: use more device damping, less delay, or other starts"
+        )
+        raise Infeasible(None, (), line)
+    F = force_map(spec.environment, coupling, spec.theta, spec.psi)
+    requirement = closed_loop(F, spec.delta)
+    return Design(coupling, "closed-loop", "rms", rms, requirement, searches, time.perf_counter() - started)
+
+
+def _default_starts(spec: Specification) -> list[SpringDamper]:
+    """Around 2 delta/(n T), the stiffness that no linear coupling exceeds for any passive environment."""
+    usable = spec.usable
+    K = usable / (spec.T * (np.asarray(spec.theta) + np.asarray(spec.psi) + 1))
+    return [SpringDamper(factor * K, share * usable) for factor, share in ((0.3, 0.1), (1.0, 0.3), (8.0, 1.0))]
 
 
 def stiffest(spec: Specification) -> Design:
@@ -130,30 +161,3 @@ def _start(spec: Specification, sigma: Array, start: SpringDamper | None) -> tup
         )
         raise Infeasible(problem, error.results, line) from error
     return np.asarray(gains.value), 1
-
-
-def _step(spec: Specification, sigma: Array, shaping: Shaping, at: Array, norm: float, w: Array) -> tuple[Array, float]:
-    """(gains, bound on the norm at the frequencies w) of one convex-concave step from the gains `at`."""
-    N = spec.channels
-    gains, t = cp.Variable(2 * N), cp.Variable()
-    constant, slopes = _tangent(spec, shaping, at, norm, w)
-    cuts = affine_lmis(constant, slopes, cp.hstack([gains, t]))
-    solve(cp.Problem(cp.Minimize(t), [*gain_sets(gains, spec.theta, sigma), *cuts]), "a step of the convex sequence")
-    return np.asarray(gains.value), norm * float(np.sqrt(t.value))
-
-
-def _tangent(spec: Specification, shaping: Shaping, at: Array, norm: float, w: Array) -> tuple[Complex, Complex]:
-    """[[g0* g + g* g0 - g0* g0, (W1 L g W2)*], [W1 L g W2, t norm^2]], scaled to order one; t is the last variable."""
-    N = spec.channels
-    left, right, late = shaping.parts(w)
-    difference = 1 - np.exp(-1j * w)
-    basis = np.eye(N)[:, None, :] * np.ones((w.size, 1))  # (N, k, N): e_i at every frequency
-    g = np.concatenate([basis, basis * difference[:, None]])  # (2N, k, N): diagonals of g by variable
-    g0 = np.tensordot(at, g, axes=1)  # (k, N)
-    scale = 1 / np.abs(g0)  # columns are divided by |g0|, rows by the norm
-    rows = (left * (spec.T / spec.usable)) @ right * scale[:, None, :] / norm
-    row_slopes = (late * g[:, :, None, :]) @ right * scale[:, None, :] / norm
-    tangent = 2 * (np.conj(g0) * g).real * scale**2
-    diagonal = np.eye(N)
-    base = -np.broadcast_to(diagonal, (w.size, N, N)).astype(np.complex128)
-    return gain_lmi(rows, row_slopes, base, tangent[..., None] * diagonal)
