@@ -25,6 +25,8 @@ from design.transparency import BAND_HZ, transparency
 #: The sampled condition keeps half as much again as the promised reserve, for what lies between the samples.
 SAMPLED_RESERVE = 1.5 * RESERVE
 SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
+CLOSEST_POLE = 1e-5  # from the unit circle
+STUCK = 1e-3  # a search that leaves the sampled condition violated by this has no feasible point nearby
 MOST_ROUNDS = 8
 
 
@@ -37,6 +39,7 @@ class Sampled:
         low, high = (per_hz * f for f in BAND_HZ)
         self.band = frequencies(spec.environment, low=low, high=min(high, np.pi), points=80)
         self.conditions = frequencies(spec.environment, low=1e-3, points=80)
+        self.loop_in_band, self.loop_at_conditions = self._loop(self.band), self._loop(self.conditions)
         E = spec.environment.at(on_circle(self.band))
         self.size2 = (np.abs(E) ** 2).sum(axis=(1, 2))
         self.target = delay(spec.lam, spec.T).at(on_circle(self.band)) @ E
@@ -49,27 +52,43 @@ class Sampled:
     def point(self, coupling: SpringDamper) -> Array:
         return np.concatenate([np.log(coupling.K), coupling.B / self.spec.delta])
 
-    def force(self, x: Array, w: Array) -> Complex:
-        """F = Theta G (G + Psi E)^-1 Psi E at exp(jw), with G = V^-1."""
+    def add(self, w: float) -> None:
+        """Impose the condition at the frequency w [rad/sample] too."""
+        self.conditions = np.append(self.conditions, w)
+        self.loop_at_conditions = self._loop(self.conditions)
+
+    def _loop(self, w: Array) -> tuple[Complex, Complex, Complex]:
+        """(z-1)/(Tz), Psi E and Theta at exp(jw)."""
         spec, z = self.spec, on_circle(w)
+        return (z - 1) / (spec.T * z), spec.delayed_environment.at(z), delay(spec.theta, spec.T).at(z)
+
+    def force(self, x: Array, loop: tuple[Complex, Complex, Complex]) -> Complex:
+        """F = Theta G (G + Psi E)^-1 Psi E with G = V^-1, (k, N, N)."""
+        D, E, theta = loop
         log_k, b = np.split(x, 2)
-        D = (z - 1) / (spec.T * z)
-        G = (np.exp(log_k) + D[:, None] * (b * spec.delta))[:, :, None] * np.eye(spec.channels)
-        E = spec.delayed_environment.at(z)
-        return delay(spec.theta, spec.T).at(z) @ G @ np.linalg.solve(G + E, E)
+        G = (np.exp(log_k) + D[:, None] * (b * self.spec.delta))[:, :, None] * np.eye(self.spec.channels)
+        return theta @ G @ np.linalg.solve(G + E, E)
 
     def square_mismatch(self, x: Array) -> float:
         """Logarithm of the mean over log frequency of ||M||_F^2 / ||E||_F^2."""
-        M = self.force(x, self.band) - self.target
+        M = self.force(x, self.loop_in_band) - self.target
         ratio = (np.abs(M) ** 2).sum(axis=(1, 2)) / self.size2
         log_w = np.log(self.band)
         return float(np.log(np.trapezoid(ratio, log_w) / (log_w[-1] - log_w[0])))
 
     def room(self, x: Array) -> Array:
-        """1 - SAMPLED_RESERVE less the damping ratio that each sampled frequency asks for."""
-        ratio = self.force(x, self.conditions) / (on_circle(self.conditions) - 1)[:, None, None]
+        """1 - SAMPLED_RESERVE less the damping ratio that each sampled frequency asks for; (k,), or (k + 1,).
+
+        Delay in the environment can make the loop unstable where the sampled condition still holds, so there the
+        distance of its poles from the circle is the last entry.
+        """
+        ratio = self.force(x, self.loop_at_conditions) / (on_circle(self.conditions) - 1)[:, None, None]
         need = -hermitian(self.root[:, None] * ratio * self.root)
-        return 1 - SAMPLED_RESERVE - np.linalg.eigvalsh(need)[:, -1]
+        room = 1 - SAMPLED_RESERVE - np.linalg.eigvalsh(need)[:, -1]
+        if not any(self.spec.psi):
+            return room
+        F = force_map(self.spec.environment, self.coupling(x), self.spec.theta, self.spec.psi)
+        return np.append(room, 1 - CLOSEST_POLE - np.abs(F.poles()).max(initial=0.0))
 
     def search(self, x: Array) -> OptimizeResult:
         N = self.spec.channels
@@ -104,8 +123,9 @@ def _certified_optimum(spec: Specification, start: SpringDamper) -> tuple[Spring
         requirement = closed_loop(force_map(spec.environment, coupling, spec.theta, spec.psi), spec.delta)
         if requirement.ratio <= 1 - RESERVE:
             return coupling, searches
-        if requirement.frequency_hz is None:  # unstable: no frequency to add
+        stuck = sampled.room(x).min() < -STUCK
+        if stuck or requirement.frequency_hz is None:  # None: unstable, so there is no frequency to add
             return None, searches
         binding = 2 * np.pi * spec.T * requirement.frequency_hz
-        sampled.conditions = np.append(sampled.conditions, max(binding, 1e-6))
+        sampled.add(max(binding, 1e-6))
     return None, MOST_ROUNDS

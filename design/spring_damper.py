@@ -35,7 +35,7 @@ def design(spec: Specification, condition: str = "theorem4", starts: Sequence[Sp
 
     theorem4: minimises ||W1 L W2||_inf (23) over the exact set; the result does not depend on the start (the first
     one is used). closed-loop: minimises the rms mismatch in this environment from every start, local optima only.
-    Raises Infeasible where the condition admits no gains (for closed-loop: where none were found).
+    Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for closed-loop.
     """
     if condition == "theorem4":
         return _for_any_environment(spec, starts[0] if starts else None)
@@ -72,17 +72,25 @@ def _for_this_environment(spec: Specification, starts: Sequence[SpringDamper]) -
             f"no spring-damper was found that the closed-loop condition certifies for theta = {spec.theta}, psi = "
             f"{spec.psi}, delta = {spec.delta}: use more device damping, less delay, or other starts"
         )
-        raise Infeasible(None, (), line)
+        raise DesignFailed(None, (), line)
     F = force_map(spec.environment, coupling, spec.theta, spec.psi)
     requirement = closed_loop(F, spec.delta)
     return Design(coupling, "closed-loop", "rms", rms, requirement, searches, time.perf_counter() - started)
 
 
 def _default_starts(spec: Specification) -> list[SpringDamper]:
-    """Around 2 delta/(n T), the stiffness that no linear coupling exceeds for any passive environment."""
+    """Around 2 d/(n T), the stiffness that no linear coupling exceeds for any passive environment.
+
+    With delay in the environment a loop is stable if the coupling is the stiffer of the two at every frequency,
+    which the last start takes from the environment's stiffness at half the sampling rate.
+    """
     usable = spec.usable
     K = usable / (spec.T * (np.asarray(spec.theta) + np.asarray(spec.psi) + 1))
-    return [SpringDamper(factor * K, share * usable) for factor, share in ((0.3, 0.1), (1.0, 0.3), (8.0, 1.0))]
+    starts = [SpringDamper(factor * K, share * usable) for factor, share in ((0.3, 0.1), (1.0, 0.3), (8.0, 1.0))]
+    if any(spec.psi):
+        highest = np.linalg.norm(spec.environment.at(-1.0), 2)
+        starts.append(SpringDamper(K, np.full(spec.channels, spec.T * highest)))
+    return starts
 
 
 def stiffest(spec: Specification) -> Design:

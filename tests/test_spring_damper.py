@@ -16,7 +16,7 @@ from design.delayed import theorem4_delayed
 from design.gain_set import gain_set
 from design.margin import closed_loop, theorem4
 from design.shaping import Shaping
-from design.solve import CROSS_CHECK, Infeasible, solve
+from design.solve import CROSS_CHECK, DesignFailed, Infeasible, solve
 from design.specification import RESERVE, Specification
 from design.spring_damper import design, stiffest, stiffest_at
 
@@ -191,9 +191,17 @@ def test_the_closed_loop_design_spends_the_environments_own_damping(case, rms_db
     assert not theorem4(found.coupling.compliance(T), spec.theta, DELTA).certified
 
 
-def test_closed_loop_admits_delay_that_theorem_4_refuses():
-    found = design(specification((0, 0), psi=(1, 1)), "closed-loop")
-    assert found.requirement.certified
+def test_the_closed_loop_design_keeps_a_delayed_environment_stable():
+    spec = specification((0, 0), psi=(1, 1), delta=(2.0, 2.0))
+    found = design(spec, "closed-loop")
+    assert found.requirement.ratio <= 1 - RESERVE
+    assert force_map(spec.environment, found.coupling, spec.theta, spec.psi).is_stable()
+
+
+def test_a_search_that_finds_nothing_does_not_claim_that_there_is_nothing():
+    with pytest.raises(DesignFailed, match="no spring-damper was found") as caught:
+        design(specification((0, 0), psi=(1, 1), delta=(0.5, 0.5)), "closed-loop")
+    assert not isinstance(caught.value, Infeasible)
 
 
 REFUSALS = [
