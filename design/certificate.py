@@ -115,9 +115,7 @@ def required_damping(loop: Loop, coupling: CouplingData, condition: Condition) -
             return margin.theorem4(built.compliance(loop.T), loop.theta, loop.delta)
         case controller_coupling.Compliance(V=V):
             return margin.theorem4(V, loop.theta, loop.delta)
-    return margin.Requirement(
-        "theorem4", np.inf, loop.delta, None, "theorem4 needs a coupling: V = 0 dissipates nothing"
-    )
+    return margin.refusal("theorem4", loop.delta, "theorem4 needs a coupling: V = 0 dissipates nothing")
 
 
 def _block(loop: Loop, coupling: CouplingData, condition: Condition) -> Exact:

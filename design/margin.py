@@ -45,10 +45,10 @@ class Requirement:
 
 def closed_loop(F: Lti, delta: Sequence[float]) -> Requirement:
     """The closed-loop condition for the force map F and device dampings `delta` [N s/m]."""
-    available = _dampings(delta, F.inputs)
+    available = dampings(delta, F.inputs)
 
     def refused(reason: str) -> Requirement:
-        return _refused("closed-loop", available, reason)
+        return refusal("closed-loop", available, reason)
 
     if min(available) == 0:
         return refused("a device guarantees no damping, so no coupling is safe for every passive human")
@@ -71,7 +71,7 @@ def closed_loop(F: Lti, delta: Sequence[float]) -> Requirement:
 
     grid = np.concatenate([[0.0], frequencies(F)])
     ratio, w = supremum(needed, grid)
-    return _requirement("closed-loop", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
+    return from_ratio("closed-loop", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
 
 
 def theorem4(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Requirement:
@@ -80,12 +80,12 @@ def theorem4(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Requiremen
     Dividing by |1 - 1/z|^2 it reads (V(1)/2 - He[(V - V(1))/(z - 1)]) / T >= diag(|vt_i|^2 / (4 s delta_i)), with
     vt_i = 1 + 1/z + ... + z^-theta_i, so s is a generalised eigenvalue per frequency.
     """
-    available = _dampings(delta, V.inputs)
+    available = dampings(delta, V.inputs)
     if len(theta) != V.inputs:
         raise ValueError(f"theta has {len(theta)} entries for {V.inputs} channels")
 
     def refused(reason: str) -> Requirement:
-        return _refused("theorem4", available, reason)
+        return refusal("theorem4", available, reason)
 
     if min(available) == 0:
         return refused("a device guarantees no damping, so no coupling is safe for every passive human")
@@ -114,7 +114,7 @@ def theorem4(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Requiremen
     ratio, w = supremum(needed, np.concatenate([[0.0], frequencies(V)]))
     if np.isinf(ratio):
         return refused(f"V is not passive enough at {w / (2 * np.pi * V.T):.4g} Hz: its damping vanishes there")
-    return _requirement("theorem4", ratio, available, w / (2 * np.pi * V.T))
+    return from_ratio("theorem4", ratio, available, w / (2 * np.pi * V.T))
 
 
 def theorem4_per_channel(V: Sequence[Lti], theta: Sequence[int], delta: Sequence[float]) -> Requirement:
@@ -126,15 +126,18 @@ def theorem4_per_channel(V: Sequence[Lti], theta: Sequence[int], delta: Sequence
     return Requirement("theorem4", required, available, worst.frequency_hz, worst.reason)
 
 
-def _requirement(condition: str, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement:
+def from_ratio(condition: str, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement:
+    """The requirement of `ratio` times what is available, on every channel."""
     return Requirement(condition, tuple(ratio * delta for delta in available), available, frequency_hz)
 
 
-def _refused(condition: str, available: tuple[float, ...], reason: str) -> Requirement:
+def refusal(condition: str, available: tuple[float, ...], reason: str) -> Requirement:
+    """The requirement that no damping satisfies."""
     return Requirement(condition, (np.inf,) * len(available), available, None, reason)
 
 
-def _dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
+def dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
+    """`delta` as floats, one positive damping per channel [N s/m]."""
     values = tuple(float(d) for d in delta)
     if len(values) != channels:
         raise ValueError(f"delta has {len(values)} entries for {channels} channels")
