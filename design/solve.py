@@ -16,6 +16,8 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
+from design.failure import DesignFailed, Infeasible
+
 #: Largest violation of a constraint that is taken for rounding; problems are posed in units where 1 is large.
 TOLERANCE = 1e-4
 
@@ -50,18 +52,6 @@ class Attempt:
     value: float | None  # the objective, None where the attempt was refused
     wall_s: float
     reason: str | None = None  # why it was refused
-
-
-class DesignFailed(ValueError):
-    """No setting of the solver gave a result that could be verified."""
-
-    def __init__(self, problem: cp.Problem | None, results: Sequence[Attempt], advice: str) -> None:
-        self.problem, self.results, self.advice = problem, tuple(results), advice
-        super().__init__(advice)
-
-
-class Infeasible(DesignFailed):
-    """What was asked for does not exist."""
 
 
 def solve(

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from controller.lti import SingularLoop
+from design.failure import DesignFailed
 from sim.files import folder
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
 
@@ -119,6 +120,9 @@ def execute(main: Callable[[list[str]], int]) -> NoReturn:
     except (InputError, SingularLoop) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         code = BAD_INPUT
+    except DesignFailed as error:
+        print(f"not possible: {' '.join(str(error).split())}", file=sys.stderr)
+        code = DOES_NOT_HOLD
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         code = INTERRUPTED

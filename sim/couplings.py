@@ -1,56 +1,88 @@
-"""The couplings that a command can be asked for, by name."""
+"""The coupling that a command was asked for: a name, or a file."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
-from controller.coupling import Coupling, NoCoupling, SpringDamper
-from design.margin import Requirement, closed_loop, theorem4_per_channel
+from controller.coupling import Coupling, NoCoupling
+from controller.lti import Array
+from design.assess import specification
+from design.designs import KINDS, design_coupling
+from design.failure import DesignFailed
 from design.published import PUBLISHED
+from design.store import BadFile, Stored, load
 from sim.scenario import InputError, Scenario
-from sim.simulate import Assembly
 
-KINDS = ("none", "published")
-CONDITIONS = ("theorem4", "closed-loop")
+NAMES = ("none", "published", *KINDS)
 
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """A coupling, how it came about, and the condition that it was made or is judged by."""
+    """A coupling, how it came about, and the condition that it was made for or is judged by."""
 
     kind: str
     coupling: Coupling
     condition: str
+    phi: Array | None = None  # (m,) multiplier of Theorem 4 that the design found, if it needed one
+    note: str | None = None  # what a reader should know of its origin
 
 
-def choose(scenario: Scenario, case: str, kind: str | None, condition: str | None) -> Chosen:
-    """The coupling of a case. Raises InputError where the request contradicts itself."""
+def choose(scenario: Scenario, case: str, name: str | None = None, condition: str | None = None) -> Chosen:
+    """The coupling of a case; by default the designed spring-damper.
+
+    Raises InputError where the request contradicts itself, DesignFailed where there is no such coupling.
+    """
     if case == "none":
-        if kind not in (None, "none"):
-            raise InputError(f"--coupling {kind} with --case none: that case is the loop without coupling")
-        kind = "none"
-    kind = kind or "published"
-    if kind == "none":
-        return Chosen(kind, NoCoupling(), condition or "closed-loop")
+        if name not in (None, "none"):
+            raise InputError(f"--coupling {name} with --case none: that case is the loop without coupling")
+        name = "none"
+    name = name or "spring-damper"
+    if name == "none":
+        return Chosen(name, NoCoupling(), condition or "closed-loop")
+    if name == "published":
+        return _published(scenario, case, condition)
+    if name in KINDS:
+        try:
+            design = design_coupling(specification(scenario.loop(case)), name, condition)
+        except DesignFailed:
+            raise
+        except ValueError as error:
+            raise InputError(str(error)) from None
+        return Chosen(name, design.coupling, design.condition, design.phi)
+    return _from_file(scenario, case, name, condition)
+
+
+def _published(scenario: Scenario, case: str, condition: str | None) -> Chosen:
     if scenario.channels != 2:
         raise InputError(f"--coupling published: the paper prints gains for 2 channels, not {scenario.channels}")
-    return Chosen(kind, PUBLISHED[case], condition or "theorem4")
+    return Chosen("published", PUBLISHED[case], condition or "theorem4")
 
 
-def requirements(assembly: Assembly, coupling: Coupling) -> dict[str, Requirement]:
-    """What each condition asks of the devices."""
-    scenario = assembly.scenario
-    return {
-        "theorem4": _theorem4(scenario, coupling),
-        "closed-loop": closed_loop(assembly.F, scenario.delta),
-    }
+def _from_file(scenario: Scenario, case: str, name: str, condition: str | None) -> Chosen:
+    if Path(name).suffix != ".json":
+        raise InputError(f"--coupling is {name!r}, allowed are {', '.join(NAMES)} or a FILE.json")
+    try:
+        stored = load(name)
+    except OSError as error:
+        raise InputError(f"--coupling {name}: {error.strerror}") from None
+    except BadFile as error:
+        raise InputError(str(error)) from None
+    if len(stored.loop.delta) != scenario.channels:
+        raise InputError(f"--coupling {name} is for {len(stored.loop.delta)} channels, not {scenario.channels}")
+    made_for = stored.certificate.condition if stored.certificate else "closed-loop"
+    coupling = stored.coupling.build(scenario.T)
+    return Chosen(Path(name).name, coupling, condition or made_for, note=_differences(stored, scenario, case))
 
 
-def _theorem4(scenario: Scenario, coupling: Coupling) -> Requirement:
-    unknown = (float("inf"),) * scenario.channels
-    if isinstance(coupling, NoCoupling):
-        return Requirement("theorem4", unknown, scenario.delta, None, "without a coupling Theorem 4 has nothing to use")
-    if any(scenario.psi):
-        return Requirement("theorem4", unknown, scenario.delta, None, "an environment delay (psi >= 1) needs the LMI")
-    assert isinstance(coupling, SpringDamper)
-    return theorem4_per_channel(coupling.channels(scenario.T), scenario.theta, scenario.delta)
+def _differences(stored: Stored, scenario: Scenario, case: str) -> str | None:
+    """In what the loop of a stored coupling differs from this one: then its certificate is not about this one."""
+    here = scenario.loop(case)
+    differ = [
+        name for name in here.__struct_fields__ if name != "lam" and getattr(here, name) != getattr(stored.loop, name)
+    ]
+    if not differ:
+        return None
+    return (
+        f"the coupling was stored for another loop (different {', '.join(differ)}): it is certified anew for this one"
+    )

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from controller.coupling import SpringDamper
 from controller.lti import Array
-from design.margin import Requirement
-from design.transparency import decibels, transparency
-from sim.couplings import Chosen
+from design.summary import finite
 from sim.loop import Record
 from sim.simulate import Assembly
 from sim.stability import clipped_ticks, close, dominant_mode, measured_growth, verdict
@@ -23,53 +19,6 @@ CAVEATS = (
     "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted), "
     "not for contacts that make and break, jitter of T, quantisation, velocity filters or friction compensation."
 )
-
-
-def finite(value: float) -> float | None:
-    """JSON knows neither infinity nor not-a-number."""
-    return float(value) if math.isfinite(value) else None
-
-
-def coupling_part(chosen: Chosen, assembly: Assembly) -> dict[str, Any]:
-    """Kind, gains and order of the coupling."""
-    coupling = chosen.coupling
-    part: dict[str, Any] = {"kind": chosen.kind, "K": None, "B": None, "order": 0}
-    if isinstance(coupling, SpringDamper):
-        part |= {"K": coupling.K.tolist(), "B": coupling.B.tolist()}
-        part["order"] = coupling.compliance(assembly.scenario.T).order
-    return part
-
-
-def certificate_part(requirement: Requirement) -> dict[str, Any]:
-    """Required against available damping."""
-    part = {
-        "condition": requirement.condition,
-        "required_damping": [finite(b) for b in requirement.required],
-        "available_damping": list(requirement.available),
-        "margin": finite(1 / requirement.ratio) if requirement.ratio > 0 else None,
-        "binding_frequency_hz": requirement.frequency_hz,
-        "certified": requirement.certified,
-        "proof": requirement.proof,
-    }
-    return part | ({"reason": requirement.reason} if requirement.reason else {})
-
-
-def transparency_part(assembly: Assembly, case: str) -> dict[str, Any]:
-    """The figures of the mismatch, in decibels, with a reason where one is infinite."""
-    figures = transparency(assembly.F, assembly.environment, assembly.scenario.reference_delays(case))
-    part: dict[str, Any] = {
-        "tau_db": finite(decibels(figures.tau)),
-        "relative_mismatch_db": finite(decibels(figures.relative_mismatch)),
-        "rms_mismatch_db": finite(decibels(figures.rms_mismatch)),
-        "dc_ratio": finite(figures.dc_ratio),
-        "high_frequency_gain": finite(figures.high_frequency_gain),
-        "band_hz": list(figures.band_hz),
-    }
-    if figures.relative_mismatch == 0:
-        part["reason"] = "the devices see the reference exactly: the mismatch is zero, minus infinity in dB"
-    elif math.isinf(figures.tau):
-        part["reason"] = "tau (25) divides by inf sigma_min(E), which is 0: some motion costs no static force"
-    return part
 
 
 def stability_part(assembly: Assembly, record: Record) -> dict[str, Any]:
@@ -106,13 +55,6 @@ def error_part(record: Record, exact: Record, assembly: Assembly) -> dict[str, A
     until = f"the unstable run first clips at t = {linear * assembly.scenario.T:.3f} s"
     reason = f"{until}; up to there the relative rms is {relative:.1e}, and its growth multiplies any difference"
     return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
-
-
-def promise(certificates: dict[str, Any]) -> str | None:
-    """For which environments the coupling is certified."""
-    if certificates["theorem4"]["certified"]:
-        return "any passive environment"
-    return "this environment" if certificates["closed-loop"]["certified"] else None
 
 
 def remarks(outcome: dict[str, Any]) -> list[str]:
@@ -162,8 +104,19 @@ def print_report(report: dict[str, Any], console: Console) -> None:
     for name, value in _rows(report):
         table.add_row(name, value)
     console.print(table)
+    if report["reproducibility"]:
+        console.print(_beside_the_paper(report["reproducibility"]))
     for remark in report["remarks"]:
         console.print(f"[dim]·[/] {remark}", soft_wrap=False)
+
+
+def _beside_the_paper(rows: list[dict[str, str]]) -> Table:
+    table = Table(title="beside the paper")
+    for column in ("what", "paper", "here", "why"):
+        table.add_column("" if column == "what" else column)
+    for row in rows:
+        table.add_row(*(row[column] for column in ("what", "paper", "here", "why")))
+    return table
 
 
 def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
@@ -172,11 +125,13 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     if coupling["K"]:
         rows.append(("coupling K / B", f"{_list(coupling['K'])} N/m / {_list(coupling['B'])} N s/m"))
     for part in report["certificates"].values():
-        word = "[green]certified[/]" if part["certified"] else "[red]not certified[/]"
+        proof = ", proved exactly" if part["proof"] == "rational" else ""
+        word = f"[green]certified[/]{proof}" if part["certified"] else "[red]not certified[/]"
         need = _list(part["required_damping"])
         rows.append(
             (f"damping, {part['condition']}", f"needs {need} of {_list(part['available_damping'])} N s/m: {word}")
         )
+    rows.append(("promise", f"holds for {report['promise']}" if report["promise"] else "none"))
     rows.append(
         ("relative mismatch", f"{_db(transparent['relative_mismatch_db'])} (rms {_db(transparent['rms_mismatch_db'])})")
     )

@@ -6,6 +6,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Self
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -57,11 +58,11 @@ class Result:
     def load_npz(cls, path: Path) -> Self:
         """A trace written by `save_npz`. Raises InputError where it is none."""
         try:
-            with np.load(path, allow_pickle=False) as archive:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 return cls(**{name: archive[name] for name in _ARRAYS}, meta=json.loads(str(archive["meta"])))
         except OSError as error:
             raise InputError(f"{path}: {error.strerror or error}") from None
-        except (KeyError, ValueError, EOFError) as error:
+        except (KeyError, ValueError, EOFError, BadZipFile) as error:
             raise InputError(f"{path}: not a trace of this program ({error})") from None
 
     def save_csv(self, path: Path) -> Path:

@@ -10,7 +10,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sim import report
+from design.assess import CONDITIONS, assess
+from design.summary import certificate_part, coupling_part, promise, transparency_part
+from design.transparency import transparency
+from sim import report, reproducibility
 from sim.command import (
     DONE,
     INTERRUPTED,
@@ -25,7 +28,7 @@ from sim.command import (
     scenario_from,
     seed_from,
 )
-from sim.couplings import CONDITIONS, KINDS, Chosen, choose, requirements
+from sim.couplings import NAMES, Chosen, choose
 from sim.files import write, write_json
 from sim.loop import Record
 from sim.mujoco_engine import INTEGRATORS
@@ -47,7 +50,7 @@ def main(argv: list[str]) -> int:
         begin = time.perf_counter()
         record = simulate(assembly, args.engine, args.integrator, substeps, progress=bar[1])
         wall = time.perf_counter() - begin
-    exact = record if args.engine == "exact" else simulate(assembly, "exact")
+    exact = record if args.engine == "exact" else simulate(assembly, "exact", samples=record.s.shape[0])
 
     outcome = _outcome(args, chosen, assembly, record, exact, wall)
     outcome["run"]["seed"] = seed
@@ -63,7 +66,8 @@ def _parser() -> Parser:
         "sim.run", "Close the loop once and report stability, transparency and error.", "python -m sim.run --case none"
     )
     add_loop_options(parser)
-    parser.add_argument("--coupling", choices=KINDS, help="default: the case's own")
+    names = ", ".join(NAMES)
+    parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
     parser.add_argument("--engine", choices=ENGINES, default="mujoco")
     parser.add_argument("--integrator", choices=tuple(INTEGRATORS), default="RK4", help="MuJoCo's (default RK4)")
@@ -85,20 +89,19 @@ def _outcome(
     args: argparse.Namespace, chosen: Chosen, assembly: Assembly, record: Record, exact: Record, wall: float
 ) -> dict[str, Any]:
     scenario, samples = assembly.scenario, record.s.shape[0]
-    certificates = {
-        name: report.certificate_part(requirement)
-        for name, requirement in requirements(assembly, chosen.coupling).items()
-    }
+    loop = scenario.loop(args.case)
+    requirements = assess(loop, chosen.coupling, chosen.phi)
+    certificates = {name: certificate_part(requirement) for name, requirement in requirements.items()}
     simulated = samples * scenario.T
     mujoco = args.engine == "mujoco"
     outcome = {
         "case": args.case,
         "scenario": scenario.name,
-        "coupling": report.coupling_part(chosen, assembly),
+        "coupling": coupling_part(chosen.kind, chosen.coupling, scenario.T),
         "certificate": certificates[chosen.condition],
         "certificates": certificates,
-        "promise": report.promise(certificates),
-        "transparency": report.transparency_part(assembly, args.case),
+        "promise": promise(requirements, scenario.psi),
+        "transparency": transparency_part(transparency(assembly.F, assembly.E, loop.lam)),
         "stability": report.stability_part(assembly, record),
         "run": {
             "engine": args.engine,
@@ -110,14 +113,15 @@ def _outcome(
             "real_time_factor": simulated / wall,
             "theta": list(scenario.theta),
             "psi": list(scenario.psi),
-            "lam": list(scenario.reference_delays(args.case)),
+            "lam": list(loop.lam),
             "T_s": scenario.T,
             "interrupted": record.interrupted,
             "scenario_digest": scenario.digest,
         },
         "error": report.error_part(record, exact, assembly),
     }
-    return outcome | {"remarks": report.remarks(outcome)}
+    outcome["reproducibility"] = reproducibility.table(scenario, args.case, outcome)
+    return outcome | {"remarks": [*([chosen.note] if chosen.note else []), *report.remarks(outcome)]}
 
 
 def _save(

@@ -8,12 +8,12 @@ import re
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Self, get_args
+from typing import Any, Self, get_args
 
 import msgspec
 
 from controller.environment import Network, Spring, environment
-from controller.lti import Lti
+from design.store import Loop
 from models.device import Device, passivity_level, with_damping
 from models.human import Human, Link, Population, Voluntary
 from models.quantity import require
@@ -22,7 +22,8 @@ CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
-Delays = tuple[Annotated[int, msgspec.Meta(ge=0, le=10_000)], ...]
+LONGEST_DELAY = 1000  # [samples]; every one is a state
+Delays = tuple[int, ...]
 
 
 class InputError(ValueError):
@@ -66,6 +67,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if value is not None and len(value) != self.channels:
                 contacts = f"the environment has {self.channels} contacts ({', '.join(self.environment.contacts)})"
                 raise ValueError(f"{name} has {len(value)} entries, but {contacts}")
+            for i, n in enumerate(value if name in ("theta", "psi", "lam") and value else ()):
+                require(f"{name}[{i}]", n, 0, LONGEST_DELAY, "samples")
         for i, lam in enumerate(self.lam or ()):
             if lam > self.theta[i] + self.psi[i]:
                 total = self.theta[i] + self.psi[i]
@@ -99,9 +102,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return (0,) * self.channels
         return tuple(t + p for t, p in zip(self.theta, self.psi, strict=True))
 
-    def discrete_environment(self) -> Lti:
-        """E(z)."""
-        return environment(self.environment, self.T)
+    def loop(self, case: str) -> Loop:
+        """All that a design may know: no device but its damping, no human."""
+        return Loop(self.T, self.theta, self.psi, self.reference_delays(case), self.delta, self.environment)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping."""
@@ -136,7 +139,7 @@ def parse(text: str, source: str = "scenario") -> Scenario:
         raise InputError(f"{source}: not valid TOML: {error}") from None
     try:
         scenario = msgspec.convert(raw, Scenario)
-        scenario.discrete_environment()
+        environment(scenario.environment, scenario.T)
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_located(str(error), raw)}") from None
     except ValueError as error:
@@ -163,7 +166,9 @@ def _located(message: str, raw: dict[str, Any]) -> str:
             value = None
             break
     shown = f" = {value!r}" if isinstance(value, int | float | str) else ""
-    return f"{path}{shown}: {what[0].lower()}{what[1:]}" if path else f"{what[0].lower()}{what[1:]}"
+    if what[1:2].islower():  # a word of msgspec's, not a symbol of ours
+        what = what[0].lower() + what[1:]
+    return f"{path}{shown}: {what}" if path else what
 
 
 def _hint(what: str) -> str:

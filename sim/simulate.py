@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.coupling import Coupling
+from controller.environment import environment
 from controller.lti import Array, Lti
 from controller.process import Process, force_map
 from models.device import Device
@@ -25,7 +26,7 @@ class Assembly:
     """A scenario with its coupling, ready to run."""
 
     scenario: Scenario
-    environment: Lti  # E
+    E: Lti
     F: Lti
     process: Process
     scene: Scene
@@ -34,11 +35,11 @@ class Assembly:
 
 def assemble(scenario: Scenario, coupling: Coupling) -> Assembly:
     """Build both worlds. Raises SingularLoop where the algebraic loop has no solution."""
-    environment = scenario.discrete_environment()
-    F = force_map(environment, coupling, scenario.theta, scenario.psi)
+    E = environment(scenario.environment, scenario.T)
+    F = force_map(E, coupling, scenario.theta, scenario.psi)
     process = Process(F, _each(scenario.device, "force_limit"), _each(scenario.device, "encoder_step"))
     scene = build(scenario.device, scenario.human)
-    return Assembly(scenario, environment, F, process, scene, hold(plant(scene.model), scenario.T))
+    return Assembly(scenario, E, F, process, scene, hold(plant(scene.model), scenario.T))
 
 
 def simulate(
@@ -47,9 +48,10 @@ def simulate(
     integrator: str = "RK4",
     substeps: int = 4,
     voluntary: bool = True,
+    samples: int | None = None,
     progress: Progress = lambda done, ticks: None,
 ) -> Record:
-    """The scenario's run, from rest."""
+    """The scenario's run, from rest; `samples` ticks of it where that is given."""
     scenario, scene = assembly.scenario, assembly.scene
 
     def outside(first: int, ticks: int) -> Array:
@@ -58,7 +60,7 @@ def simulate(
     rest = np.zeros((assembly.plant.A.shape[0], 1))
     with profiler_off(), quiet_warnings():
         plant_engine = make_engine(assembly, engine, integrator, substeps)
-        return run(assembly.process, plant_engine, outside, scenario.samples, rest, progress)
+        return run(assembly.process, plant_engine, outside, samples or scenario.samples, rest, progress)
 
 
 def make_engine(assembly: Assembly, engine: str, integrator: str = "RK4", substeps: int = 4) -> Engine:

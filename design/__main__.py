@@ -1,0 +1,119 @@
+"""python -m design: design a coupling, prove it, and store it with its certificate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from controller.process import force_map
+from design.assess import CONDITIONS, assess, specification
+from design.certificate import NotProved, prove
+from design.designs import KINDS, design_coupling
+from design.failure import DesignFailed
+from design.result import Design
+from design.store import Condition, Loop, Stored, data_of, save
+from design.summary import certificate_part, coupling_part, promise, transparency_part
+from design.transparency import transparency
+from sim.command import (
+    DOES_NOT_HOLD,
+    DONE,
+    Parser,
+    add_loop_options,
+    add_output_options,
+    console,
+    execute,
+    scenario_from,
+)
+from sim.files import folder, write_json
+from sim.scenario import InputError
+
+
+def main(argv: list[str]) -> int:
+    args = _parser().parse_args(argv)
+    if args.case == "none":
+        raise InputError("--case none has no coupling to design: give I or II")
+    out = Path(args.out or f"out/design-{args.case}.json")
+    folder(out.parent)
+    loop = scenario_from(args).loop(args.case)
+    try:
+        spec = specification(loop)
+        design = design_coupling(spec, args.coupling, args.condition)
+    except DesignFailed:
+        raise
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    F = force_map(spec.environment, design.coupling, loop.theta, loop.psi)
+    requirements = assess(loop, design.coupling, design.phi)
+    outcome = {
+        "case": args.case,
+        "coupling": coupling_part(args.coupling, design.coupling, loop.T),
+        "certificate": certificate_part(requirements[design.condition]),
+        "certificates": {name: certificate_part(r) for name, r in requirements.items()},
+        "promise": promise(requirements, loop.psi),
+        "transparency": transparency_part(transparency(F, spec.environment, loop.lam)),
+        "objective": design.objective,
+        "objective_name": design.figure,
+        "sdps": design.sdps,
+        "wall_s": design.wall_s,
+        "stored": _store(loop, design, out),
+    }
+    console(args).print(_table(outcome))
+    if args.json:
+        write_json(args.json, outcome)
+    return DONE if outcome["certificate"]["certified"] else DOES_NOT_HOLD
+
+
+def _parser() -> Parser:
+    example = "python -m design --case I --coupling spring-damper --out coupling.json"
+    parser = Parser("design", "Design a coupling, prove its certificate and store both.", example)
+    add_loop_options(parser)
+    parser.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
+    parser.add_argument("--condition", choices=CONDITIONS, help="what to certify (default: the coupling's own)")
+    add_output_options(parser)
+    return parser
+
+
+def _store(loop: Loop, design: Design, out: Path) -> dict[str, Any]:
+    """Save the coupling with the proof of its condition, or without where there is none yet."""
+    data = data_of(design.coupling)
+    condition: Condition = "closed-loop" if design.condition == "closed-loop" else "theorem4"
+    try:
+        certificate, reason = prove(loop, data, condition), None
+    except NotProved as error:
+        certificate, reason = None, str(error)
+    try:
+        save(Stored(loop, data, certificate), out)
+    except OSError as error:
+        raise InputError(f"--out {out}: {error.strerror}") from None
+    return {"file": str(out), "proof": certificate.proof if certificate else None, "reason": reason}
+
+
+def _table(outcome: dict[str, Any]) -> Table:
+    coupling, certificate, transparent = outcome["coupling"], outcome["certificate"], outcome["transparency"]
+    table = Table(title=f"{coupling['kind']}, case {outcome['case']}, {certificate['condition']}", show_header=False)
+    if coupling["K"]:
+        table.add_row("K [N/m]", _list(coupling["K"]))
+        table.add_row("B [N s/m]", _list(coupling["B"]))
+    for part in outcome["certificates"].values():
+        word = "certified" if part["certified"] else "not certified"
+        required = _list(part["required_damping"])
+        available = _list(part["available_damping"])
+        table.add_row(f"damping, {part['condition']}", f"needs {required} of {available} N s/m: {word}")
+    table.add_row("promise", outcome["promise"] or "none")
+    table.add_row(outcome["objective_name"], f"{outcome['objective']:.5g}")
+    rms = transparent["rms_mismatch_db"]
+    table.add_row("mismatch", f"{transparent['relative_mismatch_db']:.2f} dB (rms {rms:.2f} dB)")
+    table.add_row("convex problems", f"{outcome['sdps']} in {outcome['wall_s']:.2f} s")
+    stored = outcome["stored"]
+    table.add_row("stored", f"{stored['file']} (proof: {stored['proof'] or stored['reason']})")
+    return table
+
+
+def _list(values: list[float | None]) -> str:
+    return ", ".join("inf" if v is None else f"{v:.6g}" for v in values)
+
+
+if __name__ == "__main__":
+    execute(main)

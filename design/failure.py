@@ -1,0 +1,18 @@
+"""What a design raises when it has nothing to return."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+
+class DesignFailed(ValueError):
+    """No result could be verified. `problem` is the convex problem, if there is one, `results` what was tried."""
+
+    def __init__(self, problem: Any, results: Sequence[Any], advice: str) -> None:
+        self.problem, self.results, self.advice = problem, tuple(results), advice
+        super().__init__(advice)
+
+
+class Infeasible(DesignFailed):
+    """What was asked for does not exist."""

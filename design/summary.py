@@ -1,0 +1,65 @@
+"""Couplings, certificates and transparency as plain data: what the commands print and write as JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from controller.coupling import Compliance, Coupling, SpringDamper
+from design.margin import Requirement
+from design.transparency import Transparency, decibels
+
+
+def finite(value: float) -> float | None:
+    """JSON knows neither infinity nor not-a-number."""
+    return float(value) if math.isfinite(value) else None
+
+
+def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
+    """Kind, gains (None where it has none) and order of V."""
+    part: dict[str, Any] = {"kind": kind, "K": None, "B": None, "order": 0}
+    match coupling:
+        case SpringDamper(K=K, B=B):
+            part |= {"K": K.tolist(), "B": B.tolist(), "order": coupling.compliance(T).order}
+        case Compliance(V=V):
+            part["order"] = V.order
+    return part
+
+
+def certificate_part(requirement: Requirement) -> dict[str, Any]:
+    """Required against available damping [N s/m]."""
+    part = {
+        "condition": requirement.condition,
+        "required_damping": [finite(b) for b in requirement.required],
+        "available_damping": list(requirement.available),
+        "margin": finite(1 / requirement.ratio) if requirement.ratio > 0 else None,
+        "binding_frequency_hz": requirement.frequency_hz,
+        "certified": requirement.certified,
+        "proof": requirement.proof,
+    }
+    return part | ({"reason": requirement.reason} if requirement.reason else {})
+
+
+def promise(requirements: dict[str, Requirement], psi: Sequence[int]) -> str | None:
+    """For which environments the coupling is certified. A multiplier (psi >= 1) belongs to one environment."""
+    if requirements["theorem4"].certified and not any(psi):
+        return "any passive environment"
+    return "this environment" if any(r.certified for r in requirements.values()) else None
+
+
+def transparency_part(figures: Transparency) -> dict[str, Any]:
+    """The figures of the mismatch, in decibels, with a reason where one is infinite."""
+    part: dict[str, Any] = {
+        "tau_db": finite(decibels(figures.tau)),
+        "relative_mismatch_db": finite(decibels(figures.relative_mismatch)),
+        "rms_mismatch_db": finite(decibels(figures.rms_mismatch)),
+        "dc_ratio": finite(figures.dc_ratio),
+        "high_frequency_gain": finite(figures.high_frequency_gain),
+        "band_hz": list(figures.band_hz),
+    }
+    if figures.relative_mismatch == 0:
+        part["reason"] = "the devices see the reference exactly: the mismatch is zero, minus infinity in dB"
+    elif math.isinf(figures.tau):
+        part["reason"] = "tau (25) divides by inf sigma_min(E), which is 0: some motion costs no static force"
+    return part

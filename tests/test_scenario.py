@@ -1,0 +1,89 @@
+"""Scenarios are strict: every impossible one gives one line that names the field."""
+
+import pytest
+
+from controller.environment import FIGURE_4
+from sim.scenario import SCENARIOS, InputError, built_in, load, parse
+
+TEXT = (SCENARIOS / "omega-pair.toml").read_text()
+
+BAD = [
+    ("theta = [1, 2]", "theta = [1, 1.5]", "theta[1] = 1.5: expected `int`, got `float`"),
+    ("theta = [1, 2]", "theta = [1]", "theta has 1 entries, but the environment has 2 contacts"),
+    ("theta = [1, 2]", "theta = [1, -1]", "theta[1] is -1, allowed are 0 to 1000 samples"),
+    ("theta = [1, 2]", "theta = [1, true]", "theta[1] = True: expected `int`"),
+    ("psi = [0, 0]", "psi = [0, 0, 0]", "psi has 3 entries"),
+    ("psi = [0, 0]", "psi = [0, 0]\nlam = [2, 2]", "lam[0] is 2, allowed are 0 to theta + psi = 1 samples"),
+    ("T = 1.2e-3", "T = 1.2", "T is 1.2, allowed are 1e-06 to 0.1 s (the unit is s)"),
+    ("T = 1.2e-3", "T = nan", "T is nan"),
+    ("T = 1.2e-3", "T = '1.2 ms'", "T = '1.2 ms': expected `float`, got `str`"),
+    ("T = 1.2e-3", "T == 1", "not valid TOML"),
+    ("name = ", "nam = ", "unknown field `nam` (did you mean `name`?)"),
+    ("motor_mass = 0.06 ", "motor_mass = -0.06", "device[0]: motor_mass is -0.06, allowed are 1e-06 to 1000 kg"),
+    ("motor_mass = 0.06 ", "motor_mas = 0.06", "unknown field `motor_mas` (did you mean `motor_mass`?)"),
+    ("damping = 1.37 ", "damping = 1.37\ndelta = 2.0", "delta is 2 N s/m, allowed are values in (0, damping = 1.37]"),
+    ('kind = "compliant" ', 'kind = "soft"', "device[0].kind = 'soft': invalid value 'soft', allowed are 'compliant'"),
+    ("mass = 0.3", "mass = 3e5", "human[0].links[0]: mass is 300000, allowed are 0 to 1000 kg"),
+    ("frequency = 0.6", "frequency = inf", "frequency is inf"),
+    ("stiffness = 800.0", "stiffness = -800.0", "stiffness between contact 1 and mass is -800.0"),
+    ("mass = 1.0 }", "mas = 1.0 }", "masses names 'mas', which no spring reaches"),
+    ("channel = 1", "channel = 3", "tap.channel is 3, allowed are 1 to 2"),
+    ("[tap]", "[tapp]", "unknown field `tapp` (did you mean `tap`?)"),
+    ("duration = 15.0", "duration = 0.0", "duration is 0"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "message"), BAD, ids=[new for _, new, _ in BAD])
+def test_a_bad_scenario_gets_one_line_that_names_the_field(old, new, message):
+    assert old in TEXT
+    with pytest.raises(InputError) as caught:
+        parse(TEXT.replace(old, new, 1), "mine.toml")
+    assert str(caught.value).startswith("mine.toml: ")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("nix.toml", "No such file or directory; give a TOML file or one of: omega-pair"), (".", "Is a directory")],
+)
+def test_a_missing_file_names_what_there_is(name, message):
+    with pytest.raises(InputError, match=message):
+        load(name)
+
+
+def test_a_file_that_is_no_text(tmp_path):
+    (tmp_path / "x.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="UTF-8"):
+        load(tmp_path / "x.toml")
+
+
+@pytest.mark.parametrize("name", built_in())
+def test_built_in_scenarios_load(name):
+    assert load(name).name == name
+
+
+def test_the_default_is_the_papers():
+    scenario = load()
+    assert scenario.environment == FIGURE_4
+    assert (scenario.T, scenario.theta, scenario.psi, scenario.delta) == (1.2e-3, (1, 2), (0, 0), (1.37, 1.37))
+    assert scenario.reference_delays("I") == (1, 2)
+    assert scenario.reference_delays("II") == (0, 0)
+
+
+def test_replacing_checks_again():
+    scenario = load()
+    assert scenario.replace(delta=(2.0, 0.8)).delta == (2.0, 0.8)
+    for change, message in [
+        ({"theta": (1, 2, 3)}, "theta has 3 entries"),
+        ({"delta": (1.0, -1.0)}, "damping is -1"),
+        ({"delta": (1.0,)}, "delta has 1 entries for 2 channels"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            scenario.replace(**change)
+
+
+def test_the_digest_knows_every_number():
+    scenario = load()
+    assert scenario.digest == load().digest
+    assert scenario.digest != scenario.replace(theta=(1, 3)).digest
