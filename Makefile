@@ -1,9 +1,10 @@
 # make run    the paper's case I, from a fresh clone to a picture
 # make test   the whole test suite
+# make figures  the pictures that README and docs show
 PYTHON ?= python3
 PY := .venv/bin/python
 
-.PHONY: run test lint bench clean
+.PHONY: run test lint bench figures clean
 
 run: .venv/ready
 	$(PY) -m sim.run --case I
@@ -15,6 +16,12 @@ lint: .venv/ready
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m pyright
+
+figures: .venv/ready
+	$(PY) -m sim.run --case none --out out/figure-5
+	$(PY) -m sim.run --case I --out out/figure-6
+	cp out/figure-5/figure.png docs/pictures/figure-5.png
+	cp out/figure-6/figure.png docs/pictures/figure-6.png
 
 bench: .venv/ready
 	$(PY) -m pytest tests/benchmarks --benchmark-only -s
