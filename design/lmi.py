@@ -130,10 +130,12 @@ def shifted_ports(H: Lti) -> Ports:
     return Ports(H.A, H.B, -quotient.C, (static + static.T) / 4, H.C, H.D)
 
 
-def symmetric(rows: list[list[Matrix]]) -> cp.Expression:
-    """The block matrix, made exactly symmetric; blocks with no rows or columns are left out."""
+def symmetric(rows: list[list[Matrix]]) -> Matrix:
+    """The block matrix, made exactly symmetric; an array if every block is one. Empty blocks are left out."""
     kept = [[block for block in row if 0 not in block.shape] for row in rows]
-    M = cp.bmat([row for row in kept if row])
+    kept = [row for row in kept if row]
+    numbers = all(isinstance(block, np.ndarray) for row in kept for block in row)
+    M = np.block(kept) if numbers else cp.bmat(kept)
     return (M + M.T) / 2
 
 

@@ -47,7 +47,7 @@ def design(spec: Specification, condition: str = "theorem4", starts: Sequence[Sp
 def _for_any_environment(spec: Specification, start: SpringDamper | None) -> Design:
     started = time.perf_counter()
     phi = shortage(spec)
-    sigma = _sigma(spec, phi)
+    sigma = excess_limits(spec, phi)
     shaping = Shaping(spec)
     gains, sdps = _start(spec, sigma, start)
     norm, peak = shaping.norm(_coupling(spec, gains).compliance(spec.T))
@@ -97,7 +97,7 @@ def stiffest(spec: Specification) -> Design:
     """The gains of largest total stiffness (each channel's own largest) that satisfy Theorem 4; objective in N/m."""
     started = time.perf_counter()
     phi = shortage(spec)
-    gains, sdps = _start(spec, _sigma(spec, phi), None)
+    gains, sdps = _start(spec, excess_limits(spec, phi), None)
     coupling = _coupling(spec, gains)
     requirement = verified(spec, coupling, phi)
     total = float(coupling.K.sum())
@@ -138,7 +138,7 @@ def verified(spec: Specification, coupling: SpringDamper, phi: Array | None) -> 
     return requirement
 
 
-def _sigma(spec: Specification, phi: Array | None) -> Array:
+def excess_limits(spec: Specification, phi: Array | None) -> Array:
     """(N,) Sigma = Delta_V^-1 = Phi^-1 - Delta_D^-1 in units of the usable damping; inf without a multiplier."""
     if phi is None:
         return np.full(spec.channels, np.inf)

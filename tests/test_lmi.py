@@ -113,8 +113,8 @@ def test_lemma_2_is_lemma_1():
             np.diag(rng.uniform(0.01, 1, 2)),
             -rng.uniform(0, 60) * np.eye(2),
         )
-        first = np.linalg.eigvalsh(lemma1(G, P, Delta, Phi).value).min()
-        second = np.linalg.eigvalsh(lemma2(G, np.linalg.inv(P), P, np.linalg.inv(Delta), Phi).value).min()
+        first = np.linalg.eigvalsh(lemma1(G, P, Delta, Phi)).min()
+        second = np.linalg.eigvalsh(lemma2(G, np.linalg.inv(P), P, np.linalg.inv(Delta), Phi)).min()
         assert (first > 0) == (second > 0)
 
 
@@ -136,7 +136,7 @@ def test_lemma_3_is_the_norm(seed):
         assert holds == (factor > 1)
         if holds:
             full = lemma3(A, B, C, D, X.value, np.linalg.inv(X.value), (factor * norm) ** 2)
-            assert np.linalg.eigvalsh(full.value).min() > 0
+            assert np.linalg.eigvalsh(full).min() > 0
 
 
 def test_15_as_printed_is_strictly_infeasible():
