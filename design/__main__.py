@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,7 @@ from rich.table import Table
 from controller.process import force_map
 from design.assess import CONDITIONS, assess, specification
 from design.certificate import NotProved, prove
-from design.designs import KINDS, design_coupling
+from design.designs import KINDS, METHODS, compare_methods, design_coupling
 from design.failure import DesignFailed
 from design.result import Design
 from design.store import Condition, Loop, Stored, data_of, save
@@ -24,6 +26,7 @@ from sim.command import (
     add_output_options,
     console,
     execute,
+    numbers,
     scenario_from,
 )
 from sim.files import folder, write_json
@@ -37,9 +40,10 @@ def main(argv: list[str]) -> int:
     out = Path(args.out or f"out/design-{args.case}.json")
     folder(out.parent)
     loop = scenario_from(args).loop(args.case)
+    options = _options(args)
     try:
         spec = specification(loop)
-        design = design_coupling(spec, args.coupling, args.condition)
+        design = design_coupling(spec, args.coupling, args.condition, **options)
     except DesignFailed:
         raise
     except ValueError as error:
@@ -59,7 +63,11 @@ def main(argv: list[str]) -> int:
         "wall_s": design.wall_s,
         "stored": _store(loop, design, out),
     }
+    if args.compare:
+        outcome["comparison"] = [asdict(row) for row in compare_methods(spec)]
     console(args).print(_table(outcome))
+    if args.compare:
+        console(args).print(_comparison(outcome["comparison"]))
     if args.json:
         write_json(args.json, outcome)
     return DONE if outcome["certificate"]["certified"] else DOES_NOT_HOLD
@@ -71,8 +79,29 @@ def _parser() -> Parser:
     add_loop_options(parser)
     parser.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="what to certify (default: the coupling's own)")
+    ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
+    ccl.add_argument("--order", metavar="N", help="states per channel (default 1)")
+    ccl.add_argument("--full", action="store_true", help="a coupling across channels (default: diagonal)")
+    ccl.add_argument("--method", choices=METHODS, help="complementarity is as printed (default inner)")
+    ccl.add_argument("--compare", action="store_true", help="run every method, one state per channel (a minute)")
     add_output_options(parser)
     return parser
+
+
+def _options(args: argparse.Namespace) -> dict[str, Any]:
+    """The options of a ccl design. Raises InputError where they are given for another coupling."""
+    given = {}
+    if args.order is not None:
+        (given["order"],) = numbers("--order", args.order, int, 1)
+        if not 1 <= given["order"] <= 10:
+            raise InputError(f"--order is {given['order']}, allowed are 1 to 10")
+    if args.full:
+        given["diagonal"] = False
+    if args.method:
+        given["method"] = args.method
+    if args.coupling != "ccl" and (given or args.compare):
+        raise InputError("--order, --full, --method and --compare are for --coupling ccl")
+    return given
 
 
 def _store(loop: Loop, design: Design, out: Path) -> dict[str, Any]:
@@ -108,6 +137,14 @@ def _table(outcome: dict[str, Any]) -> Table:
     table.add_row("convex problems", f"{outcome['sdps']} in {outcome['wall_s']:.2f} s")
     stored = outcome["stored"]
     table.add_row("stored", f"{stored['file']} (proof: {stored['proof'] or stored['reason']})")
+    return table
+
+
+def _comparison(rows: list[dict[str, Any]]) -> Table:
+    table = Table("method", "||W1 L W2||", "SDPs", "seconds", title="one state per channel, diagonal")
+    for row in rows:
+        norm = "-" if row["norm"] is None else f"{row['norm']:.4g}"
+        table.add_row(row["method"], norm, str(row["sdps"]), f"{row['wall_s']:.1f}")
     return table
 
 

@@ -12,39 +12,28 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from controller.coupling import Compliance, SpringDamper
 from controller.lti import Array, Lti
 from design import spring_damper
 from design.cone_complementarity import bisect
 from design.delayed import theorem4_delayed
+from design.designs import METHODS
+from design.failure import DesignFailed
 from design.fixed_order import FixedOrder
 from design.fixed_poles import FixedPoles
 from design.inner_convex import descend
 from design.margin import Requirement, theorem4
 from design.multiplier import shortage
-from design.result import Design
+from design.result import Design, Row
 from design.shaping import Shaping
-from design.solve import DesignFailed
 from design.specification import Specification
 
-METHODS = ("complementarity", "inner", "fixed-poles")
 #: The start is designed for this much less damping, so that it is strictly feasible.
 START_ROOM = 1e-3
 #: Descent ends when a step improves the norm by less than this, relatively.
 SETTLED = 1e-4
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of a comparison."""
-
-    method: str
-    norm: float | None  # ||W1 L W2||_inf, None where the method gave nothing that could be verified
-    sdps: int
-    wall_s: float
-    reason: str | None = None
 
 
 def design(

@@ -15,10 +15,11 @@ import numpy as np
 from controller.lti import Array
 from design.affine import affine, packed, symmetric_from
 from design.certificates import gain_storage, passivity_storage
+from design.failure import DesignFailed
 from design.fixed_order import FixedOrder
 from design.inner_convex import FIRST_ROOM, in_coordinates
 from design.lmi import lemma2, lemma3, symmetric
-from design.solve import DesignFailed, solve
+from design.solve import solve
 
 #: Linearised problems per value of mu, and the relative width at which bisection ends.
 PATIENCE = 20

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from design.result import Design
+from typing import Any
+
+from design.result import Design, Row
 from design.specification import Specification
 
 #: name -> the conditions that it can be made for, its own first
-KINDS = {"spring-damper": ("theorem4", "closed-loop")}
+KINDS = {"spring-damper": ("theorem4", "closed-loop"), "ccl": ("theorem4",)}
+
+#: how a state-space coupling of fixed order may be sought
+METHODS = ("complementarity", "inner", "fixed-poles")
 
 
-def design_coupling(spec: Specification, kind: str = "spring-damper", condition: str | None = None) -> Design:
-    """Design and verify a coupling.
+def design_coupling(
+    spec: Specification, kind: str = "spring-damper", condition: str | None = None, **options: Any
+) -> Design:
+    """Design and verify a coupling; `options` are those of the design's own function (order, method, ..).
 
     Raises ValueError for a kind or condition that does not exist, Infeasible or DesignFailed (design.failure) where
     there is nothing to return.
@@ -20,6 +27,15 @@ def design_coupling(spec: Specification, kind: str = "spring-damper", condition:
     condition = condition or KINDS[kind][0]
     if condition not in KINDS[kind]:
         raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(KINDS[kind])}")
-    from design import spring_damper  # cvxpy takes a second to import
+    from design import ccl, spring_damper  # cvxpy takes a second to import
 
-    return spring_damper.design(spec, condition)
+    if kind == "ccl":
+        return ccl.design(spec, **options)
+    return spring_damper.design(spec, condition, **options)
+
+
+def compare_methods(spec: Specification) -> tuple[Row, ...]:
+    """Every method on the same specification: norm, convex problems, seconds."""
+    from design import ccl
+
+    return ccl.compare(spec)

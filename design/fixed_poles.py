@@ -15,10 +15,11 @@ from scipy.optimize import minimize
 
 from controller.lti import Array, Lti
 from design.affine import affine, packed, symmetric_from
+from design.failure import DesignFailed
 from design.lmi import Ports, lemma1, symmetric, theta_hat
 from design.sampled import affine_lmis, gain_lmi
 from design.shaping import Shaping
-from design.solve import DesignFailed, solve
+from design.solve import solve
 from design.specification import Specification
 from design.sweep import on_circle
 

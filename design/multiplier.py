@@ -8,8 +8,9 @@ import numpy as np
 from controller.lti import Array
 from design.coordinates import balanced, unit_environment
 from design.delayed import uncovered
+from design.failure import DesignFailed, Infeasible
 from design.lmi import Ports, e_hat_regular, lemma1
-from design.solve import DesignFailed, Infeasible, solve
+from design.solve import solve
 from design.specification import Specification
 
 #: Phi is enlarged by this, relatively, so that a sweep confirms what a solver found to its own tolerance.

@@ -21,3 +21,14 @@ class Design:
     sdps: int  # convex problems solved (local searches count their runs)
     wall_s: float
     phi: Array | None = None  # (N,) multiplier Phi_E [N s/m] of Theorem 4, None where the environment has none
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of a comparison."""
+
+    method: str
+    norm: float | None  # ||W1 L W2||_inf, None where the method gave nothing that could be verified
+    sdps: int
+    wall_s: float
+    reason: str | None = None

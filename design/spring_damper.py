@@ -16,13 +16,14 @@ from controller.lti import Array
 from controller.process import force_map
 from design.convex_concave import step
 from design.delayed import theorem4_delayed
+from design.failure import DesignFailed, Infeasible
 from design.frozen_environment import least_rms
 from design.gain_set import gain_set, gain_sets
 from design.margin import Requirement, closed_loop, theorem4
 from design.multiplier import shortage
 from design.result import Design
 from design.shaping import Shaping
-from design.solve import DesignFailed, Infeasible, solve
+from design.solve import solve
 from design.specification import RESERVE, Specification
 
 #: The sequence stops when a step improves the norm by less than this, relatively.

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from design import solve as module
-from design.solve import CROSS_CHECK, LADDER, DesignFailed, Infeasible, solve
+from design.failure import DesignFailed, Infeasible
+from design.solve import CROSS_CHECK, LADDER, solve
 
 
 @pytest.fixture

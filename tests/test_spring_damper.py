@@ -13,10 +13,11 @@ from controller.lti import Lti
 from controller.process import force_map
 from design.analysis import analysis
 from design.delayed import theorem4_delayed
+from design.failure import DesignFailed, Infeasible
 from design.gain_set import gain_set
 from design.margin import closed_loop, theorem4
 from design.shaping import Shaping
-from design.solve import CROSS_CHECK, DesignFailed, Infeasible, solve
+from design.solve import CROSS_CHECK, solve
 from design.specification import RESERVE, Specification
 from design.spring_damper import design, stiffest, stiffest_at
 

@@ -1,6 +1,6 @@
 """What the loop costs beside the raw mj_step calls it makes, and how accurate those are.
 
-    make bench    (or: python -m pytest tests/benchmarks --benchmark-only -s)
+make bench    (or: python -m pytest tests/benchmarks --benchmark-only -s)
 """
 
 import time
