@@ -22,6 +22,8 @@ from design.solve import solve
 
 #: Room above the start's norm for its first certificate, relatively.
 FIRST_ROOM = 0.05
+#: Bounds on Q and U in coordinates where they were I: a state that little reaches leaves them free to degenerate.
+LEAST, MOST = 0.1, 1.99
 
 
 def descend(family: FixedOrder, p: Array, norm: float) -> Iterator[Array]:
@@ -59,7 +61,9 @@ def _step(family: FixedOrder, at: Array, Q0: Array, U0: Array, norm: float) -> t
         A, B, C = np.linalg.solve(LU, A @ LU), np.linalg.solve(LU, B), C @ LU / norm
         return lemma3(A, B, C, D / norm, 2 * np.eye(nu) - U, U, t)
 
-    cuts = [affine(passivity, x) >> 0, affine(gain, x) >> 0]
+    storages = [affine(lambda v, i=i: split(v)[i], x) for i in (1, 2)]
+    near = [Z >> LEAST * np.eye(Z.shape[0]) for Z in storages] + [Z << MOST * np.eye(Z.shape[0]) for Z in storages]
+    cuts = [affine(passivity, x) >> 0, affine(gain, x) >> 0, *near]
     solve(cp.Problem(cp.Minimize(x[-1]), cuts), "a step of the inner convex approximation")
     p, Q, U, _ = split(np.asarray(x.value))
     return p, LQ @ Q @ LQ.T, LU @ U @ LU.T

@@ -37,7 +37,7 @@ _LOOSE = {"tol_gap_abs": 1e-6, "tol_gap_rel": 1e-6, "tol_feas": 1e-6}
 LADDER = (
     Settings("default", cp.CLARABEL),
     Settings("tight", cp.CLARABEL, {**_TIGHT, "max_step_fraction": 0.95}),
-    Settings("as given", cp.CLARABEL, {"equilibrate_enable": False, "presolve_enable": False}),
+    Settings("as given", cp.CLARABEL, {"equilibrate_enable": False, "chordal_decomposition_enable": False}),
     Settings("loose", cp.CLARABEL, {**_LOOSE, "static_regularization_constant": 1e-7}),
 )
 CROSS_CHECK = Settings("splitting", cp.SCS, {"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 200_000})
