@@ -140,7 +140,7 @@ class _Search:
     def _fixed_poles(self, most_sdps: int) -> Lti:
         problem = FixedPoles(self.spec, self.sigma)
         rate = self.gains.B / (self.gains.B + self.gains.K * self.spec.T)
-        V, _ = problem.search(rate, evaluations=most_sdps)
+        V, _ = problem.search(rate, lambda V: self.requirement(V).certified, evaluations=most_sdps)
         self.sdps += problem.sdps
         return V
 

@@ -6,7 +6,7 @@ V_i = v_i + sum_j f_ij (1 - z)/(z - a_ij). With the poles fixed, the remedied (2
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cvxpy as cp
 import numpy as np
@@ -46,14 +46,18 @@ class FixedPoles:
             self.frequencies.append(peak)
         return V, norm
 
-    def search(self, start: Sequence[float], evaluations: int = 60) -> tuple[Lti, float]:
-        """`best` over one pole per channel, by a simplex search from `start`."""
+    def search(self, start: Sequence[float], holds: Callable[[Lti], bool], evaluations: int = 60) -> tuple[Lti, float]:
+        """`best` over one pole per channel, by a simplex search from `start`; only poles whose V `holds` count.
+
+        The search would otherwise be drawn to poles at which a solver's tolerance passes for passivity.
+        """
 
         def norm(x: Array) -> float:
             try:
-                return self.best([[a] for a in np.tanh(x)])[1]
+                V, value = self.best([[a] for a in np.tanh(x)])
             except DesignFailed:
                 return np.inf
+            return value if holds(V) else np.inf
 
         options = {"maxfev": evaluations, "xatol": 1e-3, "fatol": 1e-4}
         found = minimize(norm, np.arctanh(start), method="Nelder-Mead", options=options)
