@@ -107,7 +107,8 @@ def print_report(report: dict[str, Any], console: Console) -> None:
     if report["reproducibility"]:
         console.print(_beside_the_paper(report["reproducibility"]))
     for remark in report["remarks"]:
-        console.print(f"[dim]·[/] {remark}", soft_wrap=False)
+        console.print(f"[dim]·[/] {remark}")
+    console.print("files: " + ", ".join(report["files"]), soft_wrap=True)
 
 
 def _beside_the_paper(rows: list[dict[str, str]]) -> Table:
