@@ -10,7 +10,7 @@ ROOT = Path(__file__).parent.parent
 MENTION = re.compile(r"tests/(test_\w+\.py)::(\w+)")
 DOCS = ("theory.md", "reproducibility.md")
 #: Sections that introduce words and claim nothing
-DEFINITIONS = ("The loop and its symbols", "How to read this page")
+DEFINITIONS = ("The loop and its symbols",)
 
 
 def defined_in(name: str) -> set[str]:
