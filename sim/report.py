@@ -148,7 +148,7 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     rows.append(
         (
             "speed",
-            f"{run['wall_s']:.2f} s for {run['duration_s']:g} s: {run['real_time_factor']:.0f} x real time ({engine})",
+            f"{run['wall_s']:.2f} s for {run['duration_s']:g} s: {run['real_time_factor']:.2g} x real time ({engine})",
         )
     )
     rms = report["error"]["position_relative_rms"]

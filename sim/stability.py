@@ -80,7 +80,8 @@ def measured_growth(
     clipped = clipped_ticks(record, force_limit)
     usable = int(np.argmax(clipped)) if clipped.any() else clipped.size - 1
     if usable < SHORTEST_TRACE:
-        return None, f"only {max(usable, 0)} ticks before the first clipped one; {SHORTEST_TRACE} are needed"
+        which = "ticks before the first clipped one" if clipped.any() else "ticks"
+        return None, f"only {max(usable, 0)} {which}; a growth rate needs {SHORTEST_TRACE}"
     xi = np.concatenate([record.s[: usable + 1, :, 0], record.z[: usable + 1, :, 0]], axis=1)
     y = xi @ mode.left.conj()
     pushed = record.w[:usable, :, 0] @ (loop.B.T @ mode.left.conj())

@@ -10,13 +10,13 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "NOTATION.md", *sorted((ROOT / "docs").glob("*.md"))]
-COMMANDS = [
+LINES = [
     (page.name, line.removeprefix("$ "))
     for page in PAGES
     for block in re.findall(r"```(?:sh|console)\n(.*?)```", page.read_text(), flags=re.DOTALL)
     for line in block.splitlines()
-    if line.startswith(("$ python -m", "python -m"))
 ]
+COMMANDS = [(page, line) for page, line in LINES if line.startswith("python -m")]
 
 
 @pytest.fixture(scope="module")
@@ -46,9 +46,10 @@ def test_links_and_pictures_exist(page):
 
 def test_make_targets_exist():
     targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
-    for page in PAGES:
-        for target in re.findall(r"`make ([a-z]+)`|^\$? ?make ([a-z]+)", page.read_text(), flags=re.MULTILINE):
-            assert next(filter(None, target)) in targets
+    named = [line.split()[1] for _, line in LINES if line.startswith("make ")]
+    named += re.findall(r"`make ([a-z]+)`", "".join(page.read_text() for page in PAGES))
+    assert named
+    assert set(named) <= set(targets)
 
 
 def test_there_are_commands_to_run():

@@ -107,6 +107,14 @@ def test_unequal_devices_need_a_common_factor():
     assert one.ratio == pytest.approx(2 * two.ratio, rel=1e-9)
 
 
+@pytest.mark.parametrize("mass", [0.3, 1.0, 3.0, 30.0, 300.0, 1000.0])
+def test_a_free_mass_is_not_refused_by_rounding(mass):
+    """Its F(1) is exactly 0; a heavy one asks what a rigid wall asks."""
+    free = environment(Network(("a",), masses={"a": mass}), T)
+    F = force_map(free, SpringDamper([610.0], [0.545]), [2], [0])
+    assert closed_loop(F, [1.37]).required[0] == pytest.approx(1.3659, rel=3e-3)
+
+
 def test_moving_a_delay_between_force_and_measurement_changes_nothing():
     """Remark 3 of the paper, for stability: only the sum of the two delays of a channel matters."""
     from controller.delay import delay
