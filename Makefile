@@ -15,7 +15,6 @@ test: .venv/ready
 lint: .venv/ready
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
-	$(PY) -m pyright
 
 figures: .venv/ready
 	$(PY) -m sim.run --case none --out out/figure-5

@@ -28,6 +28,7 @@ from sim.command import (
     execute,
     numbers,
     scenario_from,
+    seed_from,
 )
 from sim.files import folder, write_json
 from sim.scenario import InputError
@@ -52,6 +53,7 @@ def main(argv: list[str]) -> int:
     requirements = assess(loop, design.coupling, design.phi)
     outcome = {
         "case": args.case,
+        "seed": seed_from(args),
         "coupling": coupling_part(args.coupling, design.coupling, loop.T),
         "certificate": certificate_part(requirements[design.condition]),
         "certificates": {name: certificate_part(r) for name, r in requirements.items()},
