@@ -11,23 +11,12 @@ from rich.table import Table
 
 from controller.coupling import SpringDamper
 from controller.lti import Array
-from design.margin import Requirement
+from design.promises import CAVEATS, finite
 from design.transparency import decibels, transparency
 from sim.couplings import Chosen
 from sim.loop import Record
 from sim.simulate import Assembly
 from sim.stability import clipped_ticks, close, dominant_mode, measured_growth, verdict
-
-#: what no certificate covers
-CAVEATS = (
-    "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted), "
-    "not for contacts that make and break, jitter of T, quantisation, velocity filters or friction compensation."
-)
-
-
-def finite(value: float) -> float | None:
-    """JSON knows neither infinity nor not-a-number."""
-    return float(value) if math.isfinite(value) else None
 
 
 def coupling_part(chosen: Chosen, assembly: Assembly) -> dict[str, Any]:
@@ -38,20 +27,6 @@ def coupling_part(chosen: Chosen, assembly: Assembly) -> dict[str, Any]:
         part |= {"K": coupling.K.tolist(), "B": coupling.B.tolist()}
         part["order"] = coupling.compliance(assembly.scenario.T).order
     return part
-
-
-def certificate_part(requirement: Requirement) -> dict[str, Any]:
-    """Required against available damping."""
-    part = {
-        "condition": requirement.condition,
-        "required_damping": [finite(b) for b in requirement.required],
-        "available_damping": list(requirement.available),
-        "margin": finite(1 / requirement.ratio) if requirement.ratio > 0 else None,
-        "binding_frequency_hz": requirement.frequency_hz,
-        "certified": requirement.certified,
-        "proof": requirement.proof,
-    }
-    return part | ({"reason": requirement.reason} if requirement.reason else {})
 
 
 def transparency_part(assembly: Assembly, case: str) -> dict[str, Any]:
@@ -106,13 +81,6 @@ def error_part(record: Record, exact: Record, assembly: Assembly) -> dict[str, A
     until = f"the unstable run first clips at t = {linear * assembly.scenario.T:.3f} s"
     reason = f"{until}; up to there the relative rms is {relative:.1e}, and its growth multiplies any difference"
     return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
-
-
-def promise(certificates: dict[str, Any]) -> str | None:
-    """For which environments the coupling is certified."""
-    if certificates["theorem4"]["certified"]:
-        return "any passive environment"
-    return "this environment" if certificates["closed-loop"]["certified"] else None
 
 
 def remarks(outcome: dict[str, Any]) -> list[str]:

@@ -22,7 +22,8 @@ CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
-Delays = tuple[Annotated[int, msgspec.Meta(ge=0, le=10_000)], ...]
+LONGEST_DELAY = 10_000  # [samples]
+Delays = tuple[Annotated[int, msgspec.Meta(ge=0, le=LONGEST_DELAY)], ...]
 
 
 class InputError(ValueError):
@@ -66,6 +67,10 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if value is not None and len(value) != self.channels:
                 contacts = f"the environment has {self.channels} contacts ({', '.join(self.environment.contacts)})"
                 raise ValueError(f"{name} has {len(value)} entries, but {contacts}")
+        for name in ("theta", "psi", "lam"):
+            for i, n in enumerate(getattr(self, name) or ()):
+                if not 0 <= n <= LONGEST_DELAY:
+                    raise ValueError(f"{name}[{i}] is {n}, allowed are 0 to {LONGEST_DELAY} samples")
         for i, lam in enumerate(self.lam or ()):
             if lam > self.theta[i] + self.psi[i]:
                 total = self.theta[i] + self.psi[i]
