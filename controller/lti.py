@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -82,14 +83,21 @@ class Lti:
         """
         z = np.asarray(z, dtype=np.complex128)
         points = z.ravel()
-        S, U = schur(self.A, output="complex") if self.order else (np.zeros((0, 0)), np.zeros((0, 0)))
+        S, U = self._schur
         rhs = U.conj().T @ self.B
-        X = np.empty((self.order, self.inputs, points.size), dtype=np.complex128)
+        X = np.empty((self.order, self.inputs * points.size), dtype=np.complex128)
         for i in reversed(range(self.order)):
-            later = np.tensordot(S[i, i + 1 :], X[i + 1 :], axes=1)
-            X[i] = (rhs[i][:, None] + later) / (points - S[i, i])
-        G = np.tensordot(self.C @ U, X, axes=1) + self.D[:, :, None]
+            later = (S[i, i + 1 :] @ X[i + 1 :]).reshape(self.inputs, points.size)
+            X[i] = ((rhs[i][:, None] + later) / (points - S[i, i])).ravel()
+        G = (self.C @ U @ X).reshape(self.outputs, self.inputs, points.size) + self.D[:, :, None]
         return np.moveaxis(G, -1, 0).reshape(*z.shape, self.outputs, self.inputs)
+
+    @cached_property
+    def _schur(self) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+        """S, U with A = U S U* and S upper triangular: once per block, however often it is evaluated."""
+        if not self.order:
+            return np.zeros((0, 0), dtype=np.complex128), np.zeros((0, 0), dtype=np.complex128)
+        return schur(self.A, output="complex")
 
     def dc(self) -> Array:
         """G(1), shape (p, m)."""

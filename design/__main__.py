@@ -14,9 +14,10 @@ from design.assess import CONDITIONS, assess, specification
 from design.certificate import NotProved, prove
 from design.designs import KINDS, METHODS, compare_methods, design_coupling
 from design.failure import DesignFailed
+from design.promises import certificate_part, promise_of
 from design.result import Design
 from design.store import Condition, Loop, Stored, data_of, save
-from design.summary import certificate_part, coupling_part, promise, transparency_part
+from design.summary import coupling_part, transparency_part
 from design.transparency import transparency
 from sim.command import (
     DOES_NOT_HOLD,
@@ -57,7 +58,7 @@ def main(argv: list[str]) -> int:
         "coupling": coupling_part(args.coupling, design.coupling, loop.T),
         "certificate": certificate_part(requirements[design.condition]),
         "certificates": {name: certificate_part(r) for name, r in requirements.items()},
-        "promise": promise(requirements, loop.psi),
+        "promise": promise_of(requirements, loop.psi),
         "transparency": transparency_part(transparency(F, spec.environment, loop.lam)),
         "objective": design.objective,
         "objective_name": design.figure,

@@ -2,50 +2,43 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
-from pathlib import Path
+from typing import Any
 
-import msgspec
-from rich.console import Console
 from rich.table import Table
 
 from design.certificate import Verdict, verify
-from design.store import Stored, load
+from design.store import Stored
+from sim.command import DOES_NOT_HOLD, DONE, Parser, console, execute
+from sim.files import read_coupling, write_json
+from sim.scenario import InputError
 
-EXAMPLE = "example: python -m design.check coupling.json --json -"
 
-
-def main(argv: list[str] | None = None) -> int:
-    """0 proved, 1 not proved, 2 bad input, 130 interrupted."""
-    options = _parser().parse_args(argv)
+def main(argv: list[str]) -> int:
+    args = _parser().parse_args(argv)
+    begin = time.perf_counter()
+    stored = read_coupling(args.coupling)
     try:
-        start = time.perf_counter()
-        stored = load(options.coupling)
         verdict = verify(stored)
-        result = _result(stored, verdict, time.perf_counter() - start)
-        if options.json:
-            _write(result, options.json)
-    except (ValueError, ArithmeticError, OSError) as error:
-        print(f"design.check: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        return 130
-    Console(stderr=options.json == "-").print(_table(result))
-    return 0 if verdict.proved else 1
+    except (ValueError, ArithmeticError) as error:
+        raise InputError(f"{args.coupling}: {error}") from None
+    result = _result(stored, verdict, time.perf_counter() - begin)
+    console(args).print(_table(result))
+    if args.json:
+        write_json(args.json, result)
+    return DONE if verdict.proved else DOES_NOT_HOLD
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m design.check", description="Prove a stored coupling again, in exact arithmetic.", epilog=EXAMPLE
+def _parser() -> Parser:
+    parser = Parser(
+        "design.check", "Prove a stored coupling again, in exact arithmetic.", "python -m design.check coupling.json"
     )
-    parser.add_argument("coupling", type=Path, help="the stored coupling (JSON)")
-    parser.add_argument("--json", metavar="FILE", help="write the result as JSON; - for standard output only")
+    parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling")
+    parser.add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
     return parser
 
 
-def _result(stored: Stored, verdict: Verdict, seconds: float) -> dict:
+def _result(stored: Stored, verdict: Verdict, seconds: float) -> dict[str, Any]:
     """The machine-readable result; figures are null where the file carries no certificate."""
     claim = stored.certificate
     return {
@@ -61,15 +54,7 @@ def _result(stored: Stored, verdict: Verdict, seconds: float) -> dict:
     }
 
 
-def _write(result: dict, target: str) -> None:
-    text = msgspec.json.format(msgspec.json.encode(result), indent=2) + b"\n"
-    if target == "-":
-        sys.stdout.buffer.write(text)
-    else:
-        Path(target).write_bytes(text)
-
-
-def _table(result: dict) -> Table:
+def _table(result: dict[str, Any]) -> Table:
     title = "proved, in exact arithmetic" if result["proved"] else "not proved"
     table = Table(title=title, show_header=False, title_justify="left")
     for key, value in result.items():
@@ -80,4 +65,4 @@ def _table(result: dict) -> Table:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    execute(main)

@@ -1,19 +1,13 @@
-"""Couplings, certificates and transparency as plain data: what the commands print and write as JSON."""
+"""Couplings and transparency as plain data: what the commands print and write as JSON."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 from controller.coupling import Compliance, Coupling, SpringDamper
-from design.margin import Requirement
+from design.promises import finite
 from design.transparency import Transparency, decibels
-
-
-def finite(value: float) -> float | None:
-    """JSON knows neither infinity nor not-a-number."""
-    return float(value) if math.isfinite(value) else None
 
 
 def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
@@ -25,27 +19,6 @@ def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
         case Compliance(V=V):
             part["order"] = V.order
     return part
-
-
-def certificate_part(requirement: Requirement) -> dict[str, Any]:
-    """Required against available damping [N s/m]."""
-    part = {
-        "condition": requirement.condition,
-        "required_damping": [finite(b) for b in requirement.required],
-        "available_damping": list(requirement.available),
-        "margin": finite(1 / requirement.ratio) if requirement.ratio > 0 else None,
-        "binding_frequency_hz": requirement.frequency_hz,
-        "certified": requirement.certified,
-        "proof": requirement.proof,
-    }
-    return part | ({"reason": requirement.reason} if requirement.reason else {})
-
-
-def promise(requirements: dict[str, Requirement], psi: Sequence[int]) -> str | None:
-    """For which environments the coupling is certified. A multiplier (psi >= 1) belongs to one environment."""
-    if requirements["theorem4"].certified and not any(psi):
-        return "any passive environment"
-    return "this environment" if any(r.certified for r in requirements.values()) else None
 
 
 def transparency_part(figures: Transparency) -> dict[str, Any]:

@@ -81,7 +81,8 @@ def numbers(option: str, text: str, kind: Callable[[str], Number], count: int) -
     if len(values) == 1:
         values *= count
     if len(values) != count:
-        raise InputError(f"{option} has {len(values)} entries, expected {count} (one per channel) or 1")
+        expected = "one" if count == 1 else f"{count} (one per channel) or 1"
+        raise InputError(f"{option} has {len(values)} entries, expected {expected}")
     return values
 
 

@@ -44,23 +44,22 @@ def run(
     engine.start(tape)
     parts: list[tuple[Array, ...]] = []
     done, diverged, interrupted = 0, False, False
-    while done < ticks and not diverged and not interrupted:
-        count = min(tape.ticks, ticks - done)
-        tape.w[:count] = outside(done, count)[:, :, None]
-        try:
+    try:
+        while done < ticks and not diverged:
+            count = min(tape.ticks, ticks - done)
+            tape.w[:count] = outside(done, count)[:, :, None]
             with np.errstate(over="ignore", invalid="ignore"):  # a diverging run is reported, not warned about
                 _stretch(tape, engine, count)
-        except KeyboardInterrupt:
-            interrupted = True
-            break
-        finite = np.isfinite(tape.s[:count]).all(axis=(1, 2)) & np.isfinite(tape.f[:count]).all(axis=(1, 2))
-        diverged = engine.troubled() or not finite.all()
-        count = count if finite.all() else int(np.argmin(finite))
-        tape.saturate(count)
-        parts.append(tuple(part[:count].copy() for part in (tape.z, tape.s, tape.w, tape.f)))
-        tape.rewind(count)
-        done += count
-        progress(done, ticks)
+            finite = np.isfinite(tape.s[:count]).all(axis=(1, 2)) & np.isfinite(tape.f[:count]).all(axis=(1, 2))
+            diverged = engine.troubled() or not finite.all()
+            count = count if finite.all() else int(np.argmin(finite))
+            tape.saturate(count)
+            parts.append(tuple(part[:count].copy() for part in (tape.z, tape.s, tape.w, tape.f)))
+            tape.rewind(count)
+            done += count
+            progress(done, ticks)
+    except KeyboardInterrupt:  # what was finished is kept
+        interrupted = True
     z, s, w, f = (np.concatenate(column) for column in zip(*parts, strict=True)) if parts else _nothing(tape)
     return Record(z, s, w, f, diverged, interrupted)
 

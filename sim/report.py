@@ -9,16 +9,10 @@ from rich.console import Console
 from rich.table import Table
 
 from controller.lti import Array
-from design.summary import finite
+from design.promises import CAVEATS, finite
 from sim.loop import Record
 from sim.simulate import Assembly
 from sim.stability import clipped_ticks, close, dominant_mode, measured_growth, verdict
-
-#: what no certificate covers
-CAVEATS = (
-    "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted), "
-    "not for contacts that make and break, jitter of T, quantisation, velocity filters or friction compensation."
-)
 
 
 def stability_part(assembly: Assembly, record: Record) -> dict[str, Any]:

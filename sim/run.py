@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from design.assess import CONDITIONS, assess
-from design.summary import certificate_part, coupling_part, promise, transparency_part
+from design.promises import certificate_part, promise_of
+from design.summary import coupling_part, transparency_part
 from design.transparency import transparency
 from sim import report, reproducibility
 from sim.command import (
@@ -100,7 +101,7 @@ def _outcome(
         "coupling": coupling_part(chosen.kind, chosen.coupling, scenario.T),
         "certificate": certificates[chosen.condition],
         "certificates": certificates,
-        "promise": promise(requirements, scenario.psi),
+        "promise": promise_of(requirements, scenario.psi),
         "transparency": transparency_part(transparency(assembly.F, assembly.E, loop.lam)),
         "stability": report.stability_part(assembly, record),
         "run": {

@@ -60,7 +60,9 @@ def simulate(
     rest = np.zeros((assembly.plant.A.shape[0], 1))
     with profiler_off(), quiet_warnings():
         plant_engine = make_engine(assembly, engine, integrator, substeps)
-        return run(assembly.process, plant_engine, outside, samples or scenario.samples, rest, progress)
+        return run(
+            assembly.process, plant_engine, outside, scenario.samples if samples is None else samples, rest, progress
+        )
 
 
 def make_engine(assembly: Assembly, engine: str, integrator: str = "RK4", substeps: int = 4) -> Engine:

@@ -10,9 +10,18 @@ from controller.environment import FIGURE_4
 from design.certificate import prove
 from design.check import main
 from design.store import Loop, SpringDamper, Stored, save
+from sim.command import execute
 
 LOOP = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
 GAINS = SpringDamper((878.7, 551.8), (0.3865, 0.5220))
+
+
+def leave(monkeypatch, *argv: str) -> int:
+    """The exit code of the command."""
+    monkeypatch.setattr(sys, "argv", ["design.check", *argv])
+    with pytest.raises(SystemExit) as leaving:
+        execute(main)
+    return leaving.value.code
 
 
 @pytest.fixture
@@ -42,14 +51,14 @@ def test_a_changed_gain_exits_with_1_and_says_why(path, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("content", [None, b"", b"{", b"[]", b"\xff", b'{"loop": {}}', b"[" * 100000])
-def test_bad_input_exits_with_2_and_one_line(tmp_path, capsys, content):
+def test_bad_input_exits_with_2_and_one_line(tmp_path, capsys, monkeypatch, content):
     file = tmp_path / "bad.json"
     if content is not None:
         file.write_bytes(content)
-    assert main([str(file)]) == 2
+    assert leave(monkeypatch, str(file)) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    assert err.startswith("design.check: ")
+    assert err.startswith("error: ")
     assert err.count("\n") == 1
 
 
@@ -57,7 +66,7 @@ def test_help_has_an_example(capsys):
     with pytest.raises(SystemExit) as leaving:
         main(["--help"])
     assert leaving.value.code == 0
-    assert "example: python -m design.check coupling.json" in capsys.readouterr().out
+    assert "python -m design.check coupling.json" in capsys.readouterr().out
 
 
 def test_checking_imports_no_solver(path):
@@ -70,4 +79,4 @@ def test_an_interruption_exits_with_130(path, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("design.check.verify", interrupted)
-    assert main([str(path)]) == 130
+    assert leave(monkeypatch, str(path)) == 130

@@ -1,15 +1,14 @@
 """sim.run as a user meets it: figures, files, exit codes, one line for bad input."""
 
 import json
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sim import loop
 from sim.result import Result
 from sim.run import main
 from sim.scenario import InputError
@@ -161,18 +160,23 @@ def test_json_on_standard_output_is_only_json(tmp_path):
     assert "growth" in err
 
 
-def test_interrupting_keeps_what_was_simulated(tmp_path):
-    process = command("--coupling", "published", "--no-plot", "--duration", "100000", "--out", "o", cwd=tmp_path)
-    # the folder is made when the options are in order; a second later the loop is running
-    while not (tmp_path / "o").exists() and process.poll() is None:
-        time.sleep(0.05)
-    time.sleep(3.0)
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=60)
-    assert process.returncode == 130, err
-    trace = Result.load_npz(tmp_path / "o" / "trace.npz")
-    assert trace.t.size > 0
-    assert trace.meta["run"]["interrupted"]
+def test_interrupting_keeps_what_was_simulated(tmp_path, monkeypatch):
+    """Ctrl-C in the third stretch: the first two are written, and the exit code says so."""
+    stretch, calls = loop._stretch, []
+
+    def interrupted(*args):
+        calls.append(args)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        stretch(*args)
+
+    monkeypatch.setattr(loop, "_stretch", interrupted)
+    code, report = run(tmp_path, "--coupling", "published")
+    trace = Result.load_npz(tmp_path / "out" / "trace.npz")
+    assert code == 130
+    assert report["run"]["interrupted"]
+    assert trace.t.size == report["run"]["samples"] == 2 * loop.STRETCH
+    assert report["error"]["position_relative_rms"] < 1e-6
 
 
 @pytest.mark.parametrize(

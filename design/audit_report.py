@@ -1,0 +1,166 @@
+"""What an audit says: one dictionary for machines, and the same as a table for people."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, get_args
+
+from rich.console import Console
+from rich.table import Table
+
+from controller.coupling import Compliance, NoCoupling, SpringDamper
+from design.audit_figures import Stiffest, Tolerance, remedies, stiffest, tolerance
+from design.margin import Requirement
+from design.promises import CAVEATS, certificate_part, promise
+from design.store import Condition
+from design.subject import Subject
+
+KINDS = {NoCoupling: "none", SpringDamper: "spring-damper", Compliance: "compliance"}
+
+
+def report(subject: Subject) -> dict[str, Any]:
+    """Both conditions with what surrounds them; SI units, null with a "reason" where a figure does not exist."""
+    requirements = {condition: subject.requirement(condition) for condition in reversed(get_args(Condition))}
+    closed_loop, theorem4 = requirements["closed-loop"].certified, requirements["theorem4"].certified
+    gains = isinstance(subject.coupling, SpringDamper)
+    return {
+        "coupling": {
+            "kind": KINDS[type(subject.coupling)],
+            "K": subject.coupling.K.tolist() if gains else None,
+            "B": subject.coupling.B.tolist() if gains else None,
+        },
+        "loop": {
+            "T_s": subject.T,
+            "theta": list(subject.theta),
+            "psi": list(subject.psi),
+            "delta": list(subject.delta),
+            "rigid": subject.network is None,
+        },
+        **{condition: _condition_part(subject, requirement) for condition, requirement in requirements.items()},
+        "certified": closed_loop,
+        "promise": promise(closed_loop and theorem4, closed_loop, rigid=subject.network is None),
+        "helps": _helps(subject, requirements["theorem4" if closed_loop else "closed-loop"]),
+        "not_covered": CAVEATS,
+    }
+
+
+def _condition_part(subject: Subject, requirement: Requirement) -> dict[str, Any]:
+    return certificate_part(requirement) | {
+        "stiffest": _stiffest_part(stiffest(subject, requirement.condition)),
+        "sensitivity": _sensitivity_part(subject, requirement, tolerance(subject, requirement)),
+    }
+
+
+def _stiffest_part(found: Stiffest) -> dict[str, Any]:
+    return {"K": list(found.K)} | _because(found.reason)
+
+
+def _sensitivity_part(subject: Subject, requirement: Requirement, found: Tolerance) -> dict[str, Any]:
+    """Errors are relative: delta may be 1 - delta_error times and T 1 + T_error times what was given."""
+    return {
+        "least_delta": None if found.least_delta is None else list(found.least_delta),
+        "delta_error": None if found.least_delta is None else 1 - requirement.ratio,
+        "largest_T_s": found.largest_T,
+        "T_error": None if found.largest_T is None else found.largest_T / subject.T - 1,
+        "extra_samples": found.extra_samples,
+    } | _because(found.reason)
+
+
+def _because(reason: str | None) -> dict[str, str]:
+    return {"reason": reason} if reason else {}
+
+
+def _helps(subject: Subject, requirement: Requirement) -> list[dict[str, Any]]:
+    """Changes that help the condition that fails first: closed-loop, else theorem4."""
+    return [
+        {
+            "change": remedy.change,
+            "condition": requirement.condition,
+            "required_damping": list(remedy.requirement.required),
+            "certified": remedy.requirement.certified,
+        }
+        for remedy in remedies(subject, requirement)
+    ]
+
+
+def print_report(report: dict[str, Any], console: Console) -> None:
+    """The report as a table, and what it does not cover."""
+    table = Table(title=_verdict(report), title_justify="left")
+    table.add_column("")
+    parts = [report[condition] for condition in ("closed-loop", "theorem4")]
+    for part in parts:
+        table.add_column(part["condition"])
+    for name, cell in ROWS.items():
+        table.add_row(name, *(cell(part) for part in parts))
+    console.print(table)
+    for line in _remarks(report):
+        console.print(f"[dim]·[/] {line}")
+
+
+def _verdict(report: dict[str, Any]) -> str:
+    coupling = report["coupling"]
+    gains = f" K {_list(coupling['K'])} N/m, B {_list(coupling['B'])} N s/m" if coupling["K"] else ""
+    outcome = f"[green]certified[/] for {report['promise']}" if report["certified"] else "[red]not certified[/]"
+    return f"{coupling['kind']}{gains}: {outcome}"
+
+
+def _needs(part: dict[str, Any]) -> str:
+    word = "[green]certified[/]" if part["certified"] else "[red]not certified[/]"
+    return f"{_list(part['required_damping'])} of {_list(part['available_damping'])} N s/m: {word}"
+
+
+def _error(key: str, sign: str) -> Callable[[dict[str, Any]], str]:
+    """A relative error in percent, rounded down so that what is printed is tolerated."""
+
+    def cell(part: dict[str, Any]) -> str:
+        error = part["sensitivity"][key]
+        return "-" if error is None else f"{sign}{math.floor(1e4 * error) / 100:.2f} %"
+
+    return cell
+
+
+def _optional(value: float | None, unit: str = "") -> str:
+    return "-" if value is None else f"{value:.5g}{unit}"
+
+
+#: name of a row -> what stands in it, given the part of a condition
+ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "needs damping": _needs,
+    "margin": lambda part: _optional(part["margin"]),
+    "binds at": lambda part: _optional(part["binding_frequency_hz"], " Hz"),
+    "stiffest K here": lambda part: ", ".join(_down(K) for K in part["stiffest"]["K"]) + " N/m",
+    "delta error": _error("delta_error", "-"),
+    "T error": _error("T_error", "+"),
+    "spare samples": lambda part: _optional(part["sensitivity"]["extra_samples"]),
+}
+
+
+def _down(K: float | None) -> str:
+    """A stiffness to five digits, rounded down so that what is printed is certified."""
+    if K is None:
+        return "-"
+    unit = 10.0 ** (math.floor(math.log10(K)) - 4)
+    return f"{math.floor(K / unit) * unit:.5g}"
+
+
+def _remarks(report: dict[str, Any]) -> list[str]:
+    lines = []
+    for condition in ("closed-loop", "theorem4"):
+        part = report[condition]
+        for name, reason in (
+            ("", part.get("reason")),
+            (", stiffest K", part["stiffest"].get("reason")),
+            (", sensitivity", part["sensitivity"].get("reason") if part["certified"] else None),
+        ):
+            if reason:
+                lines.append(f"{condition}{name}: {reason}.")
+    for helping in report["helps"]:
+        enough = "enough" if helping["certified"] else "not enough alone"
+        need = f"{helping['condition']} then needs {_list(helping['required_damping'])} N s/m, {enough}"
+        lines.append(f"What helps: {helping['change']} ({need}).")
+    return [*lines, report["not_covered"]]
+
+
+def _list(values: Sequence[float | None]) -> str:
+    return ", ".join("-" if v is None else f"{v:.6g}" for v in values)

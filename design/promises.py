@@ -1,0 +1,49 @@
+"""What may be said of a coupling: required against available damping, for which environments, and what is left out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from design.margin import Requirement
+
+ANY, HERE, WALL = "any passive environment", "this environment", "a rigid wall only"
+
+#: What no certificate covers.
+CAVEATS = (
+    "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted), "
+    "not for contacts that make and break, jitter of T, quantisation, velocity filters or friction compensation."
+)
+
+
+def finite(value: float) -> float | None:
+    """JSON knows neither infinity nor not-a-number."""
+    return float(value) if math.isfinite(value) else None
+
+
+def certificate_part(requirement: Requirement) -> dict[str, Any]:
+    """Required against available damping."""
+    part = {
+        "condition": requirement.condition,
+        "required_damping": [finite(b) for b in requirement.required],
+        "available_damping": list(requirement.available),
+        "margin": finite(1 / requirement.ratio) if requirement.ratio > 0 else None,
+        "binding_frequency_hz": requirement.frequency_hz,
+        "certified": requirement.certified,
+        "proof": requirement.proof,
+    }
+    return part | ({"reason": requirement.reason} if requirement.reason else {})
+
+
+def promise(theorem4: bool, closed_loop: bool, rigid: bool = False) -> str | None:
+    """For which environments a coupling is certified, given which conditions hold; `rigid` if E is a wall."""
+    if theorem4:
+        return ANY
+    return (WALL if rigid else HERE) if closed_loop else None
+
+
+def promise_of(requirements: dict[str, Requirement], psi: Sequence[int]) -> str | None:
+    """The promise of a coupling by its requirements; the multiplier that psi >= 1 takes is of one environment."""
+    held = {name: requirement.certified for name, requirement in requirements.items()}
+    return promise(held["theorem4"] and not any(psi), any(held.values()))

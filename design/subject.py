@@ -1,0 +1,107 @@
+"""What an audit is about: a coupling in its loop, judged by either condition and ready to be varied."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
+from controller.environment import GROUND, Network, Spring, environment
+from controller.lti import Lti, SingularLoop
+from controller.process import force_map
+from design.margin import Requirement, closed_loop, refusal, theorem4, theorem4_per_channel
+from design.store import Condition
+
+#: Beyond this many samples a sweep takes seconds, and no device's damping is enough.
+LONGEST_DELAY = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A coupling between devices and an environment. Raises ValueError naming the field that is wrong."""
+
+    coupling: Coupling
+    network: Network | None  # None is a rigid wall behind the coupling, one channel
+    T: float  # [s]
+    theta: tuple[int, ...]  # (m,) transmission delays [samples]
+    psi: tuple[int, ...]  # (m,) environment delays [samples]
+    delta: tuple[float, ...]  # (m,) damping that the devices guarantee [N s/m]
+
+    def __post_init__(self) -> None:
+        for name in ("theta", "psi"):
+            if not all(0 <= n <= LONGEST_DELAY for n in getattr(self, name)):
+                raise ValueError(f"{name} is {_list(getattr(self, name))}, allowed are 0 to {LONGEST_DELAY} samples")
+        if not all(0 < d < np.inf for d in self.delta):
+            raise ValueError(f"delta is {_list(self.delta)}, expected positive dampings in N s/m")
+        if self.network is None and not isinstance(self.coupling, SpringDamper):
+            raise ValueError("a rigid wall needs a spring-damper in front of it")
+        if self.network is None and any(self.psi):
+            raise ValueError(
+                f"psi is {_list(self.psi)}: behind a rigid wall no loop with a delayed environment is stable"
+            )
+
+    @property
+    def channels(self) -> int:
+        return len(self.delta)
+
+    @property
+    def F(self) -> Lti:
+        """What the devices see (6); against a rigid wall (E -> infinity) that is Theta V^-1. Raises SingularLoop."""
+        if self.network is not None:
+            return force_map(environment(self.network, self.T), self.coupling, self.theta, self.psi)
+        assert isinstance(self.coupling, SpringDamper)
+        (K,), (B,) = self.coupling.K.tolist(), self.coupling.B.tolist()
+        clamped = Network(("contact",), (Spring(("contact", GROUND), K, B),))
+        return force_map(environment(clamped, self.T), NoCoupling(), self.theta, self.psi)
+
+    def requirement(self, condition: Condition) -> Requirement:
+        """The damping that the condition asks of the devices."""
+        return self._closed_loop() if condition == "closed-loop" else self._theorem4()
+
+    def with_period(self, T: float) -> Self:
+        """The same gains (of a state-space coupling: the same coefficients) and delays in samples at another T [s]."""
+        coupling = self.coupling
+        if isinstance(coupling, Compliance):
+            coupling = Compliance(replace(coupling.V, T=T))
+        return replace(self, coupling=coupling, T=T)
+
+    def with_gains(self, K: Sequence[float], B: Sequence[float]) -> Self:
+        """The same loop with another spring-damper [N/m, N s/m]."""
+        return replace(self, coupling=SpringDamper(K, B))
+
+    def _closed_loop(self) -> Requirement:
+        try:
+            return closed_loop(self.F, self.delta)
+        except SingularLoop as error:
+            return refusal("closed-loop", self.delta, str(error))
+
+    def _theorem4(self) -> Requirement:
+        if isinstance(self.coupling, NoCoupling):
+            return refusal("theorem4", self.delta, "without a coupling Theorem 4 has nothing to use")
+        if any(self.psi):
+            return self._theorem4_delayed()
+        if isinstance(self.coupling, SpringDamper):
+            return theorem4_per_channel(self.coupling.channels(self.T), self.theta, self.delta)
+        return theorem4(self.coupling.V, self.theta, self.delta)
+
+    def _theorem4_delayed(self) -> Requirement:
+        """With psi >= 1 the environment needs a multiplier, which a solver finds: imported here only."""
+        from design.delayed import theorem4_delayed
+        from design.multiplier import shortage
+        from design.solve import DesignFailed
+        from design.specification import Specification
+
+        V = self.coupling.compliance(self.T) if isinstance(self.coupling, SpringDamper) else self.coupling.V
+        E = environment(self.network, self.T)
+        try:
+            phi = shortage(Specification(E, self.theta, self.psi, self.theta, self.delta))
+        except DesignFailed as error:
+            return refusal("theorem4", self.delta, str(error))
+        return theorem4_delayed(V, E, self.theta, self.psi, self.delta, phi)
+
+
+def _list(values: Sequence[float]) -> str:
+    return ", ".join(f"{v:g}" for v in values)
