@@ -13,7 +13,8 @@ from controller.environment import FIGURE_4, GROUND, Network, Spring
 from controller.lti import Lti
 from design import store
 from design.audit import main
-from design.audit_figures import MOST_EXTRA_SAMPLES, edge, remedies, stiffest, tolerance
+from design.audit_figures import MOST_EXTRA_SAMPLES, edge, stiffest, tolerance
+from design.audit_remedies import remedies
 from design.audit_report import report
 from design.presets import PRESETS
 from design.promises import CAVEATS, promise
