@@ -1,4 +1,4 @@
-"""How far a coupling is from the edge of its certificate: the stiffest K, what may be wrong, and what would help.
+"""How far a coupling is from the edge of its certificate: the stiffest K, and what may be wrong before it is lost.
 
 Everything is found by varying a Subject and asking the conditions of design.margin again: no solver. A search goes
 outwards in steps and locates the edge between the last two, so a gap narrower than a step can be missed; what is
@@ -8,10 +8,9 @@ returned is itself certified, and the other side of the edge is not.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import brentq
@@ -27,7 +26,6 @@ Ratio = Callable[[float], float]  # required over available damping, of a varied
 STIFFEST, LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
 SOFTEST, STEP = 1.0, 3.0  # [N/m]; between two stiffnesses tried
 EDGE = 1e-7  # relative accuracy of an edge
-FACTORS = (0.75, 0.5, 0.25, 0.1)  # of B and T that are tried as remedies
 NOT_CERTIFIED = "not certified: there is nothing to lose"
 
 
@@ -47,14 +45,6 @@ class Tolerance:
     largest_T: float | None  # [s], gains and delays in samples kept
     extra_samples: int | None  # of delay, on all channels at once
     reason: str | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Remedy:
-    """One change, as mild as certifies; or, where none does, the one that lowers the required damping most."""
-
-    change: str
-    requirement: Requirement
 
 
 def stiffest(subject: Subject, condition: Condition) -> Stiffest:
@@ -140,62 +130,6 @@ def _extra_samples(subject: Subject, condition: Condition) -> int | None:
     return None
 
 
-def remedies(subject: Subject, requirement: Requirement) -> list[Remedy]:
-    """What certifies, or lowers the required damping by 10 % or more, each change alone; [] where it is certified."""
-    condition = requirement.condition
-    if requirement.certified or (condition == "theorem4" and any(subject.psi)):
-        return []
-    found = [_fewer_samples(subject, condition, name) for name in ("theta", "psi")]
-    coupling = subject.coupling
-    if isinstance(coupling, SpringDamper) and coupling.B.any():
-        found.append(
-            _smaller(
-                lambda x: subject.with_gains(coupling.K, x * coupling.B),
-                lambda x: f"smaller B: {_list(x * coupling.B)} N s/m",
-                condition,
-            )
-        )
-    found.append(
-        _smaller(
-            lambda x: subject.with_period(x * subject.T),
-            lambda x: f"faster: T = {1e3 * x * subject.T:.5g} ms",
-            condition,
-        )
-    )
-    least = 0.9 * requirement.ratio
-    return [r for r in found if r and (r.requirement.certified or r.requirement.ratio < least)]
-
-
-def _fewer_samples(subject: Subject, condition: Condition, name: str) -> Remedy | None:
-    """One sample less at a time, on every channel that has one."""
-    steps, tried = getattr(subject, name), []
-    for fewer in range(1, max(steps) + 1):
-        less = tuple(max(n - fewer, 0) for n in steps)
-        tried.append(
-            Remedy(f"less delay: {name} = {_list(less)}", replace(subject, **{name: less}).requirement(condition))
-        )
-        if tried[-1].requirement.certified:
-            return tried[-1]
-    return min(tried, key=lambda remedy: remedy.requirement.ratio, default=None)
-
-
-def _smaller(vary: Callable[[float], Subject], describe: Callable[[float], str], condition: Condition) -> Remedy:
-    """The largest factor that certifies, in steps of 0.001; where none does, the one that needs the least damping."""
-
-    @cache
-    def requirement(factor: float) -> Requirement:
-        return vary(factor).requirement(condition)
-
-    for larger, factor in pairwise((1.0, *FACTORS)):
-        if requirement(factor).certified:
-            mildest = edge(lambda x: requirement(x).ratio, factor, larger)
-            printable = max(math.floor(1e3 * mildest - 1e-2) / 1e3, factor)  # certified as rounded for the report
-            mildest = printable if requirement(printable).certified else factor
-            return Remedy(describe(mildest), requirement(mildest))
-    best = min(FACTORS, key=lambda x: requirement(x).ratio)
-    return Remedy(describe(best), requirement(best))
-
-
 def edge(ratio: Ratio, inside: float, outside: float) -> float:
     """The argument nearest `outside` at which the ratio is still below 1, to a relative EDGE."""
     if ratio(outside) < 1:
@@ -210,7 +144,3 @@ def edge(ratio: Ratio, inside: float, outside: float) -> float:
         if ratio(x) < 1:
             return float(x)
     return inside
-
-
-def _list(values: Sequence[float]) -> str:
-    return ", ".join(f"{v:.5g}" for v in values)

@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.table import Table
 
 from controller.coupling import Compliance, NoCoupling, SpringDamper
-from design.audit_figures import Stiffest, Tolerance, remedies, stiffest, tolerance
+from design.audit_figures import Stiffest, Tolerance, stiffest, tolerance
+from design.audit_remedies import remedies
 from design.margin import Requirement
 from design.promises import CAVEATS, certificate_part, promise
 from design.store import Condition
@@ -23,12 +24,12 @@ def report(subject: Subject) -> dict[str, Any]:
     """Both conditions with what surrounds them; SI units, null with a "reason" where a figure does not exist."""
     requirements = {condition: subject.requirement(condition) for condition in reversed(get_args(Condition))}
     closed_loop, theorem4 = requirements["closed-loop"].certified, requirements["theorem4"].certified
-    gains = isinstance(subject.coupling, SpringDamper)
+    gains = subject.coupling if isinstance(subject.coupling, SpringDamper) else None
     return {
         "coupling": {
             "kind": KINDS[type(subject.coupling)],
-            "K": subject.coupling.K.tolist() if gains else None,
-            "B": subject.coupling.B.tolist() if gains else None,
+            "K": gains.K.tolist() if gains else None,
+            "B": gains.B.tolist() if gains else None,
         },
         "loop": {
             "T_s": subject.T,

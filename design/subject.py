@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
+from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, environment
 from controller.lti import Lti, SingularLoop
 from controller.process import force_map
@@ -23,7 +23,7 @@ LONGEST_DELAY = 100
 class Subject:
     """A coupling between devices and an environment. Raises ValueError naming the field that is wrong."""
 
-    coupling: Coupling
+    coupling: NoCoupling | SpringDamper | Compliance
     network: Network | None  # None is a rigid wall behind the coupling, one channel
     T: float  # [s]
     theta: tuple[int, ...]  # (m,) transmission delays [samples]
@@ -82,19 +82,20 @@ class Subject:
         if isinstance(self.coupling, NoCoupling):
             return refusal("theorem4", self.delta, "without a coupling Theorem 4 has nothing to use")
         if any(self.psi):
-            return self._theorem4_delayed()
+            return self._theorem4_delayed(self.coupling)
         if isinstance(self.coupling, SpringDamper):
             return theorem4_per_channel(self.coupling.channels(self.T), self.theta, self.delta)
         return theorem4(self.coupling.V, self.theta, self.delta)
 
-    def _theorem4_delayed(self) -> Requirement:
+    def _theorem4_delayed(self, coupling: SpringDamper | Compliance) -> Requirement:
         """With psi >= 1 the environment needs a multiplier, which a solver finds: imported here only."""
         from design.delayed import theorem4_delayed
         from design.multiplier import shortage
         from design.solve import DesignFailed
         from design.specification import Specification
 
-        V = self.coupling.compliance(self.T) if isinstance(self.coupling, SpringDamper) else self.coupling.V
+        assert self.network is not None  # a wall has psi = 0
+        V = coupling.compliance(self.T) if isinstance(coupling, SpringDamper) else coupling.V
         E = environment(self.network, self.T)
         try:
             phi = shortage(Specification(E, self.theta, self.psi, self.theta, self.delta))
