@@ -36,6 +36,7 @@ from sim.scenario import InputError
 
 
 def main(argv: list[str]) -> int:
+    """Design, prove and store. 0: certified, 1: not."""
     args = _parser().parse_args(argv)
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
+from controller.coupling import Compliance, Coupling, SpringDamper
 from controller.environment import environment
 from controller.lti import Array, Lti
 from controller.process import force_map
 from design.certificate import NotProved, prove
 from design.delayed import theorem4_delayed
-from design.failure import DesignFailed
 from design.margin import Requirement, closed_loop, refusal, theorem4, theorem4_per_channel
 from design.specification import Specification
 from design.store import Condition, Loop, data_of
@@ -26,35 +25,43 @@ def specification(loop: Loop) -> Specification:
 def assess(loop: Loop, coupling: Coupling, phi: Array | None = None) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any."""
     E = environment(loop.environment, loop.T)
+    any_environment = theorem4_requirement(coupling, E, loop.theta, loop.psi, loop.delta, phi)
+    this_environment = closed_loop(force_map(E, coupling, loop.theta, loop.psi), loop.delta)
     return {
-        "theorem4": _proved(loop, coupling, _theorem4(loop, coupling, E, phi)),
-        "closed-loop": _proved(loop, coupling, closed_loop(force_map(E, coupling, loop.theta, loop.psi), loop.delta)),
+        "theorem4": _proved(loop, coupling, any_environment),
+        "closed-loop": _proved(loop, coupling, this_environment),
     }
 
 
-def _theorem4(loop: Loop, coupling: Coupling, E: Lti, phi: Array | None) -> Requirement:
+def theorem4_requirement(
+    coupling: Coupling,
+    E: Lti,
+    theta: tuple[int, ...],
+    psi: tuple[int, ...],
+    delta: tuple[float, ...],
+    phi: Array | None = None,
+) -> Requirement:
+    """Theorem 4 for any coupling; E matters only with delay inside it, which takes a multiplier phi."""
     match coupling:
-        case SpringDamper() if not any(loop.psi):
-            return theorem4_per_channel(coupling.channels(loop.T), loop.theta, loop.delta)
+        case SpringDamper() if not any(psi):
+            return theorem4_per_channel(coupling.channels(E.T), theta, delta)
         case SpringDamper():
-            V = coupling.compliance(loop.T)
+            V = coupling.compliance(E.T)
         case Compliance(V=V):
             pass
-        case NoCoupling():
-            return refusal("theorem4", loop.delta, "without a coupling there is nothing that Theorem 4 could use")
         case _:
-            return refusal("theorem4", loop.delta, "this coupling has no fixed V for Theorem 4 to speak of")
-    if not any(loop.psi):
-        return theorem4(V, loop.theta, loop.delta)
+            return refusal("theorem4", delta, "without a coupling there is nothing that Theorem 4 could use")
+    if not any(psi):
+        return theorem4(V, theta, delta)
     if phi is None:
         from design.multiplier import shortage  # only an environment with delay inside needs the solver
 
         try:
-            phi = shortage(specification(loop))
-        except (DesignFailed, ValueError) as error:
-            return refusal("theorem4", loop.delta, str(error))
-    assert phi is not None
-    return theorem4_delayed(V, E, loop.theta, loop.psi, loop.delta, phi)
+            phi = shortage(Specification(E, theta, psi, theta, delta))
+        except ValueError as error:
+            return refusal("theorem4", delta, str(error))
+    assert phi is not None  # psi >= 1 has a multiplier or none is possible
+    return theorem4_delayed(V, E, theta, psi, delta, phi)
 
 
 def _proved(loop: Loop, coupling: Coupling, requirement: Requirement) -> Requirement:

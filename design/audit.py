@@ -37,6 +37,7 @@ STIFFNESSES, DAMPINGS = (1e-3, 1e9, "N/m"), (0.0, 1e6, "N s/m")
 
 
 def main(argv: list[str]) -> int:
+    """Audit a coupling. 0: safe in this environment, 1: not."""
     args = _with_preset(_parser().parse_args(argv))
     seed_from(args)
     scenario = scenario_from(args)

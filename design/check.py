@@ -15,6 +15,7 @@ from sim.scenario import InputError
 
 
 def main(argv: list[str]) -> int:
+    """Prove a stored coupling again. 0: proved, 1: not."""
     args = _parser().parse_args(argv)
     begin = time.perf_counter()
     stored = read_coupling(args.coupling)

@@ -32,7 +32,8 @@ def supremum(response: Response, grid: Array) -> tuple[float, float]:
     """(value, w): the largest `response` over [grid[0], grid[-1]], refined between grid points.
 
     The highest local maxima of the grid (32 at most, within 20 % of the largest) are bracketed by their
-    neighbours, and the brackets narrowed ten times by a factor of 8: a smooth peak is located to rounding.
+    neighbours, and the brackets narrowed by a factor of 8, ten times or until two rounds gain nothing: a smooth peak is
+    located to rounding.
     """
     values = response(grid)
     if not np.isfinite(values).all():
@@ -45,14 +46,18 @@ def supremum(response: Response, grid: Array) -> tuple[float, float]:
     peaks = np.flatnonzero(local & (values >= top - 0.2 * abs(top)))
     peaks = peaks[np.argsort(values[peaks])[-32:]]
     left, right = grid[np.maximum(peaks - 1, 0)], grid[np.minimum(peaks + 1, grid.size - 1)]
+    settled = 0
     for _ in range(10):
         trial = np.linspace(left, right, 17)
         found = response(trial.ravel()).reshape(trial.shape)
         at = np.argmax(found, axis=0)
         column = np.arange(at.size)
         value = found[at, column]
+        settled = settled + 1 if value.max() <= top + 1e-13 * abs(top) else 0
         if value.max() > top:
             top, where = float(value.max()), float(trial[at, column][np.argmax(value)])
+        if settled == 2:
+            break
         left, right = trial[np.maximum(at - 1, 0), column], trial[np.minimum(at + 1, 16), column]
     return top, where
 

@@ -11,7 +11,8 @@ from design.assess import specification
 from design.designs import KINDS, design_coupling
 from design.failure import DesignFailed
 from design.published import PUBLISHED
-from design.store import BadFile, Stored, load
+from design.store import Stored
+from sim.files import read_coupling
 from sim.scenario import InputError, Scenario
 
 NAMES = ("none", "published", *KINDS)
@@ -62,12 +63,7 @@ def _published(scenario: Scenario, case: str, condition: str | None) -> Chosen:
 def _from_file(scenario: Scenario, case: str, name: str, condition: str | None) -> Chosen:
     if Path(name).suffix != ".json":
         raise InputError(f"--coupling is {name!r}, allowed are {', '.join(NAMES)} or a FILE.json")
-    try:
-        stored = load(name)
-    except OSError as error:
-        raise InputError(f"--coupling {name}: {error.strerror}") from None
-    except BadFile as error:
-        raise InputError(str(error)) from None
+    stored = read_coupling(name)
     if len(stored.loop.delta) != scenario.channels:
         raise InputError(f"--coupling {name} is for {len(stored.loop.delta)} channels, not {scenario.channels}")
     made_for = stored.certificate.condition if stored.certificate else "closed-loop"

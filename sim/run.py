@@ -39,6 +39,7 @@ from sim.simulate import ENGINES, Assembly, assemble, simulate
 
 
 def main(argv: list[str]) -> int:
+    """Simulate and report. 0: the run was completed, stable or not; 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario = scenario_from(args)
     if args.duration is not None:

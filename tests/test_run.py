@@ -109,7 +109,7 @@ BAD = [
     (["--integrator", "RK5"], "invalid choice: 'RK5'"),
     (["--case", "none", "--coupling", "published"], "--coupling published with --case none"),
     (["--coupling", "magic"], "--coupling is 'magic', allowed are none, published, spring-damper"),
-    (["--coupling", "nix.json"], "--coupling nix.json: No such file"),
+    (["--coupling", "nix.json"], "nix.json: No such file"),
     (["--scenario", "three-rigid", "--coupling", "published"], "gains for 2 channels, not 3"),
     (["--json", "/nowhere/r.json"], "--json /nowhere/r.json: the folder /nowhere does not exist"),
 ]
