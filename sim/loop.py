@@ -49,7 +49,7 @@ def run(
         tape.w[:count] = outside(done, count)[:, :, None]
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # a diverging run is reported, not warned about
-                _stretch(tape, engine, count)
+                stretch(tape, engine, count)
         except KeyboardInterrupt:
             interrupted = True
             break
@@ -65,7 +65,7 @@ def run(
     return Record(z, s, w, f, diverged, interrupted)
 
 
-def _stretch(tape: Tape, engine: Engine, ticks: int) -> None:
+def stretch(tape: Tape, engine: Engine, ticks: int) -> None:
     tick, advance = tape.tick, engine.advance
     for k in range(ticks):
         tick(k)
