@@ -6,7 +6,8 @@ beyond that a matrix exponential, not a hand, would decide.
 
 The condition counts |dx|^2 / T where a device dissipates the integral of v^2, which is more unless v is constant
 between samples: for a sinusoid, |dx|^2 / T is (sin x / x)^2 of it, x = pi f T. So the condition asks for that much
-too much damping at the frequency f where it binds (4.8 % at 101 Hz and 1.2 ms), and no search succeeds closer.
+too much damping, about, at the frequency f where it binds: 4.8 % at 101 Hz and 1.2 ms. Closer than that no search
+has succeeded.
 """
 
 from __future__ import annotations

@@ -59,9 +59,8 @@ def main(argv: list[str]) -> int:
         findings = validate(question, shards, bar[1])
         wall = time.perf_counter() - begin
     outcome = _outcome(args, scenario, chosen, requirements, question, findings, certified, wall)
-    worst = None
-    if args.adversary and not findings.interrupted:
-        worst = _attack(scenario, chosen, seed)
+    worst = _attack(scenario, chosen, seed, outcome) if args.adversary and not findings.interrupted else None
+    if worst:
         ratio = requirements["closed-loop"].ratio
         outcome["adversary"] = verdict_report.adversary_part(worst, ratio, certified)
         outcome["holds"] = outcome["holds"] and outcome["adversary"]["holds"]
@@ -69,7 +68,7 @@ def main(argv: list[str]) -> int:
     verdict_report.print_verdicts(outcome, console(args))
     if args.json:
         write_json(args.json, outcome)
-    if findings.interrupted:
+    if outcome["interrupted"]:
         return INTERRUPTED
     return DONE if outcome["holds"] else DOES_NOT_HOLD
 
@@ -111,8 +110,13 @@ def _duration(args: argparse.Namespace, scenario: Scenario) -> float:
     return duration
 
 
-def _attack(scenario: Scenario, chosen: Chosen, seed: int) -> Worst:
-    return search(scenario, assemble(scenario, chosen.coupling).F, seed)
+def _attack(scenario: Scenario, chosen: Chosen, seed: int, outcome: dict[str, Any]) -> Worst | None:
+    """The worst human, or None where the keyboard ends the search: what was found out before is kept."""
+    try:
+        return search(scenario, assemble(scenario, chosen.coupling).F, seed)
+    except KeyboardInterrupt:
+        outcome["interrupted"] = True
+        return None
 
 
 def _outcome(
