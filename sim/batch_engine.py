@@ -7,11 +7,14 @@ separate blocks (one device with its human each), found from the zeros of the ma
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from controller.lti import Array
 from controller.process import Tape
 from sim.exact_engine import HeldPlant
+
+Which = NDArray[np.intp]
 
 
 class ExactBatchEngine:
@@ -46,7 +49,7 @@ class ExactBatchEngine:
         return False
 
 
-def _blocks(pattern: Array) -> tuple[Array, Array]:
+def _blocks(pattern: NDArray[np.bool_]) -> tuple[Which, Which]:
     """Rows and columns of the independent blocks of a (2n, 2n + inputs) pattern of nonzeros.
 
     Shapes (blocks, rows) and (blocks, columns); smaller blocks are filled up with -1.
@@ -62,7 +65,7 @@ def _blocks(pattern: Array) -> tuple[Array, Array]:
     return _filled([r for r, _ in pairs]), _filled([c for _, c in pairs])
 
 
-def _filled(lists: list[Array]) -> Array:
+def _filled(lists: list[Which]) -> Which:
     table = np.full((len(lists), max(part.size for part in lists)), -1)
     for row, part in zip(table, lists, strict=True):
         row[: part.size] = part

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller.coupling import Coupling
 from controller.lti import Array
@@ -50,13 +52,13 @@ class Question:
 class Findings:
     """One entry per set of humans, sorted by index; nan where an engine or a trace was not asked for."""
 
-    index: Array  # (n,)
+    index: NDArray[np.intp]  # (n,)
     radius: Array  # (n,) spectral radius of the exact loop
     exact: Array  # (n,) [1/s] growth, exact loop
     frequency: Array  # (n,) [Hz] of that mode
     mujoco: Array  # (n,) [1/s] growth, MuJoCo's period map
     trace: Array  # (n,) [1/s] growth on MuJoCo's trace, or on the exact one where MuJoCo is not asked
-    clipped: Array  # (n,) ticks with a force at its limit, on that trace
+    clipped: NDArray[np.int64]  # (n,) ticks with a force at its limit, on that trace
     energy: Array  # (n,) [J] least W(N) on the exact trace
     audited: Array  # (n,) [J] magnitudes that W adds up
     settling: Array  # (n,) rms speed of the handles, last quarter over second quarter, exact trace
@@ -66,7 +68,7 @@ class Findings:
     interrupted: bool = False
 
     @property
-    def disagreements(self) -> Array:
+    def disagreements(self) -> NDArray[np.bool_]:
         """(n,) whether MuJoCo, on its map or on a trace, contradicts the exact loop."""
         return disagree(self.exact, self.mujoco) | disagree(self.exact, self.trace)
 
@@ -86,12 +88,14 @@ def merge(parts: Sequence[Findings], interrupted: bool = False) -> Findings:
     """The findings of several batches as one, whatever their order."""
     arrays = [f.name for f in fields(Findings) if f.name not in ("simulated", "interrupted")]
     order = np.argsort(np.concatenate([p.index for p in parts]) if parts else np.zeros(0), kind="stable")
-    joined = {name: np.concatenate([getattr(p, name) for p in parts])[order] if parts else order for name in arrays}
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(p, name) for p in parts])[order] if parts else order for name in arrays
+    }
     return Findings(**joined, simulated=sum(p.simulated for p in parts), interrupted=interrupted)
 
 
 def _group(
-    question: Question, assembly: Assembly, index: Array, crowd: Crowd, ticked: Callable[[int], None]
+    question: Question, assembly: Assembly, index: NDArray[np.intp], crowd: Crowd, ticked: Callable[[int], None]
 ) -> Findings:
     scenario, nowhere = question.scenario, np.full(len(crowd), np.nan)
     held_by = variants(scenario.device, crowd)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller.lti import Array
 from models.crowd import Crowd
@@ -26,7 +27,7 @@ def draw(population: Population, channels: int, seed: int, index: int, links: in
 
 def crowds(
     population: Population, channels: int, seed: int, indices: Iterable[int], links: int
-) -> Iterator[tuple[Array, Crowd]]:
+) -> Iterator[tuple[NDArray[np.intp], Crowd]]:
     """The humans of these indices, grouped by their number of links: (indices of the group, crowd)."""
     drawn = {i: draw(population, channels, seed, i, links) for i in indices}
     for count in sorted({values.shape[1] for values in drawn.values()}):
