@@ -33,6 +33,8 @@ class Scene:
     handles: tuple[int, ...]  # (m,) joint of each handle
     pushed: tuple[int, ...]  # (m,) outside input that reaches the end of each human (voluntary force)
     tapped: tuple[int, ...]  # (m,) outside input that reaches each handle
+    masses: tuple[tuple[int, ...], ...]  # (m, links) joint that each mass of a human moves on
+    springs: tuple[tuple[int, ...], ...]  # (m, links - 1) tendon behind each mass but the last, whose is the joint's
 
     @property
     def channels(self) -> int:
@@ -71,12 +73,15 @@ def build(devices: Sequence[Device], humans: Sequence[Human]) -> Scene:
     for i, device in enumerate(devices, start=1):
         _add_motor(spec, f"force_{i}", f"motor_{i}", gear=-1.0, limit=device.force_limit)
     model = spec.compile()
+    chains = [_chain(i, device, human) for i, (device, human) in enumerate(zip(devices, humans, strict=True), start=1)]
     return Scene(
         model=model,
         xml=spec.to_xml(),
         handles=tuple(model.joint(name).id for name in handles),
         pushed=tuple(reached.index(name) for name in last),
         tapped=tuple(reached.index(name) for name in handles),
+        masses=tuple(tuple(model.joint(name).id for name in joints) for joints, _ in chains),
+        springs=tuple(tuple(model.tendon(name).id for name in tendons) for _, tendons in chains),
     )
 
 
@@ -88,17 +93,31 @@ def plant(model: mujoco.MjModel) -> Plant:
     mass = np.zeros((n, n))
     mujoco.mj_fullM(model, data, mass)
     inverse = np.linalg.inv(mass)
-    stiffness, damping = np.diag(model.jnt_stiffness.astype(float)), np.diag(model.dof_damping)
-    for t in range(model.ntendon):
-        across = _tendon_jacobian(model, t)
-        stiffness = stiffness + model.tendon_stiffness[t] * np.outer(across, across)
-        damping = damping + model.tendon_damping[t] * np.outer(across, across)
-    actuation = np.zeros((n, model.nu))
-    for a in range(model.nu):
-        actuation[model.actuator_trnid[a, 0], a] = model.actuator_gear[a, 0] * model.actuator_gainprm[a, 0]
+    across = tendon_jacobian(model)
+    stiffness = np.diag(model.jnt_stiffness.astype(float)) + across.T * model.tendon_stiffness @ across
+    damping = np.diag(model.dof_damping) + across.T * model.tendon_damping @ across
+    forces = actuation(model)
     A = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ stiffness, -inverse @ damping]])
-    B = np.vstack([np.zeros_like(actuation), inverse @ actuation])
+    B = np.vstack([np.zeros_like(forces), inverse @ forces])
     return Plant(A, B, np.eye(m, 2 * n))
+
+
+def tendon_jacobian(model: mujoco.MjModel) -> Array:
+    """How each tendon lengthens when a joint moves, shape (tendons, n)."""
+    rows = np.zeros((model.ntendon, model.nv))
+    for t in range(model.ntendon):
+        first, count = int(model.tendon_adr[t]), int(model.tendon_num[t])
+        for wrap in range(first, first + count):
+            rows[t, model.wrap_objid[wrap]] += model.wrap_prm[wrap]
+    return rows
+
+
+def actuation(model: mujoco.MjModel) -> Array:
+    """Force on each joint per unit of each input, shape (n, outside + m)."""
+    columns = np.zeros((model.nv, model.nu))
+    for a in range(model.nu):
+        columns[model.actuator_trnid[a, 0], a] = model.actuator_gear[a, 0] * model.actuator_gainprm[a, 0]
+    return columns
 
 
 def _only_what_the_loop_needs(spec: mujoco.MjSpec) -> None:
@@ -140,9 +159,16 @@ def _add_springs(spec: mujoco.MjSpec, i: int, device: Device, human: Human) -> N
     if isinstance(device, CompliantDevice):
         stiffness, damping = device.transmission_stiffness, device.transmission_damping
         _add_spring(spec, f"transmission_{i}", f"motor_{i}", f"handle_{i}", stiffness, damping)
-    joints = [_handle(i, device), *(f"human_{i}_{j}" for j in range(2, len(human.links) + 1))]
-    for j, link in enumerate(human.links[:-1]):
-        _add_spring(spec, f"link_{i}_{j + 1}", joints[j], joints[j + 1], link.stiffness, link.damping)
+    joints, tendons = _chain(i, device, human)
+    for j, (name, link) in enumerate(zip(tendons, human.links, strict=False)):
+        _add_spring(spec, name, joints[j], joints[j + 1], link.stiffness, link.damping)
+
+
+def _chain(i: int, device: Device, human: Human) -> tuple[list[str], list[str]]:
+    """Joints of a human's masses, and the tendons between them."""
+    links = len(human.links)
+    joints = [_handle(i, device), *(f"human_{i}_{j}" for j in range(2, links + 1))]
+    return joints, [f"link_{i}_{j}" for j in range(1, links)]
 
 
 def _add_spring(spec: mujoco.MjSpec, name: str, a: str, b: str, stiffness: float, damping: float) -> None:
@@ -164,11 +190,3 @@ def _add_motor(spec: mujoco.MjSpec, name: str, joint: str, gear: float, limit: f
 
 def _motors(model: mujoco.MjModel) -> int:
     return sum(model.actuator(a).name.startswith("force_") for a in range(model.nu))
-
-
-def _tendon_jacobian(model: mujoco.MjModel, t: int) -> Array:
-    row = np.zeros(model.nv)
-    first, count = int(model.tendon_adr[t]), int(model.tendon_num[t])
-    for wrap in range(first, first + count):
-        row[model.wrap_objid[wrap]] += model.wrap_prm[wrap]
-    return row

@@ -14,21 +14,24 @@ from models.scene import Plant
 
 @dataclass(frozen=True, eq=False)
 class HeldPlant:
-    """s[k+1] = A s[k] + B [w; f][k], x[k] = C s[k]: the plant under a zero-order hold of T seconds."""
+    """s[k+1] = A s[k] + B [w; f][k], x[k] = C s[k]: the plant under a zero-order hold of T seconds.
 
-    A: Array  # (2n, 2n)
-    B: Array  # (2n, outside + m)
+    Many plants at once have a leading axis in A and B.
+    """
+
+    A: Array  # (..., 2n, 2n)
+    B: Array  # (..., 2n, outside + m)
     C: Array  # (m, 2n)
     T: float  # [s]
 
 
 def hold(plant: Plant, T: float) -> HeldPlant:
-    """Sample a continuous plant with its input held for T."""
-    n, inputs = plant.B.shape
-    generator = np.zeros((n + inputs, n + inputs))
-    generator[:n, :n], generator[:n, n:] = plant.A, plant.B
+    """Sample a continuous plant, or many of them, with the input held for T."""
+    *many, n, inputs = plant.B.shape
+    generator = np.zeros((*many, n + inputs, n + inputs))
+    generator[..., :n, :n], generator[..., :n, n:] = plant.A, plant.B
     step = expm(generator * T)
-    return HeldPlant(step[:n, :n], step[:n, n:], plant.C, T)
+    return HeldPlant(step[..., :n, :n], step[..., :n, n:], plant.C, T)
 
 
 class ExactEngine:

@@ -49,7 +49,7 @@ def run(
             count = min(tape.ticks, ticks - done)
             tape.w[:count] = outside(done, count)[:, :, None]
             with np.errstate(over="ignore", invalid="ignore"):  # a diverging run is reported, not warned about
-                _stretch(tape, engine, count)
+                stretch(tape, engine, count)
             finite = np.isfinite(tape.s[:count]).all(axis=(1, 2)) & np.isfinite(tape.f[:count]).all(axis=(1, 2))
             diverged = engine.troubled() or not finite.all()
             count = count if finite.all() else int(np.argmin(finite))
@@ -64,7 +64,7 @@ def run(
     return Record(z, s, w, f, diverged, interrupted)
 
 
-def _stretch(tape: Tape, engine: Engine, ticks: int) -> None:
+def stretch(tape: Tape, engine: Engine, ticks: int) -> None:
     tick, advance = tape.tick, engine.advance
     for k in range(ticks):
         tick(k)

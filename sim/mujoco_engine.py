@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import glob
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
 
@@ -14,6 +14,7 @@ import numpy as np
 from mujoco import mj_step
 from mujoco.batch import Batch
 
+from controller.lti import Array
 from controller.process import Tape
 from models.scene import Scene
 
@@ -56,10 +57,22 @@ class MujocoBatchEngine:
     """All simulations of a tape in one mujoco.batch.Batch, bit for bit as MujocoEngine steps each one."""
 
     def __init__(
-        self, scene: Scene, T: float, integrator: str = "RK4", substeps: int = 4, nsim: int = 1, nthread: int = 0
+        self,
+        scene: Scene,
+        T: float,
+        integrator: str = "RK4",
+        substeps: int = 4,
+        nsim: int = 1,
+        nthread: int = 0,
+        fields: Mapping[str, Array] | None = None,
     ) -> None:
+        """`fields` gives fields of the model a row per simulation, such as masses: (nsim, ...)."""
         model = discretised(scene, T, integrator, substeps)
         self.batch = Batch(model, nsim, nthread)
+        for name, rows in (fields or {}).items():
+            self.batch.expand(name)[...] = rows
+        if fields:
+            self.batch.set_const()
         self.substeps = substeps
         time, motion = (mujoco.mj_stateSize(model, part) for part in (_TIME, _TIME | _MOTION))
         # position and velocity lie side by side in a state row, so one copy reads both

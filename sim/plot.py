@@ -73,3 +73,35 @@ def _zoom(result: Result, frequency_hz: float) -> slice:
     total = np.concatenate([[0.0], np.cumsum(agitation)])
     first = int(np.argmax(total[width:] - total[:-width])) if n > width else 0
     return slice(first, first + width)
+
+
+def plot_population(mass: Array, damping: Array, growth: Array, path: Path, title: str) -> Path:
+    """Growth rate [1/s] of every loop over its humans' mass [kg] and least damping [N s/m]; all shapes (n,).
+
+    Where a loop has several humans, mass and damping are geometric means over them.
+    """
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4.2), layout="constrained", sharey=True)
+    kinds = (("stable", growth <= 0, "o", STYLES[0]), ("unstable", growth > 0, "^", STYLES[1]))
+    for axis, values, label in zip(
+        axes, (mass, damping), ("mass of the human [kg]", "least damping of the human [N s/m]"), strict=True
+    ):
+        for name, chosen, marker, style in kinds:
+            count = f"{name}: {int(chosen.sum())}"
+            axis.scatter(values[chosen], growth[chosen], s=10, marker=marker, color=style["color"], label=count)
+        axis.axhline(0.0, color="black", linewidth=0.8)
+        axis.set(xscale="log", xlabel=label)
+        axis.set_yscale("symlog", linthresh=1e-1)
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel("growth rate [1/s]")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    figure.suptitle(title)
+
+    def content(file: BinaryIO) -> None:
+        figure.savefig(file, format="png", dpi=130)
+
+    try:
+        return write(path, content)
+    finally:
+        plt.close(figure)

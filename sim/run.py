@@ -31,6 +31,7 @@ from sim.command import (
 )
 from sim.couplings import NAMES, Chosen, choose
 from sim.files import write, write_json
+from sim.human_file import load_humans
 from sim.loop import Record
 from sim.mujoco_engine import INTEGRATORS
 from sim.result import Result
@@ -44,6 +45,8 @@ def main(argv: list[str]) -> int:
     scenario = scenario_from(args)
     if args.duration is not None:
         scenario = scenario.replace(duration=numbers("--duration", args.duration, float, 1)[0])
+    if args.human is not None:
+        scenario = scenario.replace(human=load_humans(args.human, scenario.channels))
     substeps, seed, out = _substeps(args), seed_from(args), out_folder(args, "run")
     chosen = choose(scenario, args.case, args.coupling, args.condition)
     assembly = assemble(scenario, chosen.coupling)
@@ -75,6 +78,7 @@ def _parser() -> Parser:
     parser.add_argument("--integrator", choices=tuple(INTEGRATORS), default="RK4", help="MuJoCo's (default RK4)")
     parser.add_argument("--substeps", default="4", metavar="N", help="MuJoCo steps per period (default 4)")
     parser.add_argument("--duration", metavar="SECONDS", help="default: the scenario's")
+    parser.add_argument("--human", metavar="FILE.toml", help="other humans: one [[human]] table per channel")
     parser.add_argument("--no-plot", action="store_true", help="write no picture")
     add_output_options(parser)
     return parser

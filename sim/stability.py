@@ -19,10 +19,13 @@ SHORTEST_TRACE = 200  # ticks below which a growth rate is not read from a trace
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
-    """xi+ = A xi + B w with xi = [plant state s; process state z] and w the outside forces."""
+    """xi+ = A xi + B w with xi = [plant state s; process state z] and w the outside forces.
 
-    A: Array
-    B: Array
+    Many loops at once have a leading axis in A and B.
+    """
+
+    A: Array  # (..., n, n)
+    B: Array  # (..., n, outside)
     T: float
 
 
@@ -54,10 +57,13 @@ class Mode:
 
 def close(plant: HeldPlant, F: Lti) -> ClosedLoop:
     """The plant's held input f and the force map F joined: f = C z + D x, z+ = A z + B x, x = C s."""
-    outside = plant.B.shape[1] - F.outputs
-    force = plant.B[:, outside:]
-    A = np.block([[plant.A + force @ F.D @ plant.C, force @ F.C], [F.B @ plant.C, F.A]])
-    B = np.vstack([plant.B[:, :outside], np.zeros((F.order, outside))])
+    *many, states, inputs = plant.B.shape
+    outside, n = inputs - F.outputs, states + F.order
+    force = plant.B[..., outside:]
+    A, B = np.zeros((*many, n, n)), np.zeros((*many, n, outside))
+    A[..., :states, :states], A[..., :states, states:] = plant.A + force @ F.D @ plant.C, force @ F.C
+    A[..., states:, :states], A[..., states:, states:] = F.B @ plant.C, F.A
+    B[..., :states, :] = plant.B[..., :outside]
     return ClosedLoop(A, B, plant.T)
 
 

@@ -162,7 +162,7 @@ def test_json_on_standard_output_is_only_json(tmp_path):
 
 def test_interrupting_keeps_what_was_simulated(tmp_path, monkeypatch):
     """Ctrl-C in the third stretch: the first two are written, and the exit code says so."""
-    stretch, calls = loop._stretch, []
+    stretch, calls = loop.stretch, []
 
     def interrupted(*args):
         calls.append(args)
@@ -170,7 +170,7 @@ def test_interrupting_keeps_what_was_simulated(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         stretch(*args)
 
-    monkeypatch.setattr(loop, "_stretch", interrupted)
+    monkeypatch.setattr(loop, "stretch", interrupted)
     code, report = run(tmp_path, "--coupling", "published")
     trace = Result.load_npz(tmp_path / "out" / "trace.npz")
     assert code == 130

@@ -1,0 +1,132 @@
+"""The worst passive human: a seeded global search over lossless ladders for the largest growth of the exact loop.
+
+A lossless chain of masses and springs presents any reactance that a passive hand could at the frequency where the
+loop is weakest, and takes no energy out. Ranges are bounded so that no mode of a human exceeds about 3 kHz:
+beyond that a matrix exponential, not a hand, would decide.
+
+The condition counts |dx|^2 / T where a device dissipates the integral of v^2, which is more unless v is constant
+between samples: for a sinusoid, |dx|^2 / T is (sin x / x)^2 of it, x = pi f T. So the condition asks for that much
+too much damping, about, at the frequency f where it binds: 4.8 % at 101 Hz and 1.2 ms. Closer than that no search
+has succeeded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from scipy.optimize import OptimizeResult, differential_evolution
+
+from controller.coupling import Coupling
+from controller.environment import environment
+from controller.lti import Array, Lti
+from controller.process import force_map
+from design.margin import closed_loop
+from models.crowd import Crowd, variants
+from models.human import Human
+from sim.scenario import Scenario
+from sim.verdicts import dominant_modes, exact_loops
+
+MASS, STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
+DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9
+#: (links, least frequency [Hz] of the modes looked at) of each pass. One mass and spring already present every
+#: reactance at one frequency; slow modes of a lossless hand barely decay and would hide the one that grows
+PASSES = ((1, 2.0), (2, 2.0), (1, 0.0))
+CANDIDATES = 120  # sets of humans in a generation
+
+
+@dataclass(frozen=True)
+class Worst:
+    """The worst humans that a search found."""
+
+    humans: tuple[Human, ...]
+    spectral_radius: float
+    growth: float  # [1/s]
+    frequency_hz: float
+    evaluated: int  # sets of humans
+
+    @property
+    def destabilises(self) -> bool:
+        return self.growth > DESTABILISED
+
+
+def search(scenario: Scenario, F: Lti, seed: int = 0, generations: int = 150, first: bool = False) -> Worst:
+    """The lossless humans with the largest growth that were found; with `first`, the first that destabilise."""
+    m = scenario.channels
+
+    def stop(intermediate_result: OptimizeResult) -> bool:
+        return first and bool(-intermediate_result.fun > 10 * DESTABILISED)
+
+    best, evaluated = None, 0
+    for trial, (links, audible) in enumerate(PASSES):
+        found = differential_evolution(
+            partial(_losses, scenario=scenario, F=F, links=links, audible=audible),
+            np.log([MASS, STIFFNESS] * (m * links)),
+            rng=np.random.default_rng(np.random.SeedSequence((seed, trial))),
+            popsize=CANDIDATES // (2 * m * links),
+            maxiter=generations,
+            tol=0,
+            polish=False,
+            vectorized=True,
+            updating="deferred",
+            callback=stop,
+        )
+        evaluated += (found.nit + 1) * CANDIDATES
+        worst = _worst(scenario, F, _ladders(found.x[:, None], m, links), evaluated)
+        best = worst if best is None or worst.growth > best.growth else best
+        if first and best.destabilises:
+            break
+    assert best is not None
+    return replace(best, evaluated=evaluated)
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A search against a loop placed short of its required damping."""
+
+    name: str
+    short: float  # share of the required damping that is missing
+    worst: Worst
+
+
+def attempts(
+    loops: dict[str, tuple[Scenario, Coupling]], shortages: Array, seed: int = 0, generations: int = 150
+) -> list[Attempt]:
+    """Attack every loop at every shortage: devices get (1 - short) times the damping that `closed_loop` requires.
+
+    A negative shortage gives the devices more than required: there the search must fail.
+    """
+    rows = []
+    for name, (scenario, coupling) in loops.items():
+        F = force_map(environment(scenario.environment, scenario.T), coupling, scenario.theta, scenario.psi)
+        required = np.array(closed_loop(F, scenario.delta).required)
+        for short in shortages:
+            placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
+            rows.append(Attempt(name, float(short), search(placed, F, seed, generations=generations, first=True)))
+    return rows
+
+
+def success_rate(rows: list[Attempt]) -> float:
+    """The share of attempts that found a destabilising human."""
+    return sum(row.worst.destabilises for row in rows) / len(rows)
+
+
+def _ladders(x: Array, channels: int, links: int) -> Crowd:
+    """Log masses and stiffnesses (2 channels links, nsim) as lossless humans."""
+    values = np.exp(x.T).reshape(-1, channels, links, 2)
+    return Crowd(np.stack([values[..., 0], np.zeros_like(values[..., 0]), values[..., 1]], axis=-1))
+
+
+def _losses(x: Array, scenario: Scenario, F: Lti, links: int, audible: float) -> Array:
+    """Minus the largest growth [1/s] among the modes above `audible` Hz, for every column of x."""
+    loops = exact_loops(variants(scenario.device, _ladders(x.reshape(x.shape[0], -1), scenario.channels, links)), F)
+    values = np.linalg.eigvals(loops.A)
+    heard = np.abs(np.angle(values)) / (2 * np.pi * F.T) >= audible
+    return -np.log(np.where(heard, np.abs(values), 1e-300).max(axis=1)) / F.T
+
+
+def _worst(scenario: Scenario, F: Lti, crowd: Crowd, evaluated: int) -> Worst:
+    modes = dominant_modes(exact_loops(variants(scenario.device, crowd), F))
+    radius, growth, frequency = (float(a[0]) for a in (modes.spectral_radius, modes.growth, modes.frequency_hz))
+    return Worst(crowd.humans(0), radius, growth, frequency, evaluated)

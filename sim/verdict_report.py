@@ -1,0 +1,175 @@
+"""What a validation found: one dictionary for machines, and the same as a table for people."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from controller.lti import Array
+from design.promises import finite
+from models.human import Human
+from sim.adversary import Worst
+from sim.examine import Findings, Question
+from sim.population import MIXED, draw
+from sim.verdicts import unstable
+
+ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
+
+
+def outcome(question: Question, findings: Findings, certified: bool, wall: float) -> dict[str, Any]:
+    """The contract of `sim.validate --json`."""
+    bad, mujoco = unstable(findings.exact), question.engine != "exact"
+    disagreements = int(findings.disagreements.sum())
+    wrong = int((bad | (mujoco & unstable(findings.mujoco) & (findings.mujoco > 1e-3))).sum())
+    part: dict[str, Any] = {
+        "humans": int(findings.index.size),
+        "links": "mixed" if question.links == MIXED else question.links,
+        "seed": question.seed,
+        "engine": question.engine,
+        "unstable": {
+            "exact": int(bad.sum()),
+            "mujoco": int(unstable(findings.mujoco).sum()) if mujoco else None,
+        },
+        "disagreements": disagreements,
+        "disagreeing": [_identified(question, int(i)) for i in findings.index[findings.disagreements]],
+        "worst": _worst(question, findings),
+        "largest_difference_per_s": _largest(np.abs(findings.mujoco - findings.exact)),
+        "traces": _traces(question, findings),
+        "certified": certified,
+        "holds": disagreements == 0 and not (certified and wrong),
+        "interrupted": findings.interrupted,
+        "wall_s": wall,
+        "simulated_s_per_s": findings.simulated / wall,
+    }
+    if certified and question.ticks:
+        part["energy_audit"] = _energy(findings)
+        part["holds"] = part["holds"] and part["energy_audit"]["holds"]
+    return part
+
+
+def adversary_part(worst: Worst, ratio: float, certified: bool) -> dict[str, Any]:
+    """What the search found, and how far the loop is from its required damping."""
+    return {
+        "found": worst.destabilises,
+        "spectral_radius": worst.spectral_radius,
+        "growth_rate_per_s": finite(worst.growth),
+        "frequency_hz": worst.frequency_hz,
+        "evaluated": worst.evaluated,
+        "required_over_available_damping": finite(ratio),
+        "human": human_part(worst.humans),
+        "holds": not (certified and worst.destabilises),
+    }
+
+
+def human_part(humans: tuple[Human, ...]) -> list[dict[str, Any]]:
+    """Links of each channel's human."""
+    names = ("mass", "damping", "stiffness")
+    return [{"links": [{name: getattr(link, name) for name in names} for link in human.links]} for human in humans]
+
+
+def _identified(question: Question, index: int) -> dict[str, Any]:
+    scenario = question.scenario
+    links = draw(scenario.population, scenario.channels, question.seed, index, question.links)
+    names = ("mass", "damping", "stiffness")
+    human = [{"links": [dict(zip(names, link, strict=True)) for link in channel]} for channel in links.tolist()]
+    return {"seed": question.seed, "index": index, "human": human}
+
+
+def _worst(question: Question, findings: Findings) -> dict[str, Any] | None:
+    if not findings.index.size:
+        return None
+    k = int(np.argmax(findings.radius))
+    figures = {
+        "spectral_radius": float(findings.radius[k]),
+        "growth_rate_per_s": finite(float(findings.exact[k])),
+        "frequency_hz": float(findings.frequency[k]),
+    }
+    return figures | _identified(question, int(findings.index[k]))
+
+
+def _traces(question: Question, findings: Findings) -> dict[str, Any] | None:
+    if not question.ticks or not findings.index.size:
+        return None
+    measured, stable = np.isfinite(findings.trace), ~unstable(findings.exact)
+    return {
+        "duration_s": question.ticks * question.scenario.T,
+        "clipped_runs": int((findings.clipped > 0).sum()),
+        "measured": int(measured.sum()),
+        "largest_difference_per_s": _largest(np.abs(findings.trace - findings.exact)),
+        "stable_and_settling": int((stable & (findings.settling < 1)).sum()),
+        "stable": int(stable.sum()),
+        "slowest_settling": _largest(findings.settling[stable]),
+    }
+
+
+def _energy(findings: Findings) -> dict[str, Any]:
+    unclipped = findings.clipped == 0
+    violated = unclipped & ~(findings.energy >= -ROUNDING * findings.audited)
+    return {
+        "audited": int(unclipped.sum()),
+        "clipped": int((~unclipped).sum()),
+        "violated": int(violated.sum()),
+        "least_J": float(findings.energy[unclipped].min()) if unclipped.any() else None,
+        "holds": not violated.any(),
+    }
+
+
+def _largest(values: Array) -> float | None:
+    values = values[np.isfinite(values)]
+    return float(values.max()) if values.size else None
+
+
+def print_verdicts(report: dict[str, Any], console: Console) -> None:
+    """The outcome as a table."""
+    table = Table(title=f"case {report['case']} · {report['scenario']} · coupling {report['coupling']['kind']}")
+    table.add_column("")
+    table.add_column("")
+    for name, value in _rows(report):
+        table.add_row(name, value)
+    console.print(table)
+
+
+def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
+    bad, worst, traces = report["unstable"], report["worst"], report["traces"]
+    engines = f"{bad['exact']} exact" + (f", {bad['mujoco']} MuJoCo" if bad["mujoco"] is not None else "")
+    rows = [
+        ("humans", f"{report['humans']} (links {report['links']}, seed {report['seed']})"),
+        ("unstable", engines),
+        ("disagreements", str(report["disagreements"])),
+    ]
+    if worst:
+        rows.append(
+            (
+                "worst human",
+                f"{worst['growth_rate_per_s']:+.4g} 1/s at {worst['frequency_hz']:.2f} Hz (index {worst['index']})",
+            )
+        )
+    if report["largest_difference_per_s"] is not None:
+        rows.append(("MuJoCo's growth rates", f"within {report['largest_difference_per_s']:.1e} 1/s of the exact ones"))
+    if traces:
+        rows.append(("traces", f"{traces['duration_s']:g} s each, {traces['clipped_runs']} clipped"))
+        settled = f"{traces['stable_and_settling']} of {traces['stable']} stable loops slower at the end"
+        rows.append(("handles come to rest", settled))
+    if audit := report.get("energy_audit"):
+        rows.append(
+            (
+                "energy audit W >= 0",
+                f"{audit['audited'] - audit['violated']} of {audit['audited']}, {audit['clipped']} clipped left out",
+            )
+        )
+    if adversary := report.get("adversary"):
+        found = (
+            f"a human that grows at {adversary['growth_rate_per_s']:+.4g} 1/s"
+            if adversary["found"]
+            else "no destabilising human"
+        )
+        ratio = adversary["required_over_available_damping"]
+        close = "no damping is enough" if ratio is None else f"the loop needs {ratio:.4g} of the damping it has"
+        rows.append(("adversary", f"{found} among {adversary['evaluated']}; {close}"))
+    rows.append(("certified", "yes" if report["certified"] else "no"))
+    rows.append(("holds", "[green]yes[/]" if report["holds"] else "[red]no[/]"))
+    rows.append(("time", f"{report['wall_s']:.1f} s, {report['simulated_s_per_s']:.0f} simulated seconds per second"))
+    return rows

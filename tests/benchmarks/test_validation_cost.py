@@ -1,0 +1,132 @@
+"""What a verdict about a thousand humans costs, and how accurate it is.
+
+make bench    (or: python -m pytest tests/benchmarks --benchmark-only -s)
+"""
+
+import time
+
+import numpy as np
+import pytest
+
+from controller.coupling import NoCoupling
+from controller.process import Tape
+from design.margin import closed_loop
+from design.published import CASE_I
+from models.crowd import variants
+from sim.adversary import attempts, success_rate
+from sim.batch_engine import ExactBatchEngine
+from sim.exact_engine import hold
+from sim.loop import stretch
+from sim.mujoco_engine import MujocoBatchEngine, profiler_off
+from sim.population import crowds
+from sim.scenario import load
+from sim.simulate import assemble
+from sim.verdicts import disagree, dominant_modes, exact_loops, mujoco_loops, unstable
+
+pytestmark = pytest.mark.benchmark(group="validation")
+HUMANS = 1000
+
+
+@pytest.fixture(scope="module")
+def held_by():
+    scenario = load()
+    ((_, crowd),) = crowds(scenario.population, scenario.channels, 0, range(HUMANS), 1)
+    return variants(scenario.device, crowd)
+
+
+@pytest.mark.parametrize("coupling", [NoCoupling(), CASE_I], ids=["none", "published"])
+def test_verdicts(benchmark, held_by, coupling):
+    assembly = assemble(load(), coupling)
+
+    def once():
+        return dominant_modes(exact_loops(held_by, assembly.F)).growth
+
+    exact = benchmark.pedantic(once, rounds=7, iterations=1, warmup_rounds=1)
+    begin = time.perf_counter()
+    mujoco = dominant_modes(mujoco_loops(held_by, assembly.process)).growth
+    wall = time.perf_counter() - begin
+    median = benchmark.stats.stats.median if benchmark.stats else float("nan")
+    wrong = int(disagree(exact, mujoco).sum())
+    print(
+        f"\n{HUMANS} verdicts: exact {median:.3f} s, {int(unstable(exact).sum())} unstable; MuJoCo {wall:.2f} s, "
+        f"{wrong} disagree, growth within {np.abs(mujoco - exact).max():.1e} 1/s"
+    )
+    assert wrong == 0
+
+
+def test_batched_exact_engine(benchmark, held_by):
+    """CPU seconds for the whole loop: process, limits and plant of every simulation."""
+    assembly, ticks, short = assemble(load(), CASE_I), 960, 32
+    plants = hold(held_by.plants(), assembly.scenario.T)
+    engine = ExactBatchEngine(plants, assembly.process.force_limit)
+    tape = Tape(assembly.process, short, plants.A.shape[1], held_by.scene.outside, HUMANS)
+    rng = np.random.default_rng(0)
+    tape.s[0] = 1e-4 * rng.normal(size=tape.s[0].shape)
+    engine.start(tape)
+    start, used = np.concatenate([tape.s[0], tape.z[0]]), []
+
+    def once():
+        tape.s[0], tape.z[0] = np.split(start, [tape.s.shape[1]])
+        begin = time.process_time()
+        for _ in range(ticks // short):
+            stretch(tape, engine, short)
+            tape.rewind(short)
+        used.append(time.process_time() - begin)
+
+    benchmark.pedantic(once, rounds=5, iterations=1, warmup_rounds=1)
+    loops = exact_loops(held_by, assembly.F)
+    powers = np.linalg.matrix_power(loops.A, ticks)
+    expected = np.einsum("nij,jn->in", powers, start)[: tape.s.shape[1]]
+    error = np.abs(tape.s[0] - expected).max() / np.abs(expected).max()
+    rate = ticks * assembly.scenario.T * HUMANS / np.median(used)
+    print(f"\nbatched exact engine: {rate:.0f} simulated seconds per CPU second, error {error:.1e} after {ticks} ticks")
+    assert error < 1e-9
+
+
+@pytest.mark.parametrize("substeps", [2, 4])
+def test_mujoco_batch_over_raw_stepping(benchmark, held_by, substeps):
+    """The loop around the batch against the batch's own steps, alternating, on all cores."""
+    assembly, ticks, short, nsim = assemble(load(), CASE_I), 160, 32, 200
+    T, fields = assembly.scenario.T, {name: rows[:nsim] for name, rows in held_by.fields.items()}
+    engine, bare = (MujocoBatchEngine(held_by.scene, T, "RK4", substeps, nsim, fields=fields) for _ in range(2))
+    tape = Tape(assembly.process, short, 2 * held_by.scene.model.nv, held_by.scene.outside, nsim)
+    tape.s[0] = 1e-4
+    engine.start(tape)
+    ratios = []
+
+    def once():
+        begin = time.perf_counter()
+        for _ in range(ticks):
+            bare.batch.step(nstep=substeps)
+        raw = time.perf_counter() - begin
+        begin = time.perf_counter()
+        for _ in range(ticks // short):
+            stretch(tape, engine, short)
+            tape.rewind(short)
+        ratios.append((time.perf_counter() - begin) / raw)
+
+    with profiler_off():
+        benchmark.pedantic(once, rounds=9, iterations=1, warmup_rounds=1)
+    exact = dominant_modes(exact_loops(held_by, assembly.F)).growth
+    mujoco = dominant_modes(mujoco_loops(held_by, assembly.process, substeps=substeps)).growth
+    error, wrong = np.abs(mujoco - exact).max(), int(disagree(exact, mujoco).sum())
+    print(
+        f"\nMuJoCo batch RK4 x {substeps}: loop / raw steps {np.median(ratios):.2f} (median of {len(ratios)}), growth "
+        f"within {error:.1e} 1/s, {wrong} wrong verdicts in {HUMANS}"
+    )
+    assert error < 0.1
+
+
+def test_how_tight_the_certificate_is(benchmark):
+    """The adversary against loops 1 to 20 % short of their required damping."""
+    scenario = load()
+    shortages = np.array([0.01, 0.02, 0.05, 0.1, 0.2])
+    loops = {"none": (scenario, NoCoupling()), "published": (scenario, CASE_I)}
+    rows = benchmark.pedantic(lambda: attempts(loops, shortages, generations=40), rounds=1, iterations=1)
+    for short in shortages:
+        print(f"\n{short:.0%} short: {success_rate([r for r in rows if r.short == short]):.0%} destabilised", end="")
+    for name, (_, coupling) in loops.items():
+        frequency = closed_loop(assemble(scenario, coupling).F, scenario.delta).frequency_hz
+        x = np.pi * frequency * scenario.T
+        print(f"\n{name}: binds at {frequency:.1f} Hz, where a sinusoid loses {1 - (np.sin(x) / x) ** 2:.1%}", end="")
+    assert success_rate([r for r in rows if r.short >= 0.05]) == 1.0

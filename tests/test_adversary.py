@@ -1,0 +1,71 @@
+"""The search for the worst passive human finds one where the closed-loop condition fails, and none where it holds."""
+
+import json
+
+import numpy as np
+import pytest
+
+from controller.coupling import NoCoupling, SpringDamper
+from design.published import CASE_I
+from models.scene import build, plant
+from sim import run as run_command
+from sim.adversary import DESTABILISED, attempts, search, success_rate
+from sim.exact_engine import hold
+from sim.scenario import load
+from sim.simulate import assemble
+from sim.stability import close, dominant_mode
+from sim.validate import main
+
+SCENARIO = load()
+DESIGNED = SpringDamper([878.7, 551.8], [0.3864, 0.5219])
+LOOPS = {"none": (SCENARIO, NoCoupling()), "published": (SCENARIO, CASE_I), "designed": (SCENARIO, DESIGNED)}
+
+
+def test_it_finds_what_random_humans_do_not():
+    """The published gains pass random humans; with 5 % less damping than they need, a lossless hand is found."""
+    rows = attempts(LOOPS, np.array([0.05, 0.1, 0.2]), generations=60)
+    assert success_rate(rows) == 1.0
+
+
+def test_nobody_destabilises_a_loop_with_the_damping_it_requires():
+    rows = attempts(LOOPS, np.array([-1e-3]), generations=25)
+    assert success_rate(rows) == 0.0
+    # lossless hands come to the edge: 0 from below, to the rounding of the eigenvalues
+    assert all(abs(row.worst.growth) < DESTABILISED for row in rows)
+
+
+def test_the_human_found_is_concrete_and_the_search_repeatable():
+    F = assemble(SCENARIO, NoCoupling()).F
+    worst, again = (search(SCENARIO, F, seed=4, generations=10) for _ in range(2))
+    assert worst == again
+    assert worst.destabilises
+    assert all(link.damping == 0 for human in worst.humans for link in human.links)
+    scene = build(SCENARIO.device, worst.humans)
+    mode = dominant_mode(close(hold(plant(scene.model), SCENARIO.T), F))
+    assert mode.growth == pytest.approx(worst.growth, rel=1e-9)
+
+
+def test_the_command_keeps_the_human_for_a_replay(tmp_path):
+    file, out = tmp_path / "r.json", tmp_path / "out"
+    options = ["--case", "none", "--humans", "5", "--engine", "exact", "--duration", "0", "--no-plot", "--adversary"]
+    assert main([*options, "--out", str(out), "--json", str(file)]) == 0
+    adversary = json.loads(file.read_text())["adversary"]
+    assert adversary["found"]
+    assert adversary["required_over_available_damping"] == pytest.approx(1.7229 / 1.37, rel=1e-4)
+    replay = ["--case", "none", "--human", str(out / "adversary.toml"), "--duration", "0.5", "--engine", "exact"]
+    assert run_command.main([*replay, "--no-plot", "--out", str(out), "--json", str(file)]) == 0
+    stability = json.loads(file.read_text())["stability"]
+    assert stability["spectral_radius"] == pytest.approx(adversary["spectral_radius"], abs=1e-12)
+
+
+def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypatch):
+    """Were a certificate wrong, the command would say so: here the search is told of another loop."""
+    F = assemble(SCENARIO, NoCoupling()).F
+    monkeypatch.setattr(
+        "sim.validate.search", lambda scenario, certified, seed: search(scenario, F, seed, generations=5)
+    )
+    options = ["--humans", "5", "--engine", "exact", "--duration", "0", "--no-plot", "--adversary"]
+    assert main([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 1
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["certified"]
+    assert not report["holds"]
