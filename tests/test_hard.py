@@ -8,6 +8,7 @@ import pytest
 
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.process import Tape
+from design.assess import assess
 from design.published import CASE_I
 from models.device import CompliantDevice
 from models.human import Human, Link
@@ -20,6 +21,7 @@ from sim.simulate import Assembly, assemble, make_engine, simulate
 from sim.substeps import check_substeps, default_substeps
 
 NOMINAL = load().replace(duration=1.0)
+CLOSED_LOOP = SpringDamper(np.array([7806.0, 3137.0]), np.array([0.105, 1.68]))
 
 
 def devices(**changes) -> Scenario:
@@ -90,6 +92,44 @@ def test_within_a_tenth_of_the_boundary(side):
     assert simulated_growth(loop, "RK4", default_substeps(loop)) == pytest.approx(side, abs=1e-3)
     assert simulated_growth(loop, "Euler", 4) < 0
     assert (simulated_growth(loop, "Euler2", 4) > 0) == (side > 0)
+
+
+def sustained(damping: float) -> tuple[float, float]:
+    """Of 200 starts: the share whose motion lasts after 48 s, and the frequency [Hz] of the strongest."""
+    humans = (Human((Link(1.2326, damping, 34.923),)), Human((Link(0.01999, damping, 266.28),)))
+    limits = (CompliantDevice(), CompliantDevice(force_limit=5.657))
+    scenario = load().replace(human=humans, device=limits, tap=None)
+    loop = assemble(scenario, CLOSED_LOOP)
+    assert exact_growth(loop) < 0
+    n = loop.plant.A.shape[0]
+    rng = np.random.default_rng(0)
+    start = np.concatenate([rng.uniform(-0.5, 0.5, (n // 2, 200)), rng.uniform(-10, 10, (n // 2, 200))])
+    start[2:4], start[6:8] = start[:2], start[4:6]  # the transmissions start unstretched
+    tape = Tape(loop.process, 1000, n, loop.scene.outside, 200)
+    engine = ExactEngine(loop.plant, loop.process.force_limit)
+    tape.s[0] = start
+    engine.start(tape)
+    for _ in range(40):
+        for k in range(1000):
+            tape.tick(k)
+            engine.advance(k)
+        tape.saturate(1000)
+        last = tape.x[:1000, 1].copy()
+        clipped = (np.abs(tape.f[:1000]) >= loop.process.force_limit[:, None]).any(axis=(0, 1))
+        tape.rewind(1000)
+    strongest = last[:, last.std(axis=0).argmax()]
+    spectrum = np.abs(np.fft.rfft((strongest - strongest.mean()) * np.hanning(1000), 2**15))
+    return float(clipped.mean()), float(np.fft.rfftfreq(2**15, scenario.T)[spectrum.argmax()])
+
+
+def test_saturation_breaks_a_certificate_and_damped_hands_mend_it():
+    """Section 7's counterexample: certified for the linear loop, yet with lossless hands clipping goes on for ever."""
+    assert assess(load().loop("I"), CLOSED_LOOP)["closed-loop"].certified
+    share, frequency = sustained(0.0)
+    print(f"lossless hands: {share:.1%} of starts still clip after 48 s, at {frequency:.2f} Hz")
+    assert share > 0.2
+    assert frequency == pytest.approx(1.17, abs=0.05)
+    assert sustained(0.1)[0] == 0
 
 
 def test_encoder_steps_do_not_destabilise_a_certified_loop():
