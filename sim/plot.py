@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import matplotlib as mpl
 import numpy as np
@@ -55,6 +55,35 @@ def plot_run(result: Result, path: Path, title: str, frequency_hz: float) -> Pat
 
     try:
         return write(path, content)
+    finally:
+        plt.close(figure)
+
+
+def plot_accuracy(rows: list[dict[str, Any]], path: Path) -> Path:
+    """Cost against both errors, one line per integrator; wrong verdicts are crossed."""
+    import matplotlib.pyplot as plt
+
+    errors = {"position_relative_rms": "position error, relative rms", "growth_rate_error": "|growth-rate error| [1/s]"}
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.5), layout="constrained", sharex=True)
+    for axis, (key, label) in zip(axes, errors.items(), strict=True):
+        names = list(dict.fromkeys(row["integrator"] for row in rows if row["integrator"]))
+        for name, style in zip(names, STYLES, strict=False):
+            mine = [row for row in rows if row["integrator"] == name and row[key]]
+            cost = [row["wall_s_per_simulated_s"] for row in mine]
+            axis.loglog(cost, [abs(row[key]) for row in mine], marker="o", label=name, **style)
+            for row, c in zip(mine, cost, strict=True):
+                axis.annotate(
+                    f"x{row['substeps']}", (c, abs(row[key])), fontsize=7, textcoords="offset points", xytext=(4, 4)
+                )
+                if not row["verdict_correct"]:
+                    axis.plot(c, abs(row[key]), "kx", markersize=11)
+        axis.set_xlabel("seconds per simulated second")
+        axis.set_ylabel(label)
+        axis.grid(alpha=0.3)
+    axes[0].legend()
+    figure.suptitle("speed against error (crossed: wrong verdict)")
+    try:
+        return write(path, lambda file: figure.savefig(file, format="png", dpi=130))
     finally:
         plt.close(figure)
 

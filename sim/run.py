@@ -33,10 +33,11 @@ from sim.couplings import NAMES, Chosen, choose
 from sim.files import write, write_json
 from sim.human_file import load_humans
 from sim.loop import Record
-from sim.mujoco_engine import INTEGRATORS
+from sim.mujoco_engine import INTEGRATORS, LEAPFROG
 from sim.result import Result
 from sim.scenario import InputError
 from sim.simulate import ENGINES, Assembly, assemble, simulate
+from sim.substeps import LEAST, MOST, check_substeps, default_substeps
 
 
 def main(argv: list[str]) -> int:
@@ -47,18 +48,20 @@ def main(argv: list[str]) -> int:
         scenario = scenario.replace(duration=numbers("--duration", args.duration, float, 1)[0])
     if args.human is not None:
         scenario = scenario.replace(human=load_humans(args.human, scenario.channels))
-    substeps, seed, out = _substeps(args), seed_from(args), out_folder(args, "run")
+    asked, seed, out = _substeps(args), seed_from(args), out_folder(args, "run")
     chosen = choose(scenario, args.case, args.coupling, args.condition)
     assembly = assemble(scenario, chosen.coupling)
+    substeps, warnings = _settled(args, assembly, asked)
 
     with (bar := progress_bar("simulating"))[0]:
         begin = time.perf_counter()
-        record = simulate(assembly, args.engine, args.integrator, substeps, progress=bar[1])
+        record = simulate(assembly, args.engine, args.integrator, substeps or LEAST, progress=bar[1])
         wall = time.perf_counter() - begin
     exact = record if args.engine == "exact" else simulate(assembly, "exact", samples=record.s.shape[0])
 
     outcome = _outcome(args, chosen, assembly, record, exact, wall)
-    outcome["run"]["seed"] = seed
+    outcome["run"] |= {"substeps": substeps, "seed": seed}
+    outcome["remarks"] = [*warnings, *outcome["remarks"]]
     outcome["files"] = [str(p) for p in _save(args, out, assembly, record, outcome)]
     report.print_report(outcome, console(args))
     if args.json:
@@ -75,8 +78,8 @@ def _parser() -> Parser:
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
     parser.add_argument("--engine", choices=ENGINES, default="mujoco")
-    parser.add_argument("--integrator", choices=tuple(INTEGRATORS), default="RK4", help="MuJoCo's (default RK4)")
-    parser.add_argument("--substeps", default="4", metavar="N", help="MuJoCo steps per period (default 4)")
+    parser.add_argument("--integrator", choices=(*INTEGRATORS, LEAPFROG), default="RK4", help="of MuJoCo (default RK4)")
+    parser.add_argument("--substeps", metavar="N", help="MuJoCo steps per period (default 4, more where needed)")
     parser.add_argument("--duration", metavar="SECONDS", help="default: the scenario's")
     parser.add_argument("--human", metavar="FILE.toml", help="other humans: one [[human]] table per channel")
     parser.add_argument("--no-plot", action="store_true", help="write no picture")
@@ -84,11 +87,28 @@ def _parser() -> Parser:
     return parser
 
 
-def _substeps(args: argparse.Namespace) -> int:
+def _substeps(args: argparse.Namespace) -> int | None:
+    """The number that was asked for, or None. Raises InputError."""
+    if args.substeps is None:
+        return None
     (substeps,) = numbers("--substeps", args.substeps, int, 1)
-    if not 1 <= substeps <= 10_000:
-        raise InputError(f"--substeps is {substeps}, allowed are 1 to 10000")
+    if not 1 <= substeps <= MOST:
+        raise InputError(f"--substeps is {substeps}, allowed are 1 to {MOST}")
     return substeps
+
+
+def _settled(args: argparse.Namespace, assembly: Assembly, asked: int | None) -> tuple[int | None, list[str]]:
+    """Substeps of this run (None for the exact engine), with remarks on a number that was asked for."""
+    if args.engine == "exact":
+        return None, []
+    try:
+        if asked is None:
+            return default_substeps(assembly, args.integrator), []
+        return asked, check_substeps(assembly, args.integrator, asked)
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"--integrator {args.integrator}: {error}") from None
 
 
 def _outcome(
@@ -112,7 +132,6 @@ def _outcome(
         "run": {
             "engine": args.engine,
             "integrator": args.integrator if mujoco else None,
-            "substeps": int(args.substeps) if mujoco else None,
             "duration_s": simulated,
             "samples": samples,
             "wall_s": wall,

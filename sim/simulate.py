@@ -15,7 +15,7 @@ from models.scene import Scene, build, plant
 from sim.engine import Engine, outside_forces
 from sim.exact_engine import ExactEngine, HeldPlant, hold
 from sim.loop import Progress, Record, run
-from sim.mujoco_engine import MujocoEngine, profiler_off, quiet_warnings
+from sim.mujoco_engine import LEAPFROG, LeapfrogEngine, MujocoEngine, profiler_off, quiet_warnings
 from sim.scenario import Scenario
 
 ENGINES = ("mujoco", "exact")
@@ -65,12 +65,18 @@ def simulate(
         )
 
 
-def make_engine(assembly: Assembly, engine: str, integrator: str = "RK4", substeps: int = 4) -> Engine:
-    """The engine of that name for one simulation. Raises ValueError for a name that is none."""
+def make_engine(
+    assembly: Assembly, engine: str, integrator: str = "RK4", substeps: int = 4, T: float | None = None
+) -> Engine:
+    """The engine of that name for one simulation, which MuJoCo advances by T seconds (default: the scenario's).
+
+    Raises ValueError for a name that is none.
+    """
     if engine == "exact":
         return ExactEngine(assembly.plant, assembly.process.force_limit)
     if engine == "mujoco":
-        return MujocoEngine(assembly.scene, assembly.scenario.T, integrator, substeps)
+        kind = LeapfrogEngine if integrator == LEAPFROG else MujocoEngine
+        return kind(assembly.scene, assembly.scenario.T if T is None else T, integrator, substeps)
     raise ValueError(f"engine is {engine!r}, allowed are {', '.join(ENGINES)}")
 
 
