@@ -25,6 +25,7 @@ from sim.command import (
     Parser,
     add_loop_options,
     add_output_options,
+    check_json,
     console,
     execute,
     numbers,
@@ -41,6 +42,9 @@ def main(argv: list[str]) -> int:
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
     out = Path(args.out or f"out/design-{args.case}.json")
+    if out.is_dir():
+        raise InputError(f"--out {out}: is a folder, expected the file of the coupling")
+    check_json(args)
     folder(out.parent)
     loop = scenario_from(args).loop(args.case)
     options = _options(args)
@@ -88,7 +92,7 @@ def _parser() -> Parser:
     ccl.add_argument("--full", action="store_true", help="a coupling across channels (default: diagonal)")
     ccl.add_argument("--method", choices=METHODS, help="complementarity is as printed (default inner)")
     ccl.add_argument("--compare", action="store_true", help="run every method, one state per channel (a minute)")
-    add_output_options(parser)
+    add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case>.json)")
     return parser
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
+from controller.coupling import Coupling, NoCoupling, SpringDamper
 from design.audit_report import print_report, report
 from design.presets import PRESETS
 from design.subject import Subject
@@ -25,8 +25,9 @@ from sim.command import (
     scenario_from,
     seed_from,
 )
-from sim.files import read_coupling, write_json
+from sim.files import write_json
 from sim.scenario import InputError, Scenario
+from sim.stored import doubts, fitted, read_coupling
 
 EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
   python -m design.audit --rigid --K 5000 --B 0 --T 1e-3 --theta 0 --delta 1.37
@@ -50,6 +51,7 @@ def main(argv: list[str]) -> int:
         "scenario": None if args.rigid else scenario.name,
         "preset": args.preset and {"name": args.preset, "source": PRESETS[args.preset].source},
         **report(subject),
+        "notes": doubts(read_coupling(args.coupling), scenario.loop(args.case)) if args.coupling else [],
         "wall_s": time.perf_counter() - begin,
     }
     write_json(out / "report.json", outcome)
@@ -111,7 +113,7 @@ def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Co
     if args.coupling:
         if gains:
             raise InputError(f"{given[0]} with --coupling: give one of them")
-        return _stored(args.coupling, channels, scenario)
+        return fitted(read_coupling(args.coupling), args.coupling, channels, scenario.T)
     if len(gains) == 1:
         missing = "B" if gains == ["K"] else "K"
         raise InputError(f"--{gains[0]} without --{missing}: a spring-damper has both (--B 0 is a spring alone)")
@@ -127,19 +129,6 @@ def _gains(option: str, text: str, channels: int, allowed: tuple[float, float, s
         if not low <= value <= high:
             raise InputError(f"{option} is {value:g}, allowed are {low:g} to {high:g} {unit}")
     return values
-
-
-def _stored(path: str, channels: int, scenario: Scenario) -> Coupling:
-    """The coupling of a file, for this scenario's loop rather than the file's."""
-    stored = read_coupling(path)
-    if len(stored.loop.delta) != channels:
-        raise InputError(
-            f"{path} couples {len(stored.loop.delta)} channels, the loop has {channels}: name its --scenario"
-        )
-    coupling = stored.coupling.build(scenario.T)
-    if isinstance(coupling, Compliance) and stored.loop.T != scenario.T:
-        raise InputError(f"{path}: its coefficients are for T = {stored.loop.T:g} s, the loop has {scenario.T:g} s")
-    return coupling
 
 
 if __name__ == "__main__":

@@ -130,11 +130,15 @@ ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "needs damping": _needs,
     "margin": lambda part: _optional(part["margin"]),
     "binds at": lambda part: _optional(part["binding_frequency_hz"], " Hz"),
-    "stiffest K here": lambda part: ", ".join(_down(K) for K in part["stiffest"]["K"]) + " N/m",
+    "stiffest K here": lambda part: _gains(part["stiffest"]["K"]),
     "delta error": _error("delta_error", "-"),
     "T error": _error("T_error", "+"),
     "spare samples": lambda part: _optional(part["sensitivity"]["extra_samples"]),
 }
+
+
+def _gains(K: Sequence[float | None]) -> str:
+    return "-" if None in K else ", ".join(_down(k) for k in K) + " N/m"
 
 
 def _down(K: float | None) -> str:
@@ -146,7 +150,7 @@ def _down(K: float | None) -> str:
 
 
 def _remarks(report: dict[str, Any]) -> list[str]:
-    lines = []
+    lines = [f"{note}." for note in report["notes"]]
     for condition in ("closed-loop", "theorem4"):
         part = report[condition]
         for name, reason in (

@@ -34,6 +34,7 @@ from design.rational import Matrix, SingularMatrix, definiteness, rational
 from design.store import Certificate, Condition, CouplingData, Loop, Stored, digest, sealed
 
 PROMISE = {"closed-loop": "this environment", "theorem4": "any passive environment"}
+LARGEST = 60  # states of a model that a proof is tried for: seconds; it grows with the fourth power
 CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
 
 
@@ -60,7 +61,11 @@ def prove(loop: Loop, coupling: CouplingData, condition: Condition) -> Certifica
         needed = ", ".join(f"{d:.6g}" for d in requirement.required)
         have = ", ".join(f"{d:.6g}" for d in requirement.available)
         raise NotProved(requirement.reason or f"needs {needed} N s/m of damping, has {have}", requirement)
-    P, reason = find_storage(_block(loop, coupling, condition))
+    block = _block(loop, coupling, condition)
+    if block.order > LARGEST:
+        reason = f"a proof over {block.order} states takes minutes: up to {LARGEST} are tried"
+        raise NotProved(reason, requirement)
+    P, reason = find_storage(block)
     if P is None:
         raise NotProved(f"{reason}; the sweep asks {requirement.ratio:.9f} of the available damping", requirement)
     return sealed(

@@ -9,14 +9,16 @@ from rich.table import Table
 
 from design.certificate import Verdict, verify
 from design.store import Stored
-from sim.command import DOES_NOT_HOLD, DONE, Parser, console, execute
-from sim.files import read_coupling, write_json
+from sim.command import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute
+from sim.files import write_json
 from sim.scenario import InputError
+from sim.stored import read_coupling
 
 
 def main(argv: list[str]) -> int:
     """Prove a stored coupling again. 0: proved, 1: not."""
     args = _parser().parse_args(argv)
+    check_json(args)
     begin = time.perf_counter()
     stored = read_coupling(args.coupling)
     try:

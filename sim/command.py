@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import NoReturn, TypeVar
 
 from rich.console import Console
@@ -49,12 +50,14 @@ def add_loop_options(parser: argparse.ArgumentParser) -> None:
     loop.add_argument("--T", metavar="SECONDS", help="sampling period [s]")
 
 
-def add_output_options(parser: argparse.ArgumentParser) -> None:
+def add_output_options(
+    parser: argparse.ArgumentParser, out: str = "DIR", what: str = "folder for files (default out/<command>-<case>)"
+) -> None:
     """Where results go, and the seed."""
     output = parser.add_argument_group("output")
     output.add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
-    output.add_argument("--out", metavar="DIR", help="folder for files (default out/<command>-<case>)")
-    output.add_argument("--seed", metavar="N", default="0", help="for everything that is drawn at random (default 0)")
+    output.add_argument("--out", metavar=out, help=what)
+    output.add_argument("--seed", metavar="N", default="0", help="for random draws; recorded (default 0)")
 
 
 def scenario_from(args: argparse.Namespace) -> Scenario:
@@ -94,10 +97,25 @@ def seed_from(args: argparse.Namespace) -> int:
     return seed
 
 
+def check_json(args: argparse.Namespace) -> None:
+    """Whether the file of --json can be written, before any work is done. Raises InputError."""
+    if not args.json or args.json == "-":
+        return
+    path = Path(args.json)
+    if path.is_dir():
+        raise InputError(f"--json {path}: is a folder, expected a file or -")
+    if not path.parent.is_dir():
+        raise InputError(f"--json {path}: the folder {path.parent} does not exist")
+    try:
+        with TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise InputError(f"--json {path}: cannot write to {path.parent}: {error.strerror}") from None
+
+
 def out_folder(args: argparse.Namespace, command: str) -> Path:
     """The folder for the files of a command, made before any work is done. Raises InputError."""
-    if args.json and args.json != "-" and not Path(args.json).parent.is_dir():
-        raise InputError(f"--json {args.json}: the folder {Path(args.json).parent} does not exist")
+    check_json(args)
     return folder(Path(args.out or f"out/{command}-{args.case}"))
 
 
@@ -108,7 +126,8 @@ def console(args: argparse.Namespace) -> Console:
 
 def progress_bar(description: str) -> tuple[Progress, Callable[[int, int], None]]:
     """A bar on standard error that shows only on a terminal, and the function that moves it."""
-    bar = Progress(transient=True, console=Console(stderr=True))
+    terminal = Console(stderr=True)
+    bar = Progress(transient=True, console=terminal, disable=not terminal.is_terminal)
     task = bar.add_task(description, total=None)
     return bar, lambda done, total: bar.update(task, completed=done, total=total)
 

@@ -11,9 +11,8 @@ from design.assess import specification
 from design.designs import KINDS, design_coupling
 from design.failure import DesignFailed
 from design.published import PUBLISHED
-from design.store import Stored
-from sim.files import read_coupling
 from sim.scenario import InputError, Scenario
+from sim.stored import doubts, fitted, read_coupling
 
 NAMES = ("none", "published", *KINDS)
 
@@ -26,7 +25,7 @@ class Chosen:
     coupling: Coupling
     condition: str
     phi: Array | None = None  # (m,) multiplier of Theorem 4 that the design found, if it needed one
-    note: str | None = None  # what a reader should know of its origin
+    notes: tuple[str, ...] = ()  # what a reader should know of its origin
 
 
 def choose(scenario: Scenario, case: str, name: str | None = None, condition: str | None = None) -> Chosen:
@@ -64,21 +63,7 @@ def _from_file(scenario: Scenario, case: str, name: str, condition: str | None) 
     if Path(name).suffix != ".json":
         raise InputError(f"--coupling is {name!r}, allowed are {', '.join(NAMES)} or a FILE.json")
     stored = read_coupling(name)
-    if len(stored.loop.delta) != scenario.channels:
-        raise InputError(f"--coupling {name} is for {len(stored.loop.delta)} channels, not {scenario.channels}")
+    coupling = fitted(stored, name, scenario.channels, scenario.T)
     made_for = stored.certificate.condition if stored.certificate else "closed-loop"
-    coupling = stored.coupling.build(scenario.T)
-    return Chosen(Path(name).name, coupling, condition or made_for, note=_differences(stored, scenario, case))
-
-
-def _differences(stored: Stored, scenario: Scenario, case: str) -> str | None:
-    """In what the loop of a stored coupling differs from this one: then its certificate is not about this one."""
-    here = scenario.loop(case)
-    differ = [
-        name for name in here.__struct_fields__ if name != "lam" and getattr(here, name) != getattr(stored.loop, name)
-    ]
-    if not differ:
-        return None
-    return (
-        f"the coupling was stored for another loop (different {', '.join(differ)}): it is certified anew for this one"
-    )
+    notes = doubts(stored, scenario.loop(case))
+    return Chosen(Path(name).name, coupling, condition or made_for, notes=tuple(notes))

@@ -10,7 +10,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from design import store
 from sim.scenario import InputError
 
 
@@ -21,16 +20,6 @@ def folder(path: Path) -> Path:
     except OSError as error:
         raise InputError(f"--out {path}: {error.strerror}") from None
     return path
-
-
-def read_coupling(path: str | Path) -> store.Stored:
-    """A stored coupling. Raises InputError where there is none that can be read."""
-    try:
-        return store.load(path)
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from None
-    except store.BadFile as error:
-        raise InputError(str(error)) from None
 
 
 def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path:

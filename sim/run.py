@@ -146,7 +146,7 @@ def _outcome(
         "error": report.error_part(record, exact, assembly),
     }
     outcome["reproducibility"] = reproducibility.table(scenario, args.case, outcome)
-    return outcome | {"remarks": [*([chosen.note] if chosen.note else []), *report.remarks(outcome)]}
+    return outcome | {"remarks": [*chosen.notes, *report.remarks(outcome)]}
 
 
 def _save(

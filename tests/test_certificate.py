@@ -35,6 +35,12 @@ def wall(stiffness: float, damping: float, delta: float, T: float = 1e-3) -> Loo
     return Loop(T, (0,), (0,), (0,), (delta,), network)
 
 
+def test_a_model_too_large_to_prove_in_seconds_is_said_so():
+    loop = change(DEFAULT, theta=(40, 40))
+    with pytest.raises(NotProved, match="states takes minutes: up to 60 are tried"):
+        prove(loop, SpringDamper((4.0, 4.0), (0.5, 0.5)), "closed-loop")
+
+
 def certified(loop: Loop, coupling, condition: str) -> Stored:
     return Stored(loop, coupling, prove(loop, coupling, condition))
 

@@ -18,7 +18,7 @@ MAY_IMPORT = {
 }
 #: commands of design may also read scenarios, share the command line, and draw
 DESIGN_COMMANDS = {"__main__.py", "audit.py", "check.py", "plot.py", "limits.py", "export.py"}
-COMMANDS_MAY_IMPORT = {"sim.scenario", "sim.command", "sim.files", "sim.plot"}
+COMMANDS_MAY_IMPORT = {"sim.scenario", "sim.command", "sim.files", "sim.stored", "sim.plot"}
 
 #: the only files that may import a package
 HOMES = {

@@ -5,13 +5,16 @@ import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
+from design.certificate import prove
+from design.store import SpringDamper, Stored, save
 from sim import loop
 from sim.result import Result
 from sim.run import main
-from sim.scenario import InputError
+from sim.scenario import InputError, load
 
 SECTIONS = {"case", "scenario", "coupling", "certificate", "certificates", "promise", "transparency", "stability"}
 SECTIONS |= {"run", "error", "files"}
@@ -91,6 +94,22 @@ def test_running_twice_gives_the_same_files(tmp_path):
     assert trace.meta["case"] == "I"
 
 
+def test_a_tampered_coupling_is_named(tmp_path):
+    """One gain changed by 1 %: judged anew, and the report says that the file's certificate does not hold."""
+    scenario = load()
+    data = SpringDamper((400.0, 300.0), (0.1, 0.1))
+    stored = Stored(scenario.loop("I"), data, prove(scenario.loop("I"), data, "theorem4"))
+    save(stored, tmp_path / "good.json")
+    changed = SpringDamper((404.0, 300.0), (0.1, 0.1))
+    save(msgspec.structs.replace(stored, coupling=changed), tmp_path / "bad.json")
+    short = ("--no-plot", "--duration", "0.5")
+    for name, doubted in (("good.json", False), ("bad.json", True)):
+        _, report = run(tmp_path, "--coupling", str(tmp_path / name), *short)
+        assert any("certificate in the coupling's file does not hold" in r for r in report["remarks"]) == doubted
+    _, report = run(tmp_path, "--coupling", str(tmp_path / "good.json"), "--theta", "2", *short)
+    assert any("stored for another loop (different theta)" in r for r in report["remarks"])
+
+
 BAD = [
     (["--case", "III"], "invalid choice: 'III'"),
     (["--bogus"], "unrecognized arguments: --bogus"),
@@ -111,6 +130,7 @@ BAD = [
     (["--coupling", "magic"], "--coupling is 'magic', allowed are none, published, spring-damper"),
     (["--coupling", "nix.json"], "nix.json: No such file"),
     (["--scenario", "three-rigid", "--coupling", "published"], "gains for 2 channels, not 3"),
+    (["--json", "."], "--json .: is a folder, expected a file or -"),
     (["--json", "/nowhere/r.json"], "--json /nowhere/r.json: the folder /nowhere does not exist"),
 ]
 
@@ -141,7 +161,7 @@ def test_bad_input_is_one_line_on_stderr_and_exit_code_2(tmp_path):
     out, err = process.communicate()
     assert process.returncode == 2
     assert out == ""
-    assert err == "error: T is 7, allowed are 1e-06 to 0.1 s (the unit is s)\n"
+    assert err == "error: T is 7, allowed are 1e-06 to 0.1 s\n"
 
 
 def test_what_cannot_be_designed_is_exit_code_1(tmp_path):

@@ -14,7 +14,7 @@ BAD = [
     ("theta = [1, 2]", "theta = [1, true]", "theta[1] = True: expected `int`"),
     ("psi = [0, 0]", "psi = [0, 0, 0]", "psi has 3 entries"),
     ("psi = [0, 0]", "psi = [0, 0]\nlam = [2, 2]", "lam[0] is 2, allowed are 0 to theta + psi = 1 samples"),
-    ("T = 1.2e-3", "T = 1.2", "T is 1.2, allowed are 1e-06 to 0.1 s (the unit is s)"),
+    ("T = 1.2e-3", "T = 1.2", "T is 1.2, allowed are 1e-06 to 0.1 s"),
     ("T = 1.2e-3", "T = nan", "T is nan"),
     ("T = 1.2e-3", "T = '1.2 ms'", "T = '1.2 ms': expected `float`, got `str`"),
     ("T = 1.2e-3", "T == 1", "not valid TOML"),
