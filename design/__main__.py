@@ -117,7 +117,7 @@ def _store(loop: Loop, design: Design, out: Path) -> dict[str, Any]:
     data = data_of(design.coupling)
     condition: Condition = "closed-loop" if design.condition == "closed-loop" else "theorem4"
     try:
-        certificate, reason = prove(loop, data, condition), None
+        certificate, reason = prove(loop, data, condition, design.phi), None
     except NotProved as error:
         certificate, reason = None, str(error)
     try:

@@ -28,7 +28,7 @@ def assess(loop: Loop, coupling: Coupling, phi: Array | None = None) -> dict[str
     any_environment = theorem4_requirement(coupling, E, loop.theta, loop.psi, loop.delta, phi)
     this_environment = closed_loop(force_map(E, coupling, loop.theta, loop.psi), loop.delta)
     return {
-        "theorem4": _proved(loop, coupling, any_environment),
+        "theorem4": _proved(loop, coupling, any_environment, phi),
         "closed-loop": _proved(loop, coupling, this_environment),
     }
 
@@ -64,12 +64,12 @@ def theorem4_requirement(
     return theorem4_delayed(V, E, theta, psi, delta, phi)
 
 
-def _proved(loop: Loop, coupling: Coupling, requirement: Requirement) -> Requirement:
+def _proved(loop: Loop, coupling: Coupling, requirement: Requirement, phi: Array | None = None) -> Requirement:
     """The requirement with `proof` = 'rational' where an exact proof was found, as it is where not."""
     if not requirement.certified:
         return requirement
     try:
-        prove(loop, data_of(coupling), requirement.condition)
+        prove(loop, data_of(coupling), requirement.condition, phi)
     except NotProved:
         return requirement
     return replace(requirement, proof="rational")

@@ -12,13 +12,17 @@ is strictly positive real. Then He V-hat = |1 - 1/z|^2 He[H(1)/2 - R]/T >= Delta
 Delta_V > 0, as V-hat carries the same factor: V-hat is stable and output strictly passive. The environment is
 passive because every parameter of the network is non-negative (the Network type refuses others), so
 Phi = 0 satisfies Lemma 4, whatever the environment.
+
+theorem4, psi >= 1: a multiplier Phi, stored too, and two blocks (design.delayed_proof); it is of this environment.
 """
 
 from __future__ import annotations
 
 import platform
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Literal
 
 import numpy as np
 import scipy
@@ -28,12 +32,13 @@ from controller.environment import environment
 from controller.lti import SingularLoop
 from controller.process import force_map
 from design import exact, margin
+from design.delayed import theorem4_delayed
+from design.delayed_proof import coupling_block, environment_block
 from design.exact import Exact
 from design.positive_real import find_storage, prove_positive_real
 from design.rational import Matrix, SingularMatrix, definiteness, rational
 from design.store import Certificate, Condition, CouplingData, Loop, Stored, digest, sealed
 
-PROMISE = {"closed-loop": "this environment", "theorem4": "any passive environment"}
 LARGEST = 60  # states of a model that a proof is tried for: seconds; it grows with the fourth power
 CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
 
@@ -54,29 +59,38 @@ class Verdict:
     reason: str | None = None
 
 
-def prove(loop: Loop, coupling: CouplingData, condition: Condition) -> Certificate:
-    """A certificate with an exact proof of the condition. Raises NotProved with the reason."""
-    requirement = required_damping(loop, coupling, condition)
+def prove(loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequence[float] | None = None) -> Certificate:
+    """A certificate with an exact proof of the condition; `phi` [N s/m] is Theorem 4's multiplier where psi >= 1.
+
+    Raises NotProved with the reason.
+    """
+    multiplier = None if phi is None else [rational(float(p)) for p in phi]
+    requirement = required_damping(loop, coupling, condition, multiplier)
     if not requirement.certified:
         needed = ", ".join(f"{d:.6g}" for d in requirement.required)
         have = ", ".join(f"{d:.6g}" for d in requirement.available)
         raise NotProved(requirement.reason or f"needs {needed} N s/m of damping, has {have}", requirement)
-    block = _block(loop, coupling, condition)
-    if block.order > LARGEST:
-        reason = f"a proof over {block.order} states takes minutes: up to {LARGEST} are tried"
-        raise NotProved(reason, requirement)
-    P, reason = find_storage(block)
-    if P is None:
-        raise NotProved(f"{reason}; the sweep asks {requirement.ratio:.9f} of the available damping", requirement)
+    proof: dict[str, Matrix] = {}
+    for name, block in _blocks(loop, coupling, condition, multiplier).items():
+        if block.order > LARGEST:
+            reason = f"a proof over {block.order} states takes minutes: up to {LARGEST} are tried"
+            raise NotProved(reason, requirement)
+        P, reason = find_storage(block)
+        if P is None:
+            asked = f"the sweep asks {requirement.ratio:.9f} of the available damping"
+            raise NotProved(f"{reason}; {asked}", requirement)
+        proof[name] = P
+    if multiplier is not None:
+        proof["Phi"] = Matrix.of([multiplier])
     return sealed(
         Certificate(
             condition=condition,
             required=requirement.required,
             available=loop.delta,
             margin=1 / max(requirement.ratio, 1e-12),
-            promise=PROMISE[condition],
+            promise=_promise(loop, condition),
             proof="rational",
-            matrices={"P": tuple(tuple(str(v) for v in row) for row in P.fractions())},
+            matrices={name: tuple(tuple(str(v) for v in row) for row in M.fractions()) for name, M in proof.items()},
             scenario=digest(loop, coupling),
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
         )
@@ -101,10 +115,12 @@ def verify(stored: Stored) -> Verdict:
     return Verdict(reason is None, reason)
 
 
-def required_damping(loop: Loop, coupling: CouplingData, condition: Condition) -> margin.Requirement:
+def required_damping(
+    loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequence[Fraction] | None = None
+) -> margin.Requirement:
     """The damping that the condition asks, from a refined sweep. Raises NotProved where it is undefined.
 
-    theorem4 with psi >= 1 needs a multiplier, and closed-loop an algebraic loop that has a solution.
+    theorem4 with psi >= 1 needs the multiplier phi, and closed-loop an algebraic loop that has a solution.
     """
     built = coupling.build(loop.T)
     if condition == "closed-loop":
@@ -113,14 +129,46 @@ def required_damping(loop: Loop, coupling: CouplingData, condition: Condition) -
         except SingularLoop as error:
             raise NotProved(str(error)) from None
         return margin.closed_loop(F, loop.delta)
-    if any(loop.psi):
-        raise NotProved("theorem4 with psi >= 1 needs a multiplier Phi, which these certificates do not carry")
     match built:
         case controller_coupling.SpringDamper():
-            return margin.theorem4(built.compliance(loop.T), loop.theta, loop.delta)
+            V = built.compliance(loop.T)
         case controller_coupling.Compliance(V=V):
-            return margin.theorem4(V, loop.theta, loop.delta)
+            pass
+        case _:
+            V = None
+    if V is not None and not any(loop.psi):
+        return margin.theorem4(V, loop.theta, loop.delta)
+    if V is not None:
+        if phi is None or len(phi) != len(loop.delta):
+            raise NotProved("theorem4 with psi >= 1 needs a multiplier Phi, one entry per channel")
+        E = environment(loop.environment, loop.T)
+        values = np.array([float(p) for p in phi])
+        return theorem4_delayed(V, E, loop.theta, loop.psi, loop.delta, values)
     return margin.refusal("theorem4", loop.delta, "theorem4 needs a coupling: V = 0 dissipates nothing")
+
+
+def _promise(loop: Loop, condition: Condition) -> Literal["any passive environment", "this environment"]:
+    return "any passive environment" if condition == "theorem4" and not any(loop.psi) else "this environment"
+
+
+def _blocks(
+    loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequence[Fraction] | None
+) -> dict[str, Exact]:
+    """The blocks that must be strictly positive real, by the name of the matrix that proves it. Raises NotProved."""
+    if condition == "closed-loop" or not any(loop.psi):
+        return {"P": _block(loop, coupling, condition)}
+    assert phi is not None  # required_damping has refused the rest
+    T, delta = rational(loop.T), [rational(d) for d in loop.delta]
+    try:
+        E = exact.delay(loop.psi) @ exact.environment(loop.environment, T)
+        E1, passive = environment_block(E, phi, T)
+        H = exact.shifted_compliance(exact.compliance(coupling.build(loop.T), len(delta), T), loop.theta, delta, T)
+        H1, excess = coupling_block(H, phi, delta, T)
+    except (SingularMatrix, ValueError) as error:
+        raise NotProved(str(error)) from None
+    _require_static("E(1)", E1)
+    _require_symmetric("H(1)", H1)
+    return {"P": excess, "P_E": passive}
 
 
 def _block(loop: Loop, coupling: CouplingData, condition: Condition) -> Exact:
@@ -156,11 +204,11 @@ def _refuted_claims(loop: Loop, coupling: CouplingData, certificate: Certificate
     """Why the figures on file do not follow from the loop and the coupling, or None."""
     if certificate.proof != "rational":
         return f"the certificate is {certificate.proof}: it carries no exact proof"
-    if certificate.promise != PROMISE[certificate.condition]:
+    if certificate.promise != _promise(loop, certificate.condition):
         return f"{certificate.condition} does not promise {certificate.promise!r}"
     if certificate.available != loop.delta:
         return f"available is {list(certificate.available)}, the loop has delta = {list(loop.delta)}"
-    requirement = required_damping(loop, coupling, certificate.condition)
+    requirement = required_damping(loop, coupling, certificate.condition, _multiplier(certificate))
     if len(certificate.required) != len(loop.delta) or not np.allclose(
         certificate.required, requirement.required, rtol=CLAIM_TOLERANCE
     ):
@@ -172,14 +220,33 @@ def _refuted_claims(loop: Loop, coupling: CouplingData, certificate: Certificate
 
 def _refuted_proof(loop: Loop, coupling: CouplingData, certificate: Certificate) -> str | None:
     """Why the matrices prove nothing, or None if they prove the condition."""
-    block = _block(loop, coupling, certificate.condition)
-    rows = certificate.matrices.get("P")
-    if rows is None or len(certificate.matrices) != 1:
-        return f"matrices are {', '.join(certificate.matrices) or 'none'}, expected P"
+    phi = _multiplier(certificate)
+    blocks = _blocks(loop, coupling, certificate.condition, phi)
+    expected = {*blocks, *(["Phi"] if len(blocks) > 1 else [])}
+    if set(certificate.matrices) != expected:
+        found = ", ".join(certificate.matrices) or "none"
+        return f"matrices are {found}, expected {', '.join(sorted(expected))}"
+    reasons = (_refuted_block(name, block, certificate.matrices[name]) for name, block in blocks.items())
+    return next((reason for reason in reasons if reason), None)
+
+
+def _refuted_block(name: str, block: Exact, rows: Sequence[Sequence[str]]) -> str | None:
+    """Why one matrix does not prove its block, or None."""
     if len(rows) != block.order or any(len(row) != block.order for row in rows):
-        return f"P has {len(rows)} rows, the model has {block.order} states"
+        return f"{name} has {len(rows)} rows, the model has {block.order} states"
     try:
         P = Matrix.of(rows, (block.order, block.order))
     except (ValueError, ZeroDivisionError) as error:
-        return f"P has an entry that is not a rational number: {error}"
+        return f"{name} has an entry that is not a rational number: {error}"
     return prove_positive_real(block, P)
+
+
+def _multiplier(certificate: Certificate) -> list[Fraction] | None:
+    """The stored Phi, or None. Raises NotProved where it is no row of rationals."""
+    rows = certificate.matrices.get("Phi")
+    if rows is None:
+        return None
+    try:
+        return [Fraction(value) for value in rows[0]]
+    except (IndexError, ValueError, ZeroDivisionError):
+        raise NotProved("Phi is no row of rational numbers") from None

@@ -7,6 +7,8 @@ import pytest
 from controller import coupling as controller_coupling
 from controller.environment import FIGURE_4, Network, Spring
 from controller.lti import Lti
+from design import spring_damper
+from design.assess import specification
 from design.certificate import NotProved, Verdict, prove, required_damping, verify
 from design.published import PUBLISHED
 from design.store import (
@@ -33,6 +35,30 @@ def wall(stiffness: float, damping: float, delta: float, T: float = 1e-3) -> Loo
     """One device against a spring and a damper to the ground, without delay."""
     network = Network(contacts=("tip",), springs=(Spring(("tip", "ground"), stiffness, damping),))
     return Loop(T, (0,), (0,), (0,), (delta,), network)
+
+
+SOFT = Network(
+    ("contact 1", "contact 2"),
+    (Spring(("contact 1", "mass"), 200.0, 0.25), Spring(("mass", "contact 2"), 175.0, 0.25)),
+    {"mass": 1.0},
+)
+
+
+@pytest.mark.parametrize("psi", [(1, 1), (1, 0)])
+def test_delay_inside_the_environment_is_proved_with_its_multiplier(psi):
+    """Theorem 4 with psi >= 1: the design's Phi is stored, and only for this environment is anything promised."""
+    loop = change(DEFAULT, psi=psi, environment=SOFT)
+    found = spring_damper.design(specification(loop))
+    stored = Stored(loop, data_of(found.coupling), prove(loop, data_of(found.coupling), "theorem4", found.phi))
+    assert stored.certificate.promise == "this environment"
+    assert set(stored.certificate.matrices) == {"P", "P_E", "Phi"}
+    assert verify(stored) == Verdict(True)
+    with pytest.raises(NotProved, match="needs a multiplier Phi"):
+        prove(loop, data_of(found.coupling), "theorem4")
+    with pytest.raises(NotProved, match="E-hat \\+ Phi is not passive"):
+        prove(loop, data_of(found.coupling), "theorem4", 0.9 * found.phi)
+    forged = sealed(change(stored.certificate, matrices=stored.certificate.matrices | {"Phi": (("1/100", "1/100"),)}))
+    assert not verify(change(stored, certificate=forged)).proved
 
 
 def test_a_model_too_large_to_prove_in_seconds_is_said_so():

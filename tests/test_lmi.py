@@ -245,3 +245,23 @@ def test_an_active_environment_is_refused_by_name():
     active = Lti.constant([[-5.0]], T)
     with pytest.raises(ValueError, match="environment is not passive"):
         analysis(Lti.constant([[1e-3]], T), active, [0], [0], [1.0])
+
+
+def test_the_matrices_take_parameters():
+    """Lemmas 2 and 3 are affine in (A, B, C, D): a problem is compiled once and solved for many systems."""
+    rng = np.random.default_rng(3)
+    data = {name: cp.Parameter((2, 2)) for name in "ABCD"}
+    X, U, mu2 = cp.Variable((2, 2), symmetric=True), cp.Variable((2, 2), symmetric=True), cp.Parameter(nonneg=True)
+    slack = cp.Variable()
+    bound = lemma3(*(data[name] for name in "ABCD"), X, U, mu2)
+    problem = cp.Problem(cp.Maximize(slack), [bound >> slack * np.eye(8), slack <= 1, X << 100 * np.eye(2), U << 1e3])
+    ports = Ports(data["A"], data["B"], data["C"], data["D"], data["C"], data["D"])
+    passive = cp.Problem(cp.Maximize(slack), [lemma2(ports, X, U, None, np.zeros((2, 2))) >> slack * np.eye(6)])
+    assert problem.is_dpp()
+    assert passive.is_dpp()
+    for _ in range(2):
+        for parameter in data.values():
+            parameter.value = rng.normal(size=(2, 2))
+        numbers = lemma3(*(data[name].value for name in "ABCD"), np.eye(2), np.eye(2), np.array([[2.0]]))
+        X.value, U.value, mu2.value = np.eye(2), np.eye(2), 2.0
+        np.testing.assert_allclose(bound.value, numbers)

@@ -7,9 +7,11 @@ import pytest
 
 from design import ccl, spring_damper
 from design.assess import assess, specification
+from design.audit_report import report
 from design.certificate import prove, verify
 from design.published import CASE_I
 from design.store import Stored, data_of
+from design.subject import Subject
 from sim.scenario import load
 
 pytestmark = pytest.mark.benchmark(group="design")
@@ -47,3 +49,11 @@ def test_a_refusal(benchmark):
     requirements = benchmark.pedantic(lambda: assess(LOOP, CASE_I), rounds=5, warmup_rounds=1)
     print(f"\npublished gains refused: theorem4 needs {requirements['theorem4'].required}")
     assert not any(r.certified for r in requirements.values())
+
+
+def test_audit(benchmark):
+    scenario = load()
+    subject = Subject(CASE_I, scenario.environment, scenario.T, scenario.theta, scenario.psi, scenario.delta)
+    outcome = benchmark.pedantic(lambda: report(subject), rounds=5, warmup_rounds=1)
+    print(f"\naudit of (27): closed-loop needs {outcome['closed-loop']['required_damping'][0]:.6f} N s/m")
+    assert abs(outcome["closed-loop"]["required_damping"][0] - 1.39871) < 1e-5
