@@ -65,6 +65,7 @@ def run(
 
 
 def stretch(tape: Tape, engine: Engine, ticks: int) -> None:
+    """Close the loop for the first `ticks` rows of the tape."""
     tick, advance = tape.tick, engine.advance
     for k in range(ticks):
         tick(k)

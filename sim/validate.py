@@ -44,6 +44,7 @@ LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
 
 def main(argv: list[str]) -> int:
+    """Meet random humans. 0: the claims hold, 1: not, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario = scenario_from(args)
     humans, shards = _whole(args, "humans", 1_000_000), _whole(args, "shards", 256)
