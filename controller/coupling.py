@@ -72,6 +72,68 @@ class Compliance:
         return environment.feedback(self.V)
 
 
+@dataclass(frozen=True, eq=False)
+class InternalModel:
+    """The pair of a parameter Q(z) and the environment itself: u = x - Q y, where y = Psi E x is the model's answer.
+
+    G = Psi E - Psi E Q Psi E: the same as V = Q (I - Psi E Q)^-1 in feedback, but affine in Q, and stable whenever Q
+    and the environment are. Q(z) = sum_k Q_k b_k(z) over the functions of `basis`, all of which are 1 at z = 1, so
+    the static Q(1) is the plain sum of the coefficients.
+    """
+
+    poles: Array  # (n,) in (-1, 1); all zero: an FIR filter of n + 1 taps
+    Q: Array  # (n + 1, m, m) [m/N]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "poles", frozen(self.poles, 1))
+        object.__setattr__(self, "Q", frozen(self.Q, 3))
+        functions, rows, columns = self.Q.shape
+        if functions != self.poles.size + 1 or rows != columns:
+            raise ValueError(f"Q has shape {self.Q.shape}, expected ({self.poles.size + 1}, channels, channels)")
+        if not (np.abs(self.poles) < 1).all():
+            raise ValueError(f"poles are {self.poles.tolist()}, expected numbers between -1 and 1")
+        if not np.isfinite(self.Q).all():
+            raise ValueError("Q has entries that are not finite")
+
+    def parameter(self, T: float) -> Lti:
+        """Q(z)."""
+        return Lti(*parameter(self.poles, self.Q), T)
+
+    def around(self, environment: Lti) -> Lti:
+        m = self.Q.shape[1]
+        if environment.inputs != m or environment.outputs != m:
+            raise ValueError(f"the coupling is {m} x {m}, the environment has {environment.inputs} contacts")
+        T = environment.T
+        return environment @ (Lti.constant(np.eye(m), T) - self.parameter(T) @ environment)
+
+
+def basis(poles: Array, z: Array) -> Array:
+    """b_0 = 1 and b_k = (1 - a_k)/(z - a_k) prod_{j<k} (1 - a_j z)/(z - a_j), k = 1..n; shape z.shape + (n + 1,).
+
+    Takenaka-Malmquist functions up to their lengths: all-pass sections in a row, each with a tap. Poles at zero make
+    them 1, 1/z, 1/z^2, ..
+    """
+    values, through = [np.ones_like(z)], np.ones_like(z)
+    for a in poles:
+        values.append(through * (1 - a) / (z - a))
+        through = through * (1 - a * z) / (z - a)
+    return np.stack(values, axis=-1)
+
+
+def parameter(poles: Array, Q: Array) -> tuple[Array, Array, Array, Array]:
+    """A, B, C, D of sum_k Q_k b_k(z), one chain of sections per input, in the arithmetic of the entries."""
+    n, m = poles.size, Q.shape[1]
+    signals = np.eye(n + 1, dtype=Q.dtype)
+    through, after = signals[-1], []
+    for a, state in zip(poles, signals, strict=False):
+        after.append(a * state + through)
+        through = (1 - a * a) * state - a * through
+    sections = np.array(after, dtype=Q.dtype).reshape(n, n + 1)
+    one = np.eye(m, dtype=Q.dtype)
+    C = np.moveaxis(Q[1:] * (1 - poles)[:, None, None], 0, 2).reshape(m, m * n)
+    return np.kron(one, sections[:, :n]), np.kron(one, sections[:, n:]), C, Q[0]
+
+
 def _spring_damper(k: float, b: float, T: float) -> Lti:
     gain = 1.0 / (k + b / T)
     if b == 0:

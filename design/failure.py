@@ -3,7 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What one rung of the ladder gave."""
+
+    settings: str
+    status: str
+    value: float | None  # the objective, None where the attempt was refused
+    wall_s: float
+    reason: str | None = None  # why it was refused
 
 
 class DesignFailed(ValueError):

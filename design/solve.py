@@ -1,4 +1,4 @@
-"""The only caller of a convex solver.
+"""The only caller of cvxpy's solve.
 
 A solver's status is a claim. A result is used only if every variable is finite, the constraints hold when they
 are evaluated again, and the caller's own `accept` agrees; otherwise the next settings of the ladder are tried.
@@ -16,7 +16,7 @@ from typing import Any
 import cvxpy as cp
 import numpy as np
 
-from design.failure import DesignFailed, Infeasible
+from design.failure import Attempt, DesignFailed, Infeasible
 
 #: Largest violation of a constraint that is taken for rounding; problems are posed in units where 1 is large.
 TOLERANCE = 1e-4
@@ -41,17 +41,6 @@ LADDER = (
     Settings("loose", cp.CLARABEL, {**_LOOSE, "static_regularization_constant": 1e-7}),
 )
 CROSS_CHECK = Settings("splitting", cp.SCS, {"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 200_000})
-
-
-@dataclass(frozen=True)
-class Attempt:
-    """What one rung of the ladder gave."""
-
-    settings: str
-    status: str
-    value: float | None  # the objective, None where the attempt was refused
-    wall_s: float
-    reason: str | None = None  # why it was refused
 
 
 def solve(

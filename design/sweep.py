@@ -41,25 +41,42 @@ def supremum(response: Response, grid: Array) -> tuple[float, float]:
         return np.inf, float(grid[worst])
     best = int(np.argmax(values))
     top, where = float(values[best]), float(grid[best])
-    padded = np.concatenate([[-np.inf], values, [-np.inf]])
-    local = (values >= padded[:-2]) & (values >= padded[2:])
-    peaks = np.flatnonzero(local & (values >= top - 0.2 * abs(top)))
-    peaks = peaks[np.argsort(values[peaks])[-32:]]
-    left, right = grid[np.maximum(peaks - 1, 0)], grid[np.minimum(peaks + 1, grid.size - 1)]
+    bracket = _brackets(values, grid, top - 0.2 * abs(top))
     settled = 0
     for _ in range(10):
-        trial = np.linspace(left, right, 17)
-        found = response(trial.ravel()).reshape(trial.shape)
-        at = np.argmax(found, axis=0)
-        column = np.arange(at.size)
-        value = found[at, column]
+        value, w, bracket = _narrowed(response, *bracket)
         settled = settled + 1 if value.max() <= top + 1e-13 * abs(top) else 0
         if value.max() > top:
-            top, where = float(value.max()), float(trial[at, column][np.argmax(value)])
+            top, where = float(value.max()), float(w[np.argmax(value)])
         if settled == 2:
             break
-        left, right = trial[np.maximum(at - 1, 0), column], trial[np.minimum(at + 1, 16), column]
     return top, where
+
+
+def peaks(response: Response, grid: Array, above: float) -> Array:
+    """Where `response` has its highest local maxima over [grid[0], grid[-1]] beyond `above`, 32 at most; (peaks,)."""
+    value, w, bracket = _narrowed(response, *_brackets(response(grid), grid, above))
+    if value.size:
+        value, w, _ = _narrowed(response, *bracket)
+    return w[value > above]
+
+
+def _brackets(values: Array, grid: Array, above: float) -> tuple[Array, Array]:
+    """The neighbours of the 32 highest local maxima of at least `above`."""
+    padded = np.concatenate([[-np.inf], values, [-np.inf]])
+    local = (values >= padded[:-2]) & (values >= padded[2:])
+    at = np.flatnonzero(local & (values >= above))
+    at = at[np.argsort(values[at])[-32:]]
+    return grid[np.maximum(at - 1, 0)], grid[np.minimum(at + 1, grid.size - 1)]
+
+
+def _narrowed(response: Response, left: Array, right: Array) -> tuple[Array, Array, tuple[Array, Array]]:
+    """The best of 17 points in each bracket, where it is, and the bracket of its neighbours."""
+    trial = np.linspace(left, right, 17)
+    found = response(trial.ravel()).reshape(trial.shape)
+    at, column = np.argmax(found, axis=0), np.arange(left.size)
+    closer = trial[np.maximum(at - 1, 0), column], trial[np.minimum(at + 1, 16), column]
+    return found[at, column], trial[at, column], closer
 
 
 def on_circle(w: Array) -> NDArray[np.complex128]:
