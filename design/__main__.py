@@ -12,7 +12,7 @@ from rich.table import Table
 from controller.process import force_map
 from design.assess import CONDITIONS, assess, specification
 from design.certificate import NotProved, prove
-from design.designs import KINDS, METHODS, compare_methods, design_coupling
+from design.designs import FILTERS, KINDS, METHODS, OBJECTIVES, compare_methods, design_coupling
 from design.failure import DesignFailed
 from design.promises import certificate_part, promise_of
 from design.result import Design
@@ -89,26 +89,55 @@ def _parser() -> Parser:
     parser.add_argument("--condition", choices=CONDITIONS, help="what to certify (default: the coupling's own)")
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", metavar="N", help="states per channel (default 1)")
-    ccl.add_argument("--full", action="store_true", help="a coupling across channels (default: diagonal)")
     ccl.add_argument("--method", choices=METHODS, help="complementarity is as printed (default inner)")
     ccl.add_argument("--compare", action="store_true", help="run every method, one state per channel (a minute)")
+    optimal = parser.add_argument_group("optimal: the best Q in the pair with a model of the environment")
+    optimal.add_argument("--functions", metavar="N", help="basis functions of each entry of Q (default 8)")
+    optimal.add_argument("--filter", choices=FILTERS, help="poles of the basis (default auto: by the delays)")
+    optimal.add_argument("--objective", choices=OBJECTIVES, help="which mismatch is minimised (default rms)")
+    optimal.add_argument("--high-gain", metavar="G", help="limit of |F|/|E| above 100 Hz, or none (default 1.5)")
+    optimal.add_argument("--margin", metavar="SHARE", help="of the damping that stays unused (default 0.005)")
+    both = parser.add_argument_group("ccl and optimal")
+    both.add_argument("--full", action="store_true", help="across channels (default: diagonal)")
     add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case>.json)")
     return parser
 
 
+#: options of a design -> the couplings that take them
+OPTIONS = {
+    "order": ("ccl",),
+    "method": ("ccl",),
+    "compare": ("ccl",),
+    "full": ("ccl", "optimal"),
+    "functions": ("optimal",),
+    "filter": ("optimal",),
+    "objective": ("optimal",),
+    "high_gain": ("optimal",),
+    "margin": ("optimal",),
+}
+
+
 def _options(args: argparse.Namespace) -> dict[str, Any]:
-    """The options of a ccl design. Raises InputError where they are given for another coupling."""
-    given = {}
-    if args.order is not None:
-        (given["order"],) = numbers("--order", args.order, int, 1)
-        if not 1 <= given["order"] <= 10:
-            raise InputError(f"--order is {given['order']}, allowed are 1 to 10")
-    if args.full:
+    """The options of the design's own function. Raises InputError where they are for another coupling."""
+    given = {name: getattr(args, name) for name in OPTIONS if getattr(args, name) not in (None, False)}
+    for name in given:
+        if args.coupling not in OPTIONS[name]:
+            allowed = " or ".join(OPTIONS[name])
+            raise InputError(f"--{name.replace('_', '-')} is for --coupling {allowed}, not {args.coupling}")
+    given.pop("compare", None)
+    for name in ("order", "functions"):
+        if name in given:
+            (given[name],) = numbers(f"--{name}", given[name], int, 1)
+    if not 1 <= given.get("order", 1) <= 10:
+        raise InputError(f"--order is {given['order']}, allowed are 1 to 10")
+    if given.get("high_gain") == "none":
+        given["high_gain"] = None
+    elif "high_gain" in given:
+        (given["high_gain"],) = numbers("--high-gain", given["high_gain"], float, 1)
+    if "margin" in given:
+        (given["margin"],) = numbers("--margin", given["margin"], float, 1)
+    if given.pop("full", False):
         given["diagonal"] = False
-    if args.method:
-        given["method"] = args.method
-    if args.coupling != "ccl" and (given or args.compare):
-        raise InputError("--order, --full, --method and --compare are for --coupling ccl")
     return given
 
 

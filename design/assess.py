@@ -8,7 +8,7 @@ from controller.coupling import Compliance, Coupling, SpringDamper
 from controller.environment import environment
 from controller.lti import Array, Lti
 from controller.process import force_map
-from design.certificate import NotProved, prove
+from design.certificate import NotProved, no_compliance, prove
 from design.delayed import theorem4_delayed
 from design.margin import Requirement, closed_loop, refusal, theorem4, theorem4_per_channel
 from design.specification import Specification
@@ -50,7 +50,7 @@ def theorem4_requirement(
         case Compliance(V=V):
             pass
         case _:
-            return refusal("theorem4", delta, "without a coupling there is nothing that Theorem 4 could use")
+            return refusal("theorem4", delta, no_compliance(coupling))
     if not any(psi):
         return theorem4(V, theta, delta)
     if phi is None:

@@ -144,7 +144,14 @@ def required_damping(
         E = environment(loop.environment, loop.T)
         values = np.array([float(p) for p in phi])
         return theorem4_delayed(V, E, loop.theta, loop.psi, loop.delta, values)
-    return margin.refusal("theorem4", loop.delta, "theorem4 needs a coupling: V = 0 dissipates nothing")
+    return margin.refusal("theorem4", loop.delta, no_compliance(built))
+
+
+def no_compliance(coupling: controller_coupling.Coupling) -> str:
+    """Why Theorem 4 has nothing to say of a coupling that is no V of its own."""
+    if isinstance(coupling, controller_coupling.InternalModel):
+        return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
+    return "without a coupling there is nothing that Theorem 4 could use"
 
 
 def _promise(loop: Loop, condition: Condition) -> Literal["any passive environment", "this environment"]:
@@ -174,13 +181,14 @@ def _blocks(
 def _block(loop: Loop, coupling: CouplingData, condition: Condition) -> Exact:
     """The block that must be strictly positive real, after the exact test at z = 1. Raises NotProved."""
     T, delta = rational(loop.T), [rational(d) for d in loop.delta]
-    V = exact.compliance(coupling.build(loop.T), len(delta), T)
+    built = coupling.build(loop.T)
     try:
         if condition == "closed-loop":
-            F = exact.force_map(exact.environment(loop.environment, T), V, loop.theta, loop.psi)
+            F = exact.force_map(exact.environment(loop.environment, T), built, loop.theta, loop.psi, T)
             F1, R = F.split_at_one()
             _require_static("F(1)", F1)
             return Exact(R.A, R.B, R.C, Matrix.diag(d / T for d in delta) - F1.scaled(Fraction(1, 2)))
+        V = exact.compliance(built, len(delta), T)
         H1, R = exact.shifted_compliance(V, loop.theta, delta, T).split_at_one()
     except SingularMatrix as error:
         raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None

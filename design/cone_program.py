@@ -1,4 +1,4 @@
-"""Quadratic programs over Hermitian inequalities: minimise |A x - b|^2/2 + c'x with H_0 + sum_j x_j H_j >= 0, many times over.
+"""Quadratic programs over Hermitian inequalities: minimise |A x - b|^2/2 + c'x with H_0 + sum_j x_j H_j >= 0.
 
 An inequality at k frequencies is one `Block`. A Hermitian matrix of size one is a half-line, of size two a second-order
 cone (a + b >= |(a - b, 2 Re c, 2 Im c)|), of size r the real symmetric matrix [[Re, -Im], [Im, Re]] of size 2r.
@@ -34,6 +34,11 @@ class Block:
     def least(self, x: Array) -> Array:
         """Their least eigenvalues, shape (k,)."""
         return np.linalg.eigvalsh(self.at(x))[:, 0]
+
+    def padded(self, more: int) -> Block:
+        """The same inequalities with `more` unknowns at the end, which do not enter."""
+        k, _, r, _ = self.slope.shape
+        return Block(self.constant, np.concatenate([self.slope, np.zeros((k, more, r, r))], axis=1))
 
     def changed(self, basis: Array) -> Block:
         """The same inequalities in y, where x = basis y."""

@@ -1,4 +1,4 @@
-"""Cone programs handed to Clarabel as matrices: modelling hundreds of inequalities one by one takes longer than solving them.
+"""Cone programs handed to Clarabel as matrices: modelling hundreds of inequalities takes longer than solving them.
 
 As in design.solve, a status is a claim: the answer is used only if it is finite and every inequality holds when it is
 evaluated again; otherwise the next settings are tried.

@@ -8,16 +8,21 @@ from design.result import Design, Row
 from design.specification import Specification
 
 #: name -> the conditions that it can be made for, its own first
-KINDS = {"spring-damper": ("theorem4", "closed-loop"), "ccl": ("theorem4",)}
+KINDS = {"spring-damper": ("theorem4", "closed-loop"), "ccl": ("theorem4",), "optimal": ("closed-loop",)}
 
 #: how a state-space coupling of fixed order may be sought
 METHODS = ("complementarity", "inner", "fixed-poles")
+
+#: where the poles of an optimal coupling's basis may lie, and which mismatch it minimises
+FILTERS = ("auto", "fir", "slow", "mixed")
+OBJECTIVES = ("rms", "sup")
 
 
 def design_coupling(
     spec: Specification, kind: str = "spring-damper", condition: str | None = None, **options: Any
 ) -> Design:
-    """Design and verify a coupling; `options` are those of the design's own function (order, method, ..).
+    """Design and verify a coupling; `options` are those of the design's own function: order, method, diagonal for ccl,
+    the fields of design.wish.Wish for optimal.
 
     Raises ValueError for a kind or condition that does not exist, Infeasible or DesignFailed (design.failure) where
     there is nothing to return.
@@ -27,10 +32,13 @@ def design_coupling(
     condition = condition or KINDS[kind][0]
     if condition not in KINDS[kind]:
         raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(KINDS[kind])}")
-    from design import ccl, spring_damper  # cvxpy takes a second to import
+    from design import ccl, optimal, spring_damper  # cvxpy takes a second to import
+    from design.wish import Wish
 
     if kind == "ccl":
         return ccl.design(spec, **options)
+    if kind == "optimal":
+        return optimal.design(spec, Wish(**options))
     return spring_damper.design(spec, condition, **options)
 
 

@@ -12,7 +12,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
+from controller.coupling import Compliance, Coupling, InternalModel, NoCoupling, SpringDamper, parameter
 from controller.environment import Network, realise
 from design.rational import Matrix, block, block_diag, rational
 
@@ -116,9 +116,21 @@ def _spring_damper(k: Fraction, b: Fraction, T: Fraction) -> Exact:
     return Exact(*(Matrix.of([[value]]) for value in (memory, gain, memory, gain)))
 
 
-def force_map(E: Exact, V: Exact, theta: Sequence[int], psi: Sequence[int]) -> Exact:
-    """F = Theta (I + Psi E V)^-1 Psi E (6)."""
-    return delay(theta) @ (delay(psi) @ E).feedback(V)
+def force_map(E: Exact, coupling: Coupling, theta: Sequence[int], psi: Sequence[int], T: Fraction) -> Exact:
+    """F = Theta (I + Psi E V)^-1 Psi E (6), or Theta (Psi E - Psi E Q Psi E)."""
+    delayed = delay(psi) @ E
+    m = len(theta)
+    if not isinstance(coupling, InternalModel):
+        return delay(theta) @ delayed.feedback(compliance(coupling, m, T))
+    return delay(theta) @ delayed @ (Exact.constant(Matrix.eye(m)) - _parameter(coupling) @ delayed)
+
+
+def _parameter(coupling: InternalModel) -> Exact:
+    """Q(z): the poles and coefficients as decimals, the rest follows exactly."""
+    exactly = np.vectorize(lambda value: rational(float(value)), otypes=[object])
+    poles = exactly(coupling.poles) if coupling.poles.size else np.zeros(0, dtype=object)
+    blocks = parameter(poles, exactly(coupling.Q))
+    return Exact(*(Matrix.of(values.tolist(), values.shape) for values in blocks))
 
 
 def shifted_compliance(V: Exact, theta: Sequence[int], delta: Sequence[Fraction], T: Fraction) -> Exact:

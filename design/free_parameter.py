@@ -96,13 +96,6 @@ def affine(response: Response, constant: Complex, linear: Callable[[Complex], Co
     return Block(constant + hermitian(linear(value)), np.moveaxis(hermitian(linear(np.moveaxis(slope, 1, 0))), 0, 1))
 
 
-def bounded(response: Response, limit: Array) -> Block:
-    """sigma_max(response) <= limit, one limit per frequency (k,): [[I, R/limit], [(R/limit)*, I]] >= 0."""
-    value, slope = response
-    scale, m = 1 / limit[:, None, None], value.shape[-1]
-    return Block(bordered(np.eye(m), value * scale), bordered(np.zeros((m, m)), slope * scale[:, None]))
-
-
 def bordered(diagonal: Array, corner: Complex) -> Complex:
     """[[diagonal, corner], [corner*, diagonal]]."""
     whole = np.broadcast_to(diagonal, corner.shape).astype(complex)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from controller.delay import delay
 from controller.lti import Array, Lti
 from design.cone_program import Block, Complex
-from design.free_parameter import GivenParameter, Response, affine, bounded, loop_force
+from design.free_parameter import GivenParameter, Response, affine, bordered, loop_force
 from design.sweep import frequencies, hermitian, on_circle, peaks
 
 
@@ -25,18 +25,30 @@ class Parameter(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Inequality:
-    """block(w, Q) >= 0 for every w in [grid[0], grid[-1]]; it is imposed at some of them first."""
+    """block(w, Q) + sum_e y_e shared[e] >= 0 for every w in [grid[0], grid[-1]]; it is imposed at some of them first.
+
+    `shared` names the further unknowns y that enter it, each with a matrix that is the same at all frequencies.
+    """
 
     name: str
     block: Callable[[Array, Parameter], Block]
     imposed: Array  # (k,) [rad/sample]
     grid: Array  # where it is swept [rad/sample]
+    shared: Mapping[str, Array] = field(default_factory=dict)  # name -> (r, r)
 
-    def missed(self, given: GivenParameter, slack: float) -> Array:
-        """Where it fails by more than `slack` for a given Q [rad/sample]."""
+    def unknowns(self, w: Array, Q: Parameter, names: Sequence[str]) -> Block:
+        """The inequality at w in the unknowns of Q followed by the shared ones of these names."""
+        block = self.block(w, Q)
+        more = [self.shared.get(name, np.zeros(block.constant.shape[1:])) for name in names]
+        columns = [np.broadcast_to(matrix, block.constant.shape)[:, None] for matrix in more]
+        return Block(block.constant, np.concatenate([block.slope, *columns], axis=1))
+
+    def missed(self, given: GivenParameter, shared: Mapping[str, float], slack: float) -> Array:
+        """Where it fails by more than `slack` for a given Q and given shared unknowns [rad/sample]."""
+        offset = sum((shared[name] * matrix for name, matrix in self.shared.items()), np.zeros(()))
 
         def shortage(w: Array) -> Array:
-            return -np.linalg.eigvalsh(self.block(w, given).constant)[:, 0]
+            return -np.linalg.eigvalsh(self.block(w, given).constant + offset)[:, 0]
 
         return peaks(shortage, self.grid, slack)
 
@@ -83,7 +95,7 @@ def passivity(world: World, delta: Array) -> Inequality:
         over = root / (z - 1)[:, None, None]
         return affine(world.force(z, Q), np.eye(delta.size), lambda F: root[:, None] * F * over)
 
-    return Inequality("the closed-loop condition", block, _imposed(world, 80), _swept(world))
+    return Inequality("the closed-loop condition", block, _imposed(world, 40), _swept(world))
 
 
 def stable_compliance(world: World, least: float) -> Inequality:
@@ -96,7 +108,7 @@ def stable_compliance(world: World, least: float) -> Inequality:
         eye = (1 - least) * np.eye(E.shape[-1])
         return Block(eye - hermitian(E @ constant), -hermitian(E[:, None] @ slope))
 
-    return Inequality("a stable V", block, _imposed(world, 40), _swept(world))
+    return Inequality("a stable V", block, _imposed(world, 10), _swept(world))
 
 
 def high_frequency_limit(world: World, gain: float, above_hz: float) -> Inequality:
@@ -105,10 +117,31 @@ def high_frequency_limit(world: World, gain: float, above_hz: float) -> Inequali
 
     def block(w: Array, Q: Parameter) -> Block:
         z = on_circle(w)
-        return bounded(world.force(z, Q), gain * world.size(z))
+        return _bordered(np.eye(world.environment.inputs), world.force(z, Q), gain * world.size(z))
 
-    imposed = np.linspace(low, np.pi, 24)
+    imposed = np.linspace(low, np.pi, 12)
     return Inequality(f"the limit above {above_hz:g} Hz", block, imposed, _swept(world, low=low))
+
+
+BOUND = "bound"  # the shared unknown that a sup objective minimises
+
+
+def bounded_mismatch(world: World, band: Array) -> Inequality:
+    """sigma_max(M) <= bound sigma_max(E) over the band."""
+    m = world.environment.inputs
+
+    def block(w: Array, Q: Parameter) -> Block:
+        z = on_circle(w)
+        return _bordered(np.zeros((m, m)), world.mismatch(z, Q), world.size(z))
+
+    return Inequality("the mismatch", block, band[::4], band, {BOUND: np.eye(2 * m)})
+
+
+def _bordered(diagonal: Array, response: Response, scale: Array) -> Block:
+    """[[diagonal, R/scale], [(R/scale)*, diagonal]] >= 0: for diagonal = I, sigma_max(R) <= scale (k,)."""
+    value, slope = response
+    by = 1 / scale[:, None, None]
+    return Block(bordered(diagonal, value * by), bordered(np.zeros_like(diagonal), slope * by[:, None]))
 
 
 def static_stiffness(world: World, Q: Parameter) -> Block | None:

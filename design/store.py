@@ -91,13 +91,28 @@ class Compliance(Strict, tag_field="kind", tag="compliance"):
         return coupling.Compliance(Lti(*tables, D, T))
 
 
+class InternalModel(Strict, tag_field="kind", tag="internal-model"):
+    """The parameter Q(z) of the pair with the environment: poles of its basis, and a coefficient per function."""
+
+    poles: tuple[float, ...]  # (n,)
+    Q: tuple[Rows, ...]  # (n + 1, m, m) [m/N]
+
+    def __post_init__(self) -> None:
+        if any(len(rows) != len(self.Q[0]) or any(len(row) != len(rows) for row in rows) for rows in self.Q):
+            raise ValueError("Q has coefficients that are not square matrices of one size")
+        self.build(1.0)
+
+    def build(self, T: float) -> coupling.Coupling:
+        return coupling.InternalModel(self.poles, self.Q)
+
+
 def _table(name: str, rows: Rows, height: int, width: int) -> Array:
     if len(rows) != height or any(len(row) != width for row in rows):
         raise ValueError(f"{name} has rows of {[len(row) for row in rows]} entries, expected {height} x {width}")
     return np.array(rows, dtype=float).reshape(height, width)
 
 
-CouplingData = NoCoupling | SpringDamper | Compliance
+CouplingData = NoCoupling | SpringDamper | Compliance | InternalModel
 
 
 class Certificate(Strict):
@@ -130,6 +145,11 @@ class Stored(Strict):
                 raise ValueError(f"K has {len(K)} entries, the environment has {m} contacts")
             case Compliance(D=D) if len(D) != m or len(D[0]) != m:
                 raise ValueError(f"D is {len(D)} x {len(D[0])}, the environment has {m} contacts")
+            case InternalModel(Q=Q) if len(Q[0]) != m:
+                raise ValueError(f"Q is {len(Q[0])} x {len(Q[0])}, the environment has {m} contacts")
+
+
+KNOWN = (NoCoupling, SpringDamper, Compliance, InternalModel)
 
 
 def data_of(built: coupling.Coupling) -> CouplingData:
@@ -141,7 +161,9 @@ def data_of(built: coupling.Coupling) -> CouplingData:
             return SpringDamper(tuple(K.tolist()), tuple(B.tolist()))
         case coupling.Compliance(V=V):
             return Compliance(*(tuple(map(tuple, getattr(V, name).tolist())) for name in "ABCD"))
-    raise TypeError(f"a {type(built).__name__} cannot be stored; known: NoCoupling, SpringDamper, Compliance")
+        case coupling.InternalModel(poles=poles, Q=Q):
+            return InternalModel(tuple(poles.tolist()), tuple(tuple(map(tuple, rows)) for rows in Q.tolist()))
+    raise TypeError(f"a {type(built).__name__} cannot be stored; known: {', '.join(k.__name__ for k in KNOWN)}")
 
 
 def digest(*parts: msgspec.Struct) -> str:

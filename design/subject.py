@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from controller.coupling import Compliance, NoCoupling, SpringDamper
+from controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, environment
 from controller.lti import Lti, SingularLoop
 from controller.process import force_map
@@ -24,7 +24,7 @@ LONGEST_DELAY = 100
 class Subject:
     """A coupling between devices and an environment. Raises ValueError naming the field that is wrong."""
 
-    coupling: NoCoupling | SpringDamper | Compliance
+    coupling: NoCoupling | SpringDamper | Compliance | InternalModel
     network: Network | None  # None is a rigid wall behind the coupling, one channel
     T: float  # [s]
     theta: tuple[int, ...]  # (m,) transmission delays [samples]

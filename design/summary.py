@@ -5,19 +5,21 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from controller.coupling import Compliance, Coupling, SpringDamper
+from controller.coupling import Compliance, Coupling, InternalModel, SpringDamper
 from design.promises import finite
 from design.transparency import Transparency, decibels
 
 
 def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
-    """Kind, gains (None where it has none) and order of V."""
+    """Kind, gains (None where it has none) and order of V, or of Q."""
     part: dict[str, Any] = {"kind": kind, "K": None, "B": None, "order": 0}
     match coupling:
         case SpringDamper(K=K, B=B):
             part |= {"K": K.tolist(), "B": B.tolist(), "order": coupling.compliance(T).order}
         case Compliance(V=V):
             part["order"] = V.order
+        case InternalModel():
+            part["order"] = coupling.parameter(T).order
     return part
 
 

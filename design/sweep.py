@@ -54,10 +54,9 @@ def supremum(response: Response, grid: Array) -> tuple[float, float]:
 
 
 def peaks(response: Response, grid: Array, above: float) -> Array:
-    """Where `response` has its highest local maxima over [grid[0], grid[-1]] beyond `above`, 32 at most; (peaks,)."""
-    value, w, bracket = _narrowed(response, *_brackets(response(grid), grid, above))
-    if value.size:
-        value, w, _ = _narrowed(response, *bracket)
+    """Where the 32 highest local maxima of `response` over [grid[0], grid[-1]] exceed `above`; (peaks,)."""
+    _, _, bracket = _narrowed(response, *_brackets(response(grid), grid, -np.inf))
+    value, w, _ = _narrowed(response, *bracket)
     return w[value > above]
 
 

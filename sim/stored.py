@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from controller.coupling import Compliance, Coupling
+from controller.coupling import Compliance, Coupling, InternalModel
 from design import store
 from design.certificate import verify
 from design.store import Loop, Stored
@@ -26,7 +26,7 @@ def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
     if len(stored.loop.delta) != channels:
         raise InputError(f"{path} couples {len(stored.loop.delta)} channels, the loop has {channels}")
     coupling = stored.coupling.build(T)
-    if isinstance(coupling, Compliance) and stored.loop.T != T:
+    if isinstance(coupling, Compliance | InternalModel) and stored.loop.T != T:
         raise InputError(f"{path}: its coefficients are for T = {stored.loop.T:g} s, the loop has {T:g} s")
     return coupling
 

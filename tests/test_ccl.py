@@ -89,7 +89,6 @@ def test_affine_reproduces_its_function():
 def test_the_inner_approximation_reaches_the_optimum_of_its_order(inner, structured):
     assert inner.objective <= 9.8
     assert inner.objective < structured.objective
-    assert inner.wall_s < 15  # 4.4 s here; the suite runs on slower machines too
 
 
 def test_what_is_returned_is_certified_from_the_coupling_alone(inner):

@@ -1,0 +1,143 @@
+"""A convex problem with inequalities at every frequency, solved by imposing them at a few and adding those that fail.
+
+Each round minimises the mismatch with the inequalities where they are imposed so far, sweeps the solution densely,
+and adds the peaks where one fails.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from controller.coupling import InternalModel
+from controller.lti import Array
+from design.cone_program import Block, ConeProgram
+from design.cone_solver import solve_cones
+from design.failure import DesignFailed
+from design.free_parameter import FreeParameter, GivenParameter
+from design.inequalities import (
+    BOUND,
+    Inequality,
+    World,
+    bounded_mismatch,
+    high_frequency_limit,
+    passivity,
+    stable_compliance,
+    static_stiffness,
+)
+from design.sweep import frequencies, on_circle
+from design.transparency import BAND_HZ
+from design.wish import Wish
+
+SLACK = 5e-4  # what an inequality may miss between the frequencies where it is imposed
+PASSIVE_SHARE = 0.02  # He[I - Psi E Q] keeps this much
+HIGH_HZ = 100.0  # above it the devices feel at most Wish.high_gain times the environment
+MOST_ROUNDS = 15
+FLAT = 1e-8  # directions of Q that change the loop by less than this, relatively, are left at zero
+
+
+def cut(Q: FreeParameter, wish: Wish, worlds: Sequence[World], delta: Array) -> tuple[InternalModel, int]:
+    """(the optimum over all worlds, rounds): the mismatch is that in `worlds[0]`, `delta` (m,) in N s/m.
+
+    Raises Infeasible where the inequalities contradict each other, DesignFailed where they still fail after all rounds.
+    """
+    problem = Problem.of(Q, wish, worlds, delta)
+    imposed = [one.imposed for one in problem.inequalities]
+    for rounds in range(1, MOST_ROUNDS + 1):
+        x, shared = problem.optimum(imposed)
+        coupling = Q.coupling(x)
+        given = GivenParameter(coupling)
+        missed = [one.missed(given, shared, SLACK) for one in problem.inequalities]
+        if not any(w.size for w in missed):
+            return coupling, rounds
+        imposed = [np.union1d(w, more) for w, more in zip(imposed, missed, strict=True)]
+    names = ", ".join(one.name for one, w in zip(problem.inequalities, missed, strict=True) if w.size)
+    raise DesignFailed(None, (), f"after {MOST_ROUNDS} rounds of cutting planes {names} still fails in between")
+
+
+def sketch(Q: FreeParameter, wish: Wish, worlds: Sequence[World], delta: Array) -> InternalModel:
+    """The optimum of the first round, which bounds the final one from below. Raises as `cut`."""
+    problem = Problem.of(Q, wish, worlds, delta)
+    return Q.coupling(problem.optimum([one.imposed for one in problem.inequalities])[0])
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The least mismatch in the first world under inequalities in all of them."""
+
+    Q: FreeParameter
+    worlds: Sequence[World]
+    squares: bool  # whether the rms mismatch is minimised, or its supremum
+    inequalities: Sequence[Inequality]
+    statics: Sequence[Block]
+
+    @classmethod
+    def of(cls, Q: FreeParameter, wish: Wish, worlds: Sequence[World], delta: Array) -> Problem:
+        squares = wish.objective == "rms"
+        inequalities = [one for world in worlds for one in asked(wish, world, delta)]
+        if not squares:
+            inequalities.append(bounded_mismatch(worlds[0], band(worlds[0])))
+        statics = [block for block in (static_stiffness(world, Q) for world in worlds) if block is not None]
+        return cls(Q, worlds, squares, inequalities, statics)
+
+    def optimum(self, imposed: Sequence[Array]) -> tuple[Array, dict[str, float]]:
+        """(x, shared unknowns) with the inequalities at the frequencies `imposed`, one array for each.
+
+        It is sought in coordinates where every direction of Q changes the loop alike.
+        """
+        names = list(dict.fromkeys(name for one in self.inequalities for name in one.shared))
+        blocks = [one.unknowns(w, self.Q, names) for one, w in zip(self.inequalities, imposed, strict=True)]
+        blocks += [block.padded(len(names)) for block in self.statics]
+        A, b = square_mismatch(self.worlds[0], self.Q)
+        size, shared = self.Q.size, len(names)
+        basis = _coordinates([A, *(block.rows()[1].reshape(-1, size + shared)[:, :size] for block in blocks)])
+        change = block_diag(basis, np.eye(shared))
+        A = np.hstack([A, np.zeros((A.shape[0], shared))]) @ change
+        E = np.hstack([self.Q.asymmetry(), np.zeros((self.Q.asymmetry().shape[0], shared))]) @ change
+        program = ConeProgram(
+            A=A if self.squares else A[:0],
+            b=b if self.squares else b[:0],
+            c=np.array([0.0] * basis.shape[1] + [float(name == BOUND) for name in names]),
+            blocks=tuple(block.changed(change) for block in blocks),
+            E=E,
+            e=np.zeros(E.shape[0]),
+        )
+        x = change @ solve_cones(program, "the optimal coupling")
+        return x[:size], dict(zip(names, x[size:].tolist(), strict=True))
+
+
+def asked(wish: Wish, world: World, delta: Array) -> list[Inequality]:
+    """What Q must satisfy in one environment, whatever is minimised."""
+    inequalities = [passivity(world, delta * (1 - wish.margin)), stable_compliance(world, PASSIVE_SHARE)]
+    if wish.high_gain is not None:
+        inequalities.append(high_frequency_limit(world, wish.high_gain, HIGH_HZ))
+    return inequalities
+
+
+def band(world: World) -> Array:
+    """Frequencies of the mismatch [rad/sample], dense around the environment's poles."""
+    low, high = (2 * np.pi * world.T * f for f in BAND_HZ)
+    return frequencies(world.environment, low=low, high=min(high, np.pi), points=80)
+
+
+def square_mismatch(world: World, Q: FreeParameter) -> tuple[Array, Array]:
+    """A and b with |A x - b|^2 the mean over log frequency of |M|_F^2/|E|_F^2 in the band."""
+    w = band(world)
+    z = on_circle(w)
+    step = np.diff(np.log(w))
+    share = (np.append(step, 0.0) + np.append(0.0, step)) / (2 * step.sum())  # the trapezoidal rule
+    weight = np.sqrt(share) / np.linalg.norm(world.environment.at(z), axis=(1, 2))
+    constant, slope = world.mismatch(z, Q)
+    b = -(constant * weight[:, None, None]).ravel()
+    A = np.moveaxis(slope * weight[:, None, None, None], 1, -1).reshape(b.size, Q.size)
+    return np.vstack([A.real, A.imag]), np.concatenate([b.real, b.imag])
+
+
+def _coordinates(rows: list[Array]) -> Array:
+    """(n, k): x = basis y makes the stacked rows orthonormal; flat directions are left out."""
+    _, s, Vt = np.linalg.svd(np.linalg.qr(np.vstack(rows), mode="r"))
+    kept = s > FLAT * s.max()
+    return Vt[kept].T / s[kept]
