@@ -1,0 +1,70 @@
+"""Who holds which device: what the weights of Remark 1 buy, and where they buy nothing."""
+
+import numpy as np
+import pytest
+
+from controller.coupling import Compliance, SpringDamper
+from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.lti import Lti
+from controller.process import force_map
+from design.human_structure import closed_loop_of_separate_humans, reciprocal, shared_weights, weighted
+from design.margin import closed_loop
+from design.sweep import on_circle
+
+T, DELTA = 1.2e-3, (1.37, 1.37)
+WALLS = Network(("a", "b"), (Spring(("a", GROUND), 800.0, 1.0), Spring(("b", GROUND), 700.0, 1.0)))
+
+
+def one_way(c: float) -> Compliance:
+    """Springs of 1/6e-4 and 1/8e-4 N/m, and from channel 1 to 2 a high-pass that static forces do not pass."""
+    high_pass = Lti([[0.9]], [[1.0, 0.0]], [[0.0], [c]], [[0.0, 0.0], [-10 * c, 0.0]], T)
+    return Compliance(Lti.constant([[6e-4, 0.0], [0.0, 8e-4]], T) + high_pass)
+
+
+def test_weights_certify_a_coupling_that_passes_force_one_way_only():
+    F = force_map(environment(WALLS, T), one_way(1e-4), (1, 2), (0, 0))
+    assert closed_loop(F, DELTA).ratio > 1.5
+    requirement, d = closed_loop_of_separate_humans(F, DELTA, holders=(1, 2))
+    assert requirement.ratio < 0.8
+    # two separate loops, one driving the other, need what each needs alone
+    alone = [closed_loop(force_map(environment(wall, T), SpringDamper([k], [0.0]), (n,), (0,)), (1.37,))
+             for wall, k, n in zip(each_wall(), (1 / 6e-4, 1 / 8e-4), (1, 2), strict=True)]  # fmt: skip
+    assert requirement.ratio == pytest.approx(max(r.ratio for r in alone), rel=1e-3)  # as the weights grow apart
+    # the condition itself, from F on a dense grid
+    z = on_circle(np.linspace(1e-3, np.pi, 5000))
+    X = np.array(d)[:, None] * F.at(z) / (z - 1)[:, None, None]
+    S = (X + np.conj(np.swapaxes(X, 1, 2))) / 2 + np.diag(np.array(d) * requirement.required) / T
+    assert np.linalg.eigvalsh(S).min() > -1e-9 * np.abs(S).max()
+
+
+def each_wall() -> list[Network]:
+    return [Network(("a",), (Spring(("a", GROUND), k, 1.0),)) for k in (800.0, 700.0)]
+
+
+def test_one_human_with_both_hands_is_given_no_weights():
+    F = force_map(environment(WALLS, T), one_way(1e-4), (1, 2), (0, 0))
+    requirement, d = closed_loop_of_separate_humans(F, DELTA, holders=(1, 1))
+    assert d == (1.0, 1.0)
+    assert requirement.ratio == closed_loop(F, DELTA).ratio
+
+
+@pytest.mark.parametrize(
+    "network", [FIGURE_4, WALLS, Network(("a", "b"), (*WALLS.springs, Spring(("a", "b"), 0.0, 9.0)))]
+)
+@pytest.mark.parametrize("theta", [(0, 0), (1, 2), (0, 5)])
+def test_no_weights_help_a_reciprocal_loop(network, theta):
+    """With a network behind a diagonal coupling equal weights are the best there are, whatever the delays."""
+    F = force_map(environment(network, T), SpringDamper([900.0, 600.0], [0.4, 0.5]), theta, (0, 0))
+    assert reciprocal(F)
+    plain = closed_loop(F, DELTA).ratio
+    for r in np.geomspace(0.03, 30, 12):
+        d = np.array([1.0, r])
+        other = closed_loop(weighted(F, d), tuple(d * DELTA)).ratio
+        assert other >= plain - 1e-6  # a sweep is good to that
+
+
+def test_static_stiffness_and_a_common_human_join_weights():
+    coupled = np.array([[2.0, -1.0, 0.0], [-1.0, 2.0, 0.0], [0.0, 0.0, 1.0]])
+    assert shared_weights(coupled, (1, 2, 3)) == [[0, 1], [2]]
+    assert shared_weights(np.eye(3), (1, 2, 1)) == [[0, 2], [1]]
+    assert shared_weights(coupled, (1, 2, 1)) == [[0, 1, 2]]
