@@ -76,9 +76,7 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
 def require_linear(scenario: Scenario, what: str) -> None:
     """Raises InputError where contact is made and broken, for a command whose verdicts are of linear loops."""
     if scenario.environment.walls:
-        raise InputError(
-            f"environment.walls: {what} decides linear loops; sim.run and sim.contact close the loop with walls"
-        )
+        raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
 
 
 def numbers(option: str, text: str, kind: Callable[[str], Number], count: int) -> tuple[Number, ...]:
