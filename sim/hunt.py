@@ -125,9 +125,7 @@ def _print(outcome: dict[str, Any], args: argparse.Namespace) -> None:
         table.add_row(f"loop {part['index']}", f"speed, last over second quarter: {ratios}")
     screen = console(args)
     screen.print(table)
-    screen.print(
-        f"[dim]·[/] {outcome['wall_s']:.0f} s. None found is no proof; theorem4 is one."
-    )
+    screen.print(f"[dim]·[/] {outcome['wall_s']:.0f} s. None found is no proof; theorem4 is one.")
 
 
 if __name__ == "__main__":
