@@ -25,7 +25,7 @@ from sim.command import (
     progress_bar,
     seed_from,
 )
-from sim.contact_search import Found, attack, draw
+from sim.contact_search import LENGTHS, Found, attack, draw
 from sim.files import write_json
 from sim.scenario import InputError
 
@@ -89,7 +89,7 @@ def _outcome(results: list[Found], draws: int, hands: int, seconds: float, seed:
         "duration_s": seconds,
         "searched": len(results),
         "counterexamples": sum(found.counterexample for found in results),
-        "survived": [sum(len(found.ratio) > i for found in results) for i in range(3)],
+        "runs": [sum(len(found.ratio) > i for found in results) for i in range(len(LENGTHS))],
         "strongest": [_part(found) for found in ordered[:5]],
     }
 
@@ -116,13 +116,13 @@ def _print(outcome: dict[str, Any], args: argparse.Namespace) -> None:
     table.add_row("loops drawn", f"{outcome['draws']}, of which {outcome['searched']} are not certified by theorem4")
     table.add_row("hands for each", f"{outcome['hands']}, lossless, seed {outcome['seed']}")
     seconds = outcome["duration_s"]
-    lengths = ", ".join(f"{seconds * n:g} s" for n in (1, 4, 16))
-    table.add_row(f"loops left in runs of {lengths}", ", ".join(map(str, outcome["survived"])))
+    lengths = ", ".join(f"{seconds * n:g}" for n in LENGTHS)
+    table.add_row(f"loops run for {lengths} s", ", ".join(map(str, outcome["runs"])))
     found = outcome["counterexamples"]
     table.add_row("counterexamples", f"[red]{found}[/]" if found else "[green]none found[/]")
     for part in outcome["strongest"][:3]:
         ratios = ", ".join(f"{ratio:.4g}" for ratio in part["speed_ratio"])
-        table.add_row(f"loop {part['index']}", f"speed, last over second quarter: {ratios}")
+        table.add_row(f"loop {part['index']}, last over second speed", ratios)
     screen = console(args)
     screen.print(table)
     screen.print(f"[dim]·[/] {outcome['wall_s']:.0f} s. None found is no proof; theorem4 is one.")
