@@ -90,7 +90,8 @@ class Contact:
     def frozen(self) -> dict[State, Lti]:
         """F of every contact state, without the gaps' constant forces; none touches in the first, all in the last."""
         m, T, walls = self.channels, self.block.T, range(len(self.walls))
-        stiff = [Lti([[0.0]], [[1.0]], [[w.damping / T]], [[-w.stiffness - w.damping / T]], T) for w in self.walls]
+        zero, one = np.zeros((1, 1)), np.ones((1, 1))
+        stiff = [Lti(zero, one, w.damping / T * one, -(w.stiffness + w.damping / T) * one, T) for w in self.walls]
         none, maps = Lti.constant([[0.0]], T), {}
         for touching in itertools.product((False, True), repeat=len(self.walls)):
             back = Lti.diag(*[none] * m, *(stiff[i] if touching[i] else none for i in walls))

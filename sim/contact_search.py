@@ -31,7 +31,7 @@ from sim.bounce import bounce
 from sim.exact_engine import hold
 from sim.scenario import Scenario
 from sim.simulate import assemble
-from sim.verdicts import exact_loops
+from sim.stability import close
 
 LENGTHS = (1, 4, 16)  # of the runs that a counterexample must survive, in terms of the asked length
 POOL, AUDIBLE = 20, 5.0  # hands looked at for one that is let go; [Hz]
@@ -115,10 +115,11 @@ def attack(case: Case, index: int, seed: int, hands: int, seconds: float) -> Fou
 
 def _decay(case: Case, links: Array) -> Array:
     """Of each hand: the slowest decay [1/s] among the modes above AUDIBLE, over all frozen states, (nsim,)."""
-    loop, sets = assemble(case.scenario, case.coupling), variants(case.scenario.device, Crowd(links))
-    T, slowest = case.scenario.T, np.full(len(links), np.inf)
+    loop, T = assemble(case.scenario, case.coupling), case.scenario.T
+    plants = hold(variants(case.scenario.device, Crowd(links)).plants(), T)
+    slowest = np.full(len(links), np.inf)
     for F in loop.process.frozen().values():
-        values = np.linalg.eigvals(exact_loops(sets, F).A)
+        values = np.linalg.eigvals(close(plants, F).A)
         heard = np.abs(np.angle(values)) / (2 * np.pi * T) >= AUDIBLE
         slowest = np.minimum(slowest, -np.log(np.where(heard, np.abs(values), 1e-300).max(axis=1)) / T)
     return slowest

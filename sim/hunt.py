@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -26,7 +27,7 @@ from sim.command import (
     seed_from,
 )
 from sim.contact_search import LENGTHS, Found, attack, draw
-from sim.files import write_json
+from sim.files import folder, write_json
 from sim.scenario import InputError
 
 
@@ -39,7 +40,8 @@ def main(argv: list[str]) -> int:
         raise InputError(f"--duration is {seconds:g}, allowed are 0.5 to 1000 s")
     seed = seed_from(args)
     check_json(args)
-    results, interrupted, begin = [], False, time.perf_counter()
+    out = folder(Path(args.out or "out/hunt"))
+    results, drawn, interrupted, begin = [], 0, False, time.perf_counter()
     bar, move = progress_bar("hunting")
     with bar:
         try:
@@ -48,10 +50,13 @@ def main(argv: list[str]) -> int:
                 case = draw(seed, index)
                 if case:
                     results.append(attack(case, index, seed, hands, seconds))
+                drawn += 1
         except KeyboardInterrupt:
             interrupted = True
-    outcome = _outcome(results, draws, hands, seconds, seed) | {"interrupted": interrupted}
+    outcome = _outcome(results, drawn, hands, seconds, seed) | {"interrupted": interrupted}
     outcome["wall_s"] = time.perf_counter() - begin
+    outcome["files"] = [str(out / "report.json")]
+    write_json(out / "report.json", outcome)
     _print(outcome, args)
     if args.json:
         write_json(args.json, outcome)
@@ -69,7 +74,7 @@ def _parser() -> Parser:
     parser.add_argument("--draws", default="20", metavar="N", help="random loops (default 20)")
     parser.add_argument("--hands", default="50", metavar="N", help="lossless hands and starts for each (default 50)")
     parser.add_argument("--duration", default="4", metavar="SECONDS", help="of the first run (default 4)")
-    add_output_options(parser)
+    add_output_options(parser, what="folder for report.json (default out/hunt)")
     return parser
 
 

@@ -44,11 +44,12 @@ def test_the_command_repeats_itself_and_says_what_it_did(tmp_path):
     outcomes = []
     for name in "ab":
         path = tmp_path / f"{name}.json"
-        code = main(["--draws", "4", "--hands", "10", "--duration", "0.5", "--json", str(path)])
+        code = main(["--draws", "4", "--hands", "10", "--duration", "0.5", "--json", str(path), "--out", str(tmp_path)])
         outcomes.append(json.loads(path.read_text()))
         assert code == (1 if outcomes[-1]["counterexamples"] else 0)
         del outcomes[-1]["wall_s"]
     assert outcomes[0] == outcomes[1]
+    assert json.loads((tmp_path / "report.json").read_text())["strongest"] == outcomes[0]["strongest"]
     first = outcomes[0]
     assert 0 < first["searched"] <= 4
     assert first["runs"][0] == first["searched"]
