@@ -13,9 +13,12 @@ from controller.environment import FIGURE_4, GROUND, Network, Wall, environment
 from controller.lti import SingularLoop
 from controller.process import Process, Tape, force_map
 from design.assess import assess
+from design.audit_report import report
 from design.certificate import NotProved, prove
 from design.margin import closed_loop
+from design.promises import FROZEN
 from design.store import data_of
+from design.subject import Subject
 from models.crowd import variants
 from models.device import CompliantDevice
 from models.human import Population
@@ -211,12 +214,12 @@ def test_both_engines_see_the_same_contacts():
 
 
 def test_a_run_reports_the_contact_and_who_covers_it(tmp_path):
-    def report(*options):
+    def run(*options):
         main(["--scenario", "one-wall", "--duration", "3", "--engine", "exact", "--no-plot", *options,
               "--out", str(tmp_path), "--json", str(tmp_path / "r.json")])  # fmt: skip
         return json.loads((tmp_path / "r.json").read_text())
 
-    soft, bare = report(), report("--case", "none")
+    soft, bare = run(), run("--case", "none")
     assert soft["promise"] == "any passive environment"
     assert any("theorem4 covers it" in line for line in soft["remarks"])
     assert soft["stability"]["contact"]["made"] == 2
@@ -248,6 +251,17 @@ def test_closed_loop_is_asked_of_every_frozen_state():
     assert prove(loop, data_of(SOFT), "theorem4").promise == "any passive environment"
     late = boxed(load()).replace(psi=(1, 0)).loop("I")
     assert "no walls" in (assess(late, SOFT)["theorem4"].reason or "")
+
+
+def test_a_stiffer_coupling_is_promised_for_frozen_states_only():
+    """K = 1772 N/m behind one sample of delay: closed-loop asks 1.3699 of 1.37 where the wall touches, theorem4 2.38."""
+    s = load("one-wall")
+    subject = Subject(SpringDamper([1772.0], [0.453]), s.environment, s.T, s.theta, s.psi, s.delta)
+    assert subject.requirement("closed-loop").certified
+    assert not subject.requirement("theorem4").certified
+    assert report(subject)["promise"] == FROZEN
+    open_only = Subject(subject.coupling, held(s.environment, [False]), s.T, s.theta, s.psi, s.delta)
+    assert open_only.requirement("closed-loop").ratio == 0
 
 
 TEXT = (SCENARIOS / "one-wall.toml").read_text()
