@@ -254,7 +254,7 @@ def test_closed_loop_is_asked_of_every_frozen_state():
 
 
 def test_a_stiffer_coupling_is_promised_for_frozen_states_only():
-    """K = 1772 N/m behind one sample of delay: closed-loop asks 1.3699 of 1.37 where the wall touches, theorem4 2.38."""
+    """K = 1772 N/m behind one sample of delay: closed-loop asks 1.3699 of 1.37 with the wall, theorem4 2.38."""
     s = load("one-wall")
     subject = Subject(SpringDamper([1772.0], [0.453]), s.environment, s.T, s.theta, s.psi, s.delta)
     assert subject.requirement("closed-loop").certified
