@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.contact import contact, held
-from controller.coupling import Coupling
+from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.environment import environment
 from controller.lti import Array, Lti
 from controller.process import Process, force_map
@@ -17,7 +17,7 @@ from sim.engine import Engine, outside_forces
 from sim.exact_engine import ExactEngine, HeldPlant, hold
 from sim.loop import Progress, Record, run
 from sim.mujoco_engine import LEAPFROG, LeapfrogEngine, MujocoEngine, profiler_off, quiet_warnings
-from sim.scenario import Scenario
+from sim.scenario import InputError, Scenario
 
 ENGINES = ("mujoco", "exact")
 
@@ -40,7 +40,11 @@ class Assembly:
 
 
 def assemble(scenario: Scenario, coupling: Coupling) -> Assembly:
-    """Build both worlds. Raises SingularLoop where the algebraic loop has no solution."""
+    """Build both worlds. Raises SingularLoop where the algebraic loop has no solution, InputError for walls that no
+    V stands before.
+    """
+    if scenario.environment.walls and not isinstance(coupling, NoCoupling | SpringDamper | Compliance):
+        raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
     network, delays = scenario.environment, (scenario.theta, scenario.psi)
     E = environment(held(network), scenario.T)
     walled = contact(network, coupling, *delays, scenario.T) if network.walls else None

@@ -264,6 +264,15 @@ def test_a_stiffer_coupling_is_promised_for_frozen_states_only():
     assert open_only.requirement("closed-loop").ratio == 0
 
 
+def test_a_coupling_with_a_model_of_its_own_cannot_face_walls():
+    class Model:
+        def around(self, environment, further=0):
+            return environment
+
+    with pytest.raises(InputError, match="Model holds a linear model"):
+        assemble(load("one-wall"), Model())
+
+
 TEXT = (SCENARIOS / "one-wall.toml").read_text()
 BAD = [
     ("stiffness = 3000.0", "stiffness = -1.0", "stiffness of the wall between tip and ground is -1.0"),
