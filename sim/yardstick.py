@@ -102,14 +102,15 @@ def _growth(truth: Reference, engine: str, integrator: str, substeps: int) -> Ro
 
 
 def _cycle(truth: Reference, engine: str, integrator: str, substeps: int) -> Row:
+    names = ("cycle_amplitude_n", "cycle_frequency_hz", "cycle_amplitude_error", "cycle_frequency_error_hz")
     if truth.cycle is None:
-        return {"cycle_amplitude_error": None, "cycle_frequency_error_hz": None}
+        return dict.fromkeys(names)
     channel, amplitude, frequency = truth.cycle
     record = simulate(truth.uncoupled, engine, integrator, substeps)
     if record.diverged:
-        return {"cycle_amplitude_error": None, "cycle_frequency_error_hz": None}
+        return dict.fromkeys(names)
     own, turns = limit_cycle(record, channel, truth.uncoupled.scenario.T)
-    return {"cycle_amplitude_error": own / amplitude - 1, "cycle_frequency_error_hz": turns - frequency}
+    return dict(zip(names, (own, turns, own / amplitude - 1, turns - frequency), strict=True))
 
 
 def _point(row: Row) -> Array:

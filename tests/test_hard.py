@@ -16,9 +16,11 @@ from sim.engine import outside_forces
 from sim.exact_engine import ExactEngine
 from sim.loop import run
 from sim.one_period import exact_growth, simulated_growth
+from sim.report import error_part
 from sim.scenario import InputError, Scenario, load
 from sim.simulate import Assembly, assemble, make_engine, simulate
-from sim.substeps import check_substeps, default_substeps
+from sim.substeps import NEUTRAL, check_substeps, default_substeps, step_radius
+from sim.yardstick import limit_cycle
 
 NOMINAL = load().replace(duration=1.0)
 CLOSED_LOOP = SpringDamper(np.array([7806.0, 3137.0]), np.array([0.105, 1.68]))
@@ -37,27 +39,35 @@ def light(damping: float) -> Scenario:
     return devices(handle_mass=1e-3).replace(human=(Human((Link(0.0, damping, 200.0),)),) * 2)
 
 
+#: a setting holds if it is stable, has the exact verdict, and errs by less than both of these
+GROWTH, POSITION = 1e-3, 1e-3  # [1/s]; relative rms of the device positions over the run
+RK4, EULER = ("RK4", 1), ("Euler", 1)
+TRIED = [(name, 1) for name in ("RK4", "Euler", "Euler2", "implicitfast")]
+
+
 @dataclass(frozen=True)
 class Hard:
     name: str
     scenario: Scenario
+    fails: tuple[str, int] | None  # a setting that does not hold, None where all of TRIED do
+    how: str  # what is wrong with it
     coupling: Coupling = CASE_I
-    fails: int | None = None  # RK4 substeps that are refused, None where 1 is stable
+    substeps: int | None = None  # of RK4, which hold; default: what the rule picks
 
 
 CASES = [
-    Hard("human stiffness 1e5 N/m", hands(0.3, 3.0, 1e5)),
-    Hard("handle of 1 g, human damping 3 N s/m", light(3.0), fails=1),
-    Hard("handle of 1 g, no human damping", light(0.0), fails=1),
-    Hard("motor 1 g", devices(motor_mass=1e-3), fails=1),
-    Hard("motor 100 kg", devices(motor_mass=100.0)),
-    Hard("human damping 1000 N s/m", hands(0.3, 1000.0, 200.0)),
-    Hard("transmission 1e6 N/m", devices(transmission_stiffness=1e6), fails=1),
-    Hard("T = 4 ms", NOMINAL.replace(T=4e-3)),
-    Hard("T = 10 us", NOMINAL.replace(T=1e-5, duration=0.1)),
-    Hard("50-sample delays", NOMINAL.replace(theta=(50, 50))),
-    Hard("zero damping", NOMINAL.replace(delta=(0.0, 0.0))),
-    Hard("coupling 1e5 N/m", NOMINAL, SpringDamper(np.full(2, 1e5), np.zeros(2))),
+    Hard("human stiffness 1e5 N/m", hands(0.3, 3.0, 1e5), RK4, "position"),
+    Hard("handle of 1 g, human damping 3 N s/m", light(3.0), RK4, "refused"),
+    Hard("handle of 1 g, no human damping", light(0.0), RK4, "refused", substeps=48),
+    Hard("motor 1 g", devices(motor_mass=1e-3), RK4, "refused"),
+    Hard("motor 100 kg", devices(motor_mass=100.0), EULER, "growth"),
+    Hard("human damping 1000 N s/m", hands(0.3, 1000.0, 200.0), EULER, "position"),
+    Hard("transmission 1e6 N/m", devices(transmission_stiffness=1e6), RK4, "refused"),
+    Hard("T = 4 ms", NOMINAL.replace(T=4e-3), EULER, "refused"),
+    Hard("T = 10 us", NOMINAL.replace(T=1e-5, duration=0.12), None, "none tried fails"),
+    Hard("50-sample delays", NOMINAL.replace(theta=(50, 50)), EULER, "growth"),
+    Hard("zero damping", NOMINAL.replace(delta=(0.0, 0.0)), EULER, "growth"),
+    Hard("coupling 1e5 N/m", NOMINAL, EULER, "verdict", SpringDamper(np.full(2, 1e5), np.zeros(2))),
 ]
 
 
@@ -65,23 +75,45 @@ def built(hard: Hard) -> Assembly:
     return assemble(hard.scenario, hard.coupling)
 
 
+def faults(loop: Assembly, integrator: str, substeps: int) -> dict[str, float]:
+    """What is wrong with a setting, and by how much: nothing where it holds."""
+    if step_radius(loop, integrator, substeps) > 1 + NEUTRAL:
+        with pytest.raises(InputError, match=f"outside the stable region of {integrator}"):
+            check_substeps(loop, integrator, substeps)
+        return {"refused": np.inf}
+    exact, own = exact_growth(loop), simulated_growth(loop, integrator, substeps)
+    error = error_part(simulate(loop, "mujoco", integrator, substeps), simulate(loop, "exact"), loop)
+    found = {"verdict": own - exact} if (own > 0) != (exact > 0) else {}
+    if abs(own - exact) > GROWTH:
+        found["growth"] = own - exact
+    if (error["position_relative_rms"] or 0.0) > POSITION:
+        found["position"] = error["position_relative_rms"]
+    return found
+
+
 @pytest.mark.parametrize("hard", CASES, ids=lambda hard: hard.name)
-def test_the_rule_gives_the_exact_verdict(hard):
-    """Growth within 1e-2 1/s of the exact one."""
+def test_a_setting_fails_and_the_rule_holds(hard):
+    """By GROWTH and POSITION; the rule's own choice has the exact verdict, and growth within 1e-2 1/s."""
     loop = built(hard)
-    substeps = default_substeps(loop)
-    exact, own = exact_growth(loop), simulated_growth(loop, "RK4", substeps)
-    print(f"| {hard.name} | {exact:+.4f} | {hard.fails or '-'} | {substeps} | {own - exact:+.1e} |")
-    assert (own > 0) == (exact > 0)
-    assert own == pytest.approx(exact, abs=1e-2)
-    if hard.fails:
-        with pytest.raises(InputError, match="outside the stable region of RK4"):
-            check_substeps(loop, "RK4", hard.fails)
+    rule, exact = default_substeps(loop), exact_growth(loop)
+    holds = hard.substeps or rule
+    bad = faults(loop, *hard.fails) if hard.fails else {hard.how: np.nan}
+    own = simulated_growth(loop, "RK4", holds)
+    setting = " x ".join(map(str, hard.fails)) if hard.fails else "-"
+    fault = f"{hard.how} {bad[hard.how]:+.1e}" if np.isfinite(bad[hard.how]) else hard.how
+    print(f"| {hard.name} | {exact:+.4f} | {setting} | {fault} | RK4 x {holds} | {own - exact:+.1e} |")
+    assert not faults(loop, "RK4", holds)
+    chosen = simulated_growth(loop, "RK4", rule)
+    assert (chosen > 0) == (exact > 0)
+    assert chosen == pytest.approx(exact, abs=1e-2)
+    assert (rule < holds) == (hard.substeps is not None)
+    if not hard.fails:
+        assert not any(faults(loop, *setting) for setting in TRIED)
 
 
-@pytest.mark.parametrize("side", [-0.1, 0.1])
-def test_within_a_tenth_of_the_boundary(side):
-    """Damping tuned by bisection until the exact growth is +-0.1 1/s: the default sees it, Euler x 4 does not."""
+@pytest.mark.parametrize(("side", "wrong"), [(-0.1, ("Euler2", 2)), (0.1, ("Euler", 12)), (0.1, ("RK4", 1))])
+def test_within_a_tenth_of_the_boundary(side, wrong):
+    """Damping tuned by bisection until the exact growth is +-0.1 1/s: the default sees it, cheaper settings do not."""
     low, high = 1.0, 2.0
     while high - low > 1e-9:
         middle = (low + high) / 2
@@ -89,13 +121,32 @@ def test_within_a_tenth_of_the_boundary(side):
         low, high = (middle, high) if growth > side else (low, middle)
     loop = assemble(NOMINAL.replace(delta=(low, low)), NoCoupling())
     assert exact_growth(loop) == pytest.approx(side, abs=1e-6)
-    assert simulated_growth(loop, "RK4", default_substeps(loop)) == pytest.approx(side, abs=1e-3)
-    assert simulated_growth(loop, "Euler", 4) < 0
-    assert (simulated_growth(loop, "Euler2", 4) > 0) == (side > 0)
+    own, other = simulated_growth(loop, "RK4", default_substeps(loop)), simulated_growth(loop, *wrong)
+    print(f"| growth {side:+g} 1/s | {wrong[0]} x {wrong[1]}: {other:+.4f} | RK4, by the rule: {own:+.4f} |")
+    assert own == pytest.approx(side, abs=1e-3)
+    assert (other > 0) != (side > 0)
 
 
-def sustained(damping: float) -> tuple[float, float]:
-    """Of 200 starts: the share whose motion lasts after 48 s, and the frequency [Hz] of the strongest."""
+def test_the_limit_cycle_of_saturation():
+    """Uncoupled, channel 2 over the last 4.8 of 15 s: 83.85 Hz and 9.63 N in RK4 x 4 too; Euler x 1 has none."""
+    loop = assemble(load(), NoCoupling())
+    cycles = [
+        limit_cycle(simulate(loop, *setting), 1, loop.scenario.T)
+        for setting in (("exact",), ("mujoco", "RK4", 4), ("mujoco", "Euler", 1))
+    ]
+    for name, (amplitude, frequency) in zip(("exact", "RK4 x 4", "Euler x 1"), cycles, strict=True):
+        print(f"limit cycle, {name}: {amplitude:.3f} N, {frequency:.3f} Hz")
+    exact, own, wrong = cycles
+    assert exact == pytest.approx((9.635, 83.848), abs=1e-3)
+    assert own == pytest.approx(exact, rel=1e-4)
+    assert wrong[0] < 0.1 * exact[0]
+
+
+def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
+    """The share of 200 starts within 0.5 m and 10 m/s that clip after 48 s; how many of `near` in a fifth of that do.
+
+    And the frequency [Hz] of the strongest.
+    """
     humans = (Human((Link(1.2326, damping, 34.923),)), Human((Link(0.01999, damping, 266.28),)))
     limits = (CompliantDevice(), CompliantDevice(force_limit=5.657))
     scenario = load().replace(human=humans, device=limits, tap=None)
@@ -104,8 +155,9 @@ def sustained(damping: float) -> tuple[float, float]:
     n = loop.plant.A.shape[0]
     rng = np.random.default_rng(0)
     start = np.concatenate([rng.uniform(-0.5, 0.5, (n // 2, 200)), rng.uniform(-10, 10, (n // 2, 200))])
+    start = np.hstack([start, start[:, :near] / 5])
     start[2:4], start[6:8] = start[:2], start[4:6]  # the transmissions start unstretched
-    tape = Tape(loop.process, 1000, n, loop.scene.outside, 200)
+    tape = Tape(loop.process, 1000, n, loop.scene.outside, 200 + near)
     engine = ExactEngine(loop.plant, loop.process.force_limit)
     tape.s[0] = start
     engine.start(tape)
@@ -119,21 +171,28 @@ def sustained(damping: float) -> tuple[float, float]:
         tape.rewind(1000)
     strongest = last[:, last.std(axis=0).argmax()]
     spectrum = np.abs(np.fft.rfft((strongest - strongest.mean()) * np.hanning(1000), 2**15))
-    return float(clipped.mean()), float(np.fft.rfftfreq(2**15, scenario.T)[spectrum.argmax()])
+    return (
+        float(clipped[:200].mean()),
+        int(clipped[200:].sum()),
+        float(np.fft.rfftfreq(2**15, scenario.T)[spectrum.argmax()]),
+    )
 
 
 def test_saturation_breaks_a_certificate_and_damped_hands_mend_it():
     """Section 7's counterexample: certified for the linear loop, yet with lossless hands clipping goes on for ever."""
     assert assess(load().loop("I"), CLOSED_LOOP)["closed-loop"].certified
-    share, frequency = sustained(0.0)
-    print(f"lossless hands: {share:.1%} of starts still clip after 48 s, at {frequency:.2f} Hz")
-    assert share > 0.2
+    far, near, frequency = sustained(0.0, near=100)
+    print(f"lossless hands: {far:.1%} of 200 far and {near} of 100 near starts clip after 48 s, at {frequency:.2f} Hz")
+    assert far > 0.2
     assert frequency == pytest.approx(1.17, abs=0.05)
-    assert sustained(0.1)[0] == 0
+    assert sustained(0.1)[:2] == (0, 0)
 
 
-def test_encoder_steps_do_not_destabilise_a_certified_loop():
-    """Steps of 1e-5 m: the trace stays within a few steps of the ideal one."""
+def test_encoder_steps_hum_but_do_not_grow():
+    """Steps of 1e-5 m: the trace stays within a few steps of the ideal one, yet left alone it never comes to rest.
+
+    The hum is a matter of the coupling's damper, which sees steps: the soft coupling of Theorem 4 hums within 2 steps.
+    """
     scenario = load().replace(duration=5.0)
     coarse = scenario.replace(device=tuple(CompliantDevice(encoder_step=1e-5) for _ in range(2)))
     ideal, stepped = (simulate(assemble(s, CASE_I), "exact") for s in (scenario, coarse))
@@ -141,6 +200,13 @@ def test_encoder_steps_do_not_destabilise_a_certified_loop():
     print(f"encoder steps of 1e-5 m: at most {distance:.1e} m from the ideal encoder")
     assert distance < 3e-4
     assert np.abs(simulate(assemble(coarse, CASE_I)).s[:, :2] - stepped.s[:, :2]).max() < 3e-4
+    for coupling, steps in ((CASE_I, 8), (SpringDamper(np.array([878.0, 551.0]), np.array([0.386, 0.521])), 2)):
+        free = simulate(assemble(coarse, coupling), "exact", voluntary=False).s[-1000:]
+        smooth = simulate(assemble(scenario, coupling), "exact", voluntary=False).s[-1000:]
+        hum = np.abs(free[:, :2]).max() / 1e-5
+        print(f"left alone, B = {coupling.B.tolist()}: {hum:.0f} steps, {free[:, 4:].std():.1e} m/s")
+        assert 1 <= round(hum) <= steps
+        assert free[:, 4:].std() > 100 * smooth[:, 4:].std()
 
 
 def test_one_simulated_hour_does_not_drift():
@@ -165,7 +231,9 @@ def test_one_simulated_hour_does_not_drift():
     assert drift < 1e-12
     # an accumulated clock would have missed ticks, a counter cannot
     accumulated = np.cumsum(np.full(ticks, loop.scenario.T))
-    assert (np.floor(accumulated / loop.scenario.T) != np.arange(1, ticks + 1)).any()
+    missed = (np.floor(accumulated / loop.scenario.T) != np.arange(1, ticks + 1)).sum()
+    print(f"an accumulated clock is one tick off at {missed} of {ticks} ticks")
+    assert missed > ticks // 10
 
 
 def test_a_rule_that_cannot_be_met_says_so():
