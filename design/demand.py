@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller.lti import Array, Lti
 from design.sweep import Response, hermitian, on_circle
@@ -34,7 +35,7 @@ def theorem4_demand(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Res
     """
     V1, regular = V.dc(), V.quotient_at_one()
 
-    def passivity(w: Array) -> Array:
+    def passivity(w: Array) -> NDArray[np.complex128]:
         return (V1 / 2 - hermitian(regular.at(on_circle(w)))) / V.T
 
     def window(w: Array) -> Array:

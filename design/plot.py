@@ -80,7 +80,8 @@ def _parser() -> Parser:
 
 def _names(args: argparse.Namespace) -> list[str]:
     """The couplings that were asked for. Raises InputError."""
-    names = (args.coupling or ("none" if args.case == "none" else "none,spring-damper")).split(",")
+    asked: str = args.coupling or ("none" if args.case == "none" else "none,spring-damper")
+    names = asked.split(",")
     if "" in names:
         raise InputError(f"--coupling is {args.coupling!r}, expected names separated by commas")
     if len(set(names)) < len(names):

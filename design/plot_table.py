@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from rich.markup import escape
 from rich.table import Table
 
 FEEL_HZ = (1.0, 10.0)  # where perceived stiffness and damping are quoted
@@ -21,11 +20,11 @@ def _promises(outcome: dict[str, Any]) -> Table:
     """Required damping [N s/m] where all devices have the same, else as a multiple of what each has."""
     available = outcome["available_damping"]
     alike = len(set(available)) == 1
-    damping = "required damping [N s/m]" if alike else "required over available damping"
+    damping = "required damping" if alike else "required share of the damping"
     where = f"{outcome['scenario']}, case {outcome['case']}"
-    table = Table(title=escape(f"{damping}, available {_list(available)} N s/m · {where}"))
-    table.add_column("coupling", overflow="fold", min_width=16)
-    for name in ("closed-loop", "at Hz", "theorem4", "at Hz", "mismatch dB", "rms dB"):
+    table = Table(title=f"{damping} of {_list(available)} N s/m · {where}")
+    table.add_column("coupling", overflow="fold")
+    for name in ("closed-loop", "at Hz", "theorem4", "at Hz", "M sup dB", "M rms dB"):
         table.add_column(name, justify="right")
     for coupling in outcome["couplings"]:
         parts = [coupling[condition] for condition in ("closed-loop", "theorem4")]
@@ -38,11 +37,11 @@ def _promises(outcome: dict[str, Any]) -> Table:
 
 def _feel(outcome: dict[str, Any]) -> Table:
     table = Table(title="perceived by each device's user, the other devices held still")
-    table.add_column("coupling", overflow="fold", min_width=16)
+    table.add_column("coupling", overflow="fold")
     columns = [(what, unit, hz) for what, unit in (("stiffness", "N/m"), ("damping", "N s/m")) for hz in FEEL_HZ]
     for what, unit, hz in columns:
-        table.add_column(f"{what} {unit}, {hz:g} Hz", justify="right")
-    named = {"ideal: E itself": outcome["ideal"], **{c["name"]: c["perceived"] for c in outcome["couplings"]}}
+        table.add_column(f"{what}\n{unit}, {hz:g} Hz", justify="right")
+    named = {"ideal (E)": outcome["ideal"], **{c["name"]: c["perceived"] for c in outcome["couplings"]}}
     for name, perceived in named.items():
         table.add_row(name, *(_list(_at(hz, outcome["frequency_hz"], perceived[what])) for what, _, hz in columns))
     return table
