@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag, schur
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 
 
 class SingularLoop(ValueError):

@@ -64,12 +64,11 @@ def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Judged:
         demands["closed-loop"] = closed_loop_demand(F, loop.delta)
     V = compliance(coupling, loop.T)
     if V is not None and np.isfinite(requirements["theorem4"].ratio):
-        delayed = any(loop.psi) and phi is not None
-        demands["theorem4"] = (
-            delayed_demand(V, loop.theta, np.asarray(loop.delta), phi)
-            if delayed
-            else theorem4_demand(V, loop.theta, loop.delta)
-        )
+        if any(loop.psi):
+            assert phi is not None  # a finite figure had a multiplier
+            demands["theorem4"] = delayed_demand(V, loop.theta, np.asarray(loop.delta), phi)
+        else:
+            demands["theorem4"] = theorem4_demand(V, loop.theta, loop.delta)
     return Judged(F, requirements, demands)
 
 

@@ -127,10 +127,12 @@ def _content(kind: str, block: Block, test: Trial, file: str) -> Any:
     if kind == "json":
         return json.dumps(plain, indent=1, allow_nan=False) + "\n"
 
-    def arrays(destination: BinaryIO) -> None:
-        np.savez(destination, **{name: np.array(value) for name, value in plain.items()})
+    arrays: dict[str, Any] = {name: np.array(value) for name, value in plain.items()}
 
-    return arrays
+    def archive(destination: BinaryIO) -> None:
+        np.savez(destination, **arrays)
+
+    return archive
 
 
 def _table(outcome: dict[str, Any]) -> Table:

@@ -14,9 +14,9 @@ from controller.lti import Array
 from sim.files import write
 from sim.plot import STYLES
 
-IDEAL = {"color": "0.45", "linestyle": "-", "linewidth": 3.0, "alpha": 0.55}
+IDEAL: dict[str, Any] = {"color": "0.45", "linestyle": "-", "linewidth": 3.0, "alpha": 0.55}
 #: E, F and M in every panel of singular values
-PARTS = (
+PARTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("sigma_E", "E, the environment", IDEAL),
     ("sigma_F", "F, what the devices see", STYLES[0]),
     ("sigma_M", "M, the mismatch", STYLES[1]),
@@ -35,7 +35,7 @@ def plot_singular_values(data: dict[str, Any], path: Path) -> Path:
         for key, label, style in PARTS:
             values = _array(data[key] if key in data else coupling[key])
             for i, row in enumerate(np.maximum(values, FLOOR * top / 10).T):
-                width = style.get("linewidth", 1.6) / (1 + i)
+                width = (3.0 if style is IDEAL else 1.6) / (1 + i)
                 axis.plot(hz, row, label=label if i == 0 else None, **(style | {"linewidth": width}))
         if not _array(coupling["sigma_M"]).any():
             axis.annotate("M = 0", (0.05, 0.05), xycoords="axes fraction", color=STYLES[1]["color"])
@@ -127,7 +127,7 @@ def _save(figure: Figure, axes: Any, path: Path, legend: bool = True) -> Path:
     if legend:
         figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     try:
-        return write(path, lambda file: figure.savefig(file, format="png", dpi=100))
+        return write(path, lambda file: figure.savefig(file, format="png", dpi=90))
     finally:
         plt.close(figure)
 
