@@ -50,6 +50,7 @@ def main(argv: list[str]) -> int:
     loop = scenario.loop(args.case)
     outcome = {"case": args.case, "scenario": scenario.name, "seed": seed} | _data(loop, chosen)
     outcome["notes"] = [*(f"{name}: {note}" for name, c in chosen.items() for note in c.notes), *failed]
+    outcome["notes"] += _reasons(outcome["couplings"])
     outcome["files"] = [str(path) for path in _save(args, out, outcome)]
     screen = console(args)
     for table in tables(outcome):
@@ -119,6 +120,10 @@ def _data(loop: Loop, chosen: dict[str, Chosen]) -> dict[str, Any]:
         shown = {"name": Path(name).name, **coupling_part(c.kind, c.coupling, loop.T), "states": at.F.order}
         parts.append(shown | {"transparency": transparency_part(figures)} | _coupling_data(at, curves(loop, at, hz)))
     return {
+        "T_s": loop.T,
+        "theta": list(loop.theta),
+        "psi": list(loop.psi),
+        "lam": list(loop.lam),
         "available_damping": list(loop.delta),
         "frequency_hz": hz.tolist(),
         "sigma_E": sigma_E.tolist(),
@@ -136,6 +141,12 @@ def _coupling_data(judged: Judged, lines: Curves) -> dict[str, Any]:
         if demand is None and not requirement.reason:
             data[name]["reason"] = "this coupling is no V in feedback around the environment: no curve for theorem4"
     return data
+
+
+def _reasons(couplings: list[dict[str, Any]]) -> list[str]:
+    """Why a curve is missing."""
+    parts = [(c["name"], condition, c[condition]) for c in couplings for condition in CONDITIONS]
+    return [f"{name}, {condition}: {part['reason']}" for name, condition, part in parts if "reason" in part]
 
 
 def _perceived(values: Perceived) -> dict[str, Any]:

@@ -22,6 +22,8 @@ PARTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("sigma_M", "M, the mismatch", STYLES[1]),
 )
 CONDITIONS = {"closed-loop": "closed-loop (this environment)", "theorem4": "theorem4 (any passive environment)"}
+DELAYED = "theorem4 (with a multiplier of this environment)"  # psi >= 1
+HIGHEST = 20.0  # of the available damping: what a picture of the required one still shows
 FLOOR = 1e-4  # of the largest value: what a logarithmic axis still shows
 
 
@@ -47,24 +49,24 @@ def plot_singular_values(data: dict[str, Any], path: Path) -> Path:
 
 def plot_required_damping(data: dict[str, Any], path: Path) -> Path:
     """What each condition asks of the devices at each frequency, what they have, and where it binds."""
-    figure, axes = _panels(1, 2, (5.5, 4.2), "required damping over frequency; o: where it binds")
+    figure, axes = _panels(1, 2, (5.5, 4.2), "required damping over frequency; o: where it binds, ^: above the picture")
     hz = _array(data["frequency_hz"])
     scale, unit = _damping_scale(data["available_damping"])
     for axis, (condition, title) in zip(axes[0], CONDITIONS.items(), strict=True):
         axis.axhline(scale, color="black", linewidth=1.2)
         _note(axis, "available", (hz[0], scale))
-        highest = scale
-        for coupling, style in zip(data["couplings"], STYLES, strict=False):
-            part = coupling[condition]
+        parts = [coupling[condition] for coupling in data["couplings"]]
+        top = scale * min(max([1.0, *(part["ratio"] or 0.0 for part in parts)]), HIGHEST)
+        for coupling, part, style in zip(data["couplings"], parts, STYLES, strict=False):
             if part["demand"] is None:
-                axis.plot([], [], label=f"{coupling['name']} (no damping is enough)", **style)
+                axis.plot([], [], label=f"{coupling['name']} (no curve: see the notes)", **style)
                 continue
-            demand = scale * _array(part["demand"])
-            axis.plot(hz, demand, label=coupling["name"], **style)
-            axis.plot(max(part["binding_frequency_hz"], hz[0]), scale * part["ratio"], "o", color=style["color"])
-            highest = max(highest, scale * part["ratio"])
-        axis.axhspan(scale, 1.12 * highest, color="black", alpha=0.06, linewidth=0)
-        axis.set(xscale="log", title=title, xlabel="frequency [Hz]", ylim=(-0.5 * scale, 1.12 * highest))
+            axis.plot(hz, scale * _array(part["demand"]), label=coupling["name"], **style)
+            binds, marker = scale * part["ratio"], "o" if scale * part["ratio"] <= top else "^"
+            axis.plot(max(part["binding_frequency_hz"], hz[0]), min(binds, top), marker, color=style["color"])
+        axis.axhspan(scale, 1.12 * top, color="black", alpha=0.06, linewidth=0)
+        title = DELAYED if condition == "theorem4" and any(data["psi"]) else title
+        axis.set(xscale="log", title=title, xlabel="frequency [Hz]", ylim=(-0.5 * scale, 1.12 * top))
         axis.legend(fontsize=8)
     axes[0, 0].set_ylabel(f"required damping{unit}")
     return _save(figure, axes, path, legend=False)
@@ -123,7 +125,11 @@ def _panels(rows: int, columns: int, size: tuple[float, float], title: str) -> t
 
 def _save(figure: Figure, axes: Any, path: Path, legend: bool = True) -> Path:
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import NullFormatter
 
+    for axis in (part for panel in axes.flat for part in (panel.xaxis, panel.yaxis)):
+        axis.set_major_formatter("{x:g}")  # 0.1, 1, 10 are read faster than powers of ten, and drawn faster
+        axis.set_minor_formatter(NullFormatter())
     if legend:
         figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     try:
