@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from controller.lti import Array, Lti
 
@@ -103,7 +104,8 @@ def environment(network: Network, T: float) -> Lti:
     inner = slice(len(network.contacts), None)
     if free and np.linalg.cond((M / T + D + T * K)[inner, inner]) > 1e14:
         raise ValueError(f"an internal node among {', '.join(free)} has no mass and nothing that holds it")
-    return Lti(*realise((M, D, K), len(network.contacts), T, np.linalg.inv), T)
+    A, B, C, D = realise((M, D, K), len(network.contacts), T, np.linalg.inv)
+    return Lti(A, B, C, D, T)
 
 
 def realise(matrices: tuple[Array, Array, Array], c: int, T: Any, inverse: Callable[[Array], Array]) -> list[Array]:
@@ -134,7 +136,7 @@ def _quarters(c: int) -> tuple[tuple[slice, slice], ...]:
     return (contact, contact), (contact, inner), (inner, contact), (inner, inner)
 
 
-def _remembered(after: Array, force: Array, c: int) -> Array:
+def _remembered(after: Array, force: Array, c: int) -> NDArray[np.intp]:
     """Indices of the states that reach the force now or later: the others need not be stored."""
     reads = after[:, c:] != 0
     used = (force[:, c:] != 0).any(axis=0)

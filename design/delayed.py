@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller.delay import delay
 from controller.lti import Array, Lti
@@ -70,7 +71,7 @@ def delayed_demand(V: Lti, theta: Sequence[int], delta: Array, phi: Array) -> Re
         response = V.at(z) / T
         vt = np.stack([np.exp(-1j * np.outer(w, np.arange(n + 1))).sum(axis=1) for n in theta], axis=1)
 
-        def short(s: Array) -> Array:
+        def short(s: Array) -> NDArray[np.bool_]:
             damping = s[:, None] * delta
             cover = phi + phi**2 / (damping - phi)
             H = response - (vt / (2 * damping))[:, :, None] * np.eye(delta.size)

@@ -18,6 +18,7 @@ import numpy as np
 
 from controller.lti import Lti
 from design.demand import closed_loop_demand, theorem4_demand
+from design.store import Condition
 from design.sweep import frequencies, supremum
 
 
@@ -25,7 +26,7 @@ from design.sweep import frequencies, supremum
 class Requirement:
     """The damping that a condition asks of the devices, against what they have."""
 
-    condition: str  # "closed-loop" | "theorem4"
+    condition: Condition
     required: tuple[float, ...]  # (m,) [N s/m]; inf when no damping helps
     available: tuple[float, ...]  # (m,) [N s/m]
     frequency_hz: float | None  # where it binds
@@ -103,12 +104,12 @@ def theorem4_per_channel(V: Sequence[Lti], theta: Sequence[int], delta: Sequence
     return Requirement("theorem4", required, available, worst.frequency_hz, worst.reason)
 
 
-def from_ratio(condition: str, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement:
+def from_ratio(condition: Condition, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement:
     """The requirement of `ratio` times what is available, on every channel."""
     return Requirement(condition, tuple(ratio * delta for delta in available), available, frequency_hz)
 
 
-def refusal(condition: str, available: tuple[float, ...], reason: str) -> Requirement:
+def refusal(condition: Condition, available: tuple[float, ...], reason: str) -> Requirement:
     """The requirement that no damping satisfies."""
     return Requirement(condition, (np.inf,) * len(available), available, None, reason)
 

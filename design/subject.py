@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from controller.coupling import Compliance, NoCoupling, SpringDamper
+from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, environment
 from controller.lti import Lti, SingularLoop
 from controller.process import force_map
@@ -24,7 +25,7 @@ LONGEST_DELAY = 100
 class Subject:
     """A coupling between devices and an environment. Raises ValueError naming the field that is wrong."""
 
-    coupling: NoCoupling | SpringDamper | Compliance
+    coupling: Coupling
     network: Network | None  # None is a rigid wall behind the coupling, one channel
     T: float  # [s]
     theta: tuple[int, ...]  # (m,) transmission delays [samples]
@@ -69,7 +70,7 @@ class Subject:
             coupling = Compliance(replace(coupling.V, T=T))
         return replace(self, coupling=coupling, T=T)
 
-    def with_gains(self, K: Sequence[float], B: Sequence[float]) -> Self:
+    def with_gains(self, K: ArrayLike, B: ArrayLike) -> Self:
         """The same loop with another spring-damper [N/m, N s/m]."""
         return replace(self, coupling=SpringDamper(K, B))
 
