@@ -21,6 +21,7 @@ from design.store import Loop
 from design.sweep import Response, frequencies, on_circle
 
 LOWEST_HZ = 0.1
+FEEL_HZ = (1.0, 10.0)  # where perceived stiffness and damping are quoted
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +84,13 @@ def compliance(coupling: Coupling, T: float) -> Lti | None:
 
 
 def grid(loop: Loop, couplings: Sequence[Judged], low_hz: float = LOWEST_HZ) -> Array:
-    """Frequencies [Hz] up to Nyquist's, dense around every pole and with every frequency at which a condition binds."""
+    """Frequencies [Hz] up to Nyquist's, dense around every pole, with FEEL_HZ and where conditions bind."""
     per_hz = 2 * np.pi * loop.T
     systems = (environment(loop.environment, loop.T), *(judged.F for judged in couplings))
     even = frequencies(*systems, low=low_hz * per_hz, high=np.pi, points=200) / per_hz
     binding = [r.frequency_hz for judged in couplings for r in judged.requirements.values()]
-    return np.unique([*even, *(hz for hz in binding if hz is not None and hz >= low_hz)])
+    wanted = (*FEEL_HZ, *(hz for hz in binding if hz is not None))
+    return np.unique([*even, *(hz for hz in wanted if low_hz <= hz <= even[-1])])
 
 
 def curves(loop: Loop, judged: Judged, hz: Array) -> Curves:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-FEEL_HZ = (1.0, 10.0)  # where perceived stiffness and damping are quoted
+from design.curves import FEEL_HZ
 
 
 def tables(outcome: dict[str, Any]) -> tuple[Table, Table]:
@@ -63,8 +63,8 @@ def _decibels(value: float | None) -> str:
 
 
 def _at(hz: float, grid: Sequence[float], values: Sequence[Sequence[float]]) -> list[float]:
-    """Each channel's curve at `hz`, between its points."""
-    return [float(np.interp(np.log(hz), np.log(grid), column)) for column in np.transpose(values)]
+    """Each channel's curve at `hz`, which is in the grid; nan above Nyquist's frequency."""
+    return [float(np.interp(hz, grid, column, right=np.nan)) for column in np.transpose(values)]
 
 
 def _list(values: Sequence[float]) -> str:
