@@ -21,6 +21,8 @@ figures: .venv/ready
 	$(PY) -m sim.run --case I --out out/figure-6
 	cp out/figure-5/figure.png docs/pictures/figure-5.png
 	cp out/figure-6/figure.png docs/pictures/figure-6.png
+	$(PY) -m design.plot --coupling published,spring-damper,spring-damper:closed-loop --out out/couplings
+	for name in required-damping perceived singular-values; do cp out/couplings/$$name.png docs/pictures/; done
 
 bench: .venv/ready
 	$(PY) -m pytest tests/benchmarks --benchmark-only -s

@@ -187,7 +187,7 @@ def _quarters(c: int) -> tuple[tuple[slice, slice], ...]:
     return (contact, contact), (contact, inner), (inner, contact), (inner, inner)
 
 
-def _remembered(after: Array, force: Array, inputs: int) -> Array:
+def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
     """Indices of the states that reach the outputs now or later: the others need not be stored."""
     reads = after[:, inputs:] != 0
     used = (force[:, inputs:] != 0).any(axis=0)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import block_diag, schur
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 
 
 class SingularLoop(ValueError):
@@ -36,6 +36,10 @@ class Lti:
     D: Array  # (p, m)
     T: float  # [s]
 
+    if TYPE_CHECKING:  # what __post_init__ accepts is more than what the fields then hold
+
+        def __init__(self, A: ArrayLike, B: ArrayLike, C: ArrayLike, D: ArrayLike, T: float) -> None: ...
+
     def __post_init__(self) -> None:
         for name in "ABCD":
             object.__setattr__(self, name, frozen(getattr(self, name), 2))
@@ -60,8 +64,8 @@ class Lti:
     @classmethod
     def diag(cls, *blocks: Lti) -> Self:
         """The blocks side by side, each with its own inputs and outputs."""
-        parts = (block_diag(*(getattr(g, name) for g in blocks)) for name in "ABCD")
-        return cls(*parts, _common_period(*blocks))
+        A, B, C, D = (np.asarray(block_diag(*(getattr(g, name) for g in blocks))) for name in "ABCD")
+        return cls(A, B, C, D, _common_period(*blocks))
 
     @property
     def order(self) -> int:
@@ -97,7 +101,8 @@ class Lti:
         """S, U with A = U S U* and S upper triangular: once per block, however often it is evaluated."""
         if not self.order:
             return np.zeros((0, 0), dtype=np.complex128), np.zeros((0, 0), dtype=np.complex128)
-        return schur(self.A, output="complex")
+        S, U, *_ = schur(self.A, output="complex")
+        return S, U
 
     def dc(self) -> Array:
         """G(1), shape (p, m)."""
@@ -130,7 +135,7 @@ class Lti:
 
     def __add__(self, other: Lti) -> Lti:
         T = _common_period(self, other)
-        A = block_diag(self.A, other.A)
+        A = np.asarray(block_diag(self.A, other.A))
         B = np.vstack([self.B, other.B])
         return Lti(A, B, np.hstack([self.C, other.C]), self.D + other.D, T)
 
@@ -155,7 +160,7 @@ class Lti:
         y_u = S @ self.D
         u_x = np.hstack([np.zeros((self.inputs, self.order)), -other.C]) - other.D @ y_x
         u_u = np.eye(self.inputs) - other.D @ y_u
-        A = block_diag(self.A, other.A) + np.vstack([self.B @ u_x, other.B @ y_x])
+        A = np.asarray(block_diag(self.A, other.A)) + np.vstack([self.B @ u_x, other.B @ y_x])
         return Lti(A, np.vstack([self.B @ u_u, other.B @ y_u]), y_x, y_u, T)
 
 

@@ -16,7 +16,7 @@ from design.designs import FILTERS, KINDS, METHODS, OBJECTIVES, compare_methods,
 from design.failure import DesignFailed
 from design.promises import certificate_part, promise_of
 from design.result import Design
-from design.store import Condition, Loop, Stored, data_of, save
+from design.store import Loop, Stored, data_of, save
 from design.summary import coupling_part, transparency_part
 from design.transparency import transparency
 from sim.command import (
@@ -144,9 +144,9 @@ def _options(args: argparse.Namespace) -> dict[str, Any]:
 def _store(loop: Loop, design: Design, out: Path) -> dict[str, Any]:
     """Save the coupling with the proof of its condition, or without where there is none yet."""
     data = data_of(design.coupling)
-    condition: Condition = "closed-loop" if design.condition == "closed-loop" else "theorem4"
+    phi = None if design.phi is None else design.phi.tolist()
     try:
-        certificate, reason = prove(loop, data, condition, design.phi), None
+        certificate, reason = prove(loop, data, design.condition, phi), None
     except NotProved as error:
         certificate, reason = None, str(error)
     try:

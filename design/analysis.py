@@ -12,7 +12,7 @@ from controller.lti import Array, Lti
 from design.coordinates import balanced, unit_coupling, unit_environment
 from design.lmi import Ports, e_hat_regular, lemma1, lemma4, theta_hat
 from design.margin import dampings
-from design.solve import solve
+from design.solve import solve, solved
 from design.specification import check_passive
 
 
@@ -74,8 +74,8 @@ def _solve(shortage: Lti, excess: Ports) -> Analysis:
         *(P >> 0 for P in (P_E, P_V) if isinstance(P, cp.Variable)),
     ]
     solve(cp.Problem(cp.Minimize(s), constraints), "the analysis by Theorem 4")
-    values = (np.asarray(M.value) if isinstance(M, cp.Variable) else M for M in (Phi, Delta_V, P_E, P_V))
-    return Analysis(-float(s.value), *values)
+    E_storage, V_storage = (solved(P) if isinstance(P, cp.Variable) else P for P in (P_E, P_V))
+    return Analysis(-float(solved(s)), solved(Phi), solved(Delta_V), E_storage, V_storage)
 
 
 def _storage(A: Array) -> cp.Variable | Array:

@@ -101,7 +101,7 @@ def _proved(loop: Loop, coupling: Coupling, requirement: Requirement, phi: Array
     if not requirement.certified:
         return requirement
     try:
-        prove(loop, data_of(coupling), requirement.condition, phi)
+        prove(loop, data_of(coupling), requirement.condition, None if phi is None else phi.tolist())
     except NotProved:
         return requirement
     return replace(requirement, proof="rational")

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import cast
 
 import numpy as np
 from scipy.optimize import brentq
@@ -53,7 +54,7 @@ def stiffest(subject: Subject, condition: Condition) -> Stiffest:
     if not isinstance(subject.coupling, SpringDamper):
         return Stiffest(unknown, "only a spring-damper has a K")
     if condition == "theorem4":
-        return _stiffest_for_any_environment(subject)
+        return _stiffest_for_any_environment(subject, subject.coupling)
     K, B = subject.coupling.K, subject.coupling.B
 
     @cache
@@ -71,12 +72,12 @@ def stiffest(subject: Subject, condition: Condition) -> Stiffest:
     return Stiffest(unknown, "no scale of K is certified beside this B")
 
 
-def _stiffest_for_any_environment(subject: Subject) -> Stiffest:
+def _stiffest_for_any_environment(subject: Subject, coupling: SpringDamper) -> Stiffest:
     """Between 0 and 2 (delta - B)/T, the bound where z^-n = -1; the set of gains is convex and contains K -> 0."""
     if any(subject.psi):
         return Stiffest((None,) * subject.channels, "with psi >= 1 each K needs a multiplier of its own: not searched")
     stiffest, reasons = [], []
-    for B, theta, delta in zip(subject.coupling.B, subject.theta, subject.delta, strict=True):
+    for B, theta, delta in zip(coupling.B.tolist(), subject.theta, subject.delta, strict=True):
         if delta <= B:
             stiffest.append(None)
             reasons.append(f"B = {B:g} N s/m alone uses up delta = {delta:g} N s/m")
@@ -138,7 +139,7 @@ def edge(ratio: Ratio, inside: float, outside: float) -> float:
     def above(x: float) -> float:
         return float(np.clip(math.log(max(ratio(x), 1e-9)), -3, 3))
 
-    root = brentq(above, inside, outside, rtol=EDGE, xtol=EDGE * inside)
+    root = cast(float, brentq(above, inside, outside, rtol=np.float64(EDGE), xtol=EDGE * inside))
     for back in EDGE * 4.0 ** np.arange(12):
         x = root + back * (inside - root)
         if ratio(x) < 1:

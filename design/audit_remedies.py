@@ -36,7 +36,7 @@ def remedies(subject: Subject, requirement: Requirement) -> list[Remedy]:
         found.append(
             _smaller(
                 lambda x: subject.with_gains(coupling.K, x * coupling.B),
-                lambda x: f"smaller B: {_list(x * coupling.B)} N s/m",
+                lambda x: f"smaller B: {_list((x * coupling.B).tolist())} N s/m",
                 condition,
             )
         )

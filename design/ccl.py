@@ -113,6 +113,7 @@ class _Search:
         reserved = replace(self.spec, delta=tuple((1 - START_ROOM) * d for d in self.spec.delta))
         found = spring_damper.design(reserved)
         self.sdps += found.sdps
+        assert isinstance(found.coupling, SpringDamper)
         return found.coupling
 
     def _inner(self, p: Array, most_sdps: int) -> Array:
@@ -140,7 +141,7 @@ class _Search:
     def _fixed_poles(self, most_sdps: int) -> Lti:
         problem = FixedPoles(self.spec, self.sigma)
         rate = self.gains.B / (self.gains.B + self.gains.K * self.spec.T)
-        V, _ = problem.search(rate, lambda V: self.requirement(V).certified, evaluations=most_sdps)
+        V, _ = problem.search(rate.tolist(), lambda V: self.requirement(V).certified, evaluations=most_sdps)
         self.sdps += problem.sdps
         return V
 

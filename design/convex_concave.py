@@ -14,7 +14,7 @@ from controller.lti import Array
 from design.gain_set import gain_sets
 from design.sampled import Complex, affine_lmis, gain_lmi
 from design.shaping import Shaping
-from design.solve import solve
+from design.solve import solve, solved
 from design.specification import Specification
 
 
@@ -25,7 +25,7 @@ def step(spec: Specification, sigma: Array, shaping: Shaping, at: Array, norm: f
     constant, slopes = _tangent(spec, shaping, at, norm, w)
     cuts = affine_lmis(constant, slopes, cp.hstack([gains, t]))
     solve(cp.Problem(cp.Minimize(t), [*gain_sets(gains, spec.theta, sigma), *cuts]), "a step of the convex sequence")
-    return np.asarray(gains.value), norm * float(np.sqrt(t.value))
+    return solved(gains), norm * float(np.sqrt(solved(t)))
 
 
 def _tangent(spec: Specification, shaping: Shaping, at: Array, norm: float, w: Array) -> tuple[Complex, Complex]:

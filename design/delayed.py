@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller.delay import delay
 from controller.lti import Array, Lti
 from design.margin import Requirement, dampings, from_ratio, refusal
 from design.specification import regular_part
-from design.sweep import frequencies, hermitian, on_circle, supremum
+from design.sweep import Response, frequencies, hermitian, on_circle, supremum
 
 #: What a sweep may find uncovered, relatively to the damping: rounding.
 ROUNDING = 1e-6
@@ -41,7 +42,7 @@ def theorem4_delayed(
         return refused("the static compliance V(1) is not symmetric")
     if uncovered(environment, psi, np.diag(phi)) > ROUNDING * max(available):
         return refused("E-hat + Phi is not passive for this multiplier")
-    needed = _least_scale(V, theta, np.asarray(available), np.asarray(phi))
+    needed = delayed_demand(V, theta, np.asarray(available), np.asarray(phi))
     ratio, w = supremum(needed, np.concatenate([[0.0], frequencies(V)]))
     if np.isinf(ratio):
         return refused(f"V is not passive enough at {w / (2 * np.pi * V.T):.4g} Hz for this multiplier")
@@ -59,8 +60,8 @@ def uncovered(environment: Lti, psi: Sequence[int], Phi: Array) -> float:
     return supremum(short, np.concatenate([[0.0], frequencies(delayed)]))[0]
 
 
-def _least_scale(V: Lti, theta: Sequence[int], delta: Array, phi: Array):
-    """w (k,) -> the least s at each frequency, up to 1000; inf beyond."""
+def delayed_demand(V: Lti, theta: Sequence[int], delta: Array, phi: Array) -> Response:
+    """w (k,) -> the least s of `theorem4_delayed` at each frequency, up to 1000; inf beyond."""
     V1, quotient, T = V.dc(), V.quotient_at_one(), V.T
     floor = float((phi / delta).max())
 
@@ -70,7 +71,7 @@ def _least_scale(V: Lti, theta: Sequence[int], delta: Array, phi: Array):
         response = V.at(z) / T
         vt = np.stack([np.exp(-1j * np.outer(w, np.arange(n + 1))).sum(axis=1) for n in theta], axis=1)
 
-        def short(s: Array) -> Array:
+        def short(s: Array) -> NDArray[np.bool_]:
             damping = s[:, None] * delta
             cover = phi + phi**2 / (damping - phi)
             H = response - (vt / (2 * damping))[:, :, None] * np.eye(delta.size)

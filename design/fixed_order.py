@@ -90,7 +90,7 @@ class FixedOrder:
 
     def loop(self, p: Array) -> tuple[Array, Array, Array, Array]:
         """A, B, C, D of W1 L W2: the plant with V closed between its output u and its input v."""
-        V, (G, r) = self.unit_coupling(p), (self.plant, self.spec.W2.inputs)
+        V, (G, r) = self.unit_coupling(p), (self.plant, self.spec.channels)
         Br, Bv = G.B[:, :r], G.B[:, r:]
         y = G.outputs - V.inputs
         Cy, Cu = G.C[:y], G.C[y:]
@@ -108,8 +108,8 @@ def _plant(spec: Specification) -> Lti:
     def constant(D: Array) -> Lti:
         return Lti.constant(D, T)
 
-    weighted = Lti.diag(spec.W2, constant(one))  # [W2 r; v]
+    weighted = Lti.diag(shaping.W2, constant(one))  # [W2 r; v]
     copy = constant(np.block([[one, zero], [zero, one], [one, zero]]))
     blocks = Lti.diag(shaping.late, shaping.environment @ constant(np.diag(T * root)), constant(np.diag(root)))
     add = constant(np.block([[one, one, zero], [zero, zero, one]]))
-    return Lti.diag(spec.W1, constant(one)) @ add @ blocks @ copy @ weighted
+    return Lti.diag(shaping.W1, constant(one)) @ add @ blocks @ copy @ weighted

@@ -19,7 +19,7 @@ from design.failure import DesignFailed
 from design.lmi import Ports, lemma1, symmetric, theta_hat
 from design.sampled import affine_lmis, gain_lmi
 from design.shaping import Shaping
-from design.solve import solve
+from design.solve import solve, solved
 from design.specification import Specification
 from design.sweep import on_circle
 
@@ -38,13 +38,16 @@ class FixedPoles:
 
     def best(self, poles: Sequence[Sequence[float]]) -> tuple[Lti, float]:
         """(V in SI units, ||W1 L W2||_inf) for `poles`, one real sequence per channel, each in (-1, 1)."""
-        for _ in range(MOST_CUTS):
+        cuts = 0
+        while True:
             V, bound = self._solve(poles)
             norm, peak = self.shaping.norm(V)
             if norm <= bound * (1 + GAP):
-                break
+                return V, norm
             self.frequencies.append(peak)
-        return V, norm
+            cuts += 1
+            if cuts == MOST_CUTS:
+                return V, norm
 
     def search(self, start: Sequence[float], holds: Callable[[Lti], bool], evaluations: int = 60) -> tuple[Lti, float]:
         """`best` over one pole per channel, by a simplex search from `start`; only poles whose V `holds` count.
@@ -78,15 +81,15 @@ class FixedPoles:
         problem = cp.Problem(cp.Minimize(t), [affine(passive, x) >> 0, P >> 0, *cuts])
         solve(problem, "the coupling with fixed poles")
         self.sdps += 1
-        return self._coupling(poles, np.asarray(gains.value)), float(np.sqrt(t.value))
+        return self._coupling(poles, solved(gains)), float(np.sqrt(solved(t)))
 
     def _unit(self, poles: Sequence[Sequence[float]], gains: Array) -> tuple[Lti, Array, Array]:
         """V in units T = 1 and usable damping = I, with F and V1 of design.fixed_order's realisation."""
         N = len(poles)
         V1, f = np.diag(gains[:N]), np.split(gains[N:], np.cumsum([len(a) for a in poles])[:-1])
         A = np.diag(np.concatenate(poles))
-        B = block_diag(*(np.sqrt(1 - np.square(a))[:, None] for a in poles))
-        F = block_diag(*(row[None, :] for row in f))
+        B = np.asarray(block_diag(*(np.sqrt(1 - np.square(a))[:, None] for a in poles)))
+        F = np.asarray(block_diag(*(row[None, :] for row in f)))
         return Lti(A, B, F - F @ A, V1 - F @ B, 1.0), F, V1
 
     def _coupling(self, poles: Sequence[Sequence[float]], gains: Array) -> Lti:

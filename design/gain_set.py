@@ -13,6 +13,7 @@ psi = 0 needs no excess of passivity in V-hat (Sigma = inf): the last term is ab
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import cast
 
 import cvxpy as cp
 import numpy as np
@@ -36,7 +37,8 @@ def gain_set(k: cp.Expression, b: cp.Expression, theta: int, sigma: float) -> li
     Q = cp.Variable((n + 1, n + 1), symmetric=True)
     sums = [cp.trace(Q) == k / 2 + b]
     sums += [cp.sum(cp.diag(Q, d)) == 0 for d in range(1, n + 1)]
-    return [cp.bmat([[Q, c], [c.T, np.eye(len(columns))]]) >> 0, *sums, k >= 0, b >= 0]
+    constraints = [cp.bmat([[Q, c], [c.T, np.eye(len(columns))]]) >> 0, *sums, k >= 0, b >= 0]
+    return cast(list[cp.Constraint], constraints)  # cvxpy gives the type of == as bool
 
 
 def gain_sets(gains: cp.Expression, theta: Sequence[int], sigma: Array) -> list[cp.Constraint]:

@@ -18,7 +18,7 @@ from design.affine import affine, packed, symmetric_from
 from design.certificates import gain_storage, passivity_storage
 from design.fixed_order import FixedOrder
 from design.lmi import Ports, lemma2, lemma3
-from design.solve import solve
+from design.solve import solve, solved
 
 #: Room above the start's norm for its first certificate, relatively.
 FIRST_ROOM = 0.05
@@ -61,11 +61,12 @@ def _step(family: FixedOrder, at: Array, Q0: Array, U0: Array, norm: float) -> t
         A, B, C = np.linalg.solve(LU, A @ LU), np.linalg.solve(LU, B), C @ LU / norm
         return lemma3(A, B, C, D / norm, 2 * np.eye(nu) - U, U, t)
 
-    storages = [affine(lambda v, i=i: split(v)[i], x) for i in (1, 2)]
-    near = [Z >> LEAST * np.eye(Z.shape[0]) for Z in storages] + [Z << MOST * np.eye(Z.shape[0]) for Z in storages]
-    cuts = [affine(passivity, x) >> 0, affine(gain, x) >> 0, *near]
+    storages = [affine(lambda v: split(v)[1], x), affine(lambda v: split(v)[2], x)]
+    least = [Z >> LEAST * np.eye(Z.shape[0]) for Z in storages]
+    most = [Z << MOST * np.eye(Z.shape[0]) for Z in storages]
+    cuts: list[cp.Constraint] = [affine(passivity, x) >> 0, affine(gain, x) >> 0, *least, *most]
     solve(cp.Problem(cp.Minimize(x[-1]), cuts), "a step of the inner convex approximation")
-    p, Q, U, _ = split(np.asarray(x.value))
+    p, Q, U, _ = split(solved(x))
     return p, LQ @ Q @ LQ.T, LU @ U @ LU.T
 
 

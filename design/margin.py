@@ -5,9 +5,8 @@ closed-loop: with F what the devices see and every human passive, the loop is st
 theorem4: Lemma 4 of the paper for Psi = I and any passive environment under backward Euler:
     He[(z-1) V/(Tz)] >= diag((1 - cos n_i w) / (2 delta_i)),   n_i = theta_i + 1.
 
-The required damping is s Delta_D with the least s for which s Delta_D satisfies the condition. Both
-conditions lose their singular point at z = 1 when G/(z-1) is split into G(1)/(z-1), whose Hermitian part on
-the circle is -G(1)/2, and the regular quotient (G(z) - G(1))/(z - 1).
+The required damping is s Delta_D with the least s for which s Delta_D satisfies the condition: the supremum
+of design.demand over frequency.
 """
 
 from __future__ import annotations
@@ -17,15 +16,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.lti import Array, Lti
-from design.sweep import frequencies, hermitian, on_circle, supremum
+from controller.lti import Lti
+from design.demand import closed_loop_demand, theorem4_demand
+from design.store import Condition
+from design.sweep import frequencies, supremum
 
 
 @dataclass(frozen=True)
 class Requirement:
     """The damping that a condition asks of the devices, against what they have."""
 
-    condition: str  # "closed-loop" | "theorem4"
+    condition: Condition
     required: tuple[float, ...]  # (m,) [N s/m]; inf when no damping helps
     available: tuple[float, ...]  # (m,) [N s/m]
     frequency_hz: float | None  # where it binds
@@ -63,23 +64,15 @@ def closed_loop(F: Lti, delta: Sequence[float]) -> Requirement:
     if np.linalg.eigvalsh((F1 + F1.T) / 2).min() < -1e-9 * scale:
         return refused("the static stiffness F(1) has a negative direction: it pushes outwards")
 
-    regular = F.quotient_at_one()
-    weight = np.sqrt(F.T / np.asarray(available))
-
-    def needed(w: Array) -> Array:
-        H = F1 / 2 - hermitian(regular.at(on_circle(w)))
-        return np.linalg.eigvalsh(weight[:, None] * H * weight)[:, -1]
-
     grid = np.concatenate([[0.0], frequencies(F)])
-    ratio, w = supremum(needed, grid)
+    ratio, w = supremum(closed_loop_demand(F, available), grid)
     return from_ratio("closed-loop", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
 
 
 def theorem4(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Requirement:
     """Theorem 4 for psi = 0 and the coupling V, whatever passive environment stands behind it.
 
-    Dividing by |1 - 1/z|^2 it reads (V(1)/2 - He[(V - V(1))/(z - 1)]) / T >= diag(|vt_i|^2 / (4 s delta_i)), with
-    vt_i = 1 + 1/z + ... + z^-theta_i, so s is a generalised eigenvalue per frequency.
+    Divided by |1 - 1/z|^2 it is regular, and s is a generalised eigenvalue per frequency.
     """
     available = dampings(delta, V.inputs)
     if len(theta) != V.inputs:
@@ -95,24 +88,8 @@ def theorem4(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Requiremen
     V1 = V.dc()
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return refused("the static compliance V(1) is not symmetric")
-    regular = V.quotient_at_one()
-
-    def passivity(w: Array) -> Array:
-        return (V1 / 2 - hermitian(regular.at(on_circle(w)))) / V.T
-
-    def window(w: Array) -> Array:
-        """|vt_i|^2 / (4 delta_i), shape (k, m)."""
-        vt = [np.exp(-1j * np.outer(w, np.arange(n + 1))).sum(axis=1) for n in theta]
-        return np.abs(np.stack(vt, axis=1)) ** 2 / (4 * np.asarray(available))
-
-    def needed(w: Array) -> Array:
-        eigenvalues, basis = np.linalg.eigh(passivity(w))
-        floor = np.maximum(1e-13 * np.abs(eigenvalues).max(axis=1, keepdims=True), np.finfo(float).tiny)
-        whitened = np.conj(np.swapaxes(basis, 1, 2)) / np.sqrt(np.maximum(eigenvalues, floor))[:, :, None]
-        H = whitened @ (window(w)[:, :, None] * np.conj(np.swapaxes(whitened, 1, 2)))
-        return np.where(eigenvalues[:, 0] > floor[:, 0], np.linalg.eigvalsh(H)[:, -1], np.inf)
-
-    ratio, w = supremum(needed, np.concatenate([[0.0], frequencies(V)]))
+    demand = theorem4_demand(V, theta, available)
+    ratio, w = supremum(demand, np.concatenate([[0.0], frequencies(V)]))
     if np.isinf(ratio):
         return refused(f"V is not passive enough at {w / (2 * np.pi * V.T):.4g} Hz: its damping vanishes there")
     return from_ratio("theorem4", ratio, available, w / (2 * np.pi * V.T))
@@ -127,12 +104,12 @@ def theorem4_per_channel(V: Sequence[Lti], theta: Sequence[int], delta: Sequence
     return Requirement("theorem4", required, available, worst.frequency_hz, worst.reason)
 
 
-def from_ratio(condition: str, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement:
+def from_ratio(condition: Condition, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement:
     """The requirement of `ratio` times what is available, on every channel."""
     return Requirement(condition, tuple(ratio * delta for delta in available), available, frequency_hz)
 
 
-def refusal(condition: str, available: tuple[float, ...], reason: str) -> Requirement:
+def refusal(condition: Condition, available: tuple[float, ...], reason: str) -> Requirement:
     """The requirement that no damping satisfies."""
     return Requirement(condition, (np.inf,) * len(available), available, None, reason)
 

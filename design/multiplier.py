@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import cvxpy as cp
 import numpy as np
 
@@ -10,7 +12,7 @@ from design.coordinates import balanced, unit_environment
 from design.delayed import uncovered
 from design.failure import DesignFailed, Infeasible
 from design.lmi import Ports, e_hat_regular, lemma1
-from design.solve import solve
+from design.solve import solve, solved
 from design.specification import Specification
 
 #: Phi is enlarged by this, relatively, so that a sweep confirms what a solver found to its own tolerance.
@@ -37,17 +39,17 @@ def least_multiplier(spec: Specification) -> Array:
     N = spec.channels
     full, s = cp.Variable((N, N), symmetric=True), cp.Variable()
     _minimise(s, full, regular, [full << s * np.eye(N)])
-    least = float(s.value)
+    least = float(solved(s))
     if least >= 1:
         raise Infeasible(None, (), _needs(spec, least))
     phi = cp.Variable(N)
     _minimise(s, cp.diag(phi), regular, [phi <= s])
-    least = float(s.value)
+    least = float(solved(s))
     if least >= 1:
         raise Infeasible(None, (), _needs(spec, least))
     # halfway between the least largest entry and Delta_D: least trace alone may touch Delta_D
-    _minimise(cp.sum(phi), cp.diag(phi), regular, [phi <= (1 + least) / 2])
-    return np.maximum(np.asarray(phi.value), 0.0) * np.asarray(spec.delta)
+    _minimise(cast(cp.Expression, cp.sum(phi)), cp.diag(phi), regular, [phi <= (1 + least) / 2])
+    return np.maximum(solved(phi), 0.0) * np.asarray(spec.delta)
 
 
 def _minimise(objective: cp.Expression, Phi: cp.Expression, regular, constraints: list[cp.Constraint]) -> None:

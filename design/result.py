@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from controller.coupling import Coupling
 from controller.lti import Array
 from design.margin import Requirement
+from design.store import Condition
 
 
 @dataclass(frozen=True, eq=False)
@@ -14,7 +15,7 @@ class Design:
     """A coupling, what it was designed for and what was verified from the coupling alone."""
 
     coupling: Coupling
-    condition: str  # "theorem4" | "closed-loop"
+    condition: Condition
     figure: str  # what was minimised: "loop-norm" (23), "rms" (mismatch), "stiffness" (maximised)
     objective: float  # its value, of the coupling as returned
     requirement: Requirement  # by `condition`, on a refined sweep

@@ -40,7 +40,9 @@ def affine_lmis(constant: Complex, slopes: Complex, x: cp.Expression) -> list[cp
     ]
 
 
-def gain_lmi(rows: Complex, row_slopes: Complex, base: Complex, base_slopes: Complex) -> tuple[Complex, Complex]:
+def gain_lmi(
+    rows: Complex, row_slopes: Complex, base: Complex, base_slopes: Complex | Array
+) -> tuple[Complex, Complex]:
     """Constant and slopes of [[base, rows*], [rows, t I]], whose last variable is t.
 
     rows (k, p, m) with slopes (q, k, p, m); base (k, m, m) with slopes (q, k, m, m). Where base >= 0 it says

@@ -17,7 +17,9 @@ class Shaping:
     """L (22) for one specification, evaluated fast for many couplings."""
 
     def __init__(self, spec: Specification) -> None:
-        self.spec = spec
+        assert spec.W1 is not None  # the identity and a low-pass filter, where none were given
+        assert spec.W2 is not None
+        self.spec, self.W1, self.W2 = spec, spec.W1, spec.W2
         one = Lti.constant(np.eye(spec.channels), spec.T)
         self.late = one - delay(spec.advance, spec.T)  # I - Psi Lambda^-1 Theta
         self.environment = spec.delayed_environment
@@ -25,12 +27,12 @@ class Shaping:
     def parts(self, w: Array) -> tuple[Complex, Complex, Complex]:
         """W1 Psi E, W2 and W1 (I - Psi Lambda^-1 Theta) at exp(jw), each (k, ., .)."""
         z = on_circle(w)
-        W1 = self.spec.W1.at(z)
-        return W1 @ self.environment.at(z), self.spec.W2.at(z), W1 @ self.late.at(z)
+        W1 = self.W1.at(z)
+        return W1 @ self.environment.at(z), self.W2.at(z), W1 @ self.late.at(z)
 
     def grid(self, *systems: Lti) -> Array:
         """Frequencies [rad/sample] from 0 to pi that resolve every pole of E, the weights and `systems`."""
-        known = (self.environment, self.spec.W1, self.spec.W2, *systems)
+        known = (self.environment, self.W1, self.W2, *systems)
         return np.concatenate([[0.0], frequencies(*known)])
 
     def gain(self, V: Lti, w: Array) -> Array:

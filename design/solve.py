@@ -11,11 +11,12 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import cvxpy as cp
 import numpy as np
 
+from controller.lti import Array
 from design.failure import Attempt, DesignFailed, Infeasible
 
 #: Largest violation of a constraint that is taken for rounding; problems are posed in units where 1 is large.
@@ -69,12 +70,18 @@ def solve(
     raise DesignFailed(problem, attempts, f"{what} could not be solved ({statuses}); {advice}")
 
 
+def solved(x: cp.Expression) -> Array:
+    """The value that `solve` has left in x."""
+    assert x.value is not None, "read before it was solved for"
+    return np.asarray(x.value)
+
+
 def _attempt(problem: cp.Problem, settings: Settings, accept: Callable[[], bool] | None) -> Attempt:
     started = time.perf_counter()
     status, reason = _call(problem, settings)
     if reason is None:
         reason = _doubt(problem, accept)
-    value = None if reason else float(problem.value)
+    value = None if reason else float(cast(float, problem.value))
     return Attempt(settings.name, status, value, time.perf_counter() - started, reason)
 
 

@@ -23,7 +23,7 @@ from design.margin import Requirement, closed_loop, theorem4
 from design.multiplier import shortage
 from design.result import Design
 from design.shaping import Shaping
-from design.solve import solve
+from design.solve import solve, solved
 from design.specification import RESERVE, Specification
 
 #: The sequence stops when a step improves the norm by less than this, relatively.
@@ -118,7 +118,7 @@ def stiffest_at(B: float, theta: int, delta: float, T: float) -> float:
     except Infeasible as error:
         line = f"B = {B:g} N s/m leaves no stiffness with delta = {delta:g} N s/m and theta = {theta}: use less B"
         raise Infeasible(problem, error.results, line) from error
-    K = float(k.value) * usable / T
+    K = float(solved(k)) * usable / T
     requirement = theorem4(SpringDamper([K], [B]).compliance(T), [theta], [delta])
     if not requirement.certified:
         raise DesignFailed(problem, (), f"K = {K:g} N/m beside B = {B:g} needs {requirement.required[0]:g} N s/m")
@@ -169,4 +169,4 @@ def _start(spec: Specification, sigma: Array, start: SpringDamper | None) -> tup
             "use less psi, a softer environment or more device damping"
         )
         raise Infeasible(problem, error.results, line) from error
-    return np.asarray(gains.value), 1
+    return solved(gains), 1

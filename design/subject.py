@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from controller.contact import held
-from controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
+from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, environment
 from controller.lti import Lti, SingularLoop
 from controller.process import force_map
@@ -25,7 +26,7 @@ LONGEST_DELAY = 100
 class Subject:
     """A coupling between devices and an environment. Raises ValueError naming the field that is wrong."""
 
-    coupling: NoCoupling | SpringDamper | Compliance | InternalModel
+    coupling: Coupling
     network: Network | None  # None is a rigid wall behind the coupling, one channel
     T: float  # [s]
     theta: tuple[int, ...]  # (m,) transmission delays [samples]
@@ -78,7 +79,7 @@ class Subject:
             coupling = Compliance(replace(coupling.V, T=T))
         return replace(self, coupling=coupling, T=T)
 
-    def with_gains(self, K: Sequence[float], B: Sequence[float]) -> Self:
+    def with_gains(self, K: ArrayLike, B: ArrayLike) -> Self:
         """The same loop with another spring-damper [N/m, N s/m]."""
         return replace(self, coupling=SpringDamper(K, B))
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller.delay import delay
 from controller.lti import Array, Lti
@@ -35,7 +36,7 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
     def sigma(G: Lti, w: Array, which: int) -> Array:
         return np.linalg.svd(G.at(on_circle(w)), compute_uv=False)[:, which]
 
-    def mismatch(w: Array) -> Array:
+    def mismatch(w: Array) -> NDArray[np.complex128]:
         z = on_circle(w)
         return F.at(z) - target.at(z)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from models.quantity import require
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating[Any]]
 Range = tuple[float, float]
 
 

@@ -18,14 +18,22 @@ MAY_IMPORT = {
 }
 #: commands of design may also read scenarios, share the command line, and draw
 DESIGN_COMMANDS = {"__main__.py", "audit.py", "check.py", "plot.py", "limits.py", "export.py"}
-COMMANDS_MAY_IMPORT = {"sim.scenario", "sim.command", "sim.files", "sim.stored", "sim.plot"}
+COMMANDS_MAY_IMPORT = {
+    "sim.scenario",
+    "sim.command",
+    "sim.couplings",
+    "sim.files",
+    "sim.stored",
+    "sim.plot",
+    "sim.plot_frequency",
+}
 
 #: the only files that may import a package
 HOMES = {
     "mujoco": {"models/scene.py", "sim/mujoco_engine.py"},
     "cvxpy": {"design/"},
     "serial": {"hw/port.py"},
-    "matplotlib": {"sim/plot.py"},
+    "matplotlib": {"sim/plot"},
 }
 
 FILES = [path for world in WORLDS for path in sorted((ROOT / world).rglob("*.py"))]
