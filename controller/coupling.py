@@ -7,9 +7,10 @@ environment sees u = x - V f. A coupling is anything that turns Psi E into G = (
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from controller.lti import Array, Lti, frozen
 
@@ -36,6 +37,10 @@ class SpringDamper:
 
     K: Array  # (m,) [N/m]
     B: Array  # (m,) [N s/m]
+
+    if TYPE_CHECKING:  # what __post_init__ accepts is more than what the fields then hold
+
+        def __init__(self, K: ArrayLike, B: ArrayLike) -> None: ...
 
     def __post_init__(self) -> None:
         for name in "KB":
@@ -85,6 +90,10 @@ class InternalModel:
 
     poles: Array  # (n,) in (-1, 1); all zero: an FIR filter of n + 1 taps
     Q: Array  # (n + 1, m, m) [m/N]
+
+    if TYPE_CHECKING:
+
+        def __init__(self, poles: ArrayLike, Q: ArrayLike) -> None: ...
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "poles", frozen(self.poles, 1))

@@ -42,9 +42,11 @@ class Specification:
             i = ahead[0]
             limit = self.theta[i] + self.psi[i]
             raise ValueError(f"lam[{i}] is {self.lam[i]}, expected at most theta + psi = {limit} samples (7)")
-        object.__setattr__(self, "W1", self.W1 or Lti.constant(np.eye(E.inputs), E.T))
-        object.__setattr__(self, "W2", self.W2 or low_pass(E.inputs, E.T))
-        _check_weights(self.W1, self.W2, E)
+        W1 = self.W1 or Lti.constant(np.eye(E.inputs), E.T)
+        W2 = self.W2 or low_pass(E.inputs, E.T)
+        object.__setattr__(self, "W1", W1)
+        object.__setattr__(self, "W2", W2)
+        _check_weights(W1, W2, E)
         check_passive(E)
 
     @property

@@ -33,7 +33,7 @@ class Strict(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Immutable, and refuses fields that it does not know."""
 
 
-class Loop(Strict):
+class Loop(Strict, frozen=True):
     """All that enters a condition beside the coupling."""
 
     T: Positive  # [s]
@@ -53,14 +53,14 @@ class Loop(Strict):
         environment(self.environment, self.T)  # raises ValueError if nothing holds an internal node
 
 
-class NoCoupling(Strict, tag_field="kind", tag="none"):
+class NoCoupling(Strict, frozen=True, tag_field="kind", tag="none"):
     """V = 0."""
 
     def build(self, T: float) -> coupling.Coupling:
         return coupling.NoCoupling()
 
 
-class SpringDamper(Strict, tag_field="kind", tag="spring-damper"):
+class SpringDamper(Strict, frozen=True, tag_field="kind", tag="spring-damper"):
     """One spring and damper per channel (26)."""
 
     K: tuple[float, ...]  # (m,) [N/m]
@@ -73,7 +73,7 @@ class SpringDamper(Strict, tag_field="kind", tag="spring-damper"):
         return coupling.SpringDamper(self.K, self.B)
 
 
-class Compliance(Strict, tag_field="kind", tag="compliance"):
+class Compliance(Strict, frozen=True, tag_field="kind", tag="compliance"):
     """A general V(z), as the rows of its state-space matrices."""
 
     A: Rows
@@ -91,7 +91,7 @@ class Compliance(Strict, tag_field="kind", tag="compliance"):
         return coupling.Compliance(Lti(*tables, D, T))
 
 
-class InternalModel(Strict, tag_field="kind", tag="internal-model"):
+class InternalModel(Strict, frozen=True, tag_field="kind", tag="internal-model"):
     """The parameter Q(z) of the pair with the environment: poles of its basis, and a coefficient per function."""
 
     poles: tuple[float, ...]  # (n,)
@@ -115,7 +115,7 @@ def _table(name: str, rows: Rows, height: int, width: int) -> Array:
 CouplingData = NoCoupling | SpringDamper | Compliance | InternalModel
 
 
-class Certificate(Strict):
+class Certificate(Strict, frozen=True):
     """What is claimed of a coupling in its loop, and what proves it."""
 
     condition: Condition
@@ -130,7 +130,7 @@ class Certificate(Strict):
     seal: str = ""  # digest of all of the above
 
 
-class Stored(Strict):
+class Stored(Strict, frozen=True):
     """A coupling with its loop and, once it is proved, its certificate."""
 
     loop: Loop
