@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -91,7 +92,7 @@ def merge(parts: Sequence[Findings], interrupted: bool = False) -> Findings:
     joined: dict[str, Any] = {
         name: np.concatenate([getattr(p, name) for p in parts])[order] if parts else order for name in arrays
     }
-    return Findings(**joined, simulated=sum(p.simulated for p in parts), interrupted=interrupted)
+    return Findings(**joined, simulated=math.fsum(p.simulated for p in parts), interrupted=interrupted)
 
 
 def _group(

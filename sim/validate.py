@@ -16,6 +16,7 @@ from design.summary import coupling_part
 from models.crowd import Crowd
 from sim import verdict_report
 from sim.adversary import Worst, search
+from sim.cluster import validate_on_cluster
 from sim.command import (
     DOES_NOT_HOLD,
     DONE,
@@ -47,7 +48,7 @@ def main(argv: list[str]) -> int:
     """Meet random humans. 0: the claims hold, 1: not, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario = scenario_from(args)
-    humans, shards = _whole(args, "humans", 1_000_000), _whole(args, "shards", 256)
+    humans, shards = _whole(args, "humans", 1_000_000), _shards(args)
     seed, duration = seed_from(args), _duration(args, scenario)
     links = LINKS[args.links] if args.links else scenario.population.links
     out = out_folder(args, "validate")
@@ -58,7 +59,10 @@ def main(argv: list[str]) -> int:
 
     with (bar := progress_bar("validating"))[0]:
         begin = time.perf_counter()
-        findings = validate(question, shards, bar[1])
+        if args.dask is not None:
+            findings = validate_on_cluster(question, args.dask, bar[1])
+        else:
+            findings = validate(question, shards, bar[1])
         wall = time.perf_counter() - begin
     outcome = _outcome(args, scenario, chosen, requirements, question, findings, certified, wall)
     worst = _attack(scenario, chosen, seed, outcome) if args.adversary and not findings.interrupted else None
@@ -92,6 +96,7 @@ def _parser() -> Parser:
     parser.add_argument(
         "--shards", default="1", metavar="K", help="local processes (default 1); the result is the same"
     )
+    parser.add_argument("--dask", metavar="HOST:PORT", help="work on an existing Dask cluster; the result is the same")
     parser.add_argument("--adversary", action="store_true", help="also search for the worst passive human")
     parser.add_argument("--no-plot", action="store_true", help="write no picture")
     add_output_options(parser)
@@ -103,6 +108,13 @@ def _whole(args: argparse.Namespace, name: str, most: int) -> int:
     if not 1 <= value <= most:
         raise InputError(f"--{name} is {value}, allowed are 1 to {most}")
     return value
+
+
+def _shards(args: argparse.Namespace) -> int:
+    shards = _whole(args, "shards", 256)
+    if args.dask is not None and shards > 1:
+        raise InputError(f"--shards {shards} with --dask: the cluster decides who does what, give one of them")
+    return shards
 
 
 def _duration(args: argparse.Namespace, scenario: Scenario) -> float:

@@ -24,6 +24,7 @@ COMMANDS_MAY_IMPORT = {"sim.scenario", "sim.command", "sim.files", "sim.stored",
 HOMES = {
     "mujoco": {"models/scene.py", "sim/mujoco_engine.py"},
     "cvxpy": {"design/"},
+    "distributed": {"sim/cluster.py"},
     "serial": {"hw/port.py"},
     "matplotlib": {"sim/plot.py"},
 }

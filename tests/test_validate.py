@@ -1,6 +1,7 @@
 """A thousand humans at once give what each alone gives, in both engines, however the work is split."""
 
 import json
+import sys
 from dataclasses import fields, replace
 
 import numpy as np
@@ -111,13 +112,18 @@ def test_a_human_depends_on_seed_and_index_only():
     assert {c.links.shape[2]: len(i) for i, c in crowds(SCENARIO.population, 2, 5, range(20), MIXED)}.keys() == {1, 2}
 
 
-def test_shards_repeat_the_single_run_bit_for_bit(monkeypatch):
-    question = Question(SCENARIO, CASE_I, 0, 300, MIXED, "both", 0.0)
+def test_shards_repeat_the_single_run_bit_for_bit():
+    """Verdicts and MuJoCo's traces, long enough for a growth rate on each."""
+    question = Question(SCENARIO, CASE_I, 0, 300, MIXED, "both", 0.3)
     assert len(question.batches()) > 2
     alone, shared = validate(question), validate(question, shards=2)
     for field in fields(Findings):
         np.testing.assert_array_equal(getattr(alone, field.name), getattr(shared, field.name), err_msg=field.name)
     np.testing.assert_array_equal(alone.index, np.arange(300))
+    assert np.isfinite(alone.mujoco).all()
+    assert np.isfinite(alone.trace).mean() > 0.9
+    # the trace is MuJoCo's own, not the exact engine's again
+    assert not np.array_equal(alone.trace, validate(replace(question, engine="exact")).trace)
 
 
 def test_designed_coupling_holds_for_everyone():
@@ -202,6 +208,7 @@ def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
         (["--humans", "many"], "--humans is 'many', expected a whole number"),
         (["--engine", "drake"], "--engine: invalid choice: 'drake'"),
         (["--links", "9"], "--links: invalid choice: '9'"),
+        (["--shards", "2", "--dask", "here:8786"], "--shards 2 with --dask: the cluster decides"),
         (["--shards", "0"], "--shards is 0, allowed are 1 to 256"),
         (["--duration", "-1"], "--duration is -1, allowed are 0 and 0.0048 to 100000 s"),
         (["--seed", "-1"], "--seed is -1"),
@@ -241,3 +248,9 @@ def test_impossible_crowds_cannot_be_built():
         Crowd(-np.ones((1, 2, 1, 3)))
     with pytest.raises(ValueError, match="expected \\(sets, devices, links, 3\\)"):
         Crowd(np.ones((2, 3)))
+
+
+def test_without_dask_the_command_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match="--dask needs Dask: pip install 'distributed"):
+        main(["--dask", "127.0.0.1:9", "--humans", "5", "--out", str(tmp_path)])
