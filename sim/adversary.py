@@ -12,6 +12,7 @@ has succeeded.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -25,6 +26,7 @@ from controller.process import force_map
 from design.margin import closed_loop
 from models.crowd import Crowd, variants
 from models.human import Human
+from sim.loop import Progress
 from sim.scenario import Scenario
 from sim.verdicts import dominant_modes, exact_loops
 
@@ -51,11 +53,24 @@ class Worst:
         return self.growth > DESTABILISED
 
 
-def search(scenario: Scenario, F: Lti, seed: int = 0, generations: int = 150, first: bool = False) -> Worst:
-    """The lossless humans with the largest growth that were found; with `first`, the first that destabilise."""
-    m = scenario.channels
+def search(
+    scenario: Scenario,
+    F: Lti,
+    seed: int = 0,
+    generations: int = 150,
+    first: bool = False,
+    progress: Progress = lambda done, total: None,
+) -> Worst:
+    """The lossless humans with the largest growth that were found; with `first`, the first that destabilise.
+
+    `progress` hears of every generation.
+    """
+    m, done = scenario.channels, 0
 
     def stop(intermediate_result: OptimizeResult) -> bool:
+        nonlocal done
+        done += 1
+        progress(done, len(PASSES) * generations)
         return first and bool(-intermediate_result.fun > 10 * DESTABILISED)
 
     best, evaluated = None, 0
@@ -72,6 +87,7 @@ def search(scenario: Scenario, F: Lti, seed: int = 0, generations: int = 150, fi
             updating="deferred",
             callback=stop,
         )
+        done = (trial + 1) * generations
         evaluated += (found.nit + 1) * CANDIDATES
         worst = _worst(scenario, F, _ladders(found.x[:, None], m, links), evaluated)
         best = worst if best is None or worst.growth > best.growth else best
@@ -91,11 +107,15 @@ class Attempt:
 
 
 def attempts(
-    loops: dict[str, tuple[Scenario, Coupling]], shortages: Array, seed: int = 0, generations: int = 150
+    loops: dict[str, tuple[Scenario, Coupling]],
+    shortages: Array,
+    seed: int = 0,
+    generations: int = 150,
+    attempted: Callable[[Attempt], None] = lambda attempt: None,
 ) -> list[Attempt]:
     """Attack every loop at every shortage: devices get (1 - short) times the damping that `closed_loop` requires.
 
-    A negative shortage gives the devices more than required: there the search must fail.
+    A negative shortage gives the devices more than required: there the search must fail. `attempted` hears of each.
     """
     rows = []
     for name, (scenario, coupling) in loops.items():
@@ -104,6 +124,7 @@ def attempts(
         for short in shortages:
             placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
             rows.append(Attempt(name, float(short), search(placed, F, seed, generations=generations, first=True)))
+            attempted(rows[-1])
     return rows
 
 

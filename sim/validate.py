@@ -127,7 +127,8 @@ def _duration(args: argparse.Namespace, scenario: Scenario) -> float:
 def _attack(scenario: Scenario, chosen: Chosen, seed: int, outcome: dict[str, Any]) -> Worst | None:
     """The worst human, or None where the keyboard ends the search: what was found out before is kept."""
     try:
-        return search(scenario, assemble(scenario, chosen.coupling).F, seed)
+        with (bar := progress_bar("searching the worst human"))[0]:
+            return search(scenario, assemble(scenario, chosen.coupling).F, seed, progress=bar[1])
     except KeyboardInterrupt:
         outcome["interrupted"] = True
         return None

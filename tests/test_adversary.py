@@ -1,19 +1,22 @@
 """The search for the worst passive human finds one where the closed-loop condition fails, and none where it holds."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from controller.coupling import NoCoupling, SpringDamper
+from design.margin import closed_loop as real
 from design.published import CASE_I
 from models.scene import build, plant
 from sim import run as run_command
 from sim.adversary import DESTABILISED, attempts, search, success_rate
 from sim.exact_engine import hold
-from sim.scenario import load
+from sim.scenario import InputError, load
 from sim.simulate import assemble
 from sim.stability import close, dominant_mode
+from sim.tightness import main as tightness
 from sim.validate import main
 
 SCENARIO = load()
@@ -62,10 +65,38 @@ def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypa
     """Were a certificate wrong, the command would say so: here the search is told of another loop."""
     F = assemble(SCENARIO, NoCoupling()).F
     monkeypatch.setattr(
-        "sim.validate.search", lambda scenario, certified, seed: search(scenario, F, seed, generations=5)
+        "sim.validate.search", lambda scenario, certified, seed, progress: search(scenario, F, seed, generations=5)
     )
     options = ["--humans", "5", "--engine", "exact", "--duration", "0", "--no-plot", "--adversary"]
     assert main([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 1
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["certified"]
     assert not report["holds"]
+
+
+def test_the_tightness_command_reports_the_rate_by_shortage(tmp_path):
+    options = ["--short", "0,20", "--generations", "10", "--seed", "1", "--json", str(tmp_path / "r.json")]
+    assert tightness([*options, "--out", str(tmp_path)]) == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["rates"] == [{"short": 0.0, "attempts": 2, "rate": 0.0}, {"short": 0.2, "attempts": 2, "rate": 1.0}]
+    assert {row["loop"] for row in report["rows"]} == {"no coupling", "spring-damper, case I"}
+    assert (tmp_path / "tightness.png").stat().st_size > 10_000
+
+
+def test_somebody_who_destabilises_a_loop_with_enough_damping_fails_the_command(tmp_path, monkeypatch):
+    """Were the condition wrong, the command would say so: here it is told that a third of the damping is enough."""
+    monkeypatch.setattr("sim.adversary.closed_loop", lambda F, delta: replace(real(F, delta), required=(0.5, 0.5)))
+    assert tightness(["--case", "none", "--short", "0", "--generations", "5", "--out", str(tmp_path)]) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--short", "-1"], "--short is -1, allowed are 0 to below 100"),
+        (["--short", "5,many"], "--short is '5,many', expected numbers"),
+        (["--generations", "0"], "--generations is 0, allowed are 1 to 10000"),
+    ],
+)
+def test_bad_calls_of_tightness(options, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        tightness([*options, "--out", str(tmp_path)])
