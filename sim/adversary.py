@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import OptimizeResult, differential_evolution
@@ -25,16 +26,24 @@ from controller.lti import Array, Lti
 from controller.process import force_map
 from design.margin import closed_loop
 from models.crowd import Crowd, variants
-from models.human import Human
+from models.human import Human, Person
 from sim.loop import Progress
 from sim.scenario import Scenario
 from sim.verdicts import dominant_modes, exact_loops
 
 MASS, STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
 DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9
-#: (links, least frequency [Hz] of the modes looked at) of each pass. One mass and spring already present every
-#: reactance at one frequency; slow modes of a lossless hand barely decay and would hide the one that grows
-PASSES = ((1, 2.0), (2, 2.0), (1, 0.0))
+
+
+class Pass(NamedTuple):
+    """One search. Slow modes of a lossless hand barely decay and would hide the one that grows."""
+
+    links: int  # of each arm; one mass and spring already present every reactance at one frequency
+    audible: float  # [Hz] least frequency of the modes looked at
+    held: bool = False  # by one person, whose body and cross spring present every reactance matrix
+
+
+PASSES = (Pass(1, 2.0), Pass(2, 2.0), Pass(1, 0.0), Pass(1, 2.0, held=True))
 CANDIDATES = 120  # sets of humans in a generation
 
 
@@ -43,6 +52,7 @@ class Worst:
     """The worst humans that a search found."""
 
     humans: tuple[Human, ...]
+    persons: tuple[Person, ...]  # who hold several devices
     spectral_radius: float
     growth: float  # [1/s]
     frequency_hz: float
@@ -66,20 +76,22 @@ def search(
     `progress` hears of every generation.
     """
     m, done = scenario.channels, 0
+    passes = [p for p in PASSES if m > 1 or not p.held]
 
     def stop(intermediate_result: OptimizeResult) -> bool:
         nonlocal done
         done += 1
-        progress(done, len(PASSES) * generations)
+        progress(done, len(passes) * generations)
         return first and bool(-intermediate_result.fun > 10 * DESTABILISED)
 
     best, evaluated = None, 0
-    for trial, (links, audible) in enumerate(PASSES):
+    for trial, kind in enumerate(passes):
+        ranges = [MASS, STIFFNESS] * (m * kind.links) + [MASS, STIFFNESS, STIFFNESS] * kind.held
         found = differential_evolution(
-            partial(_losses, scenario=scenario, F=F, links=links, audible=audible),
-            np.log([MASS, STIFFNESS] * (m * links)),
+            partial(_losses, scenario=scenario, F=F, kind=kind),
+            np.log(ranges),
             rng=np.random.default_rng(np.random.SeedSequence((seed, trial))),
-            popsize=CANDIDATES // (2 * m * links),
+            popsize=CANDIDATES // len(ranges),
             maxiter=generations,
             tol=0,
             polish=False,
@@ -88,8 +100,8 @@ def search(
             callback=stop,
         )
         done = (trial + 1) * generations
-        evaluated += (found.nit + 1) * CANDIDATES
-        worst = _worst(scenario, F, _ladders(found.x[:, None], m, links), evaluated)
+        evaluated += (found.nit + 1) * (CANDIDATES // len(ranges)) * len(ranges)
+        worst = _worst(scenario, F, _ladders(found.x[:, None], m, kind), evaluated)
         best = worst if best is None or worst.growth > best.growth else best
         if first and best.destabilises:
             break
@@ -133,21 +145,30 @@ def success_rate(rows: list[Attempt]) -> float:
     return sum(row.worst.destabilises for row in rows) / len(rows)
 
 
-def _ladders(x: Array, channels: int, links: int) -> Crowd:
-    """Log masses and stiffnesses (2 channels links, nsim) as lossless humans."""
-    values = np.exp(x.T).reshape(-1, channels, links, 2)
-    return Crowd(np.stack([values[..., 0], np.zeros_like(values[..., 0]), values[..., 1]], axis=-1))
+def _ladders(x: Array, channels: int, kind: Pass) -> Crowd:
+    """Logs of masses and stiffnesses, (2 channels links, nsim), as lossless humans.
+
+    Where one person holds all devices, three more rows are the body's mass and stiffness and the cross stiffness.
+    """
+    arms = 2 * channels * kind.links
+    values = np.exp(x[:arms].T).reshape(-1, channels, kind.links, 2)
+    links = np.stack([values[..., 0], np.zeros_like(values[..., 0]), values[..., 1]], axis=-1)
+    if not kind.held:
+        return Crowd(links)
+    mass, stiffness, cross = np.exp(x[arms:])
+    bodies = np.stack([mass, 0 * mass, stiffness, 0 * mass, cross], axis=-1)[:, None]
+    return Crowd(links, (tuple(range(1, channels + 1)),), bodies)
 
 
-def _losses(x: Array, scenario: Scenario, F: Lti, links: int, audible: float) -> Array:
-    """Minus the largest growth [1/s] among the modes above `audible` Hz, for every column of x."""
-    loops = exact_loops(variants(scenario.device, _ladders(x.reshape(x.shape[0], -1), scenario.channels, links)), F)
+def _losses(x: Array, scenario: Scenario, F: Lti, kind: Pass) -> Array:
+    """Minus the largest growth [1/s] among the audible modes, for every column of x."""
+    loops = exact_loops(variants(scenario.device, _ladders(x.reshape(x.shape[0], -1), scenario.channels, kind)), F)
     values = np.linalg.eigvals(loops.A)
-    heard = np.abs(np.angle(values)) / (2 * np.pi * F.T) >= audible
+    heard = np.abs(np.angle(values)) / (2 * np.pi * F.T) >= kind.audible
     return -np.log(np.where(heard, np.abs(values), 1e-300).max(axis=1)) / F.T
 
 
 def _worst(scenario: Scenario, F: Lti, crowd: Crowd, evaluated: int) -> Worst:
     modes = dominant_modes(exact_loops(variants(scenario.device, crowd), F))
     radius, growth, frequency = (float(a[0]) for a in (modes.spectral_radius, modes.growth, modes.frequency_hz))
-    return Worst(crowd.humans(0), radius, growth, frequency, evaluated)
+    return Worst(crowd.humans(0), crowd.persons(0), radius, growth, frequency, evaluated)

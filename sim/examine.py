@@ -80,7 +80,7 @@ def examine(question: Question, indices: Sequence[int], ticked: Callable[[int], 
     assembly = assemble(scenario, question.coupling)
     parts = [
         _group(question, assembly, index, crowd, ticked)
-        for index, crowd in crowds(scenario.population, scenario.channels, question.seed, indices, question.links)
+        for index, crowd in crowds(scenario, question.seed, indices, question.links)
     ]
     return merge(parts)
 

@@ -38,7 +38,7 @@ def assemble(scenario: Scenario, coupling: Coupling) -> Assembly:
     E = environment(scenario.environment, scenario.T)
     F = force_map(E, coupling, scenario.theta, scenario.psi)
     process = Process(F, _each(scenario.device, "force_limit"), _each(scenario.device, "encoder_step"))
-    scene = build(scenario.device, scenario.human)
+    scene = build(scenario.device, scenario.human, scenario.person)
     return Assembly(scenario, E, F, process, scene, hold(plant(scene.model), scenario.T))
 
 

@@ -13,7 +13,6 @@ from design.assess import CONDITIONS, assess
 from design.margin import Requirement
 from design.promises import certificate_part
 from design.summary import coupling_part
-from models.crowd import Crowd
 from sim import verdict_report
 from sim.adversary import Worst, search
 from sim.cluster import validate_on_cluster
@@ -36,7 +35,7 @@ from sim.couplings import NAMES, Chosen, choose
 from sim.examine import ENGINES, Findings, Question
 from sim.files import write_json
 from sim.human_file import save_humans
-from sim.population import MIXED, draw
+from sim.population import MIXED, crowd_of
 from sim.scenario import InputError, Scenario
 from sim.shards import validate
 from sim.simulate import assemble
@@ -168,11 +167,12 @@ def _save(
     if findings.index.size:
         named |= {"worst-human.toml": int(findings.index[np.argmax(findings.radius)])}
     for name, i in named.items():
-        links = draw(scenario.population, scenario.channels, question.seed, i, question.links)
-        files.append(save_humans(out / name, Crowd(links[None]).humans(0), f"seed {question.seed}, index {i}"))
+        crowd = crowd_of(scenario, question.seed, i, question.links)
+        remark = f"seed {question.seed}, index {i}"
+        files.append(save_humans(out / name, crowd.humans(0), remark, crowd.persons(0)))
     if adversary:
         remark = f"found by the adversary, seed {question.seed}: growth {adversary.growth:+.6g} 1/s"
-        files.append(save_humans(out / "adversary.toml", adversary.humans, remark))
+        files.append(save_humans(out / "adversary.toml", adversary.humans, remark, adversary.persons))
     if not args.no_plot and findings.index.size:
         from sim.plot import plot_population
 

@@ -104,12 +104,12 @@ def test_batch_engine_is_the_exact_engine(devices):
 
 
 def test_a_human_depends_on_seed_and_index_only():
-    few = dict(zip([7, 3], next(crowds(SCENARIO.population, 2, 5, [7, 3], 1))[1].links, strict=True))
-    many = next(crowds(SCENARIO.population, 2, 5, range(20), 1))[1].links
+    few = dict(zip([7, 3], next(crowds(SCENARIO, 5, [7, 3], 1))[1].links, strict=True))
+    many = next(crowds(SCENARIO, 5, range(20), 1))[1].links
     np.testing.assert_array_equal(few[7], many[7])
     np.testing.assert_array_equal(few[3], many[3])
     assert not np.array_equal(many[3], draw(SCENARIO.population, 2, 6, 3, 1))
-    assert {c.links.shape[2]: len(i) for i, c in crowds(SCENARIO.population, 2, 5, range(20), MIXED)}.keys() == {1, 2}
+    assert {c.links.shape[2]: len(i) for i, c in crowds(SCENARIO, 5, range(20), MIXED)}.keys() == {1, 2}
 
 
 def test_shards_repeat_the_single_run_bit_for_bit():
