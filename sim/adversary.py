@@ -6,8 +6,8 @@ beyond that a matrix exponential, not a hand, would decide.
 
 The condition counts |dx|^2 / T where a device dissipates the integral of v^2, which is more unless v is constant
 between samples: for a sinusoid, |dx|^2 / T is (sin x / x)^2 of it, x = pi f T. So the condition asks for that much
-too much damping, about, at the frequency f where it binds: 4.8 % at 101 Hz and 1.2 ms. Closer than that no search
-has succeeded.
+too much damping, about, at the frequency f where it binds: 4.8 % at 101 Hz and 1.2 ms, 0.03 % at 8 Hz (where loops
+with long delays bind). Closer than that no search has succeeded, and just outside it most do.
 """
 
 from __future__ import annotations

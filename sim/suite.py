@@ -79,6 +79,12 @@ CHECKS = (
         suite_report.verdicts,
     ),
     Check("tightness", "How tight is the condition?", "sim.tightness --case I --seed {seed}", suite_report.tightness),
+    Check(
+        "delayed",
+        "How tight is it with long delays?",
+        "sim.tightness --case none --theta 4,9 --short 0,0.2,0.5,1,2 --seed {seed}",
+        suite_report.tightness,
+    ),
     Check("accuracy", "Is MuJoCo right, and at what cost?", "sim.accuracy --duration 6", suite_report.accuracy),
     Check("hard", "Numerically hard loops", "sim.hard", suite_report.hard),
 )

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
+from sim.tightness import by_whom
+
 INTRODUCTION = """\
 Several force-feedback devices share one simulated object; the loop of hands, devices, delays and computer must not
 start to oscillate by itself, whoever holds the devices. A *coupling* is the filter between devices and object that
@@ -70,14 +72,16 @@ def tightness(report: dict[str, Any]) -> list[Part]:
     rates = report["rates"]
     rows = tuple((f"{r['short']:.1%}", str(r["attempts"]), f"{r['rate']:.0%}") for r in rates)
     first = next((r["short"] for r in rates if r["rate"] == 1), None)
-    gist = "somebody destabilises every loop " + (f"{first:.1%} short of it" if first is not None else "in no case")
+    gist = "no shortage tried lets somebody destabilise every loop"
+    if first is not None:
+        gist = f"somebody destabilises every loop whose devices lack {first:.1%} of the damping required"
     single = tuple(
-        (r["loop"], f"{r['short']:.1%}", f"{r['growth_rate_per_s']:+.3g}" if r["found"] else "nobody found")
+        (r["loop"], f"{r['short']:.1%}", by_whom(r), f"{r['growth_rate_per_s']:+.3g}" if r["found"] else "-")
         for r in report["rows"]
     )
     return [
         Part("Success rate of the adversary", ("damping missing", "loops", "destabilised"), rows, gist),
-        Part("Each loop", ("loop", "damping missing", "growth [1/s] with the first human found"), single),
+        Part("Each loop", ("loop", "damping missing", "destabilised by", "growth [1/s], first found"), single),
     ]
 
 

@@ -120,6 +120,13 @@ def _attack(loops: Loops, shortages: list[float], seed: int, generations: int) -
     return rows, False
 
 
+def by_whom(row: Row) -> str:
+    """Who destabilises a loop."""
+    if not row["found"]:
+        return "nobody"
+    return "one person" if row["held_together"] else "one hand each"
+
+
 def _row(attempt: Attempt) -> Row:
     worst = attempt.worst
     return {
@@ -128,6 +135,7 @@ def _row(attempt: Attempt) -> Row:
         "found": worst.destabilises,
         "growth_rate_per_s": finite(worst.growth),
         "frequency_hz": worst.frequency_hz,
+        "held_together": bool(worst.persons),
         "evaluated": worst.evaluated,
     }
 
@@ -150,12 +158,12 @@ def _save(args: argparse.Namespace, out: Path, outcome: dict[str, Any]) -> list[
 
 def _print(outcome: dict[str, Any], args: argparse.Namespace) -> None:
     table = Table(title=f"damping missing, and who notices · {outcome['scenario']}")
-    for name in ("loop", "short of required", "destabilised", "growth [1/s]", "at [Hz]"):
+    for name in ("loop", "short of required", "destabilised by", "growth [1/s]", "at [Hz]"):
         table.add_column(name, justify="left" if name == "loop" else "right")
     for row in outcome["rows"]:
         found = f"{row['growth_rate_per_s']:+.3g}" if row["found"] else "-"
         at = f"{row['frequency_hz']:.1f}" if row["found"] else "-"
-        table.add_row(row["loop"], f"{row['short']:.1%}", "yes" if row["found"] else "no", found, at)
+        table.add_row(row["loop"], f"{row['short']:.1%}", by_whom(row), found, at)
     console(args).print(table)
 
 
