@@ -49,7 +49,7 @@ class Check:
     figures: Callable[[dict[str, Any]], list[Part]]
 
 
-_MEET = "--humans {humans} --links mixed --duration 1 --adversary --seed {seed}"
+_MEET = "--humans {humans} --links mixed --duration 1 --adversary --generations 60 --seed {seed}"
 
 CHECKS = (
     Check("none", "Two devices without a coupling", f"sim.validate --case none {_MEET}", suite_report.verdicts),

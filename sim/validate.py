@@ -48,7 +48,7 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     scenario = scenario_from(args)
     humans, shards = _whole(args, "humans", 1_000_000), _shards(args)
-    seed, duration = seed_from(args), _duration(args, scenario)
+    seed, duration, generations = seed_from(args), _duration(args, scenario), _whole(args, "generations", 10_000)
     links = LINKS[args.links] if args.links else scenario.population.links
     out = out_folder(args, "validate")
     chosen = choose(scenario, args.case, args.coupling, args.condition)
@@ -64,7 +64,9 @@ def main(argv: list[str]) -> int:
             findings = validate(question, shards, bar[1])
         wall = time.perf_counter() - begin
     outcome = _outcome(args, scenario, chosen, requirements, question, findings, certified, wall)
-    worst = _attack(scenario, chosen, seed, outcome) if args.adversary and not findings.interrupted else None
+    worst = (
+        _attack(scenario, chosen, seed, generations, outcome) if args.adversary and not findings.interrupted else None
+    )
     if worst:
         ratio = requirements["closed-loop"].ratio
         outcome["adversary"] = verdict_report.adversary_part(worst, ratio, certified)
@@ -97,6 +99,7 @@ def _parser() -> Parser:
     )
     parser.add_argument("--dask", metavar="HOST:PORT", help="work on an existing Dask cluster; the result is the same")
     parser.add_argument("--adversary", action="store_true", help="also search for the worst passive human")
+    parser.add_argument("--generations", default="150", metavar="N", help="of the adversary's search (default 150)")
     parser.add_argument("--no-plot", action="store_true", help="write no picture")
     add_output_options(parser)
     return parser
@@ -123,11 +126,11 @@ def _duration(args: argparse.Namespace, scenario: Scenario) -> float:
     return duration
 
 
-def _attack(scenario: Scenario, chosen: Chosen, seed: int, outcome: dict[str, Any]) -> Worst | None:
+def _attack(scenario: Scenario, chosen: Chosen, seed: int, generations: int, outcome: dict[str, Any]) -> Worst | None:
     """The worst human, or None where the keyboard ends the search: what was found out before is kept."""
     try:
         with (bar := progress_bar("searching the worst human"))[0]:
-            return search(scenario, assemble(scenario, chosen.coupling).F, seed, progress=bar[1])
+            return search(scenario, assemble(scenario, chosen.coupling).F, seed, generations, progress=bar[1])
     except KeyboardInterrupt:
         outcome["interrupted"] = True
         return None

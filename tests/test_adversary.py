@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -81,8 +80,7 @@ def test_the_person_found_is_kept_for_a_replay(tmp_path, monkeypatch):
     both_hands(monkeypatch)
     file, out = tmp_path / "r.json", tmp_path / "out"
     base = ["--case", "none", "--engine", "exact", "--no-plot", "--out", str(out), "--json", str(file)]
-    monkeypatch.setattr("sim.validate.search", partial(search, generations=8))
-    assert main([*base, "--humans", "5", "--duration", "0", "--adversary"]) == 0
+    assert main([*base, "--humans", "5", "--duration", "0", "--adversary", "--generations", "8"]) == 0
     found = json.loads(file.read_text())["adversary"]
     assert found["person"][0]["holds"] == [1, 2]
     assert run_command.main([*base, "--human", str(out / "adversary.toml"), "--duration", "0.5"]) == 0
@@ -101,10 +99,10 @@ def test_the_human_found_is_concrete_and_the_search_repeatable():
     assert mode.growth == pytest.approx(worst.growth, rel=1e-9)
 
 
-def test_the_command_keeps_the_human_for_a_replay(tmp_path, monkeypatch):
-    monkeypatch.setattr("sim.validate.search", partial(search, generations=8))
+def test_the_command_keeps_the_human_for_a_replay(tmp_path):
     file, out = tmp_path / "r.json", tmp_path / "out"
     options = ["--case", "none", "--humans", "5", "--engine", "exact", "--duration", "0", "--no-plot", "--adversary"]
+    options += ["--generations", "8"]
     assert main([*options, "--out", str(out), "--json", str(file)]) == 0
     adversary = json.loads(file.read_text())["adversary"]
     assert adversary["found"]
@@ -119,7 +117,7 @@ def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypa
     """Were a certificate wrong, the command would say so: here the search is told of another loop."""
     F = assemble(SCENARIO, NoCoupling()).F
     monkeypatch.setattr(
-        "sim.validate.search", lambda scenario, certified, seed, progress: search(scenario, F, seed, generations=4)
+        "sim.validate.search", lambda scenario, certified, seed, generations, progress: search(scenario, F, seed, 4)
     )
     options = ["--humans", "5", "--engine", "exact", "--duration", "0", "--no-plot", "--adversary"]
     assert main([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 1

@@ -261,6 +261,7 @@ def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
         (["--links", "9"], "--links: invalid choice: '9'"),
         (["--shards", "2", "--dask", "here:8786"], "--shards 2 with --dask: the cluster decides"),
         (["--shards", "0"], "--shards is 0, allowed are 1 to 256"),
+        (["--generations", "0"], "--generations is 0, allowed are 1 to 10000"),
         (["--duration", "-1"], "--duration is -1, allowed are 0 and 0.0048 to 100000 s"),
         (["--seed", "-1"], "--seed is -1"),
         (["--case", "none", "--coupling", "published"], "with --case none"),
