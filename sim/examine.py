@@ -17,7 +17,7 @@ from sim.batch_engine import ExactBatchEngine
 from sim.exact_engine import hold
 from sim.knock import Trace, knock
 from sim.mujoco_engine import MujocoBatchEngine
-from sim.population import crowds
+from sim.population import crowds_of
 from sim.scenario import Scenario
 from sim.simulate import Assembly, assemble
 from sim.stability import ClosedLoop
@@ -80,7 +80,7 @@ def examine(question: Question, indices: Sequence[int], ticked: Callable[[int], 
     assembly = assemble(scenario, question.coupling)
     parts = [
         _group(question, assembly, index, crowd, ticked)
-        for index, crowd in crowds(scenario, question.seed, indices, question.links)
+        for index, crowd in crowds_of(scenario, question.seed, indices, question.links)
     ]
     return merge(parts)
 

@@ -37,19 +37,34 @@ def draw_bodies(population: Population, persons: int, seed: int, index: int) -> 
     return np.exp(rng.uniform(low, high, size=(persons, 5)))
 
 
-def crowd_of(scenario: Scenario, seed: int, index: int, links: int) -> Crowd:
-    """The one set of humans with this index, held together as the scenario's persons hold its devices."""
-    ((_, crowd),) = crowds(scenario, seed, [index], links)
-    return crowd
-
-
 def crowds(
-    scenario: Scenario, seed: int, indices: Iterable[int], links: int
+    population: Population,
+    channels: int,
+    seed: int,
+    indices: Iterable[int],
+    links: int,
+    holds: tuple[tuple[int, ...], ...] = (),
 ) -> Iterator[tuple[NDArray[np.intp], Crowd]]:
-    """The humans of these indices, grouped by their number of links: (indices of the group, crowd)."""
-    population, holds = scenario.population, tuple(person.holds for person in scenario.person)
-    drawn = {i: draw(population, scenario.channels, seed, i, links) for i in indices}
+    """The humans of these indices, grouped by their number of links: (indices of the group, crowd).
+
+    `holds` says which channels one person holds, as in Crowd.
+    """
+    drawn = {i: draw(population, channels, seed, i, links) for i in indices}
     for count in sorted({values.shape[1] for values in drawn.values()}):
         group = [i for i, values in drawn.items() if values.shape[1] == count]
         bodies = np.stack([draw_bodies(population, len(holds), seed, i) for i in group])
         yield np.array(group), Crowd(np.stack([drawn[i] for i in group]), holds, bodies)
+
+
+def crowds_of(
+    scenario: Scenario, seed: int, indices: Iterable[int], links: int
+) -> Iterator[tuple[NDArray[np.intp], Crowd]]:
+    """`crowds` for a scenario: of its population, and held together as its persons hold its devices."""
+    holds = tuple(person.holds for person in scenario.person)
+    return crowds(scenario.population, scenario.channels, seed, indices, links, holds)
+
+
+def crowd_of(scenario: Scenario, seed: int, index: int, links: int) -> Crowd:
+    """The one set of humans with this index."""
+    ((_, crowd),) = crowds_of(scenario, seed, [index], links)
+    return crowd

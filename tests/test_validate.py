@@ -22,7 +22,7 @@ from sim.exact_engine import ExactEngine, hold
 from sim.examine import Findings, Question
 from sim.knock import knock_forces
 from sim.loop import run
-from sim.population import MIXED, crowds, draw
+from sim.population import MIXED, crowds, crowds_of, draw
 from sim.scenario import InputError, load
 from sim.shards import validate
 from sim.simulate import assemble, simulate
@@ -67,7 +67,7 @@ HELD = SCENARIO.replace(person=(Person((2, 1), 20.0, 1.0, 100.0),))
 def test_people_in_both_hands_are_stacked_and_simulated_alike(devices):
     """Each row of the crowd is the scene built for it, and MuJoCo's map agrees with the exact one as for others."""
     scenario = HELD.replace(device=devices)
-    ((_, people),) = crowds(scenario, 7, range(20), 2)
+    ((_, people),) = crowds_of(scenario, 7, range(20), 2)
     held_by = variants(devices, people)
     stacked = held_by.plants()
     for i in range(5):
@@ -78,7 +78,7 @@ def test_people_in_both_hands_are_stacked_and_simulated_alike(devices):
     exact = dominant_modes(exact_loops(held_by, assembly.F)).growth
     np.testing.assert_allclose(dominant_modes(mujoco_loops(held_by, assembly.process)).growth, exact, atol=1e-3)
     # the arms are the same as of people who hold one device each
-    np.testing.assert_array_equal(people.links, next(crowds(SCENARIO, 7, range(20), 2))[1].links)
+    np.testing.assert_array_equal(people.links, next(crowds_of(SCENARIO, 7, range(20), 2))[1].links)
 
 
 def test_both_engines_simulate_a_person_who_moves_both_hands():
@@ -155,12 +155,12 @@ def test_batch_engine_is_the_exact_engine(devices):
 
 
 def test_a_human_depends_on_seed_and_index_only():
-    few = dict(zip([7, 3], next(crowds(SCENARIO, 5, [7, 3], 1))[1].links, strict=True))
-    many = next(crowds(SCENARIO, 5, range(20), 1))[1].links
+    few = dict(zip([7, 3], next(crowds(SCENARIO.population, 2, 5, [7, 3], 1))[1].links, strict=True))
+    many = next(crowds(SCENARIO.population, 2, 5, range(20), 1))[1].links
     np.testing.assert_array_equal(few[7], many[7])
     np.testing.assert_array_equal(few[3], many[3])
     assert not np.array_equal(many[3], draw(SCENARIO.population, 2, 6, 3, 1))
-    assert {c.links.shape[2]: len(i) for i, c in crowds(SCENARIO, 5, range(20), MIXED)}.keys() == {1, 2}
+    assert {c.links.shape[2]: len(i) for i, c in crowds(SCENARIO.population, 2, 5, range(20), MIXED)}.keys() == {1, 2}
 
 
 def test_shards_repeat_the_single_run_bit_for_bit():

@@ -30,7 +30,7 @@ HUMANS = 1000
 @pytest.fixture(scope="module")
 def held_by():
     scenario = load()
-    ((_, crowd),) = crowds(scenario, 0, range(HUMANS), 1)
+    ((_, crowd),) = crowds(scenario.population, scenario.channels, 0, range(HUMANS), 1)
     return variants(scenario.device, crowd)
 
 
