@@ -78,7 +78,12 @@ CHECKS = (
         f"sim.validate --scenario three-rigid --case I {_MEET}",
         suite_report.verdicts,
     ),
-    Check("tightness", "How tight is the condition?", "sim.tightness --case I --seed {seed}", suite_report.tightness),
+    Check(
+        "tightness",
+        "How tight is the condition?",
+        "sim.tightness --case I --generations 25 --seed {seed}",
+        suite_report.tightness,
+    ),
     Check(
         "delayed",
         "How tight is it with long delays?",

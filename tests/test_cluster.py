@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -68,25 +69,25 @@ def cluster(tmp_path):
 
 
 def test_a_killed_worker_changes_nothing(cluster):
-    for name in ("first", "second"):
+    """One worker is frozen with its share of the batches and killed once the other has finished one of its own."""
+    for name in ("lives", "dies"):
         cluster.add_worker(name)
     lost: list[int] = []
     with distributed.Client(cluster.address, set_as_default=False) as observer:
         observer.wait_for_workers(2)
-        names = {address: worker["name"] for address, worker in observer.scheduler_info()["workers"].items()}
+        named = {worker["name"]: address for address, worker in observer.scheduler_info()["workers"].items()}
+        cluster.workers["dies"].send_signal(signal.SIGSTOP)  # however slow this machine is, it has work left then
 
-        def kill_a_busy_worker(done: int, total: int) -> None:
+        def kill(done: int, total: int) -> None:
             assert total == 4
-            if lost:
-                return
-            busy = {address: tasks for address, tasks in observer.processing().items() if tasks}
-            victim = max(busy, key=lambda address: len(busy[address]))
-            cluster.workers[names[victim]].kill()
-            lost.append(len(busy[victim]))
+            if not lost:
+                lost.append(len(observer.processing()[named["dies"]]))
+                cluster.workers["dies"].kill()
 
-        shared = validate_on_cluster(QUESTION, cluster.address, kill_a_busy_worker, patience=60)
+        shared = validate_on_cluster(QUESTION, cluster.address, kill, patience=60)
     assert lost[0] > 0
-    assert sum(worker.poll() is None for worker in cluster.workers.values()) == 1
+    assert cluster.workers["lives"].poll() is None
+    assert cluster.workers["dies"].wait() == -signal.SIGKILL
     alone = validate(QUESTION)
     for field in fields(Findings):
         np.testing.assert_array_equal(getattr(alone, field.name), getattr(shared, field.name), err_msg=field.name)
