@@ -1,16 +1,20 @@
 # make run    the paper's case I, from a fresh clone to a picture
 # make test   the whole test suite
+# make validate  every check that a verdict rests on: a report in out/validate/report.md, under five minutes
 # make figures  the pictures that README and docs show
 PYTHON ?= python3
 PY := .venv/bin/python
 
-.PHONY: run test lint bench figures clean
+.PHONY: run test validate lint bench figures clean
 
 run: .venv/ready
 	$(PY) -m sim.run --case I
 
 test: .venv/ready
 	$(PY) -m pytest
+
+validate: .venv/ready
+	$(PY) -m sim.suite --out out/validate
 
 lint: .venv/ready
 	$(PY) -m ruff check .

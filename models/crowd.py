@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from models.device import Device
-from models.human import Human, Link
+from models.human import Cross, Human, Link, Person
 from models.scene import Plant, Scene, actuation, build, plant, tendon_jacobian
 
 Array = NDArray[np.floating[Any]]
@@ -18,9 +18,15 @@ Array = NDArray[np.floating[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Crowd:
-    """Sets of humans, one per device, all with the same number of links. They have no voluntary motion."""
+    """Sets of humans, one per device, all with the same number of links. They have no voluntary motion.
+
+    `holds` says which channels' humans are arms of one person, whose body and cross spring are in `bodies`.
+    """
 
     links: Array  # (nsim, m, links, 3): mass [kg], damping [N s/m], stiffness [N/m]
+    holds: tuple[tuple[int, ...], ...] = ()  # (persons,) channels, counted from 1
+    bodies: Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
+    # (nsim, persons, 5): mass, damping, stiffness as above, damping and stiffness from hand to hand
 
     def __post_init__(self) -> None:
         links = np.array(self.links, dtype=float)
@@ -28,8 +34,14 @@ class Crowd:
             raise ValueError(f"links has the shape {links.shape}, expected (sets, devices, links, 3)")
         if not ((links >= 0) & (links < np.inf)).all():
             raise ValueError("links has a negative or infinite entry: such a human is not passive")
-        links.setflags(write=False)
-        object.__setattr__(self, "links", links)
+        bodies = np.array(self.bodies, dtype=float) if self.holds else np.zeros((len(links), 0, 5))
+        if bodies.shape != (len(links), len(self.holds), 5):
+            raise ValueError(f"bodies has the shape {bodies.shape}, expected {(len(links), len(self.holds), 5)}")
+        if not ((bodies >= 0) & (bodies < np.inf)).all() or not (bodies[..., 0] > 0).all():
+            raise ValueError("bodies has a negative, infinite or massless entry: such a person is not passive")
+        for name, values in (("links", links), ("bodies", bodies)):
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
 
     def __len__(self) -> int:
         return self.links.shape[0]
@@ -37,6 +49,11 @@ class Crowd:
     def humans(self, i: int) -> tuple[Human, ...]:
         """Set i, one human per device."""
         return tuple(Human(tuple(Link(*link) for link in human)) for human in self.links[i].tolist())
+
+    def persons(self, i: int) -> tuple[Person, ...]:
+        """Set i, those who hold several devices."""
+        pairs = zip(self.holds, self.bodies[i].tolist(), strict=True)
+        return tuple(Person(holds, *body[:3], Cross(*body[3:])) for holds, body in pairs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +90,7 @@ def variants(devices: Sequence[Device], crowd: Crowd) -> Variants:
     nsim, m, links, _ = crowd.links.shape
     # a hand without mass, damping or stiffness leaves the devices' own parameters; further masses cannot be zero
     nobody = Human((Link(0, 0, 0), *(Link(1, 0, 0) for _ in range(links - 1))))
-    scene = build(devices, [nobody] * m)
+    scene = build(devices, [nobody] * m, [Person(holds, 1, 0, 0) for holds in crowd.holds])
     model = scene.model
     names = ("body_mass", "jnt_stiffness", "dof_damping", "tendon_stiffness", "tendon_damping")
     fields = {name: np.tile(getattr(model, name).astype(float), (nsim, 1)) for name in names}
@@ -82,8 +99,15 @@ def variants(devices: Sequence[Device], crowd: Crowd) -> Variants:
         bodies = model.jnt_bodyid[list(joints)]
         fields["body_mass"][:, bodies[0]] += mass[:, 0]
         fields["body_mass"][:, bodies[1:]] = mass[:, 1:]
-        fields["dof_damping"][:, joints[-1]] += damping[:, -1]
-        fields["jnt_stiffness"][:, joints[-1]] = stiffness[:, -1]
-        fields["tendon_damping"][:, list(tendons)] = damping[:, :-1]
-        fields["tendon_stiffness"][:, list(tendons)] = stiffness[:, :-1]
+        if len(tendons) < links:  # the last link ends on ground
+            fields["dof_damping"][:, joints[-1]] += damping[:, -1]
+            fields["jnt_stiffness"][:, joints[-1]] = stiffness[:, -1]
+        fields["tendon_damping"][:, list(tendons)] = damping[:, : len(tendons)]
+        fields["tendon_stiffness"][:, list(tendons)] = stiffness[:, : len(tendons)]
+    for p, (joint, crossings) in enumerate(zip(scene.bodies, scene.crossings, strict=True)):
+        mass, damping, stiffness, cross_damping, cross_stiffness = crowd.bodies[:, p].T
+        fields["body_mass"][:, model.jnt_bodyid[joint]] = mass
+        fields["dof_damping"][:, joint], fields["jnt_stiffness"][:, joint] = damping, stiffness
+        fields["tendon_damping"][:, list(crossings)] = cross_damping[:, None]
+        fields["tendon_stiffness"][:, list(crossings)] = cross_stiffness[:, None]
     return Variants(scene, fields)

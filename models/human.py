@@ -1,7 +1,8 @@
-"""Human hands as passive mechanical one-ports, and the voluntary motion that drives them."""
+"""Human hands as passive one-ports, people who hold several devices as multi-ports, and their voluntary motion."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import msgspec
@@ -75,6 +76,50 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return np.zeros_like(t)
         position, velocity = self.voluntary.motion(t)
         return self.links[-1].stiffness * position + self.links[-1].damping * velocity
+
+
+class Cross(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A spring-damper from hand to hand of one person."""
+
+    damping: float = 0.0  # [N s/m]
+    stiffness: float = 0.0  # [N/m]
+
+    def __post_init__(self) -> None:
+        require("damping", self.damping, 0.0, 1e6, "N s/m")
+        require("stiffness", self.stiffness, 0.0, 1e9, "N/m")
+
+
+class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Somebody who holds several devices: a passive mechanical multi-port.
+
+    The arms of these channels' humans end on this person's body instead of on ground: a mass with a spring-damper
+    to ground. `cross` joins each hand to the next, in the order of `holds`.
+    """
+
+    holds: tuple[int, ...]  # channels, counted from 1
+    mass: float  # [kg] of the body
+    damping: float  # [N s/m] between body and ground
+    stiffness: float  # [N/m]
+    cross: Cross = Cross()
+
+    def __post_init__(self) -> None:
+        if len(self.holds) < 2 or len(set(self.holds)) < len(self.holds) or min(self.holds) < 1:
+            raise ValueError(f"holds is {list(self.holds)}, expected two or more different channels, counted from 1")
+        require("mass", self.mass, 1e-6, 1e3, "kg")
+        require("damping", self.damping, 0.0, 1e6, "N s/m")
+        require("stiffness", self.stiffness, 0.0, 1e9, "N/m")
+
+
+def check_holds(persons: Sequence[Person], channels: int) -> None:
+    """Raise ValueError where somebody holds what is not there or what another one holds."""
+    held: set[int] = set()
+    for i, person in enumerate(persons):
+        for channel in person.holds:
+            if channel > channels:
+                raise ValueError(f"person[{i}].holds has channel {channel}, allowed are 1 to {channels}")
+            if channel in held:
+                raise ValueError(f"person[{i}].holds has channel {channel}, which somebody else holds already")
+        held.update(person.holds)
 
 
 class Population(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -1,10 +1,11 @@
 """Devices and humans as one MuJoCo model, and the same plant as matrices, read from that model.
 
 The only place that knows joint names. Every body slides along x. Joints come in the order motors, handles
-(of compliant devices), further masses of the humans, so that the first m positions are the encoders':
+(of compliant devices), further masses of the humans, bodies, so that the first m positions are the encoders':
 
     actuator (-f) -> motor_i ==transmission== handle_i (with the human's first mass) ==link== human_i_2 == ...
 
+The last link of a human ends on ground, or on the body of a person who holds several devices (the last joints).
 Gravity, contacts and constraints are off. Inputs are MuJoCo actuators: first the outside forces (voluntary
 motion and taps), then one motor per device with gear -1, because the device feels -f.
 """
@@ -13,14 +14,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from models.device import CompliantDevice, Device
-from models.human import Human
+from models.human import Human, Person, check_holds
 
 Array = NDArray[np.floating[Any]]
 
@@ -35,7 +37,10 @@ class Scene:
     pushed: tuple[int, ...]  # (m,) outside input that reaches the end of each human (voluntary force)
     tapped: tuple[int, ...]  # (m,) outside input that reaches each handle
     masses: tuple[tuple[int, ...], ...]  # (m, links) joint that each mass of a human moves on
-    springs: tuple[tuple[int, ...], ...]  # (m, links - 1) tendon behind each mass but the last, whose is the joint's
+    springs: tuple[tuple[int, ...], ...]  # (m, links - 1) tendon behind each mass but the last, whose is the joint's;
+    # (m, links) where a body is behind the last
+    bodies: tuple[int, ...]  # (persons,) joint of each body
+    crossings: tuple[tuple[int, ...], ...]  # (persons, hands - 1) tendons from hand to hand
 
     @property
     def channels(self) -> int:
@@ -56,33 +61,47 @@ class Plant:
     C: Array  # (m, 2n)
 
 
-def build(devices: Sequence[Device], humans: Sequence[Human]) -> Scene:
-    """One scene of devices, each held by its human. Raises ValueError where their numbers differ."""
+def build(devices: Sequence[Device], humans: Sequence[Human], persons: Sequence[Person] = ()) -> Scene:
+    """One scene of devices, each held by its human; `persons` are those who hold several.
+
+    Raises ValueError where the numbers of devices and humans differ, or a device is held twice.
+    """
     if len(devices) != len(humans) or not devices:
         raise ValueError(f"{len(devices)} devices and {len(humans)} humans: each device needs one human")
+    check_holds(persons, len(devices))
     spec = mujoco.MjSpec()
     spec.modelname = "haptic loop"
     _only_what_the_loop_needs(spec)
-    last = _add_masses(spec, devices, humans)
-    for i, (device, human) in enumerate(zip(devices, humans, strict=True), start=1):
-        _add_springs(spec, i, device, human)
+    body = {channel: f"body_{p}" for p, person in enumerate(persons, start=1) for channel in person.holds}
+    parts = list(enumerate(zip(devices, humans, strict=True), start=1))
+    chains = [_chain(i, device, human, body.get(i)) for i, (device, human) in parts]
+    _add_masses(spec, devices, humans, persons)
+    for (_, (device, human)), (i, chain) in zip(parts, enumerate(chains, start=1), strict=True):
+        _add_springs(spec, i, device, human, chain)
 
     handles = [_handle(i, device) for i, device in enumerate(devices, start=1)]
-    reached = list(dict.fromkeys((*handles, *last)))
-    for joint in reached:
-        _add_motor(spec, f"push_{joint}", joint, gear=1.0)
+    crossings = [_add_crossings(spec, p, person, handles) for p, person in enumerate(persons, start=1)]
+    # a voluntary force acts on the last mass, and back on the body that the arm ends on
+    ends = [c.tendons[-1] if i in body else c.joints[-1] for i, c in enumerate(chains, start=1)]
+    reached = list(dict.fromkeys((*handles, *ends)))
+    for name in reached:
+        _add_motor(spec, f"push_{name}", name, gear=-1.0 if name.startswith("link") else 1.0)
     for i, device in enumerate(devices, start=1):
         _add_motor(spec, f"force_{i}", f"motor_{i}", gear=-1.0, limit=device.force_limit)
     model = spec.compile()
-    chains = [_chain(i, device, human) for i, (device, human) in enumerate(zip(devices, humans, strict=True), start=1)]
     return Scene(
         model=model,
         xml=spec.to_xml(),
         handles=tuple(model.joint(name).id for name in handles),
-        pushed=tuple(reached.index(name) for name in last),
+        pushed=tuple(reached.index(name) for name in ends),
         tapped=tuple(reached.index(name) for name in handles),
-        masses=tuple(tuple(model.joint(name).id for name in joints) for joints, _ in chains),
-        springs=tuple(tuple(model.tendon(name).id for name in tendons) for _, tendons in chains),
+        masses=tuple(
+            tuple(model.joint(name).id for name in c.joints if name != body.get(i))
+            for i, c in enumerate(chains, start=1)
+        ),
+        springs=tuple(tuple(model.tendon(name).id for name in c.tendons) for c in chains),
+        bodies=tuple(model.joint(f"body_{p}").id for p in range(1, len(persons) + 1)),
+        crossings=tuple(tuple(model.tendon(name).id for name in names) for names in crossings),
     )
 
 
@@ -115,9 +134,13 @@ def tendon_jacobian(model: mujoco.MjModel) -> Array:
 
 def actuation(model: mujoco.MjModel) -> Array:
     """Force on each joint per unit of each input, shape (n, outside + m)."""
-    columns = np.zeros((model.nv, model.nu))
+    columns, across = np.zeros((model.nv, model.nu)), tendon_jacobian(model)
     for a in range(model.nu):
-        columns[model.actuator_trnid[a, 0], a] = model.actuator_gear[a, 0] * model.actuator_gainprm[a, 0]
+        target, gain = model.actuator_trnid[a, 0], model.actuator_gear[a, 0] * model.actuator_gainprm[a, 0]
+        if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_TENDON:
+            columns[:, a] = gain * across[target]
+        else:
+            columns[target, a] = gain
     return columns
 
 
@@ -132,44 +155,65 @@ def _handle(i: int, device: Device) -> str:
     return f"handle_{i}" if isinstance(device, CompliantDevice) else f"motor_{i}"
 
 
-def _add_masses(spec: mujoco.MjSpec, devices: Sequence[Device], humans: Sequence[Human]) -> list[str]:
-    """Bodies in the order motors, handles, human masses. Returns the joint at the end of each human."""
-    motors, handles, arms, last = [], [], [], []
+def _add_masses(
+    spec: mujoco.MjSpec, devices: Sequence[Device], humans: Sequence[Human], persons: Sequence[Person]
+) -> None:
+    """Masses in the order motors, handles, human masses, bodies, with what joins them to ground."""
+    motors, handles, arms = [], [], []
+    grounded: dict[str, tuple[float, float]] = {}  # damping and stiffness
+    held = {channel for person in persons for channel in person.holds}
     for i, (device, human) in enumerate(zip(devices, humans, strict=True), start=1):
-        held = human.links[0].mass
+        first = human.links[0].mass
         if isinstance(device, CompliantDevice):
             motors.append((f"motor_{i}", device.motor_mass, device.damping))
-            handles.append((f"handle_{i}", device.handle_mass + held, 0.0))
+            handles.append((f"handle_{i}", device.handle_mass + first, 0.0))
         else:
-            motors.append((f"motor_{i}", device.mass + held, device.damping))
+            motors.append((f"motor_{i}", device.mass + first, device.damping))
         arms += [(f"human_{i}_{j}", link.mass, 0.0) for j, link in enumerate(human.links[1:], start=2)]
-        last.append(f"human_{i}_{len(human.links)}" if len(human.links) > 1 else _handle(i, device))
-    end = {name: human.links[-1] for name, human in zip(last, humans, strict=True)}
-    for name, mass, damping in (*motors, *handles, *arms):
+        if i not in held:
+            grounded[_chain(i, device, human).joints[-1]] = human.links[-1].damping, human.links[-1].stiffness
+    bodies = [(f"body_{p}", person.mass, 0.0) for p, person in enumerate(persons, start=1)]
+    grounded |= {name: (p.damping, p.stiffness) for (name, *_), p in zip(bodies, persons, strict=True)}
+    for name, mass, damping in (*motors, *handles, *arms, *bodies):
         body = spec.worldbody.add_body(name=name, mass=mass, ipos=[0, 0, 0], inertia=[1e-3] * 3, explicitinertial=True)
         joint = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
         joint.damping[0] = damping
-        if name in end:
-            joint.damping[0] += end[name].damping
-            joint.stiffness[0] = end[name].stiffness
-    return last
+        if name in grounded:
+            joint.damping[0] += grounded[name][0]
+            joint.stiffness[0] = grounded[name][1]
 
 
-def _add_springs(spec: mujoco.MjSpec, i: int, device: Device, human: Human) -> None:
+def _add_springs(spec: mujoco.MjSpec, i: int, device: Device, human: Human, chain: _Chain) -> None:
     """The transmission and the links between the masses of one human, as fixed tendons."""
     if isinstance(device, CompliantDevice):
         stiffness, damping = device.transmission_stiffness, device.transmission_damping
         _add_spring(spec, f"transmission_{i}", f"motor_{i}", f"handle_{i}", stiffness, damping)
-    joints, tendons = _chain(i, device, human)
-    for j, (name, link) in enumerate(zip(tendons, human.links, strict=False)):
-        _add_spring(spec, name, joints[j], joints[j + 1], link.stiffness, link.damping)
+    for j, (name, link) in enumerate(zip(chain.tendons, human.links, strict=False)):
+        _add_spring(spec, name, chain.joints[j], chain.joints[j + 1], link.stiffness, link.damping)
 
 
-def _chain(i: int, device: Device, human: Human) -> tuple[list[str], list[str]]:
-    """Joints of a human's masses, and the tendons between them."""
+def _add_crossings(spec: mujoco.MjSpec, p: int, person: Person, handles: Sequence[str]) -> list[str]:
+    """The springs from hand to hand; returns their names."""
+    names = []
+    for a, b in pairwise(person.holds):
+        names.append(f"cross_{p}_{a}_{b}")
+        _add_spring(spec, names[-1], handles[a - 1], handles[b - 1], person.cross.stiffness, person.cross.damping)
+    return names
+
+
+class _Chain(NamedTuple):
+    """The joints of a human's masses, with the body that they end on, and the tendons between them."""
+
+    joints: list[str]
+    tendons: list[str]
+
+
+def _chain(i: int, device: Device, human: Human, body: str | None = None) -> _Chain:
     links = len(human.links)
     joints = [_handle(i, device), *(f"human_{i}_{j}" for j in range(2, links + 1))]
-    return joints, [f"link_{i}_{j}" for j in range(1, links)]
+    if body:
+        joints.append(body)
+    return _Chain(joints, [f"link_{i}_{j}" for j in range(1, len(joints))])
 
 
 def _add_spring(spec: mujoco.MjSpec, name: str, a: str, b: str, stiffness: float, damping: float) -> None:
@@ -181,8 +225,9 @@ def _add_spring(spec: mujoco.MjSpec, name: str, a: str, b: str, stiffness: float
     tendon.wrap_joint(a, -1.0)
 
 
-def _add_motor(spec: mujoco.MjSpec, name: str, joint: str, gear: float, limit: float | None = None) -> None:
-    motor = spec.add_actuator(name=name, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+def _add_motor(spec: mujoco.MjSpec, name: str, target: str, gear: float, limit: float | None = None) -> None:
+    kind = mujoco.mjtTrn.mjTRN_TENDON if target.startswith("link") else mujoco.mjtTrn.mjTRN_JOINT
+    motor = spec.add_actuator(name=name, target=target, trntype=kind)
     motor.set_to_motor()
     motor.gear = [gear, 0, 0, 0, 0, 0]
     if limit is not None:

@@ -6,14 +6,16 @@ beyond that a matrix exponential, not a hand, would decide.
 
 The condition counts |dx|^2 / T where a device dissipates the integral of v^2, which is more unless v is constant
 between samples: for a sinusoid, |dx|^2 / T is (sin x / x)^2 of it, x = pi f T. So the condition asks for that much
-too much damping, about, at the frequency f where it binds: 4.8 % at 101 Hz and 1.2 ms. Closer than that no search
-has succeeded.
+too much damping, about, at the frequency f where it binds: 4.8 % at 101 Hz and 1.2 ms, 0.03 % at 8 Hz (where loops
+with long delays bind). Closer than that no search has succeeded, and just outside it most do.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import OptimizeResult, differential_evolution
@@ -24,15 +26,24 @@ from controller.lti import Array, Lti
 from controller.process import force_map
 from design.margin import closed_loop
 from models.crowd import Crowd, variants
-from models.human import Human
+from models.human import Human, Person
+from sim.loop import Progress
 from sim.scenario import Scenario
 from sim.verdicts import dominant_modes, exact_loops
 
 MASS, STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
 DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9
-#: (links, least frequency [Hz] of the modes looked at) of each pass. One mass and spring already present every
-#: reactance at one frequency; slow modes of a lossless hand barely decay and would hide the one that grows
-PASSES = ((1, 2.0), (2, 2.0), (1, 0.0))
+
+
+class Pass(NamedTuple):
+    """One search. Slow modes of a lossless hand barely decay and would hide the one that grows."""
+
+    links: int  # of each arm; one mass and spring already present every reactance at one frequency
+    audible: float  # [Hz] least frequency of the modes looked at
+    held: bool = False  # by one person, whose body and cross spring present every reactance matrix
+
+
+PASSES = (Pass(1, 2.0), Pass(2, 2.0), Pass(1, 0.0), Pass(1, 2.0, held=True))
 CANDIDATES = 120  # sets of humans in a generation
 
 
@@ -41,6 +52,7 @@ class Worst:
     """The worst humans that a search found."""
 
     humans: tuple[Human, ...]
+    persons: tuple[Person, ...]  # who hold several devices
     spectral_radius: float
     growth: float  # [1/s]
     frequency_hz: float
@@ -51,20 +63,35 @@ class Worst:
         return self.growth > DESTABILISED
 
 
-def search(scenario: Scenario, F: Lti, seed: int = 0, generations: int = 150, first: bool = False) -> Worst:
-    """The lossless humans with the largest growth that were found; with `first`, the first that destabilise."""
-    m = scenario.channels
+def search(
+    scenario: Scenario,
+    F: Lti,
+    seed: int = 0,
+    generations: int = 150,
+    first: bool = False,
+    progress: Progress = lambda done, total: None,
+) -> Worst:
+    """The lossless humans with the largest growth that were found; with `first`, the first that destabilise.
+
+    `progress` hears of every generation.
+    """
+    m, done = scenario.channels, 0
+    passes = [p for p in PASSES if m > 1 or not p.held]
 
     def stop(intermediate_result: OptimizeResult) -> bool:
+        nonlocal done
+        done += 1
+        progress(done, len(passes) * generations)
         return first and bool(-intermediate_result.fun > 10 * DESTABILISED)
 
     best, evaluated = None, 0
-    for trial, (links, audible) in enumerate(PASSES):
+    for trial, kind in enumerate(passes):
+        ranges = [MASS, STIFFNESS] * (m * kind.links) + [MASS, STIFFNESS, STIFFNESS] * kind.held
         found = differential_evolution(
-            partial(_losses, scenario=scenario, F=F, links=links, audible=audible),
-            np.log([MASS, STIFFNESS] * (m * links)),
+            partial(_losses, scenario=scenario, F=F, kind=kind),
+            np.log(ranges),
             rng=np.random.default_rng(np.random.SeedSequence((seed, trial))),
-            popsize=CANDIDATES // (2 * m * links),
+            popsize=CANDIDATES // len(ranges),
             maxiter=generations,
             tol=0,
             polish=False,
@@ -72,8 +99,9 @@ def search(scenario: Scenario, F: Lti, seed: int = 0, generations: int = 150, fi
             updating="deferred",
             callback=stop,
         )
-        evaluated += (found.nit + 1) * CANDIDATES
-        worst = _worst(scenario, F, _ladders(found.x[:, None], m, links), evaluated)
+        done = (trial + 1) * generations
+        evaluated += (found.nit + 1) * (CANDIDATES // len(ranges)) * len(ranges)
+        worst = _worst(scenario, F, _ladders(found.x[:, None], m, kind), evaluated)
         best = worst if best is None or worst.growth > best.growth else best
         if first and best.destabilises:
             break
@@ -91,11 +119,15 @@ class Attempt:
 
 
 def attempts(
-    loops: dict[str, tuple[Scenario, Coupling]], shortages: Array, seed: int = 0, generations: int = 150
+    loops: dict[str, tuple[Scenario, Coupling]],
+    shortages: Array,
+    seed: int = 0,
+    generations: int = 150,
+    attempted: Callable[[Attempt], None] = lambda attempt: None,
 ) -> list[Attempt]:
     """Attack every loop at every shortage: devices get (1 - short) times the damping that `closed_loop` requires.
 
-    A negative shortage gives the devices more than required: there the search must fail.
+    A negative shortage gives the devices more than required: there the search must fail. `attempted` hears of each.
     """
     rows = []
     for name, (scenario, coupling) in loops.items():
@@ -104,6 +136,7 @@ def attempts(
         for short in shortages:
             placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
             rows.append(Attempt(name, float(short), search(placed, F, seed, generations=generations, first=True)))
+            attempted(rows[-1])
     return rows
 
 
@@ -112,21 +145,30 @@ def success_rate(rows: list[Attempt]) -> float:
     return sum(row.worst.destabilises for row in rows) / len(rows)
 
 
-def _ladders(x: Array, channels: int, links: int) -> Crowd:
-    """Log masses and stiffnesses (2 channels links, nsim) as lossless humans."""
-    values = np.exp(x.T).reshape(-1, channels, links, 2)
-    return Crowd(np.stack([values[..., 0], np.zeros_like(values[..., 0]), values[..., 1]], axis=-1))
+def _ladders(x: Array, channels: int, kind: Pass) -> Crowd:
+    """Logs of masses and stiffnesses, (2 channels links, nsim), as lossless humans.
+
+    Where one person holds all devices, three more rows are the body's mass and stiffness and the cross stiffness.
+    """
+    arms = 2 * channels * kind.links
+    values = np.exp(x[:arms].T).reshape(-1, channels, kind.links, 2)
+    links = np.stack([values[..., 0], np.zeros_like(values[..., 0]), values[..., 1]], axis=-1)
+    if not kind.held:
+        return Crowd(links)
+    mass, stiffness, cross = np.exp(x[arms:])
+    bodies = np.stack([mass, 0 * mass, stiffness, 0 * mass, cross], axis=-1)[:, None]
+    return Crowd(links, (tuple(range(1, channels + 1)),), bodies)
 
 
-def _losses(x: Array, scenario: Scenario, F: Lti, links: int, audible: float) -> Array:
-    """Minus the largest growth [1/s] among the modes above `audible` Hz, for every column of x."""
-    loops = exact_loops(variants(scenario.device, _ladders(x.reshape(x.shape[0], -1), scenario.channels, links)), F)
+def _losses(x: Array, scenario: Scenario, F: Lti, kind: Pass) -> Array:
+    """Minus the largest growth [1/s] among the audible modes, for every column of x."""
+    loops = exact_loops(variants(scenario.device, _ladders(x.reshape(x.shape[0], -1), scenario.channels, kind)), F)
     values = np.linalg.eigvals(loops.A)
-    heard = np.abs(np.angle(values)) / (2 * np.pi * F.T) >= audible
+    heard = np.abs(np.angle(values)) / (2 * np.pi * F.T) >= kind.audible
     return -np.log(np.where(heard, np.abs(values), 1e-300).max(axis=1)) / F.T
 
 
 def _worst(scenario: Scenario, F: Lti, crowd: Crowd, evaluated: int) -> Worst:
     modes = dominant_modes(exact_loops(variants(scenario.device, crowd), F))
     radius, growth, frequency = (float(a[0]) for a in (modes.spectral_radius, modes.growth, modes.frequency_hz))
-    return Worst(crowd.humans(0), radius, growth, frequency, evaluated)
+    return Worst(crowd.humans(0), crowd.persons(0), radius, growth, frequency, evaluated)

@@ -10,6 +10,7 @@ from scipy.linalg import expm
 from controller.lti import Array
 from controller.process import Tape
 from models.scene import Plant
+from sim.exponential import expm_each
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +31,7 @@ def hold(plant: Plant, T: float) -> HeldPlant:
     *many, n, inputs = plant.B.shape
     generator = np.zeros((*many, n + inputs, n + inputs))
     generator[..., :n, :n], generator[..., :n, n:] = plant.A, plant.B
-    step = expm(generator * T)
+    step = expm_each(generator * T) if many else expm(generator * T)
     return HeldPlant(step[..., :n, :n], step[..., :n, n:], plant.C, T)
 
 

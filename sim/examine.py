@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -16,7 +17,7 @@ from sim.batch_engine import ExactBatchEngine
 from sim.exact_engine import hold
 from sim.knock import Trace, knock
 from sim.mujoco_engine import MujocoBatchEngine
-from sim.population import crowds
+from sim.population import crowds_of
 from sim.scenario import Scenario
 from sim.simulate import Assembly, assemble
 from sim.stability import ClosedLoop
@@ -79,7 +80,7 @@ def examine(question: Question, indices: Sequence[int], ticked: Callable[[int], 
     assembly = assemble(scenario, question.coupling)
     parts = [
         _group(question, assembly, index, crowd, ticked)
-        for index, crowd in crowds(scenario.population, scenario.channels, question.seed, indices, question.links)
+        for index, crowd in crowds_of(scenario, question.seed, indices, question.links)
     ]
     return merge(parts)
 
@@ -91,7 +92,7 @@ def merge(parts: Sequence[Findings], interrupted: bool = False) -> Findings:
     joined: dict[str, Any] = {
         name: np.concatenate([getattr(p, name) for p in parts])[order] if parts else order for name in arrays
     }
-    return Findings(**joined, simulated=sum(p.simulated for p in parts), interrupted=interrupted)
+    return Findings(**joined, simulated=math.fsum(p.simulated for p in parts), interrupted=interrupted)
 
 
 def _group(

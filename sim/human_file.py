@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from models.human import Human
+from models.human import Human, Person, check_holds
 from sim.files import write
 from sim.scenario import InputError
 
@@ -16,12 +16,16 @@ class HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The whole file."""
 
     human: tuple[Human, ...]
+    person: tuple[Person, ...] = ()
 
 
-def load_humans(path: str | Path, channels: int) -> tuple[Human, ...]:
-    """The humans of a file, one per channel. Raises InputError with one line that names the file and the field."""
+def load_humans(path: str | Path, channels: int) -> HumanFile:
+    """The humans of a file, one per channel, and who holds several devices.
+
+    Raises InputError with one line that names the file and the field.
+    """
     try:
-        humans = msgspec.convert(tomllib.loads(Path(path).read_text(encoding="utf-8")), HumanFile).human
+        people = msgspec.convert(tomllib.loads(Path(path).read_text(encoding="utf-8")), HumanFile)
     except OSError as error:
         raise InputError(f"--human {path}: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -30,17 +34,30 @@ def load_humans(path: str | Path, channels: int) -> tuple[Human, ...]:
         raise InputError(f"--human {path}: not valid TOML: {error}") from None
     except msgspec.ValidationError as error:
         raise InputError(f"--human {path}: {error}") from None
-    if len(humans) != channels:
-        raise InputError(f"--human {path} has {len(humans)} [[human]] tables, expected {channels} (one per channel)")
-    return humans
+    if len(people.human) != channels:
+        raise InputError(
+            f"--human {path} has {len(people.human)} [[human]] tables, expected {channels} (one per channel)"
+        )
+    try:
+        check_holds(people.person, channels)
+    except ValueError as error:
+        raise InputError(f"--human {path}: {error}") from None
+    return people
 
 
-def save_humans(path: Path, humans: tuple[Human, ...], remark: str) -> Path:
-    """Write humans without voluntary motion so that reading gives the same numbers; `remark` becomes a comment."""
+def save_humans(path: Path, humans: tuple[Human, ...], remark: str, persons: tuple[Person, ...] = ()) -> Path:
+    """Write humans and persons without voluntary motion so that reading gives the same numbers.
+
+    `remark` becomes a comment.
+    """
     lines = [f"# {line}" for line in remark.splitlines()]
     for human in humans:
         rows = (
             f"    {{ mass = {x.mass!r}, damping = {x.damping!r}, stiffness = {x.stiffness!r} }}," for x in human.links
         )
         lines += ["", "[[human]]", "links = [", *rows, "]"]
+    for person in persons:
+        body = [f"{name} = {getattr(person, name)!r}" for name in ("mass", "damping", "stiffness")]
+        cross = f"cross = {{ damping = {person.cross.damping!r}, stiffness = {person.cross.stiffness!r} }}"
+        lines += ["", "[[person]]", f"holds = {list(person.holds)}", *body, cross]
     return write(path, "\n".join(lines) + "\n")

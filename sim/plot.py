@@ -134,3 +134,34 @@ def plot_population(mass: Array, damping: Array, growth: Array, path: Path, titl
         return write(path, content)
     finally:
         plt.close(figure)
+
+
+def plot_tightness(rows: list[dict[str, Any]], path: Path) -> Path:
+    """Growth rate with the first destabilising human found, over the share of the required damping that was missing."""
+    import matplotlib.pyplot as plt
+
+    figure, axis = plt.subplots(figsize=(7, 4.2), layout="constrained")
+    for name, style in zip(dict.fromkeys(row["loop"] for row in rows), STYLES, strict=False):
+        mine = [row for row in rows if row["loop"] == name]
+        short = [100 * row["short"] for row in mine]
+        growth = [row["growth_rate_per_s"] if row["found"] else 0.0 for row in mine]
+        axis.plot(short, growth, label=name, **style)
+        for found, marker in ((True, "^"), (False, "o")):
+            chosen = [i for i, row in enumerate(mine) if row["found"] == found]
+            axis.plot([short[i] for i in chosen], [growth[i] for i in chosen], marker, color=style["color"])
+    axis.plot([], [], "k^", label="somebody destabilises it")
+    axis.plot([], [], "ko", label="nobody was found")
+    axis.set(
+        xlabel="damping missing of what the closed-loop condition requires [%]",
+        ylabel="growth with the first human found [1/s]",
+    )
+    axis.grid(alpha=0.3)
+    axis.legend()
+
+    def content(file: BinaryIO) -> None:
+        figure.savefig(file, format="png", dpi=130)
+
+    try:
+        return write(path, content)
+    finally:
+        plt.close(figure)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from controller.lti import Array
 from models.crowd import Crowd
 from models.human import Population
+from sim.scenario import Scenario
 
 MIXED = 0  # as a number of links: half the humans are simple, half are networks of two links
 
@@ -25,11 +26,45 @@ def draw(population: Population, channels: int, seed: int, index: int, links: in
     return np.exp(rng.uniform(low, high, size=(channels, count, 3)))
 
 
+def draw_bodies(population: Population, persons: int, seed: int, index: int) -> Array:
+    """Bodies of the persons with this index who hold several devices: (persons, 5) as in Crowd, from the same ranges.
+
+    Drawn apart from the links, which are the same whether or not somebody holds several devices.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence((seed, index, 1)))
+    ranges = (population.mass, population.damping, population.stiffness, population.damping, population.stiffness)
+    low, high = np.log(ranges).T
+    return np.exp(rng.uniform(low, high, size=(persons, 5)))
+
+
 def crowds(
-    population: Population, channels: int, seed: int, indices: Iterable[int], links: int
+    population: Population,
+    channels: int,
+    seed: int,
+    indices: Iterable[int],
+    links: int,
+    holds: tuple[tuple[int, ...], ...] = (),
 ) -> Iterator[tuple[NDArray[np.intp], Crowd]]:
-    """The humans of these indices, grouped by their number of links: (indices of the group, crowd)."""
+    """The humans of these indices, grouped by their number of links: (indices of the group, crowd).
+
+    `holds` says which channels one person holds, as in Crowd.
+    """
     drawn = {i: draw(population, channels, seed, i, links) for i in indices}
     for count in sorted({values.shape[1] for values in drawn.values()}):
         group = [i for i, values in drawn.items() if values.shape[1] == count]
-        yield np.array(group), Crowd(np.stack([drawn[i] for i in group]))
+        bodies = np.stack([draw_bodies(population, len(holds), seed, i) for i in group])
+        yield np.array(group), Crowd(np.stack([drawn[i] for i in group]), holds, bodies)
+
+
+def crowds_of(
+    scenario: Scenario, seed: int, indices: Iterable[int], links: int
+) -> Iterator[tuple[NDArray[np.intp], Crowd]]:
+    """`crowds` for a scenario: of its population, and held together as its persons hold its devices."""
+    holds = tuple(person.holds for person in scenario.person)
+    return crowds(scenario.population, scenario.channels, seed, indices, links, holds)
+
+
+def crowd_of(scenario: Scenario, seed: int, index: int, links: int) -> Crowd:
+    """The one set of humans with this index."""
+    ((_, crowd),) = crowds_of(scenario, seed, [index], links)
+    return crowd

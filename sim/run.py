@@ -47,7 +47,8 @@ def main(argv: list[str]) -> int:
     if args.duration is not None:
         scenario = scenario.replace(duration=numbers("--duration", args.duration, float, 1)[0])
     if args.human is not None:
-        scenario = scenario.replace(human=load_humans(args.human, scenario.channels))
+        people = load_humans(args.human, scenario.channels)
+        scenario = scenario.replace(human=people.human, person=people.person)
     asked, seed, out = _substeps(args), seed_from(args), out_folder(args, "run")
     chosen = choose(scenario, args.case, args.coupling, args.condition)
     assembly = assemble(scenario, chosen.coupling)
@@ -81,7 +82,7 @@ def _parser() -> Parser:
     parser.add_argument("--integrator", choices=(*INTEGRATORS, LEAPFROG), default="RK4", help="of MuJoCo (default RK4)")
     parser.add_argument("--substeps", metavar="N", help="MuJoCo steps per period (default 4, more where needed)")
     parser.add_argument("--duration", metavar="SECONDS", help="default: the scenario's")
-    parser.add_argument("--human", metavar="FILE.toml", help="other humans: one [[human]] table per channel")
+    parser.add_argument("--human", metavar="FILE.toml", help="other humans: [[human]] per channel, [[person]]")
     parser.add_argument("--no-plot", action="store_true", help="write no picture")
     add_output_options(parser)
     return parser

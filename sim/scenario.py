@@ -15,7 +15,7 @@ import msgspec
 from controller.environment import Network, Spring, Wall, environment
 from design.store import Loop
 from models.device import Device, passivity_level, with_damping
-from models.human import Human, Link, Population, Voluntary
+from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
 from models.quantity import require
 
 CASES = ("none", "I", "II")
@@ -55,6 +55,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     human: tuple[Human, ...]
     environment: Network
     lam: Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
+    person: tuple[Person, ...] = ()  # those who hold several devices
     tap: Tap | None = None
     duration: float = 15.0  # [s]
     population: Population = Population()  # who `validate` draws
@@ -73,6 +74,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if lam > self.theta[i] + self.psi[i]:
                 total = self.theta[i] + self.psi[i]
                 raise ValueError(f"lam[{i}] is {lam}, allowed are 0 to theta + psi = {total} samples")
+        check_holds(self.person, self.channels)
         if self.tap and not 1 <= self.tap.channel <= self.channels:
             raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
 
@@ -183,4 +185,4 @@ def _hint(what: str) -> str:
     return ""
 
 
-_STRUCTS = (Scenario, Tap, Human, Link, Voluntary, Population, Network, Spring, Wall, *get_args(Device))
+_STRUCTS = (Scenario, Tap, Human, Link, Voluntary, Person, Cross, Population, Network, Spring, Wall, *get_args(Device))

@@ -50,7 +50,7 @@ def assemble(scenario: Scenario, coupling: Coupling) -> Assembly:
     walled = contact(network, coupling, *delays, scenario.T) if network.walls else None
     F = walled.open if walled else force_map(E, coupling, *delays)
     process = Process(F, _each(scenario.device, "force_limit"), _each(scenario.device, "encoder_step"), walled)
-    scene = build(scenario.device, scenario.human)
+    scene = build(scenario.device, scenario.human, scenario.person)
     return Assembly(scenario, E, F, process, scene, hold(plant(scene.model), scenario.T))
 
 

@@ -13,9 +13,9 @@ from design.assess import CONDITIONS, assess
 from design.margin import Requirement
 from design.promises import certificate_part
 from design.summary import coupling_part
-from models.crowd import Crowd
 from sim import verdict_report
 from sim.adversary import Worst, search
+from sim.cluster import validate_on_cluster
 from sim.command import (
     DOES_NOT_HOLD,
     DONE,
@@ -36,7 +36,7 @@ from sim.couplings import NAMES, Chosen, choose
 from sim.examine import ENGINES, Findings, Question
 from sim.files import write_json
 from sim.human_file import save_humans
-from sim.population import MIXED, draw
+from sim.population import MIXED, crowd_of
 from sim.scenario import InputError, Scenario
 from sim.shards import validate
 from sim.simulate import assemble
@@ -49,8 +49,8 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     scenario = scenario_from(args)
     require_linear(scenario, "sim.validate")
-    humans, shards = _whole(args, "humans", 1_000_000), _whole(args, "shards", 256)
-    seed, duration = seed_from(args), _duration(args, scenario)
+    humans, shards = _whole(args, "humans", 1_000_000), _shards(args)
+    seed, duration, generations = seed_from(args), _duration(args, scenario), _whole(args, "generations", 10_000)
     links = LINKS[args.links] if args.links else scenario.population.links
     out = out_folder(args, "validate")
     chosen = choose(scenario, args.case, args.coupling, args.condition)
@@ -60,10 +60,15 @@ def main(argv: list[str]) -> int:
 
     with (bar := progress_bar("validating"))[0]:
         begin = time.perf_counter()
-        findings = validate(question, shards, bar[1])
+        if args.dask is not None:
+            findings = validate_on_cluster(question, args.dask, bar[1])
+        else:
+            findings = validate(question, shards, bar[1])
         wall = time.perf_counter() - begin
     outcome = _outcome(args, scenario, chosen, requirements, question, findings, certified, wall)
-    worst = _attack(scenario, chosen, seed, outcome) if args.adversary and not findings.interrupted else None
+    worst = (
+        _attack(scenario, chosen, seed, generations, outcome) if args.adversary and not findings.interrupted else None
+    )
     if worst:
         ratio = requirements["closed-loop"].ratio
         outcome["adversary"] = verdict_report.adversary_part(worst, ratio, certified)
@@ -94,7 +99,9 @@ def _parser() -> Parser:
     parser.add_argument(
         "--shards", default="1", metavar="K", help="local processes (default 1); the result is the same"
     )
+    parser.add_argument("--dask", metavar="HOST:PORT", help="work on an existing Dask cluster; the result is the same")
     parser.add_argument("--adversary", action="store_true", help="also search for the worst passive human")
+    parser.add_argument("--generations", default="150", metavar="N", help="of the adversary's search (default 150)")
     parser.add_argument("--no-plot", action="store_true", help="write no picture")
     add_output_options(parser)
     return parser
@@ -107,6 +114,13 @@ def _whole(args: argparse.Namespace, name: str, most: int) -> int:
     return value
 
 
+def _shards(args: argparse.Namespace) -> int:
+    shards = _whole(args, "shards", 256)
+    if args.dask is not None and shards > 1:
+        raise InputError(f"--shards {shards} with --dask: the cluster decides who does what, give one of them")
+    return shards
+
+
 def _duration(args: argparse.Namespace, scenario: Scenario) -> float:
     (duration,) = numbers("--duration", args.duration or "2", float, 1)
     if not (duration == 0 or 4 * scenario.T <= duration <= 1e5):
@@ -114,10 +128,11 @@ def _duration(args: argparse.Namespace, scenario: Scenario) -> float:
     return duration
 
 
-def _attack(scenario: Scenario, chosen: Chosen, seed: int, outcome: dict[str, Any]) -> Worst | None:
+def _attack(scenario: Scenario, chosen: Chosen, seed: int, generations: int, outcome: dict[str, Any]) -> Worst | None:
     """The worst human, or None where the keyboard ends the search: what was found out before is kept."""
     try:
-        return search(scenario, assemble(scenario, chosen.coupling).F, seed)
+        with (bar := progress_bar("searching the worst human"))[0]:
+            return search(scenario, assemble(scenario, chosen.coupling).F, seed, generations, progress=bar[1])
     except KeyboardInterrupt:
         outcome["interrupted"] = True
         return None
@@ -157,11 +172,12 @@ def _save(
     if findings.index.size:
         named |= {"worst-human.toml": int(findings.index[np.argmax(findings.radius)])}
     for name, i in named.items():
-        links = draw(scenario.population, scenario.channels, question.seed, i, question.links)
-        files.append(save_humans(out / name, Crowd(links[None]).humans(0), f"seed {question.seed}, index {i}"))
+        crowd = crowd_of(scenario, question.seed, i, question.links)
+        remark = f"seed {question.seed}, index {i}"
+        files.append(save_humans(out / name, crowd.humans(0), remark, crowd.persons(0)))
     if adversary:
         remark = f"found by the adversary, seed {question.seed}: growth {adversary.growth:+.6g} 1/s"
-        files.append(save_humans(out / "adversary.toml", adversary.humans, remark))
+        files.append(save_humans(out / "adversary.toml", adversary.humans, remark, adversary.persons))
     if not args.no_plot and findings.index.size:
         from sim.plot import plot_population
 

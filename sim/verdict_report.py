@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from controller.lti import Array
 from design.promises import finite
-from models.human import Human
+from models.human import Human, Person
 from sim.adversary import Worst
 from sim.examine import Findings, Question
-from sim.population import MIXED, draw
+from sim.population import MIXED, crowd_of
 from sim.verdicts import unstable
 
 ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
@@ -60,6 +61,7 @@ def adversary_part(worst: Worst, ratio: float, certified: bool) -> dict[str, Any
         "evaluated": worst.evaluated,
         "required_over_available_damping": finite(ratio),
         "human": human_part(worst.humans),
+        "person": person_part(worst.persons),
         "holds": not (certified and worst.destabilises),
     }
 
@@ -70,12 +72,15 @@ def human_part(humans: tuple[Human, ...]) -> list[dict[str, Any]]:
     return [{"links": [{name: getattr(link, name) for name in names} for link in human.links]} for human in humans]
 
 
+def person_part(persons: tuple[Person, ...]) -> list[dict[str, Any]]:
+    """Those who hold several devices."""
+    return [msgspec.to_builtins(person) for person in persons]
+
+
 def _identified(question: Question, index: int) -> dict[str, Any]:
-    scenario = question.scenario
-    links = draw(scenario.population, scenario.channels, question.seed, index, question.links)
-    names = ("mass", "damping", "stiffness")
-    human = [{"links": [dict(zip(names, link, strict=True)) for link in channel]} for channel in links.tolist()]
-    return {"seed": question.seed, "index": index, "human": human}
+    crowd = crowd_of(question.scenario, question.seed, index, question.links)
+    who = {"human": human_part(crowd.humans(0)), "person": person_part(crowd.persons(0))}
+    return {"seed": question.seed, "index": index} | who
 
 
 def _worst(question: Question, findings: Findings) -> dict[str, Any] | None:

@@ -1,12 +1,11 @@
 """Numerically hard loops: each with the setting that fails, where there is one, and the one that holds."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from controller.coupling import Coupling, NoCoupling, SpringDamper
+from controller.coupling import NoCoupling, SpringDamper
 from controller.process import Tape
 from design.assess import assess
 from design.published import CASE_I
@@ -14,101 +13,23 @@ from models.device import CompliantDevice
 from models.human import Human, Link
 from sim.engine import outside_forces
 from sim.exact_engine import ExactEngine
+from sim.hard import cases, devices, measure, nominal
 from sim.loop import run
 from sim.one_period import exact_growth, simulated_growth
-from sim.report import error_part
-from sim.scenario import InputError, Scenario, load
-from sim.simulate import Assembly, assemble, make_engine, simulate
-from sim.substeps import NEUTRAL, check_substeps, default_substeps, step_radius
+from sim.scenario import InputError, load
+from sim.simulate import assemble, make_engine, simulate
+from sim.substeps import default_substeps
 from sim.yardstick import limit_cycle
 
-NOMINAL = load().replace(duration=1.0)
 CLOSED_LOOP = SpringDamper(np.array([7806.0, 3137.0]), np.array([0.105, 1.68]))
 
 
-def devices(**changes) -> Scenario:
-    return NOMINAL.replace(device=(CompliantDevice(**changes),) * 2)
-
-
-def hands(mass: float, damping: float, stiffness: float) -> Scenario:
-    return NOMINAL.replace(human=(Human((Link(mass, damping, stiffness),)),) * 2)
-
-
-def light(damping: float) -> Scenario:
-    """A handle of 1 g that nobody's mass is added to."""
-    return devices(handle_mass=1e-3).replace(human=(Human((Link(0.0, damping, 200.0),)),) * 2)
-
-
-#: a setting holds if it is stable, has the exact verdict, and errs by less than both of these
-GROWTH, POSITION = 1e-3, 1e-3  # [1/s]; relative rms of the device positions over the run
-RK4, EULER = ("RK4", 1), ("Euler", 1)
-TRIED = [(name, 1) for name in ("RK4", "Euler", "Euler2", "implicitfast")]
-
-
-@dataclass(frozen=True)
-class Hard:
-    name: str
-    scenario: Scenario
-    fails: tuple[str, int] | None  # a setting that does not hold, None where all of TRIED do
-    how: str  # what is wrong with it
-    coupling: Coupling = CASE_I
-    substeps: int | None = None  # of RK4, which hold; default: what the rule picks
-
-
-CASES = [
-    Hard("human stiffness 1e5 N/m", hands(0.3, 3.0, 1e5), RK4, "position"),
-    Hard("handle of 1 g, human damping 3 N s/m", light(3.0), RK4, "refused"),
-    Hard("handle of 1 g, no human damping", light(0.0), RK4, "refused", substeps=48),
-    Hard("motor 1 g", devices(motor_mass=1e-3), RK4, "refused"),
-    Hard("motor 100 kg", devices(motor_mass=100.0), EULER, "growth"),
-    Hard("human damping 1000 N s/m", hands(0.3, 1000.0, 200.0), EULER, "position"),
-    Hard("transmission 1e6 N/m", devices(transmission_stiffness=1e6), RK4, "refused"),
-    Hard("T = 4 ms", NOMINAL.replace(T=4e-3), EULER, "refused"),
-    Hard("T = 10 us", NOMINAL.replace(T=1e-5, duration=0.12), None, "none tried fails"),
-    Hard("50-sample delays", NOMINAL.replace(theta=(50, 50)), EULER, "growth"),
-    Hard("zero damping", NOMINAL.replace(delta=(0.0, 0.0)), EULER, "growth"),
-    Hard("coupling 1e5 N/m", NOMINAL, EULER, "verdict", SpringDamper(np.full(2, 1e5), np.zeros(2))),
-]
-
-
-def built(hard: Hard) -> Assembly:
-    return assemble(hard.scenario, hard.coupling)
-
-
-def faults(loop: Assembly, integrator: str, substeps: int) -> dict[str, float]:
-    """What is wrong with a setting, and by how much: nothing where it holds."""
-    if step_radius(loop, integrator, substeps) > 1 + NEUTRAL:
-        with pytest.raises(InputError, match=f"outside the stable region of {integrator}"):
-            check_substeps(loop, integrator, substeps)
-        return {"refused": np.inf}
-    exact, own = exact_growth(loop), simulated_growth(loop, integrator, substeps)
-    error = error_part(simulate(loop, "mujoco", integrator, substeps), simulate(loop, "exact"), loop)
-    found = {"verdict": own - exact} if (own > 0) != (exact > 0) else {}
-    if abs(own - exact) > GROWTH:
-        found["growth"] = own - exact
-    if (error["position_relative_rms"] or 0.0) > POSITION:
-        found["position"] = error["position_relative_rms"]
-    return found
-
-
-@pytest.mark.parametrize("hard", CASES, ids=lambda hard: hard.name)
+@pytest.mark.parametrize("hard", cases(), ids=lambda hard: hard.name)
 def test_a_setting_fails_and_the_rule_holds(hard):
-    """By GROWTH and POSITION; the rule's own choice has the exact verdict, and growth within 1e-2 1/s."""
-    loop = built(hard)
-    rule, exact = default_substeps(loop), exact_growth(loop)
-    holds = hard.substeps or rule
-    bad = faults(loop, *hard.fails) if hard.fails else {hard.how: np.nan}
-    own = simulated_growth(loop, "RK4", holds)
-    setting = " x ".join(map(str, hard.fails)) if hard.fails else "-"
-    fault = f"{hard.how} {bad[hard.how]:+.1e}" if np.isfinite(bad[hard.how]) else hard.how
-    print(f"| {hard.name} | {exact:+.4f} | {setting} | {fault} | RK4 x {holds} | {own - exact:+.1e} |")
-    assert not faults(loop, "RK4", holds)
-    chosen = simulated_growth(loop, "RK4", rule)
-    assert (chosen > 0) == (exact > 0)
-    assert chosen == pytest.approx(exact, abs=1e-2)
-    assert (rule < holds) == (hard.substeps is not None)
-    if not hard.fails:
-        assert not any(faults(loop, *setting) for setting in TRIED)
+    """By GROWTH and POSITION of sim.hard; the rule's own choice has the exact verdict, and growth within 1e-2 1/s."""
+    row = measure(hard)
+    print(row.markdown())
+    assert row.holds, row
 
 
 @pytest.mark.parametrize(("side", "wrong"), [(-0.1, ("Euler2", 2)), (0.1, ("Euler", 12)), (0.1, ("RK4", 1))])
@@ -117,9 +38,9 @@ def test_within_a_tenth_of_the_boundary(side, wrong):
     low, high = 1.0, 2.0
     while high - low > 1e-9:
         middle = (low + high) / 2
-        growth = exact_growth(assemble(NOMINAL.replace(delta=(middle, middle)), NoCoupling()))
+        growth = exact_growth(assemble(nominal().replace(delta=(middle, middle)), NoCoupling()))
         low, high = (middle, high) if growth > side else (low, middle)
-    loop = assemble(NOMINAL.replace(delta=(low, low)), NoCoupling())
+    loop = assemble(nominal().replace(delta=(low, low)), NoCoupling())
     assert exact_growth(loop) == pytest.approx(side, abs=1e-6)
     own, other = simulated_growth(loop, "RK4", default_substeps(loop)), simulated_growth(loop, *wrong)
     print(f"| growth {side:+g} 1/s | {wrong[0]} x {wrong[1]}: {other:+.4f} | RK4, by the rule: {own:+.4f} |")
@@ -245,7 +166,7 @@ def test_a_rule_that_cannot_be_met_says_so():
 
 def test_the_loop_runs_from_any_state():
     """Both engines agree from a random start under the rule's setting, for the stiffest transmission."""
-    loop = built(CASES[6])
+    loop = assemble(devices(transmission_stiffness=1e6), CASE_I)
     start = 1e-3 * np.random.default_rng(0).normal(size=(loop.plant.A.shape[0], 1))
 
     def quiet(first, ticks):

@@ -32,6 +32,7 @@ COMMANDS_MAY_IMPORT = {
 HOMES = {
     "mujoco": {"models/scene.py", "sim/mujoco_engine.py"},
     "cvxpy": {"design/"},
+    "distributed": {"sim/cluster.py"},
     "serial": {"hw/port.py"},
     "matplotlib": {"sim/plot"},
 }

@@ -6,7 +6,7 @@ import pytest
 from scipy.linalg import expm
 
 from models.device import CompliantDevice, RigidDevice, passivity_level, with_damping
-from models.human import Human, Link, Population, Voluntary
+from models.human import Cross, Human, Link, Person, Population, Voluntary
 from models.scene import build, plant
 
 HAND = Human((Link(0.3, 3.0, 200.0),))
@@ -53,8 +53,76 @@ def test_several_channels_do_not_touch_each_other():
         assert not together.A[np.ix_(rows, others)].any()
 
 
-def test_mujoco_accelerates_as_the_matrices_say():
-    scene = build([CompliantDevice(), RigidDevice()], [ARM, HAND])
+TWO_HANDS = Person((1, 2), 20.0, 15.0, 900.0, Cross(2.0, 60.0))
+
+
+def test_a_person_in_both_hands_is_two_arms_on_one_body():
+    """Against the matrices written out by hand: rigid devices, an arm of one link and one of two."""
+    d, (one,), (near, far), p = RigidDevice(), HAND.links, ARM.links, TWO_HANDS
+    scene = build([d, d], [HAND, ARM], [p])
+    got = plant(scene.model)
+    assert [scene.model.joint(j).name for j in range(4)] == ["motor_1", "motor_2", "human_2_2", "body_1"]
+    M = np.diag([d.mass + one.mass, d.mass + near.mass, far.mass, p.mass])
+
+    def springs(a, b, c, body, cross):
+        """a: hand 1 to body, b: hand 2 to its arm, c: arm to body."""
+        return np.array(
+            [
+                [a + cross, -cross, 0, -a],
+                [-cross, b + cross, -b, 0],
+                [0, -b, b + c, -c],
+                [-a, 0, -c, a + c + body],
+            ]
+        )
+
+    K = springs(one.stiffness, near.stiffness, far.stiffness, p.stiffness, p.cross.stiffness)
+    D = springs(one.damping, near.damping, far.damping, p.damping, p.cross.damping) + np.diag([d.damping] * 2 + [0, 0])
+    np.testing.assert_allclose(got.A[4:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
+    # a muscle pulls the hand and pushes the body; taps reach the hands
+    pushed = M @ got.B[4:][:, list(scene.pushed)]
+    np.testing.assert_allclose(pushed, [[1, 0], [0, 0], [0, 1], [-1, -1]], atol=1e-12)
+    tapped = M @ got.B[4:][:, list(scene.tapped)]
+    np.testing.assert_allclose(tapped, [[1, 0], [0, 1], [0, 0], [0, 0]], atol=1e-12)
+
+
+def test_a_heavy_body_without_a_cross_spring_is_ground():
+    separate = plant(build([CompliantDevice()] * 2, [HAND, ARM]).model).A
+    held = plant(build([CompliantDevice()] * 2, [HAND, ARM], [Person((1, 2), 1e3, 1e6, 1e9)]).model).A
+    n = separate.shape[0] // 2
+    rows = [*range(n), *range(n + 1, 2 * n + 1)]  # without the body, the last joint
+    np.testing.assert_array_equal(held[np.ix_(rows, rows)], separate)
+    body = [n, 2 * n + 1]
+    # the arms' springs and dampers over the body's mass are all that moves it
+    assert np.abs(held[2 * n + 1, rows]).max() == HAND.links[0].stiffness / 1e3
+    assert held[2 * n + 1, body[0]] == pytest.approx(-1e9 / 1e3, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_person_in_both_hands_is_passive(seed):
+    """Hermitian part of the impedance matrix at the handles: never negative; without damping it is zero."""
+    rng = np.random.default_rng(seed)
+    humans = Population(links=int(rng.integers(1, 3))).draw(rng, 2)
+    mass, damping, stiffness, cd, ck = np.exp(rng.uniform(-2, 4, 5))
+    light = RigidDevice(mass=1e-6, damping=0.0)
+    lossless = [Human(tuple(Link(x.mass, 0.0, x.stiffness) for x in h.links)) for h in humans]
+    for people, person, lost in (
+        (humans, Person((1, 2), mass, damping, stiffness, Cross(cd, ck)), True),
+        (lossless, Person((1, 2), mass, 0.0, stiffness, Cross(0.0, ck)), False),
+    ):
+        linear = plant(build([light, light], people, [person]).model)
+        n = linear.A.shape[0] // 2
+        for w in np.geomspace(0.3, 3e3, 20):
+            velocity = np.linalg.solve(1j * w * np.eye(2 * n) - linear.A, -linear.B[:, -2:])[n : n + 2]
+            impedance = np.linalg.inv(velocity)
+            hermitian = np.linalg.eigvalsh(impedance + impedance.conj().T) / 2
+            # the rounding of the inverses, beside the impedance itself
+            noise = 1e-9 * np.abs(impedance).max()
+            assert (hermitian > noise).all() if lost else np.abs(hermitian).max() < noise
+
+
+@pytest.mark.parametrize("persons", [(), (TWO_HANDS,)], ids=["apart", "held together"])
+def test_mujoco_accelerates_as_the_matrices_say(persons):
+    scene = build([CompliantDevice(), RigidDevice()], [ARM, HAND], persons)
     linear, model = plant(scene.model), scene.model
     data = mujoco.MjData(model)
     rng = np.random.default_rng(0)
@@ -136,6 +204,16 @@ def test_voluntary_motion_is_smooth_and_its_velocity_its_derivative():
         (lambda: Link(0.1, -1.0, 1.0), "damping is -1"),
         (lambda: Human((Link(0.1, 1.0, 1.0), Link(0.0, 1.0, 1.0))), r"links\[1\].mass is 0"),
         (lambda: Population(mass=(1.0, 0.1)), r"mass\[1\] is 0.1, allowed are 1 to"),
+        (lambda: Person((1,), 1.0, 0.0, 0.0), r"holds is \[1\], expected two or more different channels"),
+        (lambda: Person((1, 1), 1.0, 0.0, 0.0), r"holds is \[1, 1\]"),
+        (lambda: Person((1, 2), 0.0, 0.0, 0.0), "mass is 0, allowed are 1e-06 to 1000 kg"),
+        (lambda: Person((1, 2), 1.0, -1.0, 0.0), "damping is -1"),
+        (lambda: Cross(stiffness=-1.0), "stiffness is -1"),
+        (lambda: build([RigidDevice()], [HAND], [TWO_HANDS]), r"person\[0\].holds has channel 2, allowed are 1 to 1"),
+        (
+            lambda: build([RigidDevice()] * 2, [HAND] * 2, [TWO_HANDS] * 2),
+            "channel 1, which somebody else holds already",
+        ),
         (lambda: build([RigidDevice()], []), "1 devices and 0 humans"),
     ],
 )
