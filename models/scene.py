@@ -5,7 +5,7 @@ The only place that knows joint names. Every body slides along x. Joints come in
 
     actuator (-f) -> motor_i ==transmission== handle_i (with the human's first mass) ==link== human_i_2 == ...
 
-Gravity, contacts and constraints are off. Inputs are MuJoCo actuators: first the outside forces (voluntary
+Gravity, contacts and constraints are off, but for the Coulomb friction of devices that have some. Inputs are MuJoCo actuators: first the outside forces (voluntary
 motion and taps), then one motor per device with gear -1, because the device feels -f.
 """
 
@@ -22,6 +22,10 @@ from models.device import CompliantDevice, Device
 from models.human import Human
 
 Array = NDArray[np.float64]
+
+#: MuJoCo's friction constraint creeps while it sticks; this hard it stops a 0.25 kg device within 1.5e-6 m of where
+#: Coulomb's law does, and creeps at 1e-7 m/s under half its force (MuJoCo's defaults: 7e-5 m and 6e-4 m/s)
+STICK, HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +65,7 @@ def build(devices: Sequence[Device], humans: Sequence[Human]) -> Scene:
         raise ValueError(f"{len(devices)} devices and {len(humans)} humans: each device needs one human")
     spec = mujoco.MjSpec()
     spec.modelname = "haptic loop"
-    _only_what_the_loop_needs(spec)
+    _only_what_the_loop_needs(spec, friction=any(device.friction for device in devices))
     last = _add_masses(spec, devices, humans)
     for i, (device, human) in enumerate(zip(devices, humans, strict=True), start=1):
         _add_springs(spec, i, device, human)
@@ -86,7 +90,7 @@ def build(devices: Sequence[Device], humans: Sequence[Human]) -> Scene:
 
 
 def plant(model: mujoco.MjModel) -> Plant:
-    """The linear plant that `model` simulates: its mass, damping, stiffness and actuation matrices."""
+    """The linear plant that `model` simulates: its mass, damping, stiffness and actuation matrices, no friction."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     n, m = model.nv, _motors(model)
@@ -120,9 +124,11 @@ def actuation(model: mujoco.MjModel) -> Array:
     return columns
 
 
-def _only_what_the_loop_needs(spec: mujoco.MjSpec) -> None:
+def _only_what_the_loop_needs(spec: mujoco.MjSpec, friction: bool) -> None:
     off = mujoco.mjtDisableBit
-    disabled = (off.mjDSBL_CONTACT, off.mjDSBL_CONSTRAINT, off.mjDSBL_AUTORESET, off.mjDSBL_SENSOR)
+    disabled = [off.mjDSBL_CONTACT, off.mjDSBL_AUTORESET, off.mjDSBL_SENSOR]
+    if not friction:  # MuJoCo's Coulomb friction is a constraint
+        disabled.append(off.mjDSBL_CONSTRAINT)
     spec.option.gravity = [0, 0, 0]
     spec.option.disableflags = sum(int(flag) for flag in disabled)
 
@@ -134,6 +140,7 @@ def _handle(i: int, device: Device) -> str:
 def _add_masses(spec: mujoco.MjSpec, devices: Sequence[Device], humans: Sequence[Human]) -> list[str]:
     """Bodies in the order motors, handles, human masses. Returns the joint at the end of each human."""
     motors, handles, arms, last = [], [], [], []
+    rubbing: dict[str, float] = {}
     for i, (device, human) in enumerate(zip(devices, humans, strict=True), start=1):
         held = human.links[0].mass
         if isinstance(device, CompliantDevice):
@@ -141,6 +148,7 @@ def _add_masses(spec: mujoco.MjSpec, devices: Sequence[Device], humans: Sequence
             handles.append((f"handle_{i}", device.handle_mass + held, 0.0))
         else:
             motors.append((f"motor_{i}", device.mass + held, device.damping))
+        rubbing[f"motor_{i}"] = device.friction
         arms += [(f"human_{i}_{j}", link.mass, 0.0) for j, link in enumerate(human.links[1:], start=2)]
         last.append(f"human_{i}_{len(human.links)}" if len(human.links) > 1 else _handle(i, device))
     end = {name: human.links[-1] for name, human in zip(last, humans, strict=True)}
@@ -148,6 +156,9 @@ def _add_masses(spec: mujoco.MjSpec, devices: Sequence[Device], humans: Sequence
         body = spec.worldbody.add_body(name=name, mass=mass, ipos=[0, 0, 0], inertia=[1e-3] * 3, explicitinertial=True)
         joint = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
         joint.damping[0] = damping
+        if rubbing.get(name):
+            joint.frictionloss = rubbing[name]
+            joint.solref_friction, joint.solimp_friction = STICK, HARD
         if name in end:
             joint.damping[0] += end[name].damping
             joint.stiffness[0] = end[name].stiffness
