@@ -17,8 +17,8 @@ from controller.lti import Array, Lti, frozen
 class Coupling(Protocol):
     """Anything that can be closed around the (delayed) environment."""
 
-    def around(self, environment: Lti) -> Lti:
-        """(I + Psi E V)^-1 Psi E, given Psi E."""
+    def around(self, environment: Lti, further: int = 0) -> Lti:
+        """(I + Psi E V)^-1 Psi E, given Psi E, whose last `further` ports lie behind no coupling."""
         ...
 
 
@@ -26,7 +26,7 @@ class Coupling(Protocol):
 class NoCoupling:
     """V = 0: the devices touch the environment directly."""
 
-    def around(self, environment: Lti) -> Lti:
+    def around(self, environment: Lti, further: int = 0) -> Lti:
         return environment
 
 
@@ -55,8 +55,8 @@ class SpringDamper:
         """V(z), diagonal."""
         return Lti.diag(*self.channels(T))
 
-    def around(self, environment: Lti) -> Lti:
-        return Compliance(self.compliance(environment.T)).around(environment)
+    def around(self, environment: Lti, further: int = 0) -> Lti:
+        return Compliance(self.compliance(environment.T)).around(environment, further)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,11 +65,13 @@ class Compliance:
 
     V: Lti
 
-    def around(self, environment: Lti) -> Lti:
-        if self.V.inputs != environment.outputs or self.V.outputs != environment.inputs:
+    def around(self, environment: Lti, further: int = 0) -> Lti:
+        contacts = environment.inputs - further
+        if self.V.inputs != environment.outputs - further or self.V.outputs != contacts:
             channels = f"{self.V.outputs} x {self.V.inputs}"
-            raise ValueError(f"the coupling is {channels}, the environment has {environment.inputs} contacts")
-        return environment.feedback(self.V)
+            raise ValueError(f"the coupling is {channels}, the environment has {contacts} contacts")
+        V = Lti.diag(self.V, Lti.constant(np.zeros((further, further)), self.V.T)) if further else self.V
+        return environment.feedback(V)
 
 
 def _spring_damper(k: float, b: float, T: float) -> Lti:

@@ -14,11 +14,12 @@ Steps 2, 3 and 5 are linear: they are ONE state-space block, and a tick is one m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from controller.contact import Contact, State
 from controller.coupling import Coupling
 from controller.delay import delay
 from controller.lti import Array, Lti, frozen
@@ -37,6 +38,7 @@ class Process:
     F: Lti
     force_limit: Array  # (m,) [N], inf where there is none
     encoder_step: Array  # (m,) [m], 0 for an ideal encoder
+    contact: Contact | None = None  # walls that F, which knows them open, is joined with
 
     def __post_init__(self) -> None:
         for name in ("force_limit", "encoder_step"):
@@ -52,6 +54,16 @@ class Process:
     @property
     def channels(self) -> int:
         return self.F.inputs
+
+    def frozen(self) -> dict[State, Lti]:
+        """The linear force maps that the process switches between, by the walls that touch: F alone without walls."""
+        return self.contact.frozen() if self.contact else {(): self.F}
+
+    def transition(self) -> Callable[[Array, Array], object]:
+        """Writes [f; z+] of a tick, (m + order, nsim), given its [z; x], (order + m, nsim)."""
+        if self.contact:
+            return self.contact.transition()
+        return np.block([[self.F.C, self.F.D], [self.F.A, self.F.B]]).dot
 
 
 class Tape:
@@ -88,8 +100,7 @@ class Tape:
         self._input = slabs(0, nz + m)
         self._output = slabs(width - m, m + nz)
         self._measured = slabs(nz, m)
-        F = process.F
-        self._product = np.block([[F.C, F.D], [F.A, F.B]]).dot
+        self._transition = process.transition()
         self._step = np.where(process.encoder_step > 0, process.encoder_step, np.inf)[:, None]
         self._quantised = bool((process.encoder_step > 0).any())
 
@@ -97,7 +108,7 @@ class Tape:
         """Steps 1, 2, 3 and 5 for row k, whose plant state has been written: f[k] and z[k + 1]."""
         if self._quantised:
             self._quantise(self._measured[k])
-        self._product(self._input[k], self._output[k])
+        self._transition(self._input[k], self._output[k])
 
     def saturate(self, ticks: int) -> None:
         """Turn the forces of the first `ticks` rows from asked for into applied, as the actuators did."""

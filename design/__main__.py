@@ -63,7 +63,7 @@ def main(argv: list[str]) -> int:
         "coupling": coupling_part(args.coupling, design.coupling, loop.T),
         "certificate": certificate_part(requirements[design.condition]),
         "certificates": {name: certificate_part(r) for name, r in requirements.items()},
-        "promise": promise_of(requirements, loop.psi),
+        "promise": promise_of(requirements, loop),
         "transparency": transparency_part(transparency(F, spec.environment, loop.lam)),
         "objective": design.objective,
         "objective_name": design.figure,

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from controller.contact import frozen_states, held
 from controller.coupling import Compliance, Coupling, SpringDamper
-from controller.environment import environment
+from controller.environment import Network, environment
 from controller.lti import Array, Lti
 from controller.process import force_map
 from design.certificate import NotProved, prove
@@ -18,19 +19,50 @@ CONDITIONS: tuple[Condition, ...] = ("theorem4", "closed-loop")
 
 
 def specification(loop: Loop) -> Specification:
-    """The loop as a request for a design. Raises ValueError naming the field that is wrong."""
-    return Specification(environment(loop.environment, loop.T), loop.theta, loop.psi, loop.lam, loop.delta)
+    """The loop as a request for a design, every wall touching. Raises ValueError naming the field that is wrong."""
+    return Specification(environment(held(loop.environment), loop.T), loop.theta, loop.psi, loop.lam, loop.delta)
 
 
 def assess(loop: Loop, coupling: Coupling, phi: Array | None = None) -> dict[str, Requirement]:
-    """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any."""
-    E = environment(loop.environment, loop.T)
-    any_environment = theorem4_requirement(coupling, E, loop.theta, loop.psi, loop.delta, phi)
-    this_environment = closed_loop(force_map(E, coupling, loop.theta, loop.psi), loop.delta)
+    """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
+
+    Where there are walls, closed-loop is about the frozen contact state that asks for most.
+    """
+    any_environment = theorem4_of(loop.environment, loop.T, coupling, loop.theta, loop.psi, loop.delta, phi)
+    this_environment = closed_loop_of(loop.environment, loop.T, coupling, loop.theta, loop.psi, loop.delta)
     return {
         "theorem4": _proved(loop, coupling, any_environment, phi),
         "closed-loop": _proved(loop, coupling, this_environment),
     }
+
+
+def closed_loop_of(
+    network: Network,
+    T: float,
+    coupling: Coupling,
+    theta: tuple[int, ...],
+    psi: tuple[int, ...],
+    delta: tuple[float, ...],
+) -> Requirement:
+    """The closed-loop requirement; of an environment with walls, that of its most demanding contact state."""
+    states = (environment(state, T) for state in frozen_states(network).values())
+    requirements = [closed_loop(force_map(E, coupling, theta, psi), delta) for E in states]
+    return max(requirements, key=lambda requirement: requirement.ratio)
+
+
+def theorem4_of(
+    network: Network,
+    T: float,
+    coupling: Coupling,
+    theta: tuple[int, ...],
+    psi: tuple[int, ...],
+    delta: tuple[float, ...],
+    phi: Array | None = None,
+) -> Requirement:
+    """Theorem 4's requirement; walls are covered without delay in the environment, and refused with it."""
+    if network.walls and any(psi):
+        return refusal("theorem4", delta, "with delay in the environment its multiplier is of a linear one: no walls")
+    return theorem4_requirement(coupling, environment(held(network), T), theta, psi, delta, phi)
 
 
 def theorem4_requirement(

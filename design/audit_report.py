@@ -40,7 +40,7 @@ def report(subject: Subject) -> dict[str, Any]:
         },
         **{condition: _condition_part(subject, requirement) for condition, requirement in requirements.items()},
         "certified": closed_loop,
-        "promise": promise(closed_loop and theorem4, closed_loop, rigid=subject.network is None),
+        "promise": promise(closed_loop and theorem4, closed_loop, rigid=subject.network is None, walls=subject.walls),
         "helps": _helps(subject, requirements["theorem4" if closed_loop else "closed-loop"]),
         "not_covered": CAVEATS,
     }

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 from design.margin import Requirement
+from design.store import Loop
 
 ANY, HERE, WALL = "any passive environment", "this environment", "a rigid wall only"
+FROZEN = "each frozen contact state of this environment (contact that makes and breaks is not covered)"
 
 #: What no certificate covers.
 CAVEATS = (
     "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted), "
-    "not for contacts that make and break, jitter of T, quantisation, velocity filters or friction compensation."
+    "not for contacts that make and break (except walls under theorem4, without delay in the environment), "
+    "jitter of T, quantisation, velocity filters or friction compensation."
 )
 
 
@@ -36,14 +38,18 @@ def certificate_part(requirement: Requirement) -> dict[str, Any]:
     return part | ({"reason": requirement.reason} if requirement.reason else {})
 
 
-def promise(theorem4: bool, closed_loop: bool, rigid: bool = False) -> str | None:
-    """For which environments a coupling is certified, given which conditions hold; `rigid` if E is a wall."""
+def promise(theorem4: bool, closed_loop: bool, rigid: bool = False, walls: bool = False) -> str | None:
+    """For which environments a coupling is certified, given which conditions hold.
+
+    `rigid` if E is a rigid wall that is never left, `walls` if contact is made and broken.
+    """
     if theorem4:
         return ANY
-    return (WALL if rigid else HERE) if closed_loop else None
+    return (WALL if rigid else FROZEN if walls else HERE) if closed_loop else None
 
 
-def promise_of(requirements: dict[str, Requirement], psi: Sequence[int]) -> str | None:
+def promise_of(requirements: dict[str, Requirement], loop: Loop) -> str | None:
     """The promise of a coupling by its requirements; the multiplier that psi >= 1 takes is of one environment."""
     held = {name: requirement.certified for name, requirement in requirements.items()}
-    return promise(held["theorem4"] and not any(psi), any(held.values()))
+    walls = bool(loop.environment.walls)
+    return promise(held["theorem4"] and not any(loop.psi), any(held.values()), walls=walls)

@@ -8,11 +8,12 @@ from typing import Self
 
 import numpy as np
 
+from controller.contact import held
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, environment
 from controller.lti import Lti, SingularLoop
 from controller.process import force_map
-from design.assess import theorem4_requirement
+from design.assess import closed_loop_of, theorem4_of
 from design.margin import Requirement, closed_loop, refusal
 from design.store import Condition
 
@@ -49,10 +50,18 @@ class Subject:
         return len(self.delta)
 
     @property
+    def walls(self) -> bool:
+        """Whether contact is made and broken."""
+        return self.network is not None and bool(self.network.walls)
+
+    @property
     def F(self) -> Lti:
-        """What the devices see (6); against a rigid wall (E -> infinity) that is Theta V^-1. Raises SingularLoop."""
+        """What the devices see (6), walls touching; against a rigid wall (E -> infinity) that is Theta V^-1.
+
+        Raises SingularLoop.
+        """
         if self.network is not None:
-            return force_map(environment(self.network, self.T), self.coupling, self.theta, self.psi)
+            return force_map(environment(held(self.network), self.T), self.coupling, self.theta, self.psi)
         assert isinstance(self.coupling, SpringDamper)
         (K,), (B,) = self.coupling.K.tolist(), self.coupling.B.tolist()
         clamped = Network(("contact",), (Spring(("contact", GROUND), K, B),))
@@ -75,14 +84,16 @@ class Subject:
 
     def _closed_loop(self) -> Requirement:
         try:
-            return closed_loop(self.F, self.delta)
+            if self.network is None:
+                return closed_loop(self.F, self.delta)
+            return closed_loop_of(self.network, self.T, self.coupling, self.theta, self.psi, self.delta)
         except SingularLoop as error:
             return refusal("closed-loop", self.delta, str(error))
 
     def _theorem4(self) -> Requirement:
         # what is behind a wall's coupling does not matter to Theorem 4
-        E = environment(self.network, self.T) if self.network else Lti.constant(np.eye(1), self.T)
-        return theorem4_requirement(self.coupling, E, self.theta, self.psi, self.delta)
+        network = self.network or Network(("contact",), masses={"contact": 1.0})
+        return theorem4_of(network, self.T, self.coupling, self.theta, self.psi, self.delta)
 
 
 def _list(values: Sequence[float]) -> str:

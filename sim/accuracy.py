@@ -22,6 +22,7 @@ from sim.command import (
     numbers,
     out_folder,
     progress_bar,
+    require_linear,
     scenario_from,
     seed_from,
 )
@@ -37,6 +38,7 @@ def main(argv: list[str]) -> int:
     """Measure every engine and step. 0: the default has the right verdict, 1: not, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario = scenario_from(args)
+    require_linear(scenario, "sim.accuracy")
     if args.duration is not None:
         scenario = scenario.replace(duration=numbers("--duration", args.duration, float, 1)[0])
     seed, out = seed_from(args), out_folder(args, "accuracy")

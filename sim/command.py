@@ -73,6 +73,14 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     return scenario.replace(delta, **changes) if changes or delta else scenario
 
 
+def require_linear(scenario: Scenario, what: str) -> None:
+    """Raises InputError where contact is made and broken, for a command whose verdicts are of linear loops."""
+    if scenario.environment.walls:
+        raise InputError(
+            f"environment.walls: {what} decides linear loops; sim.run and sim.contact close the loop with walls"
+        )
+
+
 def numbers(option: str, text: str, kind: Callable[[str], Number], count: int) -> tuple[Number, ...]:
     """'1,2' as `count` numbers; a single one serves all channels. Raises InputError."""
     try:

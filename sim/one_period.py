@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from controller.contact import State
 from controller.process import Tape
 from sim.exact_engine import HeldPlant
 from sim.mujoco_engine import quiet_warnings
 from sim.simulate import Assembly, make_engine
-from sim.stability import close, dominant_mode
+from sim.stability import Mode, close, dominant_mode
 
 #: basis states and inputs are this long: the plant is linear, and no actuator limit is so small
 UNIT = 1e-6
@@ -38,10 +39,21 @@ def measured_hold(
 
 
 def simulated_growth(assembly: Assembly, integrator: str, substeps: int) -> float:
-    """The growth rate [1/s] of the loop that MuJoCo simulates with these settings."""
-    return dominant_mode(close(measured_hold(assembly, "mujoco", integrator, substeps), assembly.F)).growth
+    """The growth rate [1/s] of the loop that MuJoCo simulates with these settings; of walls, in the worst state."""
+    held = measured_hold(assembly, "mujoco", integrator, substeps)
+    return max(dominant_mode(close(held, F)).growth for F in assembly.process.frozen().values())
 
 
 def exact_growth(assembly: Assembly) -> float:
-    """The growth rate [1/s] of the exact loop."""
-    return dominant_mode(close(assembly.plant, assembly.F)).growth
+    """The growth rate [1/s] of the exact loop; where there are walls, in the worst frozen contact state."""
+    return worst_mode(assembly).growth
+
+
+def worst_mode(assembly: Assembly) -> Mode:
+    """The dominant mode of the exact loop; where there are walls, of the worst frozen contact state."""
+    return max(frozen_modes(assembly).values(), key=lambda mode: mode.spectral_radius)
+
+
+def frozen_modes(assembly: Assembly) -> dict[State, Mode]:
+    """The dominant mode of the exact loop for every set of walls that touch."""
+    return {walls: dominant_mode(close(assembly.plant, F)) for walls, F in assembly.process.frozen().items()}

@@ -9,18 +9,23 @@ from rich.console import Console
 from rich.table import Table
 
 from controller.lti import Array
-from design.promises import CAVEATS, finite
+from design.promises import ANY, CAVEATS, finite
 from sim.loop import Record
+from sim.one_period import frozen_modes, worst_mode
 from sim.simulate import Assembly
 from sim.stability import clipped_ticks, close, dominant_mode, measured_growth, verdict
 
 
 def stability_part(assembly: Assembly, record: Record) -> dict[str, Any]:
-    """Measured on the trace, and from the eigenvalues of the exact loop."""
-    loop = close(assembly.plant, assembly.F)
-    mode = dominant_mode(loop)
+    """Measured on the trace, and from the eigenvalues of the exact loop; of walls, in the worst contact state."""
+    mode = worst_mode(assembly)
     limit = assembly.process.force_limit
-    growth, reason = measured_growth(loop, mode, record, limit)
+    contact = contact_part(assembly, record) if assembly.process.contact else {}
+    if contact.get("ticks"):
+        growth, reason = None, f"contact was made {contact['made']} times, and a growth rate is of one linear loop"
+    else:
+        loop = close(assembly.plant, assembly.F)
+        growth, reason = measured_growth(loop, dominant_mode(loop), record, limit)
     if record.diverged:
         reason = "the simulation left the range of finite numbers: reported as unstable"
     part: dict[str, Any] = {
@@ -33,7 +38,29 @@ def stability_part(assembly: Assembly, record: Record) -> dict[str, Any]:
         "exact_frequency_hz": mode.frequency_hz,
         "spectral_radius": mode.spectral_radius,
     }
+    part |= {"contact": contact} if contact else {}
     return part | ({"reason": reason} if reason else {})
+
+
+def contact_part(assembly: Assembly, record: Record) -> dict[str, Any]:
+    """How often the walls were touched in a run, and the linear loops that they switch between."""
+    walls = assembly.process.contact
+    assert walls is not None
+    touching = walls.depths(record.z[:, :, 0]) > 0
+    states = [
+        {
+            "touching": [i + 1 for i, on in enumerate(state) if on],
+            "exact_growth_rate_per_s": finite(mode.growth),
+            "exact_frequency_hz": mode.frequency_hz,
+            "exact_verdict": mode.verdict,
+        }
+        for state, mode in frozen_modes(assembly).items()
+    ]
+    return {
+        "made": int((touching[1:] & ~touching[:-1]).sum() + touching[:1].sum()),
+        "ticks": int(touching.any(axis=1).sum()),
+        "frozen": states,
+    }
 
 
 def error_part(record: Record, exact: Record, assembly: Assembly) -> dict[str, Any]:
@@ -41,7 +68,7 @@ def error_part(record: Record, exact: Record, assembly: Assembly) -> dict[str, A
     limit, m = assembly.process.force_limit, assembly.process.channels
     n = min(record.s.shape[0], exact.s.shape[0])
     clipped = clipped_ticks(exact, limit)[:n] | clipped_ticks(record, limit)[:n]
-    unstable = dominant_mode(close(assembly.plant, assembly.F)).verdict == "unstable"
+    unstable = worst_mode(assembly).verdict == "unstable"
     linear = int(np.argmax(clipped)) if unstable and clipped.any() else n
     relative, largest = _distance(record.s[:linear, :m], exact.s[:linear, :m])
     if linear == n:
@@ -62,6 +89,9 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
             "the paper's own condition (Theorem 4)" if part["condition"] == "theorem4" else "the closed-loop condition"
         )
         lines.append(f"These gains fail {name}: they need {worst:.3g} times the damping that the devices guarantee.")
+    if "contact" in outcome["stability"]:
+        covered = "theorem4 covers" if outcome["promise"] == ANY else "no certificate covers"
+        lines.append(f"Contact that makes and breaks: {covered} it in this loop; closed-loop is about frozen states.")
     for name in ("stability", "error", "transparency"):
         if "reason" in outcome[name]:
             lines.append(f"{name}: {outcome[name]['reason']}.")
@@ -131,12 +161,15 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         ("relative mismatch", f"{_db(transparent['relative_mismatch_db'])} (rms {_db(transparent['rms_mismatch_db'])})")
     )
     rows.append(("static stiffness felt", f"{100 * transparent['dc_ratio']:.1f} %" if transparent["dc_ratio"] else "-"))
-    exact = f"{stability['exact_growth_rate_per_s']:+.4f} 1/s at {stability['exact_frequency_hz']:.2f} Hz"
-    rows.append(("growth, eigenvalues", f"{exact}: {_verdict(stability['exact_verdict'])}"))
+    rows.append(("growth, eigenvalues", _growth(stability)))
     growth = stability["growth_rate_per_s"]
     measured = "-" if growth is None else f"{growth:+.4f} 1/s"
     rows.append(("growth, simulated trace", f"{measured}: {_verdict(stability['verdict'])}"))
     run = report["run"]
+    if "contact" in stability:
+        contact = stability["contact"]
+        rows.append(("contact", f"made {contact['made']} times, lasting {contact['ticks']} of {run['samples']} ticks"))
+        rows += [(f"growth, {_walls(state['touching'])}", _growth(state)) for state in contact["frozen"]]
     rows.append(("clipped ticks", f"{stability['clipped_ticks']} of {run['samples']}"))
     engine = run["engine"] + (f" {run['integrator']} x {run['substeps']}" if run["integrator"] else "")
     rows.append(
@@ -153,6 +186,17 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         )
     )
     return rows
+
+
+def _growth(part: dict[str, Any]) -> str:
+    exact = f"{part['exact_growth_rate_per_s']:+.4f} 1/s at {part['exact_frequency_hz']:.2f} Hz"
+    return f"{exact}: {_verdict(part['exact_verdict'])}"
+
+
+def _walls(touching: list[int]) -> str:
+    if not touching:
+        return "no wall touching"
+    return f"wall{'s' if len(touching) > 1 else ''} {', '.join(map(str, touching))} touching"
 
 
 def _verdict(word: str | None) -> str:

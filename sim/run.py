@@ -126,8 +126,8 @@ def _outcome(
         "coupling": coupling_part(chosen.kind, chosen.coupling, scenario.T),
         "certificate": certificates[chosen.condition],
         "certificates": certificates,
-        "promise": promise_of(requirements, scenario.psi),
-        "transparency": transparency_part(transparency(assembly.F, assembly.E, loop.lam)),
+        "promise": promise_of(requirements, loop),
+        "transparency": transparency_part(transparency(assembly.felt, assembly.E, loop.lam)),
         "stability": report.stability_part(assembly, record),
         "run": {
             "engine": args.engine,

@@ -12,7 +12,7 @@ from typing import Any, Self, get_args
 
 import msgspec
 
-from controller.environment import Network, Spring, environment
+from controller.environment import Network, Spring, Wall, environment
 from design.store import Loop
 from models.device import Device, passivity_level, with_damping
 from models.human import Human, Link, Population, Voluntary
@@ -183,4 +183,4 @@ def _hint(what: str) -> str:
     return ""
 
 
-_STRUCTS = (Scenario, Tap, Human, Link, Voluntary, Population, Network, Spring, *get_args(Device))
+_STRUCTS = (Scenario, Tap, Human, Link, Voluntary, Population, Network, Spring, Wall, *get_args(Device))

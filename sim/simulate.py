@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from controller.contact import contact, held
 from controller.coupling import Coupling
 from controller.environment import environment
 from controller.lti import Array, Lti
@@ -26,18 +27,25 @@ class Assembly:
     """A scenario with its coupling, ready to run."""
 
     scenario: Scenario
-    E: Lti
-    F: Lti
+    E: Lti  # what is to be felt: the environment, with every wall touching
+    F: Lti  # what the devices feel while no wall touches
     process: Process
     scene: Scene
     plant: HeldPlant
 
+    @property
+    def felt(self) -> Lti:
+        """What the devices feel of E: F with every wall touching."""
+        return list(self.process.frozen().values())[-1]
+
 
 def assemble(scenario: Scenario, coupling: Coupling) -> Assembly:
     """Build both worlds. Raises SingularLoop where the algebraic loop has no solution."""
-    E = environment(scenario.environment, scenario.T)
-    F = force_map(E, coupling, scenario.theta, scenario.psi)
-    process = Process(F, _each(scenario.device, "force_limit"), _each(scenario.device, "encoder_step"))
+    network, delays = scenario.environment, (scenario.theta, scenario.psi)
+    E = environment(held(network), scenario.T)
+    walled = contact(network, coupling, *delays, scenario.T) if network.walls else None
+    F = walled.open if walled else force_map(E, coupling, *delays)
+    process = Process(F, _each(scenario.device, "force_limit"), _each(scenario.device, "encoder_step"), walled)
     scene = build(scenario.device, scenario.human)
     return Assembly(scenario, E, F, process, scene, hold(plant(scene.model), scenario.T))
 

@@ -28,6 +28,7 @@ from sim.command import (
     numbers,
     out_folder,
     progress_bar,
+    require_linear,
     scenario_from,
     seed_from,
 )
@@ -47,6 +48,7 @@ def main(argv: list[str]) -> int:
     """Meet random humans. 0: the claims hold, 1: not, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario = scenario_from(args)
+    require_linear(scenario, "sim.validate")
     humans, shards = _whole(args, "humans", 1_000_000), _whole(args, "shards", 256)
     seed, duration = seed_from(args), _duration(args, scenario)
     links = LINKS[args.links] if args.links else scenario.population.links
