@@ -37,9 +37,9 @@ class Gains:
             object.__setattr__(self, name, frozen(getattr(self, name), 1))
         if self.K.shape != self.B.shape:
             raise ValueError(f"K has {self.K.size} entries and B has {self.B.size}")
-        if not ((self.K > 0) & (self.K < np.inf)).all():
+        if not ((self.K > 0) & (np.inf > self.K)).all():
             raise ValueError("K has an entry that is not positive and finite")
-        if not ((self.B >= 0) & (self.B < np.inf)).all():
+        if not ((self.B >= 0) & (np.inf > self.B)).all():
             raise ValueError("B has an entry that is negative or not finite")
         if self.cutoff is not None and not 0 < self.cutoff < np.inf:
             raise ValueError(f"cutoff is {self.cutoff}, expected a positive frequency in Hz")

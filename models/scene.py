@@ -5,8 +5,9 @@ The only place that knows joint names. Every body slides along x. Joints come in
 
     actuator (-f) -> motor_i ==transmission== handle_i (with the human's first mass) ==link== human_i_2 == ...
 
-Gravity, contacts and constraints are off, but for the Coulomb friction of devices that have some. Inputs are MuJoCo actuators: first the outside forces (voluntary
-motion and taps), then one motor per device with gear -1, because the device feels -f.
+Gravity, contacts and constraints are off, but for the Coulomb friction of devices that have some. Inputs are MuJoCo
+actuators: first the outside forces (voluntary motion and taps), then one motor per device with gear -1, because
+the device feels -f.
 """
 
 from __future__ import annotations

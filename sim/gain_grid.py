@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,18 +56,23 @@ def make_grid(
         wide = (2.5 * stiff / n, 2.5 * stiff), (0.0, 2.5 * most)
     else:
         wide = (stiff / 30, stiff * 30), (most / 100, most * 10)
+    of_marks = tuple(zip(*marks, strict=True)) if marks else ((), ())
     ends = []
-    for name, given, usual, allowed, of_marks in zip(
-        "KB", (K, B), wide, (STIFFNESSES, DAMPINGS), zip(*marks, strict=True) if marks else ((), ()), strict=True
-    ):
-        low, high = given or (min(usual[0], *(m / 1.1 for m in of_marks if m > 0), usual[0]), max(usual[1], *(1.1 * m for m in of_marks), usual[1]))
+    for name, given, usual, allowed, marked in zip("KB", (K, B), wide, (STIFFNESSES, DAMPINGS), of_marks, strict=True):
+        low, high = given or _with_room(usual, marked)
         _check(name, low, high, allowed, scale)
-        for mark in of_marks:
-            if not low <= mark <= high and not (given is None and mark == 0):
+        for mark in marked:
+            if given and not low <= mark <= high:
                 raise InputError(f"--mark has {name} = {mark:g}, outside --{name}-range {low:g},{high:g}")
         ends.append((low, high))
     spread = np.linspace if scale == "linear" else np.geomspace
     return Grid(spread(*ends[0], n), spread(*ends[1], n), scale)
+
+
+def _with_room(usual: Range, marked: Sequence[float]) -> Range:
+    """The range, widened so that marks lie well inside; a mark at 0 stays on the edge of a logarithmic map."""
+    low, high = usual
+    return min([low, *(mark / 1.1 for mark in marked if mark > 0)]), max([high, *(1.1 * mark for mark in marked)])
 
 
 def _check(name: str, low: float, high: float, allowed: Range, scale: str) -> None:

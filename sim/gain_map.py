@@ -10,15 +10,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.gains import Stack
-from controller.lti import Array
-from controller.process import Process
+from controller.gains import Gains
+from controller.lti import Array, Lti
 from design.assess import CONDITIONS
 from models.device import Device
 from sim.cells import in_slices
 from sim.gain_grid import Grid
-from sim.gain_ground import Ground
-from sim.gain_points import Trial, simulate_trials
+from sim.gain_ground import Ground, press_directions
+from sim.gain_points import START, Trial, simulate_trials
 from sim.gain_population import Holders
 from sim.oscillation import slowest_seen
 from sim.stability import MARGINAL
@@ -47,8 +46,8 @@ class Effects:
             changes["friction"] = self.friction
         return tuple(msgspec.structs.replace(device, **changes) for device in devices)
 
-    def any(self, devices: Sequence[Device]) -> bool:
-        """Whether the simulated loop is not linear."""
+    def nonlinear(self, devices: Sequence[Device]) -> bool:
+        """Whether the devices make the simulated loop another one than the linear one."""
         return self.saturation or any(device.encoder_step or device.friction for device in self.on(devices))
 
 
@@ -100,7 +99,7 @@ def draw_map(ground: Ground, grid: Grid, holders: Holders, plan: Plan, progress:
         return tuple(ground.ratios(name, gains.take(part)) for name in CONDITIONS)
 
     def population(part: slice) -> tuple[float, int]:
-        return _population(holders, stack, leading, part.start)
+        return _population(holders, [stack[part.start] for stack in stacks], leading)
 
     begin = time.perf_counter()
     _ = ground.multiplier  # once, before threads ask for it
@@ -111,9 +110,9 @@ def draw_map(ground: Ground, grid: Grid, holders: Holders, plan: Plan, progress:
     seconds["certificates"] = time.perf_counter() - begin
     if not stopped:
         begin = time.perf_counter()
-        stack = ground.force_maps(gains)
+        stacks = ground.force_maps(gains)
         sample = np.unique(np.linspace(0, n - 1, min(SAMPLE, n)).astype(int))
-        leading = holders.leading([stack[i] for i in sample])
+        leading = holders.leading([stacks[0][i] for i in sample])
         done, stopped = in_slices(population, n, 1, lambda k, of: progress("population", k, of))
         for part, values in done:
             growth[part], unstable[part] = values
@@ -121,60 +120,82 @@ def draw_map(ground: Ground, grid: Grid, holders: Holders, plan: Plan, progress:
     if not stopped and plan.points:
         begin = time.perf_counter()
         cells = grid.subset(plan.points)
-        points, stopped = _simulated(ground, stack, holders, plan, cells, lambda k, of: progress("MuJoCo", k, of))
+        points, stopped = _simulated(ground, grid, holders, plan, cells, lambda k, of: progress("MuJoCo", k, of))
         seconds["simulation"] = time.perf_counter() - begin
     return Map(grid, ratio, growth, unstable, points, seconds, stopped)
 
 
-def _population(holders: Holders, stack: Stack, leading: NDArray[np.bool_], cell: int) -> tuple[float, int]:
-    """Worst growth and number of unstable humans among the leading ones, or, if none of these, among all."""
-    F = stack[cell]
-    growth, _ = holders.growth(F, leading)
+def _population(holders: Holders, states: Sequence[Lti], leading: NDArray[np.bool_]) -> tuple[float, int]:
+    """Worst growth and number of unstable humans among the leading ones, or, if none of these, among all.
+
+    `states` are the force maps of one cell; a human is unstable if it is with any of them.
+    """
+    growth = np.max([holders.growth(F, leading)[0] for F in states], axis=0)
     if not (growth > MARGINAL).any() and not leading.all():
-        growth = np.maximum(growth, holders.growth(F, ~leading)[0])
+        rest = np.max([holders.growth(F, ~leading)[0] for F in states], axis=0)
+        growth = np.maximum(growth, rest)
     return float(growth.max()), int((growth > MARGINAL).sum())
 
 
 def _simulated(
-    ground: Ground, stack: Stack, holders: Holders, plan: Plan, cells: NDArray[np.intp], progress: Callable[[int, int], None]
+    ground: Ground,
+    grid: Grid,
+    holders: Holders,
+    plan: Plan,
+    cells: NDArray[np.intp],
+    progress: Callable[[int, int], None],
 ) -> tuple[Points, bool]:
-    """Trials, grouped by the humans' number of links, in batches that hold whole points."""
-    devices = plan.effects.on(ground.devices)
-    step, limit = (np.array([getattr(d, name) for d in devices]) for name in ("encoder_step", "force_limit"))
+    """Trials in batches that hold whole points."""
     parts: list[Points] = []
-    size, audible = max(1, BATCH // plan.trials), slowest_seen(plan.duration)
-    ticks = round(plan.duration / ground.T)
+    size, ticks = max(1, BATCH // plan.trials), round(plan.duration / ground.T)
     try:
         for first in range(0, cells.size, size):
-            some, trials, growth = cells[first : first + size], [], []
-            for cell in some.tolist():
-                audibly = holders.growth(stack[cell], audible=audible)[1]
-                worst = np.argsort(-audibly, kind="stable")[: plan.trials]
-                process = Process(stack[cell], limit, step)
-                trials += [Trial(process, holders.links(human)) for human in worst.tolist()]
-                growth.append(audibly[worst[0]])
+            some = cells[first : first + size]
+            trials, growth = _trials(ground, ground.gains(*(axis[some] for axis in grid.flat)), holders, plan)
             seen = 0
 
             def ticked(count: int, first: int = first) -> None:
                 nonlocal seen
                 seen += count
-                progress(first * ticks + seen * min(size, cells.size - first), cells.size * ticks)
+                progress(first * ticks + min(seen, ticks) * min(size, cells.size - first), cells.size * ticks)
 
-            parts.append(_points(some, np.array(growth), trials, devices, plan, ticked))
+            parts.append(_points(some, growth, trials, ground, plan, ticked))
     except KeyboardInterrupt:
         return _joined(parts), True
     return _joined(parts), False
 
 
+def _trials(ground: Ground, gains: Gains, holders: Holders, plan: Plan) -> tuple[list[Trial], Array]:
+    """The trials of these gains, plan.trials of each in succession, and the growth of the worst of each."""
+    audible, stack = slowest_seen(plan.duration), ground.force_maps(gains)[0]
+    devices = plan.effects.on(ground.devices)
+    trials, growth = [], []
+    for i in range(len(gains)):
+        audibly = holders.growth(stack[i], audible=audible)[1]
+        worst = np.argsort(-audibly, kind="stable")[: plan.trials]
+        process = ground.process(gains, i, devices)
+        for human in worst.tolist():
+            trials.append(Trial(process, holders.links(human), START * holders.mode(stack[i], human, audible)))
+        growth.append(audibly[worst[0]])
+    return trials, np.array(growth)
+
+
 def _points(
-    cells: NDArray[np.intp], growth: Array, trials: list[Trial], devices: Sequence[Device], plan: Plan, ticked: Callable[[int], None]
+    cells: NDArray[np.intp],
+    growth: Array,
+    trials: list[Trial],
+    ground: Ground,
+    plan: Plan,
+    ticked: Callable[[int], None],
 ) -> Points:
     """Simulate the trials of these cells, plan.trials of each in succession."""
+    devices = plan.effects.on(ground.devices)
+    press = plan.press * press_directions(ground.walled, ground.channels)
     lasting, amplitude, frequency = np.zeros(len(trials), dtype=bool), np.zeros(len(trials)), np.zeros(len(trials))
     links = np.array([trial.links.shape[1] for trial in trials])
     for count in np.unique(links):
         which = np.flatnonzero(links == count)
-        found = simulate_trials([trials[i] for i in which], devices, plan.press, plan.duration, plan.threshold, ticked)
+        found = simulate_trials([trials[i] for i in which], devices, press, plan.duration, plan.threshold, ticked)
         lasting[which], amplitude[which], frequency[which] = found.sustained, found.amplitude, found.frequency_hz
     shape = (cells.size, -1)
     shown = np.where(lasting, amplitude + 1e9, amplitude).reshape(shape).argmax(axis=1)[:, None]

@@ -1,8 +1,8 @@
 """Points of a K-B map simulated in MuJoCo, with the effects that no theory covers switched on.
 
-At every point the humans that are nearest to oscillating there, by the exact linear loop, hold the devices. They press
-them with a constant force, eased in, every handle is knocked once, and what still oscillates at the end decides:
-see oscillation.py. Many points are stepped in one MuJoCo batch, each with its own process.
+The human that is nearest to oscillating at a point, by the exact linear loop, holds the devices. The loop starts on
+that mode, its largest displacement START; the hand presses with a constant force, eased in; and what still
+oscillates at the end decides: see oscillation.py. Many points are stepped in one MuJoCo batch, each with its process.
 """
 
 from __future__ import annotations
@@ -17,85 +17,90 @@ from controller.process import Process, Tape
 from models.crowd import Crowd, variants
 from models.device import Device
 from models.scene import Scene
-from sim.knock import knock_forces
+from sim.gain_population import motors_and_handles
 from sim.loop import stretch
 from sim.mujoco_engine import MujocoBatchEngine, profiler_off, quiet_warnings
 from sim.oscillation import Oscillation, oscillation
 from sim.substeps import pace
 
-EASE = 0.1  # [s] in which the press grows
+START = 1e-4  # [m]
+EASE = 0.5  # [s] in which the press grows
 STRETCH = 64  # ticks between two looks at the keyboard
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One simulation: a process and who holds the devices."""
+    """One simulation: a process, who holds the devices, and where it starts."""
 
     process: Process
     links: Array  # (m, links, 3) as in Crowd
+    start: Array  # (2n + order,) plant state, then the state of the linear process
 
 
 class ManyProcesses(Tape):
-    """A tape whose simulations have a process each, all with the same channels, limits and encoder steps."""
+    """A tape whose simulations have a process each, of the same order, limits and encoder steps."""
 
     def __init__(self, processes: Sequence[Process], ticks: int, plant_states: int, outside: int) -> None:
-        order = max(process.F.order for process in processes)
-        blocks = np.array([_transition(process, order) for process in processes])
-        super().__init__(_widest(processes), ticks, plant_states, outside, len(processes))
+        super().__init__(processes[0], ticks, plant_states, outside, len(processes))
+        self._walled = None
+        if any(process.contact for process in processes):
+            self._walled = [process.transition() for process in processes]
+            return
+        blocks = [np.block([[p.F.C, p.F.D], [p.F.A, p.F.B]]) for p in processes]
         self._blocks = np.ascontiguousarray(np.moveaxis(blocks, 0, -1))  # (outputs, inputs, nsim)
 
     def tick(self, k: int) -> None:
         if self._quantised:
             self._quantise(self._measured[k])
-        np.einsum("oin,in->on", self._blocks, self._input[k], out=self._output[k])
+        before, after = self._input[k], self._output[k]
+        if self._walled is None:
+            np.einsum("oin,in->on", self._blocks, before, out=after)
+            return
+        column = np.empty((after.shape[0], 1))
+        for i, transition in enumerate(self._walled):
+            transition(np.ascontiguousarray(before[:, i : i + 1]), column)
+            after[:, i : i + 1] = column
 
 
 def simulate_trials(
     trials: Sequence[Trial],
     devices: Sequence[Device],
-    press: float,
+    press: Array,
     duration: float,
     threshold: float,
     ticked: Callable[[int], None] = lambda ticks: None,
 ) -> Oscillation:
-    """All trials at once; their humans must have the same number of links. `press` [N], `threshold` [m]."""
+    """All trials at once; their humans must have the same number of links. `press` (m,) [N], `threshold` [m]."""
     T = trials[0].process.F.T
     held_by = variants(devices, Crowd(np.stack([trial.links for trial in trials])))
     scene, ticks = held_by.scene, round(duration / T)
     substeps = pace(held_by.plants().A).substeps(T)
-    tape = ManyProcesses([trial.process for trial in trials], min(STRETCH, ticks), 2 * scene.model.nv, scene.outside)
-    kept, done = [], 0
+    n, processes = 2 * scene.model.nv, [trial.process for trial in trials]
+    tape = ManyProcesses(processes, min(STRETCH, ticks), n, scene.outside)
+    starts = np.stack([trial.start for trial in trials], axis=1)
+    tape.s[0] = starts[:n]
+    if processes[0].contact is None:  # the states of a process with walls are others: it begins at rest
+        tape.z[0] = starts[n:]
+    seen, kept, done = list(motors_and_handles(scene)), [], 0
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
         engine = MujocoBatchEngine(scene, T, substeps=substeps, nsim=len(trials), fields=held_by.fields)
         engine.start(tape)
         while done < ticks:
             count = min(tape.ticks, ticks - done)
-            tape.w[:count] = forces(scene, T, press, done, count)[:, :, None]
+            tape.w[:count] = press_forces(scene, T, press, done, count)[:, :, None]
             stretch(tape, engine, count)
-            kept.append(tape.s[:count, list(scene.handles)].copy())
+            kept.append(tape.s[:count, seen].copy())
             tape.rewind(count)
             done += count
             ticked(count)
     return oscillation(np.concatenate(kept)[ticks // 2 :], T, threshold)
 
 
-def forces(scene: Scene, T: float, press: float, first: int, ticks: int) -> Array:
-    """Outside forces [N], (ticks, outside): the knock, and `press` on the ends of the humans, alternately signed."""
+def press_forces(scene: Scene, T: float, press: Array, first: int, ticks: int) -> Array:
+    """Outside forces [N], (ticks, outside): `press` (m,) on the ends of the humans."""
     t = (first + np.arange(ticks)) * T
-    eased = press * np.where(t < EASE, (1 - np.cos(np.pi * t / EASE)) / 2, 1.0)
-    w = knock_forces(scene, T, first, ticks)
-    for i, column in enumerate(scene.pushed):
-        w[:, column] += (-1) ** i * eased
+    eased = np.where(t < EASE, (1 - np.cos(np.pi * t / EASE)) / 2, 1.0)
+    w = np.zeros((ticks, scene.outside))
+    for force, column in zip(press, scene.pushed, strict=True):
+        w[:, column] += force * eased
     return w
-
-
-def _transition(process: Process, order: int) -> Array:
-    """[C D; A B] of the process, with idle states up to `order`."""
-    F = process.F
-    idle = order - F.order
-    A, B, C = np.pad(F.A, (0, idle)), np.pad(F.B, ((0, idle), (0, 0))), np.pad(F.C, ((0, 0), (0, idle)))
-    return np.block([[C, F.D], [A, B]])
-
-
-def _widest(processes: Sequence[Process]) -> Process:
-    return max(processes, key=lambda process: process.F.order)

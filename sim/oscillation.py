@@ -1,8 +1,8 @@
 """Does a trace go on oscillating? For loops that are not linear, where "unstable" may be a limit cycle.
 
-After the hands have come to rest, the second half of a trace is cut in two windows. In each, the motion of a handle
-without its slow part (a cubic fitted to the window) is split into octaves, from PERIODS in a window to half the
-sampling rate.
+The hands rest, or press with a constant force. The second half of a trace is cut in two windows. In each, the motion of
+each motor and handle without its slow part (a cubic fitted to the window) is split into octaves, from PERIODS in a
+window to half the sampling rate.
 The trace oscillates if in some octave the amplitude in the last window
 
     exceeds a threshold [m], and is at least SUSTAINED of that in the window before:
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from controller.lti import Array
 
-PERIODS = 2  # in a window, of the slowest oscillation that is seen: a cubic could pass for less
+PERIODS = 4  # in a window, of the slowest oscillation that is seen: of fewer the window function mixes octaves
 SUSTAINED = 0.95
 TREND = 3  # degree of the polynomial that is the slow part
 RUNAWAY = 1e3  # [m] no handle moves that far: the trace has diverged
@@ -41,7 +41,7 @@ def slowest_seen(duration: float) -> float:
 
 
 def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
-    """Of handle positions x (ticks, m, nsim) [m] in the second half of traces, sampled every T seconds."""
+    """Of positions x (ticks, m, nsim) [m] in the second half of traces, sampled every T seconds."""
     half = x.shape[0] // 2
     diverged = ~(np.abs(x) < RUNAWAY).all(axis=(0, 1))
     calm = np.where(diverged, 0.0, x)

@@ -25,7 +25,7 @@ HOMES = {
     "mujoco": {"models/scene.py", "sim/mujoco_engine.py"},
     "cvxpy": {"design/"},
     "serial": {"hw/port.py"},
-    "matplotlib": {"sim/plot.py"},
+    "matplotlib": {"sim/plot"},
 }
 
 FILES = [path for world in WORLDS for path in sorted((ROOT / world).rglob("*.py"))]
