@@ -74,10 +74,8 @@ def _theorem4_dampings(gains: Gains, theta: int, phi: float) -> Array:
 
 def _needed(gains: Gains, X: Lti | None, z: Complex, theta: Sequence[int], delta: Sequence[float]) -> Array:
     """The largest eigenvalue of -T He[F/(z-1)] relatively to Delta_D, shape of z (n, k)."""
-    if X is None:
-        G = gains.stiffness(z)[..., None, None]
-    else:
-        G = _closed(X.at(z), 1 / gains.stiffness(z))
+    stiffness = gains.stiffness(z)
+    G = stiffness[..., None, None] if X is None else _closed(X.at(z), 1 / stiffness)
     F = z[..., None, None] ** -np.asarray(theta)[:, None] * G / (z - 1)[..., None, None]
     weight = np.sqrt(gains.T / np.asarray(delta))
     return _largest_eigenvalue(-(weight[:, None] * weight) * (F + np.conj(np.swapaxes(F, -1, -2))) / 2)

@@ -17,7 +17,7 @@ from models.device import Device
 from sim.cells import in_slices
 from sim.gain_grid import Grid
 from sim.gain_ground import Ground, press_directions
-from sim.gain_points import START, Trial, simulate_trials
+from sim.gain_points import Trial, simulate_trials
 from sim.gain_population import Holders
 from sim.oscillation import slowest_seen
 from sim.stability import MARGINAL
@@ -25,7 +25,8 @@ from sim.stability import MARGINAL
 UNLIMITED = 1e6  # [N] force limit of a motor that does not saturate: the largest that a device may have
 SLICE, SAMPLE = 60, 25  # cells in one pass of a condition; cells that tell which humans are the leading ones
 BATCH = 20  # simulations in one MuJoCo batch
-DECIDED = 0.2  # [1/s] growth nearer to zero than this does not show within a trace
+DECIDED = 0.2  # [1/s] linear growth nearer to zero than this does not show within a trace
+UNDECIDED = "too slow to say"  # verdict where the trace goes on oscillating as the linear loop would, decaying or not
 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 
@@ -58,6 +59,7 @@ class Plan:
     effects: Effects
     points: int  # rows and columns of the grid that are simulated; 0 for none
     trials: int  # humans at each point
+    start: float  # [m] displacement of the motor or handle that moves most, at the start
     press: float  # [N]
     duration: float  # [s]
     threshold: float  # [m] amplitude above which a handle oscillates
@@ -68,10 +70,26 @@ class Points:
     """The simulated points, (k,) each."""
 
     cell: NDArray[np.intp]  # flat index in the grid
-    oscillates: NDArray[np.bool_]  # whether with any of the humans that were tried
+    oscillates: NDArray[np.bool_]  # to the end of the trace, with any of the humans that were tried
     amplitude: Array  # [m] the largest among them that decided; inf: diverged
     frequency_hz: Array  # [Hz] of it; nan: diverged
     growth: Array  # [1/s] of the exact linear loop's dominant audible mode, with the worst of these humans
+
+    @property
+    def near(self) -> NDArray[np.bool_]:
+        """Whether the linear loop neither grows nor decays enough to be told from a limit cycle."""
+        return np.abs(self.growth) <= DECIDED
+
+    @property
+    def differ(self) -> NDArray[np.bool_]:
+        """Whether MuJoCo does what the linear loop clearly does not."""
+        return ~self.near & ((self.growth > 0) != self.oscillates)
+
+    @property
+    def verdicts(self) -> list[str]:
+        """Each one "rests", "oscillates" or UNDECIDED."""
+        words = np.where(self.oscillates, np.where(self.near, UNDECIDED, "oscillates"), "rests")
+        return [str(word) for word in words]
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +193,7 @@ def _trials(ground: Ground, gains: Gains, holders: Holders, plan: Plan) -> tuple
         worst = np.argsort(-audibly, kind="stable")[: plan.trials]
         process = ground.process(gains, i, devices)
         for human in worst.tolist():
-            trials.append(Trial(process, holders.links(human), START * holders.mode(stack[i], human, audible)))
+            trials.append(Trial(process, holders.links(human), plan.start * holders.mode(stack[i], human, audible)))
         growth.append(audibly[worst[0]])
     return trials, np.array(growth)
 

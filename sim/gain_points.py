@@ -1,7 +1,7 @@
 """Points of a K-B map simulated in MuJoCo, with the effects that no theory covers switched on.
 
 The human that is nearest to oscillating at a point, by the exact linear loop, holds the devices. The loop starts on
-that mode, its largest displacement START; the hand presses with a constant force, eased in; and what still
+that mode, so far that Coulomb friction does not hold it; the hand presses with a constant force, eased in; and what still
 oscillates at the end decides: see oscillation.py. Many points are stepped in one MuJoCo batch, each with its process.
 """
 
@@ -13,17 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.lti import Array
-from controller.process import Process, Tape
+from controller.process import Process
 from models.crowd import Crowd, variants
 from models.device import Device
 from models.scene import Scene
 from sim.gain_population import motors_and_handles
 from sim.loop import stretch
+from sim.many_processes import ManyProcesses
 from sim.mujoco_engine import MujocoBatchEngine, profiler_off, quiet_warnings
 from sim.oscillation import Oscillation, oscillation
 from sim.substeps import pace
 
-START = 1e-4  # [m]
 EASE = 0.5  # [s] in which the press grows
 STRETCH = 64  # ticks between two looks at the keyboard
 
@@ -35,31 +35,6 @@ class Trial:
     process: Process
     links: Array  # (m, links, 3) as in Crowd
     start: Array  # (2n + order,) plant state, then the state of the linear process
-
-
-class ManyProcesses(Tape):
-    """A tape whose simulations have a process each, of the same order, limits and encoder steps."""
-
-    def __init__(self, processes: Sequence[Process], ticks: int, plant_states: int, outside: int) -> None:
-        super().__init__(processes[0], ticks, plant_states, outside, len(processes))
-        self._walled = None
-        if any(process.contact for process in processes):
-            self._walled = [process.transition() for process in processes]
-            return
-        blocks = [np.block([[p.F.C, p.F.D], [p.F.A, p.F.B]]) for p in processes]
-        self._blocks = np.ascontiguousarray(np.moveaxis(blocks, 0, -1))  # (outputs, inputs, nsim)
-
-    def tick(self, k: int) -> None:
-        if self._quantised:
-            self._quantise(self._measured[k])
-        before, after = self._input[k], self._output[k]
-        if self._walled is None:
-            np.einsum("oin,in->on", self._blocks, before, out=after)
-            return
-        column = np.empty((after.shape[0], 1))
-        for i, transition in enumerate(self._walled):
-            transition(np.ascontiguousarray(before[:, i : i + 1]), column)
-            after[:, i : i + 1] = column
 
 
 def simulate_trials(

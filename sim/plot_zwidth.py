@@ -14,12 +14,16 @@ from matplotlib.patches import Patch
 
 from controller.lti import Array
 from sim.files import write
-from sim.gain_map import Map
+from sim.gain_map import UNDECIDED, Map
 from sim.plot import STYLES
 from sim.stability import MARGINAL
 
 STABLE, UNSTABLE = "#DDEBF4", "#F6D9C6"
-LINES = {"theorem4": STYLES[0] | {"linestyle": "--"}, "closed-loop": STYLES[2] | {"linestyle": "-"}}
+#: the broken line lies on the other, so that both are seen where they are the same
+LINES = {
+    "closed-loop": {"color": STYLES[2]["color"], "linestyle": "-", "linewidth": 3.6},
+    "theorem4": {"color": STYLES[0]["color"], "linestyle": "--", "linewidth": 1.8},
+}
 
 
 def plot_zwidth(drawn: Map, outcome: dict[str, Any], path: Path) -> Path:
@@ -62,24 +66,16 @@ def _cell_edges(axis: Array, scale: str) -> Array:
 
 def _edges(axes: Axes, drawn: Map) -> list[Line2D]:
     entries = []
-    for name, ratio in drawn.ratio.items():
+    for name, style in LINES.items():
+        ratio = drawn.ratio[name]
         # the edge is where required damping is what is available; far from it the figure is only kept finite
         height = np.ma.masked_invalid(np.clip(ratio, 0, 4).reshape(drawn.grid.shape))
-        style = LINES[name]
-        safe = bool((ratio < 1).any())
-        if safe and (ratio >= 1).any():
-            axes.contour(
-                drawn.grid.B,
-                drawn.grid.K,
-                height,
-                [1],
-                colors=style["color"],
-                linestyles=style["linestyle"],
-                linewidths=2.2,
-            )
-        everywhere = "" if (ratio >= 1).any() else " (everywhere)"
-        label = f"edge of what {name} certifies{everywhere}" if safe else f"{name} certifies nothing here"
-        entries.append(Line2D([], [], linewidth=2.2, label=label, **style))
+        safe, unsafe = bool((ratio < 1).any()), bool((ratio >= 1).any())
+        if safe and unsafe:
+            drawing = {"colors": style["color"], "linestyles": style["linestyle"], "linewidths": style["linewidth"]}
+            axes.contour(drawn.grid.B, drawn.grid.K, height, [1], **drawing)
+        what = "below this edge" if safe and unsafe else "everything here" if safe else "nothing here"
+        entries.append(Line2D([], [], label=f"{name} certifies {what}", **style))
     return entries
 
 
@@ -88,9 +84,11 @@ def _points(axes: Axes, drawn: Map, outcome: dict[str, Any]) -> list[Line2D]:
     if not points:
         return []
     entries, effects = [], "" if outcome["simulation"]["nonlinear"] else ", linear loop"
-    kinds = (("comes to rest", False, "o", "white"), ("oscillates", True, "X", STYLES[1]["color"]))
-    for word, oscillates, marker, face in kinds:
-        some = [p for p in points if p["oscillates"] == oscillates]
+    kinds = (("rests", "o", "white"), ("oscillates", "X", STYLES[1]["color"]), (UNDECIDED, "D", "grey"))
+    for word, marker, face in kinds:
+        some = [p for p in points if p["verdict"] == word]
+        if not some:
+            continue
         style = {"marker": marker, "markersize": 5.5, "markerfacecolor": face, "markeredgecolor": "black"}
         style |= {"linestyle": "none", "markeredgewidth": 0.7}
         axes.plot([p["B"] for p in some], [p["K"] for p in some], clip_on=False, zorder=4, **style)

@@ -88,6 +88,9 @@ def _parser() -> Parser:
     points.add_argument("--points", default="10", metavar="N", help="rows and columns of them (default 10, 0 for none)")
     points.add_argument("--trials", default="1", metavar="N", help="humans at each, the most critical (default 1)")
     points.add_argument("--duration", default="3", metavar="SECONDS", help="of each (default 3)")
+    points.add_argument(
+        "--start", default="1e-3", metavar="METRES", help="first swing of motor or handle (default 1e-3)"
+    )
     points.add_argument("--press", default="1", metavar="NEWTONS", help="steady force of every hand (default 1)")
     points.add_argument("--threshold", metavar="METRES", help="amplitude of an oscillation (default 2 steps or 1e-5)")
     points.add_argument("--quantisation", metavar="METRES", help="encoder step of every device")
@@ -141,7 +144,8 @@ def _plan(args: argparse.Namespace, ground: Ground) -> Plan:
     threshold = max(2 * coarsest, FINEST) if args.threshold is None else _number(args, "threshold", 1e-9, 1, "m")
     duration = _number(args, "duration", max(1.5, 1024 * ground.T), 1e4, "s")
     trials, points = _whole(args, "trials", 1, 100), _whole(args, "points", 0, 400)
-    return Plan(effects, points, trials, _number(args, "press", 0, 1e3, "N"), duration, threshold)
+    start, press = _number(args, "start", 1e-9, 1, "m"), _number(args, "press", 0, 1e3, "N")
+    return Plan(effects, points, trials, start, press, duration, threshold)
 
 
 def _save(args: argparse.Namespace, ground: Ground, drawn: Map, outcome: dict[str, Any], out: Path) -> None:

@@ -16,7 +16,7 @@ from controller.lti import Array
 from design.promises import CAVEATS, certificate_part, finite
 from sim.files import write
 from sim.gain_ground import Ground
-from sim.gain_map import DECIDED, Map, Plan
+from sim.gain_map import DECIDED, UNDECIDED, Map, Plan
 from sim.gain_marks import Mark, Truth
 from sim.oscillation import SUSTAINED, slowest_seen
 from sim.stability import MARGINAL
@@ -63,17 +63,15 @@ def outcome(ground: Ground, drawn: Map, plan: Plan, population: dict[str, Any]) 
 
 def _simulation(ground: Ground, drawn: Map, plan: Plan) -> dict[str, Any]:
     points, (K, B) = drawn.points, drawn.grid.flat
-    decided = np.abs(points.growth) > DECIDED
-    differ = decided & ((points.growth > 0) != points.oscillates)
     rows = [
         {
             "K": float(K[cell]),
             "B": float(B[cell]),
-            "oscillates": bool(points.oscillates[i]),
+            "verdict": points.verdicts[i],
             "amplitude_m": finite(points.amplitude[i]),
             "frequency_hz": finite(points.frequency_hz[i]),
             "linear_growth_rate_per_s": finite(points.growth[i]),
-            "differs_from_linear": bool(differ[i]),
+            "differs_from_linear": bool(points.differ[i]),
         }
         for i, cell in enumerate(points.cell.tolist())
     ]
@@ -88,13 +86,14 @@ def _simulation(ground: Ground, drawn: Map, plan: Plan) -> dict[str, Any]:
         "nonlinear": plan.effects.nonlinear(ground.devices) or ground.walled is not None,
         "trials": plan.trials,
         "duration_s": plan.duration,
+        "start_m": plan.start,
         "press_n": plan.press,
         "threshold_m": plan.threshold,
         "from_hz": slowest_seen(plan.duration),
         "points": rows,
-        "oscillate": int(points.oscillates.sum()),
-        "undecided": int((~decided).sum()),
-        "differ_from_linear": int(differ.sum()),
+        "oscillate": points.verdicts.count("oscillates"),
+        "undecided": points.verdicts.count(UNDECIDED),
+        "differ_from_linear": int(points.differ.sum()),
     }
 
 
@@ -142,7 +141,7 @@ def save_csv(drawn: Map, path: Path) -> Path:
 
 def _simulated(drawn: Map, i: int) -> list[str]:
     points = drawn.points
-    return ["oscillates" if points.oscillates[i] else "rests", f"{points.amplitude[i]:.4g}"]
+    return [points.verdicts[i], f"{points.amplitude[i]:.4g}"]
 
 
 def print_map(outcome: dict[str, Any], console: Console) -> None:
@@ -161,8 +160,8 @@ def print_map(outcome: dict[str, Any], console: Console) -> None:
     table.add_row(who, f"{_share(crowd['stable_cells'], cells)} ({crowd['decided_cells']} decided)")
     simulation = outcome["simulation"]
     if simulation["points"]:
-        beside = f"{simulation['differ_from_linear']} unlike the linear loop, {simulation['undecided']} too near to say"
-        ends = f"{simulation['oscillate']} of {len(simulation['points'])} oscillate; {beside}"
+        beside = f"{simulation['undecided']} {UNDECIDED}, {simulation['differ_from_linear']} unlike the linear loop"
+        ends = f"{simulation['oscillate']} of {len(simulation['points'])} oscillate, {beside}"
         table.add_row(f"simulated{_effects(simulation)}", ends)
     table.add_row("seconds", ", ".join(f"{stage} {wall:.1f}" for stage, wall in outcome["wall_s"].items()) or "-")
     console.print(table)
@@ -221,7 +220,7 @@ def _remarks(outcome: dict[str, Any]) -> list[str]:
         lines.append(
             f"A simulated point oscillates if, at the end of {simulation['duration_s']:g} s, an octave above "
             f"{simulation['from_hz']:.3g} Hz keeps {100 * SUSTAINED:g} % of its amplitude, over "
-            f"{simulation['threshold_m']:g} m."
+            f"{simulation['threshold_m']:g} m; {UNDECIDED} where the linear loop is within {DECIDED:g} 1/s of the edge."
         )
     if outcome["interrupted"]:
         lines.append("Interrupted: the map has what was finished.")
