@@ -87,7 +87,11 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
 
 
 def require_linear(scenario: Scenario, what: str) -> None:
-    """Raises InputError where contact is made and broken, for a command whose verdicts are of linear loops."""
+    """Raises InputError where a loop has walls or Coulomb friction, for a command whose verdicts are of linear ones."""
+    for i, device in enumerate(scenario.device):
+        if device.friction:
+            instead = "sim.run and sim.zwidth simulate it"
+            raise InputError(f"device[{i}].friction is {device.friction:g} N: {what} decides linear loops; {instead}")
     if scenario.environment.walls:
         raise InputError(
             f"environment.walls: {what} decides linear loops; sim.run and sim.contact close the loop with walls"

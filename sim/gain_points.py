@@ -1,8 +1,8 @@
 """Points of a K-B map simulated in MuJoCo, with the effects that no theory covers switched on.
 
 The human that is nearest to oscillating at a point, by the exact linear loop, holds the devices. The loop starts on
-that mode, so far that Coulomb friction does not hold it; the hand presses with a constant force, eased in; and what still
-oscillates at the end decides: see oscillation.py. Many points are stepped in one MuJoCo batch, each with its process.
+that mode, so far out that Coulomb friction does not hold it; the hand presses with a constant force, eased in; and what
+still oscillates at the end decides: see oscillation.py. Many points, each with its process, are one MuJoCo batch.
 """
 
 from __future__ import annotations

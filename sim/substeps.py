@@ -59,6 +59,7 @@ def default_substeps(assembly: Assembly, integrator: str = "RK4") -> int:
     """At least 4, more where the rule or the verdict asks. Raises InputError where no number up to 10000 does."""
     if integrator == "discrete":  # it remembers more than position and velocity, so no map of those can vouch for it
         raise InputError(f"--integrator discrete gives no verdict to rely on: {_MODE_LOST}; use RK4 or give --substeps")
+    assembly = assembly.smooth
     speed, T = pace(plant(assembly.scene.model).A), assembly.scenario.T
     count = needed = speed.substeps(T)
     while count <= MOST and not _agrees(assembly, integrator, count):
@@ -72,6 +73,7 @@ def default_substeps(assembly: Assembly, integrator: str = "RK4") -> int:
 
 def check_substeps(assembly: Assembly, integrator: str, substeps: int) -> list[str]:
     """Remarks on a number of substeps that was asked for. Raises InputError outside the stable region."""
+    assembly = assembly.smooth
     speed, h = pace(plant(assembly.scene.model).A), assembly.scenario.T / substeps
     radius = step_radius(assembly, integrator, substeps)
     what = f"{integrator} x {substeps}: {speed.hardest(h)}"
