@@ -91,7 +91,7 @@ def _parser() -> Parser:
     points.add_argument(
         "--start", default="1e-3", metavar="METRES", help="first swing of motor or handle (default 1e-3)"
     )
-    points.add_argument("--press", default="1", metavar="NEWTONS", help="steady force of every hand (default 1)")
+    points.add_argument("--press", default="3", metavar="NEWTONS", help="steady force of every hand (default 3)")
     points.add_argument("--threshold", metavar="METRES", help="amplitude of an oscillation (default 2 steps or 1e-5)")
     points.add_argument("--quantisation", metavar="METRES", help="encoder step of every device")
     points.add_argument("--saturation", action="store_true", help="motors have their force limits")
