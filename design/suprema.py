@@ -23,10 +23,9 @@ def suprema(responses: Responses, grid: Array) -> Array:
     endless = ~np.isfinite(values).all(axis=1)
     values = np.where(np.isfinite(values), values, -np.inf)
     padded = np.pad(values, ((0, 0), (1, 1)), constant_values=-np.inf)
-    local = np.where((values >= padded[:, :-2]) & (values >= padded[:, 2:]), values, -np.inf)
+    local = np.where((values > padded[:, :-2]) & (values >= padded[:, 2:]), values, -np.inf)  # once per plateau
     peaks = np.argsort(local, axis=1)[:, -PEAKS:]
-    left = np.take_along_axis(grid, np.maximum(peaks - 1, 0), axis=1)
-    right = np.take_along_axis(grid, np.minimum(peaks + 1, grid.shape[1] - 1), axis=1)
+    left, right = _neighbours(grid, np.take_along_axis(grid, peaks, axis=1))
     top = values.max(axis=1)
     for _ in range(ROUNDS):
         trial = np.linspace(left, right, POINTS, axis=-1)  # (n, peaks, points)
@@ -36,3 +35,11 @@ def suprema(responses: Responses, grid: Array) -> Array:
         left = np.take_along_axis(trial, np.maximum(at - 1, 0), axis=2)[..., 0]
         right = np.take_along_axis(trial, np.minimum(at + 1, POINTS - 1), axis=2)[..., 0]
     return np.where(endless, np.inf, top)
+
+
+def _neighbours(grid: Array, at: Array) -> tuple[Array, Array]:
+    """The frequencies (n, peaks) of the grid below and above `at`; a grid may have some twice."""
+    room = 1e-12 * grid[:, -1:]
+    below = np.where(grid[:, None] < (at - room)[..., None], grid[:, None], grid[:, None, :1]).max(axis=2)
+    above = np.where(grid[:, None] > (at + room)[..., None], grid[:, None], grid[:, None, -1:]).min(axis=2)
+    return below, above
