@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller.lti import Array
 from sim.gain_ground import Ground
@@ -34,7 +35,7 @@ class Grid:
         K, B = np.meshgrid(self.K, self.B, indexing="ij")
         return K.ravel(), B.ravel()
 
-    def subset(self, count: int) -> Array:
+    def subset(self, count: int) -> NDArray[np.intp]:
         """(k,) flat indices of `count` rows and columns at most, evenly spread, with the corners."""
         rows, columns = (np.unique(np.round(np.linspace(0, n - 1, min(count, n))).astype(int)) for n in self.shape)
         return (rows[:, None] * self.shape[1] + columns).ravel()

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from controller.gains import Gains
 from controller.lti import Array, Lti
 from design.assess import CONDITIONS
+from design.store import Condition
 from models.device import Device
 from sim.cells import in_slices
 from sim.gain_grid import Grid
@@ -97,7 +98,7 @@ class Map:
     """Over the grid, (cells,) each, B running fastest; nan where the keyboard came first."""
 
     grid: Grid
-    ratio: dict[str, Array]  # condition -> required over available damping
+    ratio: dict[Condition, Array]  # condition -> required over available damping
     growth: Array  # [1/s] worst over the humans that were tried: all of them where none is unstable
     unstable: Array  # humans that make the cell unstable, at least
     points: Points
@@ -109,7 +110,7 @@ def draw_map(ground: Ground, grid: Grid, holders: Holders, plan: Plan, progress:
     """All stages; Ctrl-C keeps what is done."""
     gains = ground.gains(*grid.flat)
     seconds, n = {}, len(gains)
-    ratio = {name: np.full(n, np.nan) for name in CONDITIONS}
+    ratio: dict[Condition, Array] = {name: np.full(n, np.nan) for name in CONDITIONS}
     growth, unstable = np.full((2, n), np.nan)
     points, stopped = _no_points(), False
 

@@ -6,11 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller.lti import Array
 from design.assess import CONDITIONS
 from design.audit_figures import edge
 from design.margin import Requirement
+from design.store import Condition
 from sim.gain_ground import Ground
 from sim.gain_map import Map
 from sim.gain_population import Holders
@@ -58,7 +60,7 @@ def look(ground: Ground, holders: Holders, K: float, B: float, grid_K: Array) ->
     return Mark(K, B, requirement, float(growth.max()), int((growth > MARGINAL).sum()), stiffest)
 
 
-def truth(ground: Ground, drawn: Map, condition: str) -> Truth | None:
+def truth(ground: Ground, drawn: Map, condition: Condition) -> Truth | None:
     """Columns of the map that cross the edge, evenly chosen; None where there is none."""
     grid, ratio = drawn.grid, drawn.ratio[condition].reshape(drawn.grid.shape)
     inside = ratio < 1
@@ -85,7 +87,7 @@ def _interpolated(K: Array, ratio: Array, k: int, scale: str) -> float:
     return float(K[k] + share * (K[k + 1] - K[k]))
 
 
-def _edge(ground: Ground, condition: str, low: float, high: float, B: float) -> float:
+def _edge(ground: Ground, condition: Condition, low: float, high: float, B: float) -> float:
     return edge(lambda K: ground.requirement(condition, K, B).ratio, low, high)
 
 
@@ -105,7 +107,7 @@ def _bisected(ground: Ground, holders: Holders, low: float, high: float, B: floa
     return low
 
 
-def _last(tried: Array, safe: Array, between: Callable[[float, float], float]) -> float | None:
+def _last(tried: Array, safe: NDArray[np.bool_], between: Callable[[float, float], float]) -> float | None:
     """Where safety ends for the last time; inf where it does not, None where nothing is safe."""
     if not safe.any():
         return None

@@ -56,7 +56,11 @@ def main(argv: list[str]) -> int:
     bar, moved = progress_bar("certificates")
     with bar:
         drawn = draw_map(
-            ground, grid, crowd, plan, lambda stage, k, of: moved(k, of) or bar.update(0, description=stage)
+            ground,
+            grid,
+            crowd,
+            plan,
+            lambda stage, k, of: moved(k, of) or bar.update(bar.task_ids[0], description=stage),
         )
     outcome = zwidth_report.outcome(ground, drawn, plan, {"humans": humans, "seed": seed})
     outcome |= {"scenario": None if args.rigid else scenario.name, "scenario_digest": scenario.digest}
