@@ -18,10 +18,12 @@ from sim.command import (
     Parser,
     add_loop_options,
     add_output_options,
+    add_rigid_option,
     console,
     execute,
     numbers,
     out_folder,
+    rigid_loop,
     scenario_from,
     seed_from,
 )
@@ -69,8 +71,7 @@ def _parser() -> Parser:
     what.add_argument("--coupling", metavar="FILE.json", help="a stored coupling, in place of --K and --B")
     what.add_argument("--preset", choices=tuple(PRESETS), help="limits that a framework ships; other options go first")
     add_loop_options(parser)
-    wall = "a rigid wall in place of the environment; one channel, the scenario's first"
-    parser.add_argument("--rigid", action="store_true", help=wall)
+    add_rigid_option(parser)
     add_output_options(parser)
     return parser
 
@@ -89,10 +90,7 @@ def _with_preset(args: argparse.Namespace) -> argparse.Namespace:
 
 def _subject(args: argparse.Namespace, scenario: Scenario) -> Subject:
     if args.rigid:
-        for name in ("theta", "psi", "delta"):
-            numbers(f"--rigid is one channel: --{name}", getattr(args, name) or "0", float, 1)
-        scenario_delays = {"theta": scenario.theta[:1], "psi": scenario.psi[:1] if args.psi else (0,)}
-        loop = {"network": None, "delta": scenario.delta[:1], **scenario_delays}
+        loop = {"network": None, "delta": scenario.delta[:1], **rigid_loop(args, scenario)}
     else:
         delays = {"theta": scenario.theta, "psi": scenario.psi}
         loop = {"network": scenario.environment, "delta": scenario.delta, **delays}

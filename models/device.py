@@ -21,6 +21,7 @@ class CompliantDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, t
     transmission_damping: float = 0.0  # [N s/m] assumed
     force_limit: float = 12.0  # [N] omega.3 in CHAI3D's device table
     encoder_step: float = 0.0  # [m] assumed 0: an ideal encoder
+    friction: float = 0.0  # [N] Coulomb friction at the motor, assumed 0; only MuJoCo models it
     delta: float | None = None  # [N s/m] guaranteed damping; `damping` unless an identification bounds it lower
 
     def __post_init__(self) -> None:
@@ -36,6 +37,7 @@ class RigidDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
     damping: float = 1.37  # [N s/m] the paper's section 6
     force_limit: float = 12.0  # [N] omega.3 in CHAI3D's device table
     encoder_step: float = 0.0  # [m] assumed 0: an ideal encoder
+    friction: float = 0.0  # [N] Coulomb friction, assumed 0; only MuJoCo models it
     delta: float | None = None  # [N s/m] guaranteed damping
 
     def __post_init__(self) -> None:
@@ -61,5 +63,6 @@ def _check_common(device: Device, masses: tuple[str, ...]) -> None:
     require("damping", device.damping, 0.0, 1e4, "N s/m")
     require("force_limit", device.force_limit, 1e-3, 1e6, "N")
     require("encoder_step", device.encoder_step, 0.0, 1e-2, "m")
+    require("friction", device.friction, 0.0, 1e3, "N")
     if device.delta is not None and not 0 < device.delta <= device.damping:
         raise ValueError(f"delta is {device.delta:g} N s/m, allowed are values in (0, damping = {device.damping:g}]")

@@ -6,8 +6,9 @@ The only place that knows joint names. Every body slides along x. Joints come in
     actuator (-f) -> motor_i ==transmission== handle_i (with the human's first mass) ==link== human_i_2 == ...
 
 The last link of a human ends on ground, or on the body of a person who holds several devices (the last joints).
-Gravity, contacts and constraints are off. Inputs are MuJoCo actuators: first the outside forces (voluntary
-motion and taps), then one motor per device with gear -1, because the device feels -f.
+Gravity, contacts and constraints are off, but for the Coulomb friction of devices that have some. Inputs are MuJoCo
+actuators: first the outside forces (voluntary motion and taps), then one motor per device with gear -1, because
+the device feels -f.
 """
 
 from __future__ import annotations
@@ -25,6 +26,10 @@ from models.device import CompliantDevice, Device
 from models.human import Human, Person, check_holds
 
 Array = NDArray[np.floating[Any]]
+
+#: MuJoCo's friction constraint creeps while it sticks; this hard it stops a 0.25 kg device within 1.5e-6 m of where
+#: Coulomb's law does, and creeps at 1e-7 m/s under half its force (MuJoCo's defaults: 7e-5 m and 6e-4 m/s)
+STICK, HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +76,7 @@ def build(devices: Sequence[Device], humans: Sequence[Human], persons: Sequence[
     check_holds(persons, len(devices))
     spec = mujoco.MjSpec()
     spec.modelname = "haptic loop"
-    _only_what_the_loop_needs(spec)
+    _only_what_the_loop_needs(spec, friction=any(device.friction for device in devices))
     body = {channel: f"body_{p}" for p, person in enumerate(persons, start=1) for channel in person.holds}
     parts = list(enumerate(zip(devices, humans, strict=True), start=1))
     chains = [_chain(i, device, human, body.get(i)) for i, (device, human) in parts]
@@ -106,7 +111,7 @@ def build(devices: Sequence[Device], humans: Sequence[Human], persons: Sequence[
 
 
 def plant(model: mujoco.MjModel) -> Plant:
-    """The linear plant that `model` simulates: its mass, damping, stiffness and actuation matrices."""
+    """The linear plant that `model` simulates: its mass, damping, stiffness and actuation matrices, no friction."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     n, m = model.nv, _motors(model)
@@ -144,9 +149,11 @@ def actuation(model: mujoco.MjModel) -> Array:
     return columns
 
 
-def _only_what_the_loop_needs(spec: mujoco.MjSpec) -> None:
+def _only_what_the_loop_needs(spec: mujoco.MjSpec, friction: bool) -> None:
     off = mujoco.mjtDisableBit
-    disabled = (off.mjDSBL_CONTACT, off.mjDSBL_CONSTRAINT, off.mjDSBL_AUTORESET, off.mjDSBL_SENSOR)
+    disabled = [off.mjDSBL_CONTACT, off.mjDSBL_AUTORESET, off.mjDSBL_SENSOR]
+    if not friction:  # MuJoCo's Coulomb friction is a constraint
+        disabled.append(off.mjDSBL_CONSTRAINT)
     spec.option.gravity = [0, 0, 0]
     spec.option.disableflags = sum(int(flag) for flag in disabled)
 
@@ -162,6 +169,7 @@ def _add_masses(
     motors, handles, arms = [], [], []
     grounded: dict[str, tuple[float, float]] = {}  # damping and stiffness
     held = {channel for person in persons for channel in person.holds}
+    rubbing: dict[str, float] = {}
     for i, (device, human) in enumerate(zip(devices, humans, strict=True), start=1):
         first = human.links[0].mass
         if isinstance(device, CompliantDevice):
@@ -169,6 +177,7 @@ def _add_masses(
             handles.append((f"handle_{i}", device.handle_mass + first, 0.0))
         else:
             motors.append((f"motor_{i}", device.mass + first, device.damping))
+        rubbing[f"motor_{i}"] = device.friction
         arms += [(f"human_{i}_{j}", link.mass, 0.0) for j, link in enumerate(human.links[1:], start=2)]
         if i not in held:
             grounded[_chain(i, device, human).joints[-1]] = human.links[-1].damping, human.links[-1].stiffness
@@ -178,6 +187,9 @@ def _add_masses(
         body = spec.worldbody.add_body(name=name, mass=mass, ipos=[0, 0, 0], inertia=[1e-3] * 3, explicitinertial=True)
         joint = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
         joint.damping[0] = damping
+        if rubbing.get(name):
+            joint.frictionloss = rubbing[name]
+            joint.solref_friction, joint.solimp_friction = STICK, HARD
         if name in grounded:
             joint.damping[0] += grounded[name][0]
             joint.stiffness[0] = grounded[name][1]

@@ -60,6 +60,19 @@ def add_output_options(
     output.add_argument("--seed", metavar="N", default="0", help="for random draws; recorded (default 0)")
 
 
+def add_rigid_option(parser: argparse.ArgumentParser) -> None:
+    """A rigid wall in place of the environment."""
+    wall = "a rigid wall in place of the environment; one channel, the scenario's first"
+    parser.add_argument("--rigid", action="store_true", help=wall)
+
+
+def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> dict[str, tuple[int, ...]]:
+    """theta and psi of the one channel that --rigid is about. Raises InputError where options name more of them."""
+    for name in ("theta", "psi", "delta"):
+        numbers(f"--rigid is one channel: --{name}", getattr(args, name) or "0", float, 1)
+    return {"theta": scenario.theta[:1], "psi": scenario.psi[:1] if args.psi else (0,)}
+
+
 def scenario_from(args: argparse.Namespace) -> Scenario:
     """The scenario that the loop options describe. Raises InputError."""
     scenario = load(args.scenario)
@@ -74,7 +87,11 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
 
 
 def require_linear(scenario: Scenario, what: str) -> None:
-    """Raises InputError where contact is made and broken, for a command whose verdicts are of linear loops."""
+    """Raises InputError where a loop has walls or Coulomb friction, for a command whose verdicts are of linear ones."""
+    for i, device in enumerate(scenario.device):
+        if device.friction:
+            instead = "sim.run and sim.zwidth simulate it"
+            raise InputError(f"device[{i}].friction is {device.friction:g} N: {what} decides linear loops; {instead}")
     if scenario.environment.walls:
         raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
 

@@ -23,6 +23,8 @@ def stability_part(assembly: Assembly, record: Record) -> dict[str, Any]:
     contact = contact_part(assembly, record) if assembly.process.contact else {}
     if contact.get("ticks"):
         growth, reason = None, f"contact was made {contact['made']} times, and a growth rate is of one linear loop"
+    elif assembly.friction:
+        growth, reason = None, "with Coulomb friction there is no growth rate; the eigenvalues are those without it"
     else:
         loop = close(assembly.plant, assembly.F)
         growth, reason = measured_growth(loop, dominant_mode(loop), record, limit)
@@ -63,8 +65,11 @@ def contact_part(assembly: Assembly, record: Record) -> dict[str, Any]:
     }
 
 
-def error_part(record: Record, exact: Record, assembly: Assembly) -> dict[str, Any]:
-    """Device positions against the exact engine's closed loop."""
+def error_part(record: Record, exact: Record | None, assembly: Assembly) -> dict[str, Any]:
+    """Device positions against the exact engine's closed loop, where there is one."""
+    if exact is None:
+        reason = "the exact engine is linear and has no Coulomb friction to compare with"
+        return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
     limit, m = assembly.process.force_limit, assembly.process.channels
     n = min(record.s.shape[0], exact.s.shape[0])
     clipped = clipped_ticks(exact, limit)[:n] | clipped_ticks(record, limit)[:n]

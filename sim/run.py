@@ -52,13 +52,15 @@ def main(argv: list[str]) -> int:
     asked, seed, out = _substeps(args), seed_from(args), out_folder(args, "run")
     chosen = choose(scenario, args.case, args.coupling, args.condition)
     assembly = assemble(scenario, chosen.coupling)
+    if args.engine == "exact" and assembly.friction:
+        raise InputError("--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco")
     substeps, warnings = _settled(args, assembly, asked)
 
     with (bar := progress_bar("simulating"))[0]:
         begin = time.perf_counter()
         record = simulate(assembly, args.engine, args.integrator, substeps or LEAST, progress=bar[1])
         wall = time.perf_counter() - begin
-    exact = record if args.engine == "exact" else simulate(assembly, "exact", samples=record.s.shape[0])
+    exact = record if args.engine == "exact" else _exact(assembly, record)
 
     outcome = _outcome(args, chosen, assembly, record, exact, wall)
     outcome["run"] |= {"substeps": substeps, "seed": seed}
@@ -68,6 +70,11 @@ def main(argv: list[str]) -> int:
     if args.json:
         write_json(args.json, outcome)
     return INTERRUPTED if record.interrupted else DONE
+
+
+def _exact(assembly: Assembly, record: Record) -> Record | None:
+    """The exact engine's run; None where friction makes the loop another one than the linear."""
+    return None if assembly.friction else simulate(assembly, "exact", samples=record.s.shape[0])
 
 
 def _parser() -> Parser:
@@ -113,7 +120,7 @@ def _settled(args: argparse.Namespace, assembly: Assembly, asked: int | None) ->
 
 
 def _outcome(
-    args: argparse.Namespace, chosen: Chosen, assembly: Assembly, record: Record, exact: Record, wall: float
+    args: argparse.Namespace, chosen: Chosen, assembly: Assembly, record: Record, exact: Record | None, wall: float
 ) -> dict[str, Any]:
     scenario, samples = assembly.scenario, record.s.shape[0]
     loop = scenario.loop(args.case)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 
 from controller.contact import contact, held
@@ -32,6 +33,20 @@ class Assembly:
     process: Process
     scene: Scene
     plant: HeldPlant
+
+    @property
+    def friction(self) -> bool:
+        """Whether a device has Coulomb friction: the scene has it then, `plant` has not."""
+        return any(device.friction for device in self.scenario.device)
+
+    @property
+    def smooth(self) -> Assembly:
+        """The same without Coulomb friction in the scene, which is what linear verdicts are about."""
+        if not self.friction:
+            return self
+        devices = tuple(msgspec.structs.replace(device, friction=0.0) for device in self.scenario.device)
+        scenario = self.scenario.replace(device=devices)
+        return replace(self, scenario=scenario, scene=build(devices, scenario.human))
 
     @property
     def felt(self) -> Lti:
@@ -85,6 +100,8 @@ def make_engine(
     Raises ValueError for a name that is none.
     """
     if engine == "exact":
+        if assembly.friction:
+            raise ValueError("the devices have Coulomb friction, which the exact engine, being linear, does not model")
         return ExactEngine(assembly.plant, assembly.process.force_limit)
     if engine == "mujoco":
         kind = LeapfrogEngine if integrator == LEAPFROG else MujocoEngine

@@ -37,6 +37,10 @@ class Pace:
         """Whether a step of h seconds follows it."""
         return self.mode * h <= RESOLVED and self.rate * h < FOLLOWED
 
+    def substeps(self, T: float) -> int:
+        """The least number of steps in T seconds that follows it, LEAST at least."""
+        return max(LEAST, math.ceil(self.mode * T / RESOLVED), math.floor(self.rate * T / FOLLOWED) + 1)
+
     def hardest(self, h: float) -> str:
         """What a step of h seconds has most trouble with, in words."""
         if self.mode / RESOLVED >= self.rate / FOLLOWED:
@@ -45,7 +49,7 @@ class Pace:
 
 
 def pace(A: Array) -> Pace:
-    """The pace of x' = A x. Weakly damped is what turns faster than it decays."""
+    """The pace of x' = A x, or the fastest of many. Weakly damped is what turns faster than it decays."""
     values = np.linalg.eigvals(A)
     weak = np.abs(values.imag) > np.abs(values.real)
     return Pace(float(np.abs(values[weak]).max(initial=0.0)), float(-values.real.min(initial=0.0)))
@@ -55,9 +59,9 @@ def default_substeps(assembly: Assembly, integrator: str = "RK4") -> int:
     """At least 4, more where the rule or the verdict asks. Raises InputError where no number up to 10000 does."""
     if integrator == "discrete":  # it remembers more than position and velocity, so no map of those can vouch for it
         raise InputError(f"--integrator discrete gives no verdict to rely on: {_MODE_LOST}; use RK4 or give --substeps")
+    assembly = assembly.smooth
     speed, T = pace(plant(assembly.scene.model).A), assembly.scenario.T
-    count = max(LEAST, math.ceil(speed.mode * T / RESOLVED), math.floor(speed.rate * T / FOLLOWED) + 1)
-    needed = count
+    count = needed = speed.substeps(T)
     while count <= MOST and not _agrees(assembly, integrator, count):
         count *= 2
     if needed > MOST:
@@ -69,6 +73,7 @@ def default_substeps(assembly: Assembly, integrator: str = "RK4") -> int:
 
 def check_substeps(assembly: Assembly, integrator: str, substeps: int) -> list[str]:
     """Remarks on a number of substeps that was asked for. Raises InputError outside the stable region."""
+    assembly = assembly.smooth
     speed, h = pace(plant(assembly.scene.model).A), assembly.scenario.T / substeps
     radius = step_radius(assembly, integrator, substeps)
     what = f"{integrator} x {substeps}: {speed.hardest(h)}"

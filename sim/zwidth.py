@@ -1,0 +1,189 @@
+"""python -m sim.zwidth: the K-B map that haptics people draw - certified, exact for random humans, simulated.
+
+options -> Ground (the loop without its coupling) -> Grid of gains -> Map -> picture, CSV, JSON
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from sim import zwidth_report
+from sim.command import (
+    DOES_NOT_HOLD,
+    DONE,
+    INTERRUPTED,
+    Parser,
+    add_loop_options,
+    add_output_options,
+    add_rigid_option,
+    console,
+    execute,
+    numbers,
+    out_folder,
+    progress_bar,
+    rigid_loop,
+    scenario_from,
+    seed_from,
+)
+from sim.files import write_json
+from sim.gain_grid import Grid, Range, make_grid
+from sim.gain_ground import Ground, one_sided
+from sim.gain_map import Effects, Map, Plan, draw_map
+from sim.gain_marks import look, truth
+from sim.gain_population import holders
+from sim.scenario import InputError, Scenario
+
+EXAMPLE = """python -m sim.zwidth --theta 1 --grid 30
+  python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0
+  python -m sim.zwidth --rigid --theta 1 --quantisation 1e-5 --saturation --friction 0.2 --wall"""
+FINEST = 1e-5  # [m] least default threshold: what a desk device's encoders resolve
+
+
+def main(argv: list[str]) -> int:
+    """Draw a map. 0: nothing contradicts it and every mark is certified, 1: else, 130: interrupted."""
+    args = _parser().parse_args(argv)
+    scenario = scenario_from(args)
+    ground = _ground(args, scenario)
+    seed, humans = seed_from(args), _whole(args, "humans", 1, 100_000)
+    marks = tuple(_pair("--mark", mark) for mark in args.mark or ())
+    grid = _grid(args, ground, marks)
+    plan = _plan(args, ground)
+    out = out_folder(args, "zwidth")
+
+    crowd = holders(ground.devices, ground.population, seed, humans, ground.population.links, ground.T)
+    bar, moved = progress_bar("certificates")
+    with bar:
+        drawn = draw_map(
+            ground,
+            grid,
+            crowd,
+            plan,
+            lambda stage, k, of: moved(k, of) or bar.update(bar.task_ids[0], description=stage),
+        )
+    outcome = zwidth_report.outcome(ground, drawn, plan, {"humans": humans, "seed": seed})
+    outcome |= {"scenario": None if args.rigid else scenario.name, "scenario_digest": scenario.digest}
+    if not drawn.interrupted:
+        zwidth_report.add_truth(outcome, {name: truth(ground, drawn, name) for name in drawn.ratio})
+        zwidth_report.add_marks(outcome, [look(ground, crowd, *mark, grid.K) for mark in marks])
+    _save(args, ground, drawn, outcome, out)
+    zwidth_report.print_map(outcome, console(args))
+    if args.json:
+        write_json(args.json, outcome)
+    if drawn.interrupted:
+        return INTERRUPTED
+    return DONE if outcome["holds"] else DOES_NOT_HOLD
+
+
+def _parser() -> Parser:
+    parser = Parser("sim.zwidth", "Draw the K-B map: which spring-dampers are safe, for whom, by which test.", EXAMPLE)
+    add_loop_options(parser)
+    add_rigid_option(parser)
+    of_map = parser.add_argument_group("the map (K and B are the same on all channels)")
+    of_map.add_argument("--grid", default="60", metavar="N", help="rows and columns (default 60)")
+    of_map.add_argument("--K-range", metavar="LOW,HIGH", help="[N/m]; default from delta, theta and T")
+    of_map.add_argument("--B-range", metavar="LOW,HIGH", help="[N s/m]; default from delta")
+    of_map.add_argument("--scale", choices=("linear", "log"), help="default linear with --rigid, else log")
+    of_map.add_argument("--mark", action="append", metavar="K,B", help="where does this coupling lie? (repeatable)")
+    of_map.add_argument("--humans", default="200", metavar="N", help="random humans per device (default 200)")
+    of_map.add_argument("--no-plot", action="store_true", help="write no picture")
+    points = parser.add_argument_group("the points simulated in MuJoCo, and what they have beside the linear loop")
+    points.add_argument("--points", default="10", metavar="N", help="rows and columns of them (default 10, 0 for none)")
+    points.add_argument("--trials", default="1", metavar="N", help="humans at each, the most critical (default 1)")
+    points.add_argument("--duration", default="3", metavar="SECONDS", help="of each (default 3)")
+    points.add_argument(
+        "--start", default="1e-3", metavar="METRES", help="first swing of motor or handle (default 1e-3)"
+    )
+    points.add_argument("--press", default="3", metavar="NEWTONS", help="steady force of every hand (default 3)")
+    points.add_argument("--threshold", metavar="METRES", help="amplitude of an oscillation (default 2 steps or 1e-5)")
+    points.add_argument("--quantisation", metavar="METRES", help="encoder step of every device")
+    points.add_argument("--saturation", action="store_true", help="motors have their force limits")
+    points.add_argument("--friction", metavar="NEWTONS", help="Coulomb friction of every device")
+    points.add_argument("--wall", action="store_true", help="contacts push and never pull")
+    points.add_argument(
+        "--velocity-filter", metavar="HERTZ", help="first-order cut-off of the damped velocity; in all maps"
+    )
+    add_output_options(parser)
+    return parser
+
+
+def _ground(args: argparse.Namespace, scenario: Scenario) -> Ground:
+    """The loop. Raises InputError."""
+    if args.case == "none":
+        raise InputError("--case none is the loop without coupling, and the map is of couplings: use --case I")
+    cutoff = None
+    if args.velocity_filter is not None:
+        cutoff = _number(args, "velocity_filter", 1e-3, 1e6, "Hz")
+    loop: dict[str, Any] = {"network": scenario.environment, "theta": scenario.theta, "psi": scenario.psi}
+    devices = scenario.device
+    try:
+        if args.rigid:
+            loop, devices = {"network": None, **rigid_loop(args, scenario)}, devices[:1]
+        elif args.wall:
+            loop["network"] = one_sided(scenario.environment)
+        return Ground(
+            devices, scenario.population, T=scenario.T, cutoff=cutoff, one_sided=args.rigid and args.wall, **loop
+        )
+    except ValueError as error:
+        raise error if isinstance(error, InputError) else InputError(str(error)) from None
+
+
+def _grid(args: argparse.Namespace, ground: Ground, marks: tuple[Range, ...]) -> Grid:
+    K, B = (
+        None if getattr(args, f"{name}_range") is None else _pair(f"--{name}-range", getattr(args, f"{name}_range"))
+        for name in "KB"
+    )
+    for stiffness, damping in marks:
+        if not (1e-3 <= stiffness <= 1e9 and 0 <= damping <= 1e6):
+            raise InputError(f"--mark is {stiffness:g},{damping:g}, allowed are K 1e-3 to 1e9 N/m, B 0 to 1e6 N s/m")
+    return make_grid(ground, _whole(args, "grid", 4, 400), K, B, args.scale, marks)
+
+
+def _plan(args: argparse.Namespace, ground: Ground) -> Plan:
+    step = None if args.quantisation is None else _number(args, "quantisation", 0, 1e-2, "m")
+    friction = None if args.friction is None else _number(args, "friction", 0, 1e3, "N")
+    effects = Effects(step, friction, args.saturation)
+    coarsest = max(device.encoder_step for device in effects.on(ground.devices))
+    threshold = max(2 * coarsest, FINEST) if args.threshold is None else _number(args, "threshold", 1e-9, 1, "m")
+    duration = _number(args, "duration", max(1.5, 1024 * ground.T), 1e4, "s")
+    trials, points = _whole(args, "trials", 1, 100), _whole(args, "points", 0, 400)
+    start, press = _number(args, "start", 1e-9, 1, "m"), _number(args, "press", 0, 1e3, "N")
+    return Plan(effects, points, trials, start, press, duration, threshold)
+
+
+def _save(args: argparse.Namespace, ground: Ground, drawn: Map, outcome: dict[str, Any], out: Path) -> None:
+    """The picture, the table and the report; `outcome` learns where they are."""
+    files = [zwidth_report.save_csv(drawn, out / "map.csv")]
+    if not args.no_plot:
+        from sim.plot_zwidth import plot_zwidth
+
+        files.append(plot_zwidth(drawn, outcome, out / "zwidth.png"))
+    outcome["files"] = [str(path) for path in (*files, out / "report.json")]
+    write_json(out / "report.json", outcome)
+
+
+def _whole(args: argparse.Namespace, name: str, least: int, most: int) -> int:
+    (value,) = numbers(f"--{name}", getattr(args, name), int, 1)
+    if not least <= value <= most:
+        raise InputError(f"--{name} is {value}, allowed are {least} to {most}")
+    return value
+
+
+def _number(args: argparse.Namespace, name: str, least: float, most: float, unit: str) -> float:
+    option = f"--{name.replace('_', '-')}"
+    (value,) = numbers(option, getattr(args, name), float, 1)
+    if not least <= value <= most:
+        raise InputError(f"{option} is {value:g}, allowed are {least:g} to {most:g} {unit}")
+    return value
+
+
+def _pair(option: str, text: str) -> Range:
+    if text.count(",") != 1:
+        raise InputError(f"{option} is {text!r}, expected two numbers separated by a comma")
+    first, second = numbers(option, text, float, 2)
+    return first, second
+
+
+if __name__ == "__main__":
+    execute(main)
