@@ -10,6 +10,7 @@
 With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later.
 Steps 2, 3 and 5 are linear: they are ONE state-space block, and a tick is one matrix product
 [f; z+] = [C D; A B] [z; x] for any number of simulations at once. Saturation is what the actuators do.
+Where delays vary, Theta is not in the block: its forces pass through a line that holds (controller.delay).
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.coupling import Coupling
-from controller.delay import delay
+from controller.delay import HeldLine, Ticks, delay, packet_delays
 from controller.lti import Array, Lti, frozen
 
 
@@ -32,11 +33,12 @@ def force_map(environment: Lti, coupling: Coupling, theta: Sequence[int], psi: S
 
 @dataclass(frozen=True, eq=False)
 class Process:
-    """The linear block F with what wraps around it: force limits and encoder steps."""
+    """The linear block F with what wraps around it: force limits, encoder steps, and delays that vary."""
 
     F: Lti
     force_limit: Array  # (m,) [N], inf where there is none
     encoder_step: Array  # (m,) [m], 0 for an ideal encoder
+    delays: Ticks | None = None  # (ticks, m, nsim or 1) of every packet behind F [samples]; None where none varies
 
     def __post_init__(self) -> None:
         for name in ("force_limit", "encoder_step"):
@@ -48,6 +50,10 @@ class Process:
             raise ValueError(f"force_limit is {self.force_limit.tolist()}, expected positive forces in N")
         if not ((self.encoder_step >= 0) & (self.encoder_step < np.inf)).all():
             raise ValueError(f"encoder_step is {self.encoder_step.tolist()}, expected steps >= 0 in m")
+        if self.delays is not None:
+            object.__setattr__(self, "delays", packet_delays(self.delays))
+            if self.delays.shape[1] != self.F.outputs:
+                raise ValueError(f"delays have {self.delays.shape[1]} channels, expected {self.F.outputs}")
 
     @property
     def channels(self) -> int:
@@ -92,12 +98,16 @@ class Tape:
         self._product = np.block([[F.C, F.D], [F.A, F.B]]).dot
         self._step = np.where(process.encoder_step > 0, process.encoder_step, np.inf)[:, None]
         self._quantised = bool((process.encoder_step > 0).any())
+        self._line = None if process.delays is None else HeldLine(process.delays, nsim)
+        self._rewound = 0  # ticks before row 0
 
     def tick(self, k: int) -> None:
         """Steps 1, 2, 3 and 5 for row k, whose plant state has been written: f[k] and z[k + 1]."""
         if self._quantised:
             self._quantise(self._measured[k])
         self._product(self._input[k], self._output[k])
+        if self._line is not None:
+            self._line.carry(self._rewound + k, self.force[k])
 
     def saturate(self, ticks: int) -> None:
         """Turn the forces of the first `ticks` rows from asked for into applied, as the actuators did."""
@@ -108,6 +118,7 @@ class Tape:
         """Start a new stretch where this one stood after `ticks` ticks."""
         self.z[0] = self.z[ticks]
         self.s[0] = self.s[ticks]
+        self._rewound += ticks
 
     def _quantise(self, x: Array) -> None:
         """Round to whole encoder steps, in place; an ideal channel (step inf) is left as it is."""
