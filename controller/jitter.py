@@ -6,6 +6,7 @@ from typing import Literal
 
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from controller.delay import LOST, Ticks
 
@@ -31,7 +32,9 @@ class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"jitter.lo has {len(self.lo)} entries and jitter.hi {len(self.hi)}: one each per channel")
         for i, (lo, hi) in enumerate(zip(self.lo, self.hi, strict=True)):
             if not 0 <= lo <= hi <= LONGEST:
-                raise ValueError(f"jitter on channel {i + 1} is {lo} to {hi}, expected 0 <= lo <= hi <= {LONGEST} samples")
+                raise ValueError(
+                    f"jitter on channel {i + 1} is {lo} to {hi}, expected 0 <= lo <= hi <= {LONGEST} samples"
+                )
         if not 0 <= self.loss <= 1:
             raise ValueError(f"jitter.loss is {self.loss:g}, allowed are probabilities 0 to 1")
         for name in ("calm", "burst"):
@@ -55,25 +58,27 @@ class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return len(self.lo)
 
     @property
-    def varies(self) -> bool:
-        """Whether any delay can differ from another on its channel (losses apart)."""
-        return not self.playout and self.lo != self.hi
+    def steady(self) -> bool:
+        """Whether every force is delayed by a constant theta after all: then Theta is linear, and certificates hold."""
+        return self.loss == 0 and (self.playout or self.pattern == "constant" or self.lo == self.hi) and not self._gaps
 
-    def draw(self, rng: np.random.Generator, ticks: int, adversarial: Ticks | None = None) -> Ticks:
+    @property
+    def _gaps(self) -> bool:
+        return any(LOST in row for row in self.recorded)
+
+    def draw(self, rng: np.random.Generator, ticks: int, given: ArrayLike | None = None) -> Ticks:
         """Delays of the packets of one run, (ticks, m), LOST among them.
 
-        `adversarial` are the (period, m) delays that a search has found worst, repeated; the pattern of that name
-        needs them, since what is worst depends on the loop.
+        `given` are the rows (period, m), repeated, of the patterns that depend on the loop: theta for constant, what
+        a search has found worst for adversarial. Raises ValueError where they are missing.
         """
-        delays = self._delays(rng, ticks, adversarial)
+        delays = self._delays(rng, ticks, given)
         lost = (delays == LOST) | (rng.random(delays.shape) < self.loss)
         return np.where(lost, LOST, np.array(self.hi) if self.playout else delays)
 
-    def _delays(self, rng: np.random.Generator, ticks: int, adversarial: Ticks | None) -> Ticks:
+    def _delays(self, rng: np.random.Generator, ticks: int, given: ArrayLike | None) -> Ticks:
         lo, hi = np.array(self.lo), np.array(self.hi)
         match self.pattern:
-            case "constant":
-                return np.tile(hi, (ticks, 1))
             case "random":
                 return rng.integers(lo, hi, size=(ticks, lo.size), endpoint=True)
             case "bursty":
@@ -81,12 +86,12 @@ class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 return np.where(self._bursts(rng, ticks), late, lo)
             case "recorded":
                 return np.resize(np.array(self.recorded, dtype=np.int64), (ticks, lo.size))
-            case "adversarial":
-                if adversarial is None:
-                    raise ValueError("the adversarial pattern is found for a loop: give the delays of its period")
-                return np.resize(adversarial, (ticks, lo.size))
+            case "constant" | "adversarial":
+                if given is None:
+                    raise ValueError(f"the {self.pattern} pattern depends on the loop: give its delays")
+                return np.resize(np.asarray(given, dtype=np.int64), (ticks, lo.size))
 
-    def _bursts(self, rng: np.random.Generator, ticks: int) -> np.ndarray:
+    def _bursts(self, rng: np.random.Generator, ticks: int) -> NDArray[np.bool_]:
         """(ticks, m) whether a packet is in a burst: two states per channel with geometric stretches, calm first."""
         count = 1 + int(2 * ticks / (self.calm + self.burst)) + 8 * int(np.sqrt(ticks) + 1)
         columns = []

@@ -12,7 +12,7 @@ from controller.lti import Array
 from design.promises import CAVEATS, finite
 from sim.loop import Record
 from sim.simulate import Assembly
-from sim.stability import clipped_ticks, close, dominant_mode, measured_growth, verdict
+from sim.stability import Mode, clipped_ticks, close, dominant_mode, measured_growth, verdict
 
 
 def stability_part(assembly: Assembly, record: Record) -> dict[str, Any]:
@@ -27,21 +27,29 @@ def stability_part(assembly: Assembly, record: Record) -> dict[str, Any]:
         "verdict": "unstable" if record.diverged else None if growth is None else verdict(growth),
         "clipped_ticks": int(clipped_ticks(record, limit).sum()),
         "growth_rate_per_s": growth,
-        "frequency_hz": _dominant_frequency(record, assembly.scenario.T),
+        "frequency_hz": dominant_frequency(record, assembly.scenario.T),
+        **eigenvalue_part(mode),
+    }
+    return part | ({"reason": reason} if reason else {})
+
+
+def eigenvalue_part(mode: Mode) -> dict[str, Any]:
+    """What the eigenvalues of the exact loop say."""
+    return {
         "exact_verdict": mode.verdict,
         "exact_growth_rate_per_s": finite(mode.growth),
         "exact_frequency_hz": mode.frequency_hz,
         "spectral_radius": mode.spectral_radius,
     }
-    return part | ({"reason": reason} if reason else {})
 
 
-def error_part(record: Record, exact: Record, assembly: Assembly) -> dict[str, Any]:
-    """Device positions against the exact engine's closed loop."""
+def error_part(record: Record, exact: Record, assembly: Assembly, unstable: bool | None = None) -> dict[str, Any]:
+    """Device positions against the exact engine's closed loop; `unstable` where its eigenvalues do not say it."""
     limit, m = assembly.process.force_limit, assembly.process.channels
     n = min(record.s.shape[0], exact.s.shape[0])
     clipped = clipped_ticks(exact, limit)[:n] | clipped_ticks(record, limit)[:n]
-    unstable = dominant_mode(close(assembly.plant, assembly.F)).verdict == "unstable"
+    if unstable is None:
+        unstable = dominant_mode(close(assembly.plant, assembly.F)).verdict == "unstable"
     linear = int(np.argmax(clipped)) if unstable and clipped.any() else n
     relative, largest = _distance(record.s[:linear, :m], exact.s[:linear, :m])
     if linear == n:
@@ -68,6 +76,8 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
     for part in outcome["certificates"].values():
         if "reason" in part:
             lines.append(f"{part['condition']}: {part['reason']}.")
+    if outcome.get("jitter"):
+        lines.append(f"Delays that vary: {outcome['jitter']['covers']}.")
     return [*lines, CAVEATS]
 
 
@@ -78,7 +88,7 @@ def _distance(a: Array, b: Array) -> tuple[float | None, float | None]:
     return float(np.sqrt(np.mean((a - b) ** 2))) / size, float(np.abs(a - b).max())
 
 
-def _dominant_frequency(record: Record, T: float) -> float | None:
+def dominant_frequency(record: Record, T: float) -> float | None:
     """The strongest line above 10 Hz in the last quarter of the forces: what one hears and feels."""
     tail = record.f[-(record.f.shape[0] // 4) :, :, 0]
     if tail.shape[0] < 64:
@@ -135,7 +145,10 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     rows.append(("growth, eigenvalues", f"{exact}: {_verdict(stability['exact_verdict'])}"))
     growth = stability["growth_rate_per_s"]
     measured = "-" if growth is None else f"{growth:+.4f} 1/s"
-    rows.append(("growth, simulated trace", f"{measured}: {_verdict(stability['verdict'])}"))
+    how = "growth, switching" if (report.get("jitter") or {}).get("verdict") else "growth, simulated trace"
+    rows.append((how, f"{measured}: {_verdict(stability['verdict'])}"))
+    if jitter := report.get("jitter"):
+        rows += _varying(jitter)
     run = report["run"]
     rows.append(("clipped ticks", f"{stability['clipped_ticks']} of {run['samples']}"))
     engine = run["engine"] + (f" {run['integrator']} x {run['substeps']}" if run["integrator"] else "")
@@ -153,6 +166,24 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         )
     )
     return rows
+
+
+def _varying(jitter: dict[str, Any]) -> list[tuple[str, str]]:
+    spans = ", ".join(f"{lo} to {hi}" for lo, hi in zip(jitter["lo"], jitter["hi"], strict=True))
+    how = jitter["pattern"] + (", played out at the largest" if jitter["playout"] else "")
+    rows = [("delays", f"{spans} samples, {how}" + (f", {100 * jitter['loss']:g} % lost" if jitter["loss"] else ""))]
+    if age := jitter.get("age"):
+        met = zip(age["least"], age["largest"], age["mean"], strict=True)
+        rows.append(("age of the forces", "; ".join(f"{a} to {b}, mean {c:.2f}" for a, b, c in met) + " samples"))
+    if period := jitter.get("period"):
+        growth = f"{period['growth_rate_per_s']:+.4f} 1/s"
+        rows.append(
+            (
+                "worst switching found",
+                f"{growth} with a period of {period['ticks']} ticks: {_verdict(period['verdict'])}",
+            )
+        )
+    return [*rows, ("switching covered", "[green]yes[/]" if jitter["covered"] else "[yellow]no[/]")]
 
 
 def _verdict(word: str | None) -> str:

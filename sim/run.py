@@ -14,7 +14,7 @@ from design.assess import CONDITIONS, assess
 from design.promises import certificate_part, promise_of
 from design.summary import coupling_part, transparency_part
 from design.transparency import transparency
-from sim import report, reproducibility
+from sim import jitter_report, report, reproducibility
 from sim.command import (
     DONE,
     INTERRUPTED,
@@ -30,27 +30,32 @@ from sim.command import (
     seed_from,
 )
 from sim.couplings import NAMES, Chosen, choose
+from sim.drawn import switching
 from sim.files import write, write_json
 from sim.human_file import load_humans
+from sim.jitter_options import add_jitter_options, with_jitter
 from sim.loop import Record
 from sim.mujoco_engine import INTEGRATORS, LEAPFROG
 from sim.result import Result
 from sim.scenario import InputError
 from sim.simulate import ENGINES, Assembly, assemble, simulate
 from sim.substeps import LEAST, MOST, check_substeps, default_substeps
+from sim.worst_switching import Period
 
 
 def main(argv: list[str]) -> int:
     """Simulate and report. 0: the run was completed, stable or not; 130: interrupted."""
     args = _parser().parse_args(argv)
-    scenario = scenario_from(args)
+    scenario = with_jitter(args, scenario_from(args))
     if args.duration is not None:
         scenario = scenario.replace(duration=numbers("--duration", args.duration, float, 1)[0])
     if args.human is not None:
         scenario = scenario.replace(human=load_humans(args.human, scenario.channels))
     asked, seed, out = _substeps(args), seed_from(args), out_folder(args, "run")
     chosen = choose(scenario, args.case, args.coupling, args.condition)
-    assembly = assemble(scenario, chosen.coupling)
+    assembly, period = assemble(scenario, chosen.coupling), None
+    if scenario.switches:
+        assembly, period = switching(assembly, chosen.coupling, seed, scenario.samples)
     substeps, warnings = _settled(args, assembly, asked)
 
     with (bar := progress_bar("simulating"))[0]:
@@ -59,7 +64,7 @@ def main(argv: list[str]) -> int:
         wall = time.perf_counter() - begin
     exact = record if args.engine == "exact" else simulate(assembly, "exact", samples=record.s.shape[0])
 
-    outcome = _outcome(args, chosen, assembly, record, exact, wall)
+    outcome = _outcome(args, chosen, assembly, period, record, exact, wall)
     outcome["run"] |= {"substeps": substeps, "seed": seed}
     outcome["remarks"] = [*warnings, *outcome["remarks"]]
     outcome["files"] = [str(p) for p in _save(args, out, assembly, record, outcome)]
@@ -74,6 +79,7 @@ def _parser() -> Parser:
         "sim.run", "Close the loop once and report stability, transparency and error.", "python -m sim.run --case none"
     )
     add_loop_options(parser)
+    add_jitter_options(parser)
     names = ", ".join(NAMES)
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
@@ -112,13 +118,22 @@ def _settled(args: argparse.Namespace, assembly: Assembly, asked: int | None) ->
 
 
 def _outcome(
-    args: argparse.Namespace, chosen: Chosen, assembly: Assembly, record: Record, exact: Record, wall: float
+    args: argparse.Namespace,
+    chosen: Chosen,
+    assembly: Assembly,
+    period: Period | None,
+    record: Record,
+    exact: Record,
+    wall: float,
 ) -> dict[str, Any]:
     scenario, samples = assembly.scenario, record.s.shape[0]
     loop = scenario.loop(args.case)
     requirements = assess(loop, chosen.coupling, chosen.phi)
     certificates = {name: certificate_part(requirement) for name, requirement in requirements.items()}
     simulated = samples * scenario.T
+    jitter = jitter_report.part(assembly, period, samples, any(r.certified for r in requirements.values()))
+    switched = jitter if scenario.switches else None
+    stability = jitter_report.stability_part(assembly, record, switched) if switched else None
     mujoco = args.engine == "mujoco"
     outcome = {
         "case": args.case,
@@ -128,7 +143,8 @@ def _outcome(
         "certificates": certificates,
         "promise": promise_of(requirements, scenario.psi),
         "transparency": transparency_part(transparency(assembly.F, assembly.E, loop.lam)),
-        "stability": report.stability_part(assembly, record),
+        "stability": stability or report.stability_part(assembly, record),
+        "jitter": jitter,
         "run": {
             "engine": args.engine,
             "integrator": args.integrator if mujoco else None,
@@ -143,7 +159,7 @@ def _outcome(
             "interrupted": record.interrupted,
             "scenario_digest": scenario.digest,
         },
-        "error": report.error_part(record, exact, assembly),
+        "error": report.error_part(record, exact, assembly, stability and stability["verdict"] == "unstable"),
     }
     outcome["reproducibility"] = reproducibility.table(scenario, args.case, outcome)
     return outcome | {"remarks": [*chosen.notes, *report.remarks(outcome)]}

@@ -32,12 +32,12 @@ def carried(delays, forces):
 def test_hold_last_by_hand():
     """Packets sent at k with these delays; the newest that is there is applied.
 
-        k          0    1    2    3    4     5    6
-        force      10   11   12   13   14    15   16
-        delay      1    3    1    2    lost  1    0
-        arrives    1    4    3    5    -     6    6
-        in use     -    0    0    2    2     3    6     (packet 1 comes after packet 2: too late to be of use)
-        age        -    1    2    1    2     2    0
+    k          0    1    2    3    4     5    6
+    force      10   11   12   13   14    15   16
+    delay      1    3    1    2    lost  1    0
+    arrives    1    4    3    5    -     6    6
+    in use     -    0    0    2    2     3    6     (packet 1 comes after packet 2: too late to be of use)
+    age        -    1    2    1    2     2    0
     """
     delays = column(1, 3, 1, 2, LOST, 1, 0)
     assert newest(delays).ravel().tolist() == [-1, 0, 0, 2, 2, 3, 6]
@@ -92,7 +92,7 @@ def test_wanted_ages_are_realised_by_delays_within_the_range():
 
 def test_patterns_are_what_they_are_called():
     rng, ticks = np.random.default_rng(4), 40_000
-    assert (Jitter((1,), (3,), "constant").draw(rng, 9) == 3).all()
+    assert (Jitter((1,), (3,), "constant").draw(rng, 9, [[2]]) == 2).all()
     counts = np.bincount(Jitter((1,), (3,)).draw(rng, ticks).ravel())
     # binomial: four standard deviations of a third of the packets
     np.testing.assert_allclose(counts[1:], ticks / 3, atol=4 * np.sqrt(ticks * 2 / 9))
@@ -110,7 +110,8 @@ def test_loss_and_playout():
     delays = jitter.draw(np.random.default_rng(5), 10_000)
     assert set(np.unique(delays)) == {LOST, 3}
     assert (delays == LOST).mean() == pytest.approx(0.25, abs=4 * np.sqrt(0.25 * 0.75 / 10_000))  # 4 deviations
-    assert not jitter.varies
+    assert not jitter.steady
+    assert Jitter((1,), (3,), playout=True).steady
     assert (Jitter((1,), (2,), loss=1.0).draw(np.random.default_rng(5), 50) == LOST).all()
 
 
@@ -131,9 +132,10 @@ def test_impossible_ranges_are_refused(fields, message):
         Jitter(**fields)
 
 
-def test_the_adversarial_pattern_asks_for_its_period():
-    with pytest.raises(ValueError, match="found for a loop"):
-        Jitter((1,), (2,), "adversarial").draw(np.random.default_rng(0), 10)
+@pytest.mark.parametrize("pattern", ["constant", "adversarial"])
+def test_patterns_that_depend_on_the_loop_ask_for_its_delays(pattern):
+    with pytest.raises(ValueError, match="give its delays"):
+        Jitter((1,), (2,), pattern).draw(np.random.default_rng(0), 10)
 
 
 def test_a_process_refuses_delays_that_do_not_fit():
