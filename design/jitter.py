@@ -93,12 +93,16 @@ def jitter_proof(G: Lti, lo: Sequence[int], hi: Sequence[int], delta: Sequence[f
         raise ValueError(f"delays are given for {len(h)} channels, expected {G.inputs}")
     constant = closed_loop(nominal(lo, hi, G.T) @ G, delta)
     if not np.isfinite(constant.ratio):
-        assert constant.reason is not None
-        return JitterProof(refusal("jitter-proof", available, constant.reason), (np.inf,) * G.inputs, np.inf)
+        return jitter_refusal(available, constant.reason or "no constant delay is safe")
     problem = _Ratio(G, lo, hi, np.asarray(available))
     a, ratio, w, bound = problem.least()
     alpha = tuple((a * np.asarray(available) / G.T).tolist())
     return JitterProof(from_ratio("jitter-proof", max(ratio, 0.0), available, w / (2 * np.pi * G.T)), alpha, bound)
+
+
+def jitter_refusal(available: tuple[float, ...], reason: str) -> JitterProof:
+    """That no damping is enough, and why."""
+    return JitterProof(refusal("jitter-proof", available, reason), (np.inf,) * len(available), np.inf)
 
 
 class _Ratio:
@@ -123,6 +127,7 @@ class _Ratio:
         return N, Y[:, self.active]
 
     def matrices(self, a: Array, N: Complex, Y: Complex) -> Complex:
+        """N + diag(a)/2 + Y* diag(1/2a) Y, (k, m, m)."""
         diagonal = np.zeros(self._h.size)
         diagonal[self.active] = a / 2
         return N + np.diag(diagonal) + np.conj(np.swapaxes(Y, 1, 2)) @ (Y / (2 * a[:, None]))
@@ -150,7 +155,7 @@ class _Ratio:
         return full, best[0], best[1], bound if a.size else best[0]
 
     def _largest(self, a: Array, N: Complex, Y: Complex) -> Array:
-        return np.linalg.eigvalsh(self.matrices(a, N, Y))[:, -1]
+        return np.linalg.eigvalsh(self.matrices(a, N, Y))[:, -1].astype(float)
 
     def _cut(self, a: Array, N: Complex, Y: Complex) -> float:
         """Collect the bounds at the local peaks near the worst sampled frequency; the worst value."""

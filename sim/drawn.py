@@ -9,7 +9,6 @@ import numpy as np
 from controller.coupling import Coupling
 from controller.delay import Ticks
 from controller.jitter import Jitter
-from controller.lti import Array
 from sim.exact_engine import HeldPlant
 from sim.scenario import Scenario
 from sim.simulate import Assembly
@@ -21,10 +20,10 @@ SHORTEST = 4  # ticks that are drawn at least: a growth compares quarters
 STREAM = 5  # keeps these draws apart from those of the humans with the same seed and index
 
 
-def draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, given: Array | None = None) -> Ticks:
+def draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, given: Ticks | None = None) -> Ticks:
     """Delays (ticks, m) of run number `index`; they depend on (seed, index) and the scenario only."""
     assert scenario.jitter is not None
-    rows = [scenario.theta] if scenario.jitter.pattern == "constant" else given
+    rows = np.array([scenario.theta]) if scenario.jitter.pattern == "constant" else given
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, STREAM)))
     return scenario.jitter.draw(rng, ticks, rows)
 

@@ -183,7 +183,12 @@ def _varying(jitter: dict[str, Any]) -> list[tuple[str, str]]:
                 f"{growth} with a period of {period['ticks']} ticks: {_verdict(period['verdict'])}",
             )
         )
-    return [*rows, ("switching covered", "[green]yes[/]" if jitter["covered"] else "[yellow]no[/]")]
+    if proof := jitter.get("jitter_proof"):
+        exact = ", proved exactly" if proof["proof"] == "rational" else ""
+        word = f"[green]certified[/]{exact}" if proof["certified"] else "[red]not certified[/]"
+        needs = f"needs {_list(proof['required_damping'])} of {_list(proof['available_damping'])} N s/m: {word}"
+        rows.append(("damping, any switching", needs))
+    return [*rows, ("these delays covered", "[green]yes[/]" if jitter["covered"] else "[yellow]no[/]")]
 
 
 def _verdict(word: str | None) -> str:

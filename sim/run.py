@@ -131,9 +131,11 @@ def _outcome(
     requirements = assess(loop, chosen.coupling, chosen.phi)
     certificates = {name: certificate_part(requirement) for name, requirement in requirements.items()}
     simulated = samples * scenario.T
-    jitter = jitter_report.part(assembly, period, samples, any(r.certified for r in requirements.values()))
-    switched = jitter if scenario.switches else None
-    stability = jitter_report.stability_part(assembly, record, switched) if switched else None
+    certified = any(requirement.certified for requirement in requirements.values())
+    jitter, stability, unstable = jitter_report.part(assembly, chosen.coupling, period, samples, certified), None, None
+    if jitter and scenario.switches:
+        stability = jitter_report.stability_part(assembly, record, jitter)
+        unstable = stability["verdict"] == "unstable"
     mujoco = args.engine == "mujoco"
     outcome = {
         "case": args.case,
@@ -159,7 +161,7 @@ def _outcome(
             "interrupted": record.interrupted,
             "scenario_digest": scenario.digest,
         },
-        "error": report.error_part(record, exact, assembly, stability and stability["verdict"] == "unstable"),
+        "error": report.error_part(record, exact, assembly, unstable),
     }
     outcome["reproducibility"] = reproducibility.table(scenario, args.case, outcome)
     return outcome | {"remarks": [*chosen.notes, *report.remarks(outcome)]}

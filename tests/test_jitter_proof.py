@@ -1,5 +1,7 @@
 """The condition for delays that vary: closed forms, an independent convex solver, the energy itself, exact proofs."""
 
+import json
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -9,11 +11,13 @@ from controller.environment import FIGURE_4, GROUND, Network, Spring, environmen
 from controller.lti import Lti
 from controller.process import force_map
 from design import jitter_exact
+from design.audit import main
 from design.jitter import blocks, half_widths, jitter_proof
 from design.jitter_lmi import block
 from design.jitter_part import switching_part, switching_requirement
 from design.margin import closed_loop
 from design.solve import solve
+from sim.scenario import InputError
 
 T, DELTA = 1.2e-3, (1.37, 1.37)
 STIFF = SpringDamper([7806, 3137], [0.105, 1.68])
@@ -128,17 +132,17 @@ def test_what_is_refused():
 
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((1, 1), (1, 3)), ((1, 2), (1, 2))])
 def test_what_holds_is_proved_exactly(lo, hi):
-    found = switching_requirement(SOFT, FIGURE_4, T, (0, 0), lo, hi, DELTA)
+    found = switching_requirement(SOFT, FIGURE_4, sent(SOFT), (0, 0), lo, hi, DELTA)
     assert found.requirement.certified
     assert found.requirement.proof == "rational"
-    part = switching_part(found, sent(SOFT), hi)
+    part = switching_part(found, sent(SOFT), lo, hi)
     # equal where nothing varies
     assert part["playout"]["required_damping"][0] <= part["required_damping"][0] * (1 + 1e-9)
     assert part["certified"]
 
 
 def test_what_does_not_hold_has_no_exact_proof():
-    found = switching_requirement(STIFF, FIGURE_4, T, (0, 0), (1, 1), (2, 2), DELTA)
+    found = switching_requirement(STIFF, FIGURE_4, sent(), (0, 0), (1, 1), (2, 2), DELTA)
     assert not found.requirement.certified
     assert found.requirement.proof == "sampled"
     arguments = (FIGURE_4, T, (0, 0), (1, 1), (2, 2))
@@ -156,3 +160,35 @@ def test_a_wall_with_damping():
     constant = [closed_loop(force_map(G, NoCoupling(), [n], [0]), [1.37]).required[0] for n in (0, 1)]
     assert constant[0] == pytest.approx(2000 * T / 2 + 1)
     assert needs >= max(constant) * (1 - 1e-6)
+
+
+def audit(tmp_path, *options):
+    code = main([*options, "--out", str(tmp_path), "--json", str(tmp_path / "a.json")])
+    return code, json.loads((tmp_path / "a.json").read_text())
+
+
+def test_audit_reports_switching_beside_the_constants(tmp_path):
+    code, report = audit(tmp_path, "--K", "7806,3137", "--B", "0.105,1.68", "--jitter", "1,2")
+    assert code == 1  # certified for the constant (1, 2), not for what was asked
+    assert report["closed-loop"]["certified"]
+    assert report["jitter-proof"]["required_damping"] == pytest.approx([2.0413] * 2, rel=1e-4)
+    assert report["jitter-proof"]["playout"]["required_damping"] == pytest.approx([1.7022] * 2, rel=1e-4)
+    code, report = audit(tmp_path, "--K", "879,552", "--B", "0.39,0.52", "--jitter", "1-2,1-2")
+    assert code == 0
+    assert report["jitter-proof"]["proof"] == "rational"
+    code, report = audit(tmp_path, "--K", "879,552", "--B", "0.39,0.52")
+    assert report["jitter-proof"] is None
+
+
+def test_audit_of_a_wall_with_varying_delay(tmp_path):
+    """A spring of 800 N/m at 1 ms, 0 to 1 samples: KT (hi + 1/2), as the constant delay of 1."""
+    options = ["--rigid", "--K", "800", "--B", "0", "--T", "1e-3", "--theta", "1", "--delta", "1.37"]
+    code, report = audit(tmp_path, *options, "--jitter", "0,1")
+    assert code == 0
+    assert report["jitter-proof"]["required_damping"] == pytest.approx([1.2], rel=1e-6)  # SETTLED is 1e-7
+
+
+@pytest.mark.parametrize(("jitter", "message"), [("2,3", "expected 0 <= LO <= theta = 1"), ("1", "expected LO,HI")])
+def test_audit_refuses_a_range_without_the_constant(tmp_path, jitter, message):
+    with pytest.raises(InputError, match=message):
+        main(["--K", "879,552", "--B", "0.39,0.52", "--jitter", jitter, "--out", str(tmp_path)])
