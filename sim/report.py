@@ -148,7 +148,7 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     how = "growth, switching" if (report.get("jitter") or {}).get("verdict") else "growth, simulated trace"
     rows.append((how, f"{measured}: {_verdict(stability['verdict'])}"))
     if jitter := report.get("jitter"):
-        rows += _varying(jitter)
+        rows += varying(jitter)
     run = report["run"]
     rows.append(("clipped ticks", f"{stability['clipped_ticks']} of {run['samples']}"))
     engine = run["engine"] + (f" {run['integrator']} x {run['substeps']}" if run["integrator"] else "")
@@ -168,7 +168,8 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
-def _varying(jitter: dict[str, Any]) -> list[tuple[str, str]]:
+def varying(jitter: dict[str, Any]) -> list[tuple[str, str]]:
+    """Rows about delays that vary, of a run or of a validation."""
     spans = ", ".join(f"{lo} to {hi}" for lo, hi in zip(jitter["lo"], jitter["hi"], strict=True))
     how = jitter["pattern"] + (", played out at the largest" if jitter["playout"] else "")
     rows = [("delays", f"{spans} samples, {how}" + (f", {100 * jitter['loss']:g} % lost" if jitter["loss"] else ""))]

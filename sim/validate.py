@@ -14,7 +14,7 @@ from design.margin import Requirement
 from design.promises import certificate_part
 from design.summary import coupling_part
 from models.crowd import Crowd
-from sim import verdict_report
+from sim import jitter_report, verdict_report
 from sim.adversary import Worst, search
 from sim.command import (
     DOES_NOT_HOLD,
@@ -35,6 +35,7 @@ from sim.couplings import NAMES, Chosen, choose
 from sim.examine import ENGINES, Findings, Question
 from sim.files import write_json
 from sim.human_file import save_humans
+from sim.jitter_options import add_jitter_options, with_jitter
 from sim.population import MIXED, draw
 from sim.scenario import InputError, Scenario
 from sim.shards import validate
@@ -46,7 +47,7 @@ LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 def main(argv: list[str]) -> int:
     """Meet random humans. 0: the claims hold, 1: not, 130: interrupted."""
     args = _parser().parse_args(argv)
-    scenario = scenario_from(args)
+    scenario = with_jitter(args, scenario_from(args))
     humans, shards = _whole(args, "humans", 1_000_000), _whole(args, "shards", 256)
     seed, duration = seed_from(args), _duration(args, scenario)
     links = LINKS[args.links] if args.links else scenario.population.links
@@ -61,6 +62,9 @@ def main(argv: list[str]) -> int:
         findings = validate(question, shards, bar[1])
         wall = time.perf_counter() - begin
     outcome = _outcome(args, scenario, chosen, requirements, question, findings, certified, wall)
+    if scenario.jitter:
+        outcome["switching"] = _switching(scenario, chosen, findings, certified)
+        outcome["holds"] = outcome["holds"] and outcome["switching"]["holds"]
     worst = _attack(scenario, chosen, seed, outcome) if args.adversary and not findings.interrupted else None
     if worst:
         ratio = requirements["closed-loop"].ratio
@@ -82,6 +86,7 @@ def _parser() -> Parser:
         "python -m sim.validate --case I --humans 200 --adversary",
     )
     add_loop_options(parser)
+    add_jitter_options(parser)
     names = ", ".join(NAMES)
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
@@ -119,6 +124,13 @@ def _attack(scenario: Scenario, chosen: Chosen, seed: int, outcome: dict[str, An
     except KeyboardInterrupt:
         outcome["interrupted"] = True
         return None
+
+
+def _switching(scenario: Scenario, chosen: Chosen, findings: Findings, certified: bool) -> dict[str, Any]:
+    """What delays that vary did to these humans, and whether that contradicts what is certified of them."""
+    assert scenario.jitter is not None
+    covered = jitter_report.certified_part(assemble(scenario, chosen.coupling), chosen.coupling, certified)
+    return verdict_report.switching_part(findings, jitter_report.range_part(scenario.jitter) | covered)
 
 
 def _outcome(

@@ -12,14 +12,18 @@ from controller.delay import ages, realising
 from controller.jitter import Jitter
 from controller.process import Tape
 from design import store
+from models.crowd import Crowd, variants
 from models.scene import plant
 from sim.batch_engine import ExactBatchEngine
 from sim.drawn import adversary, switching
 from sim.exact_engine import ExactEngine, HeldPlant
+from sim.population import draw
 from sim.run import main
 from sim.scenario import SCENARIOS, InputError, load, parse
 from sim.simulate import assemble, simulate
 from sim.switched import knocked, mode_matrix, unlimited, with_delays, without_theta
+from sim.switching_crowd import switched_crowd
+from sim.validate import main as validate
 from sim.worst_switching import greedy_ages
 
 STIFF = SpringDamper([7806, 3137], [0.105, 1.68])  # certified for the constants (1, 2) in the default environment
@@ -193,3 +197,49 @@ def test_a_scenario_file_may_have_jitter():
         parse(text + "\n[jitter]\nlo = [1, 1]\nhi = [2, 3]\nlos = 0.01\n")
     with pytest.raises(InputError, match="theta"):
         parse(text + "\n[jitter]\nlo = [2, 2]\nhi = [3, 3]\n")
+
+
+def validated(tmp_path, *options):
+    out = tmp_path / "v"
+    fixed = ["--engine", "exact", "--humans", "20", "--no-plot", "--jitter", "1,2"]
+    code = validate([*fixed, *options, "--out", str(out), "--json", str(tmp_path / "v.json")])
+    return code, json.loads((tmp_path / "v.json").read_text())["switching"]
+
+
+def test_random_humans_under_the_worst_switching(tmp_path):
+    """The constants' design fails for most humans, the jitter-proof one for none; 0 and 1 are what is claimed."""
+    store.save(store.Stored(load().loop("I"), store.data_of(STIFF)), tmp_path / "stiff.json")
+    code, stiff = validated(tmp_path, "--pattern", "adversarial", "--coupling", str(tmp_path / "stiff.json"))
+    assert stiff["unstable"]["exact"] >= 10
+    assert not stiff["covered"]
+    assert code == 0  # nothing that was certified is contradicted
+    code, soft = validated(tmp_path, "--pattern", "adversarial")
+    assert soft["unstable"]["exact"] == 0
+    assert soft["covered"]
+    assert soft["jitter_proof"]["proof"] == "rational"
+    assert code == 0
+
+
+def test_the_population_meets_lost_packets(tmp_path):
+    code, part = validated(tmp_path, "--pattern", "bursty", "--loss", "0.1", "--duration", "0")
+    assert code == 0
+    assert not part["covered"]
+    assert "lost packet" in part["covers"]
+    assert part["humans"] == 20
+    assert part["unstable"] == {"exact": 0, "mujoco": None}
+    code, part = validated(tmp_path, "--playout")
+    assert part["constant"]
+    assert part["covered"]
+    assert part["humans"] == 0
+
+
+def test_both_engines_see_the_population_grow_alike():
+    """Four humans, adversarial delays: MuJoCo's growth within 0.01 1/s of the exact one, as of its constant loops."""
+    scenario = load().replace(jitter=Jitter((1, 1), (2, 2), "adversarial"))
+    loop = assemble(scenario, STIFF)
+    links = np.stack([draw(scenario.population, 2, 0, i, 1) for i in range(4)])
+    held_by = variants(scenario.device, Crowd(links))
+    seen = switched_crowd(loop, STIFF, held_by, np.arange(4), 0, 2.0, mujoco=True, threads=1)
+    kept = ~np.isnan(seen.mujoco)
+    assert kept.any()
+    np.testing.assert_allclose(seen.mujoco[kept], seen.exact[kept], atol=1e-2)
