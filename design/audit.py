@@ -9,7 +9,8 @@ import argparse
 import time
 
 from controller.coupling import Coupling, NoCoupling, SpringDamper
-from design.audit_report import Range, print_report, report
+from design.audit_report import print_report, report
+from design.jitter_part import Range
 from design.presets import PRESETS
 from design.subject import LONGEST_DELAY, Subject
 from sim.command import (

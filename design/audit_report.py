@@ -12,16 +12,13 @@ from rich.table import Table
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from design.audit_figures import Stiffest, Tolerance, stiffest, tolerance
 from design.audit_remedies import remedies
-from design.jitter_part import switching_part
+from design.jitter_part import Range, switching_part
 from design.margin import Requirement
 from design.promises import CAVEATS, certificate_part, promise
 from design.store import Condition
 from design.subject import Subject
 
 KINDS = {NoCoupling: "none", SpringDamper: "spring-damper", Compliance: "compliance"}
-
-
-Range = tuple[tuple[int, ...], tuple[int, ...]]  # (lo, hi), each (m,) [samples]
 
 
 def report(subject: Subject, switching: Range | None = None) -> dict[str, Any]:

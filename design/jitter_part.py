@@ -15,6 +15,8 @@ from design.jitter import JitterProof, jitter_proof
 from design.margin import closed_loop
 from design.promises import certificate_part, finite
 
+Range = tuple[tuple[int, ...], tuple[int, ...]]  # (lo, hi), each (m,) [samples]
+
 NOT_COVERED = (
     "Covered: any ages of the forces within the range, at every tick and on every channel. Not covered: jitter on the "
     "measured positions, jitter of T, or forces older than the range, which lost packets make."
