@@ -182,6 +182,8 @@ def _save(
         stability = outcome["stability"]
         with_what = "no virtual coupling" if args.case == "none" else f"{outcome['coupling']['kind']} coupling"
         growth = f"growth {stability['exact_growth_rate_per_s']:+.3f} 1/s at {stability['exact_frequency_hz']:.1f} Hz"
+        if assembly.scenario.jitter and assembly.scenario.switches:
+            growth = f"{outcome['jitter']['pattern']} delays, {stability['verdict']}"
         title = f"{outcome['scenario']}, case {args.case}, {with_what}: {growth}"
         files.append(plot_run(result, out / "figure.png", title, stability["exact_frequency_hz"]))
     files.append(out / "report.json")
