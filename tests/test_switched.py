@@ -160,10 +160,11 @@ def test_a_playout_buffer_is_the_constant_largest_delay(tmp_path):
 
 def test_recorded_delays_and_total_loss(tmp_path):
     (tmp_path / "delays.csv").write_text("# of one afternoon\n1, 2\n2 2\n1,-1\n")
-    report = run(tmp_path, "--pattern", str(tmp_path / "delays.csv"), "--duration", "0.3", "--engine", "exact")
+    quick = ["--coupling", "published", "--engine", "exact", "--duration", "0.3"]
+    report = run(tmp_path, "--pattern", str(tmp_path / "delays.csv"), *quick)
     assert (report["jitter"]["lo"], report["jitter"]["hi"]) == ([1, 2], [2, 2])
     assert report["jitter"]["lost_packets"] == [0, 83]  # of 250 ticks every third
-    report = run(tmp_path, "--loss", "1", "--duration", "0.3")
+    report = run(tmp_path, "--loss", "1", *quick)
     assert report["jitter"]["age"] is None
     assert np.load(tmp_path / "out" / "trace.npz")["f"].any() == np.False_  # no force ever arrives
 
