@@ -53,14 +53,14 @@ class SwitchingSampled(Sampled):
         """1 - SAMPLED_RESERVE less the damping ratio at each sampled frequency, with the multiplier in x."""
         a = np.exp(x[2 * self.spec.channels :])
         D, E, _ = self.loop_at_conditions
-        now = np.broadcast_to(np.eye(self.spec.channels), E.shape)
+        now = np.broadcast_to(np.eye(self.spec.channels, dtype=complex), E.shape)
         G = self.root[:, None] * self.force(x, (D, E, now)) * self.root
         nominal = nominal_over_step(on_circle(self.conditions), *self.range)[:, :, None] * G
         error = (self.h[:, None] * G)[:, self.active]
         diagonal = np.zeros(self.h.size)
         diagonal[self.active] = a / 2
         need = np.diag(diagonal) - hermitian(nominal) + np.conj(np.swapaxes(error, 1, 2)) @ (error / (2 * a[:, None]))
-        room = 1 - SAMPLED_RESERVE - np.linalg.eigvalsh(need)[:, -1]
+        room = (1 - SAMPLED_RESERVE - np.linalg.eigvalsh(need)[:, -1]).astype(float)
         return np.append(room, self.stability(x)) if any(self.spec.psi) else room
 
     def search(self, x: Array) -> OptimizeResult:
