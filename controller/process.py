@@ -10,6 +10,7 @@
 With theta = 0 the force computed from x[k] acts during [kT, (k+1)T); with theta = 1, one period later.
 Steps 2, 3 and 5 are linear: they are ONE state-space block, and a tick is one matrix product
 [f; z+] = [C D; A B] [z; x] for any number of simulations at once. Saturation is what the actuators do.
+Where delays vary, Theta is not in the block: its forces pass through a line that holds (controller.delay).
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import numpy as np
 
 from controller.contact import Contact, State
 from controller.coupling import Coupling
-from controller.delay import delay
+from controller.delay import HeldLine, Ticks, delay, packet_delays
 from controller.lti import Array, Lti, frozen
 
 
@@ -33,12 +34,13 @@ def force_map(environment: Lti, coupling: Coupling, theta: Sequence[int], psi: S
 
 @dataclass(frozen=True, eq=False)
 class Process:
-    """The linear block F with what wraps around it: force limits and encoder steps."""
+    """The linear block F with what wraps around it: force limits, encoder steps, and delays that vary."""
 
     F: Lti
     force_limit: Array  # (m,) [N], inf where there is none
     encoder_step: Array  # (m,) [m], 0 for an ideal encoder
     contact: Contact | None = None  # walls that F, which knows them open, is joined with
+    delays: Ticks | None = None  # (ticks, m, nsim or 1) of every packet behind F [samples]; None where none varies
 
     def __post_init__(self) -> None:
         for name in ("force_limit", "encoder_step"):
@@ -50,10 +52,22 @@ class Process:
             raise ValueError(f"force_limit is {self.force_limit.tolist()}, expected positive forces in N")
         if not ((self.encoder_step >= 0) & (self.encoder_step < np.inf)).all():
             raise ValueError(f"encoder_step is {self.encoder_step.tolist()}, expected steps >= 0 in m")
+        if self.delays is not None:
+            object.__setattr__(self, "delays", packet_delays(self.delays))
+            if self.delays.shape[1] != self.F.outputs:
+                raise ValueError(f"delays have {self.delays.shape[1]} channels, expected {self.F.outputs}")
 
     @property
     def channels(self) -> int:
         return self.F.inputs
+
+    def measured(self, x: Array) -> Array:
+        """Positions (.., m) as the encoders give them: rounded to whole steps, or x itself where none is coarse."""
+        coarse = self.encoder_step > 0
+        if not coarse.any():
+            return x
+        step = np.where(coarse, self.encoder_step, 1.0)
+        return np.where(coarse, np.round(x / step) * step, x)
 
     def frozen(self) -> dict[State, Lti]:
         """The linear force maps that the process switches between, by the walls that touch: F alone without walls."""
@@ -99,16 +113,24 @@ class Tape:
         self.plant_row = slabs(nz, plant_states + outside + m)
         self._input = slabs(0, nz + m)
         self._output = slabs(width - m, m + nz)
-        self._measured = slabs(nz, m)
         self._transition = process.transition()
-        self._step = np.where(process.encoder_step > 0, process.encoder_step, np.inf)[:, None]
         self._quantised = bool((process.encoder_step > 0).any())
+        self._line = None if process.delays is None else HeldLine(process.delays, nsim)
+        self._rewound = 0  # ticks before row 0
 
     def tick(self, k: int) -> None:
         """Steps 1, 2, 3 and 5 for row k, whose plant state has been written: f[k] and z[k + 1]."""
-        if self._quantised:
-            self._quantise(self._measured[k])
-        self._transition(self._input[k], self._output[k])
+        self._transition(self.seen(k), self._output[k])
+        if self._line is not None:
+            self._line.carry(self._rewound + k, self.force[k])
+
+    def seen(self, k: int) -> Array:
+        """[z; x] of row k with x as the encoders give it, (order + m, nsim); the plant's own positions stay."""
+        row = self._input[k]
+        if not self._quantised:
+            return row
+        m = self.process.channels
+        return np.concatenate([row[:-m], self.process.measured(row[-m:].T).T])
 
     def saturate(self, ticks: int) -> None:
         """Turn the forces of the first `ticks` rows from asked for into applied, as the actuators did."""
@@ -119,9 +141,4 @@ class Tape:
         """Start a new stretch where this one stood after `ticks` ticks."""
         self.z[0] = self.z[ticks]
         self.s[0] = self.s[ticks]
-
-    def _quantise(self, x: Array) -> None:
-        """Round to whole encoder steps, in place; an ideal channel (step inf) is left as it is."""
-        coarse = np.isfinite(self._step[:, 0])
-        step = self._step[coarse]
-        x[coarse] = np.round(x[coarse] / step) * step
+        self._rewound += ticks

@@ -9,14 +9,18 @@ from typing import Any
 
 from rich.table import Table
 
+from controller.coupling import Coupling
+from controller.lti import Lti
 from controller.process import force_map
 from design.assess import CONDITIONS, assess, specification
 from design.certificate import NotProved, prove
 from design.designs import FILTERS, KINDS, METHODS, OBJECTIVES, compare_methods, design_coupling
 from design.failure import DesignFailed
+from design.jitter_part import Range, switching_part, switching_requirement
 from design.promises import certificate_part, promise_of
 from design.result import Design
 from design.store import Loop, Stored, data_of, save
+from design.subject import LONGEST_DELAY
 from design.summary import coupling_part, transparency_part
 from design.transparency import transparency
 from sim.command import (
@@ -29,6 +33,7 @@ from sim.command import (
     console,
     execute,
     numbers,
+    ranges,
     scenario_from,
     seed_from,
 )
@@ -47,7 +52,7 @@ def main(argv: list[str]) -> int:
     check_json(args)
     folder(out.parent)
     loop = scenario_from(args).loop(args.case)
-    options = _options(args)
+    options = _options(args) | _switching(args, len(loop.theta))
     try:
         spec = specification(loop)
         design = design_coupling(spec, args.coupling, args.condition, **options)
@@ -70,6 +75,7 @@ def main(argv: list[str]) -> int:
         "sdps": design.sdps,
         "wall_s": design.wall_s,
         "stored": _store(loop, design, out),
+        "jitter_proof": _switching_figures(loop, spec.environment, design.coupling, options.get("switching")),
     }
     if args.compare:
         outcome["comparison"] = [asdict(row) for row in compare_methods(spec)]
@@ -78,7 +84,8 @@ def main(argv: list[str]) -> int:
         console(args).print(_comparison(outcome["comparison"]))
     if args.json:
         write_json(args.json, outcome)
-    return DONE if outcome["certificate"]["certified"] else DOES_NOT_HOLD
+    proof = outcome["jitter_proof"]
+    return DONE if outcome["certificate"]["certified"] and (proof is None or proof["certified"]) else DOES_NOT_HOLD
 
 
 def _parser() -> Parser:
@@ -87,6 +94,8 @@ def _parser() -> Parser:
     add_loop_options(parser)
     parser.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="what to certify (default: the coupling's own)")
+    jitter = "safe under any switching of the forces' delays in this range too [samples]; spring-damper, closed-loop"
+    parser.add_argument("--jitter", metavar="LO,HI", help=jitter)
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", metavar="N", help="states per channel (default 1)")
     ccl.add_argument("--method", choices=METHODS, help="complementarity is as printed (default inner)")
@@ -141,6 +150,27 @@ def _options(args: argparse.Namespace) -> dict[str, Any]:
     return given
 
 
+def _switching(args: argparse.Namespace, channels: int) -> dict[str, Any]:
+    """The range of delays that a design must bear. Raises InputError."""
+    if args.jitter is None:
+        return {}
+    if args.coupling != "spring-damper" or args.condition != "closed-loop":
+        raise InputError("--jitter is for --coupling spring-damper with --condition closed-loop")
+    lo, hi = ranges("--jitter", args.jitter, channels)
+    if any(not 0 <= a <= b <= LONGEST_DELAY for a, b in zip(lo, hi, strict=True)):
+        raise InputError(f"--jitter is {args.jitter!r}, expected 0 <= LO <= HI <= {LONGEST_DELAY} samples")
+    return {"switching": (lo, hi)}
+
+
+def _switching_figures(loop: Loop, E: Lti, coupling: Coupling, switching: Range | None) -> dict[str, Any] | None:
+    """What any switching asks of the designed coupling, from the coupling alone."""
+    if switching is None:
+        return None
+    G = force_map(E, coupling, (0,) * len(loop.theta), loop.psi)
+    found = switching_requirement(coupling, loop.environment, G, loop.psi, *switching, loop.delta)
+    return switching_part(found, G, *switching)
+
+
 def _store(loop: Loop, design: Design, out: Path) -> dict[str, Any]:
     """Save the coupling with the proof of its condition, or without where there is none yet."""
     data = data_of(design.coupling)
@@ -167,6 +197,11 @@ def _table(outcome: dict[str, Any]) -> Table:
         required = _list(part["required_damping"])
         available = _list(part["available_damping"])
         table.add_row(f"damping, {part['condition']}", f"needs {required} of {available} N s/m: {word}")
+    if part := outcome["jitter_proof"]:
+        word = "certified" if part["certified"] else "not certified"
+        span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))
+        needs = f"needs {_list(part['required_damping'])}: {word} (proof: {part['proof']})"
+        table.add_row("damping, any switching", f"{span} samples: {needs}")
     table.add_row("promise", outcome["promise"] or "none")
     table.add_row(outcome["objective_name"], f"{outcome['objective']:.5g}")
     rms = transparent["rms_mismatch_db"]

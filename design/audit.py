@@ -10,8 +10,9 @@ import time
 
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from design.audit_report import print_report, report
+from design.jitter_part import Range
 from design.presets import PRESETS
-from design.subject import Subject
+from design.subject import LONGEST_DELAY, Subject
 from sim.command import (
     DOES_NOT_HOLD,
     DONE,
@@ -23,6 +24,7 @@ from sim.command import (
     execute,
     numbers,
     out_folder,
+    ranges,
     rigid_loop,
     scenario_from,
     seed_from,
@@ -33,6 +35,7 @@ from sim.stored import doubts, fitted, read_coupling
 
 EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
   python -m design.audit --rigid --K 5000 --B 0 --T 1e-3 --theta 0 --delta 1.37
+  python -m design.audit --case I --K 879,552 --B 0.39,0.52 --jitter 1,2
   python -m design.audit --preset chai3d-omega3"""
 
 #: what a gain may be: within these, all arithmetic is far from overflow
@@ -45,6 +48,7 @@ def main(argv: list[str]) -> int:
     seed_from(args)
     scenario = scenario_from(args)
     subject = _subject(args, scenario)
+    switching = _range(args, subject)
     out = out_folder(args, "audit")
 
     begin = time.perf_counter()
@@ -52,7 +56,7 @@ def main(argv: list[str]) -> int:
         "case": args.case,
         "scenario": None if args.rigid else scenario.name,
         "preset": args.preset and {"name": args.preset, "source": PRESETS[args.preset].source},
-        **report(subject),
+        **report(subject, switching),
         "notes": doubts(read_coupling(args.coupling), scenario.loop(args.case)) if args.coupling else [],
         "wall_s": time.perf_counter() - begin,
     }
@@ -60,7 +64,8 @@ def main(argv: list[str]) -> int:
     print_report(outcome, console(args))
     if args.json:
         write_json(args.json, outcome)
-    return DONE if outcome["certified"] else DOES_NOT_HOLD
+    proof = outcome["jitter-proof"]
+    return DONE if outcome["certified"] and (proof is None or proof["certified"]) else DOES_NOT_HOLD
 
 
 def _parser() -> Parser:
@@ -72,6 +77,8 @@ def _parser() -> Parser:
     what.add_argument("--preset", choices=tuple(PRESETS), help="limits that a framework ships; other options go first")
     add_loop_options(parser)
     add_rigid_option(parser)
+    switching = "also any switching of the forces' delays in this range [samples]; or LO-HI,LO-HI,.. per channel"
+    parser.add_argument("--jitter", metavar="LO,HI", help=switching)
     add_output_options(parser)
     return parser
 
@@ -99,6 +106,18 @@ def _subject(args: argparse.Namespace, scenario: Scenario) -> Subject:
         return Subject(coupling, T=scenario.T, **loop)
     except ValueError as error:
         raise InputError(str(error)) from None
+
+
+def _range(args: argparse.Namespace, subject: Subject) -> Range | None:
+    """(lo, hi) of --jitter, around the constant theta that the other conditions are about. Raises InputError."""
+    if args.jitter is None:
+        return None
+    lo, hi = ranges("--jitter", args.jitter, subject.channels)
+    for i, (least, n, largest) in enumerate(zip(lo, subject.theta, hi, strict=True)):
+        if not 0 <= least <= n <= largest <= LONGEST_DELAY:
+            allowed = f"0 <= LO <= theta = {n} <= HI <= {LONGEST_DELAY} samples (--theta gives another)"
+            raise InputError(f"--jitter on channel {i + 1} is {least} to {largest}, expected {allowed}")
+    return lo, hi
 
 
 def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Coupling:

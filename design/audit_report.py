@@ -12,6 +12,7 @@ from rich.table import Table
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from design.audit_figures import Stiffest, Tolerance, stiffest, tolerance
 from design.audit_remedies import remedies
+from design.jitter_part import Range, switching_part
 from design.margin import Requirement
 from design.promises import CAVEATS, certificate_part, promise
 from design.store import Condition
@@ -20,8 +21,11 @@ from design.subject import Subject
 KINDS = {NoCoupling: "none", SpringDamper: "spring-damper", Compliance: "compliance"}
 
 
-def report(subject: Subject) -> dict[str, Any]:
-    """Both conditions with what surrounds them; SI units, null with a "reason" where a figure does not exist."""
+def report(subject: Subject, switching: Range | None = None) -> dict[str, Any]:
+    """Both conditions with what surrounds them; SI units, null with a "reason" where a figure does not exist.
+
+    With a range of delays also the damping that any switching within it asks.
+    """
     requirements = {condition: subject.requirement(condition) for condition in reversed(get_args(Condition))}
     closed_loop, theorem4 = requirements["closed-loop"].certified, requirements["theorem4"].certified
     gains = subject.coupling if isinstance(subject.coupling, SpringDamper) else None
@@ -39,6 +43,7 @@ def report(subject: Subject) -> dict[str, Any]:
             "rigid": subject.network is None,
         },
         **{condition: _condition_part(subject, requirement) for condition, requirement in requirements.items()},
+        "jitter-proof": _switching_part(subject, switching) if switching else None,
         "certified": closed_loop,
         "promise": promise(closed_loop and theorem4, closed_loop, rigid=subject.network is None, walls=subject.walls),
         "helps": _helps(subject, requirements["theorem4" if closed_loop else "closed-loop"]),
@@ -51,6 +56,13 @@ def _condition_part(subject: Subject, requirement: Requirement) -> dict[str, Any
         "stiffest": _stiffest_part(stiffest(subject, requirement.condition)),
         "sensitivity": _sensitivity_part(subject, requirement, tolerance(subject, requirement)),
     }
+
+
+def _switching_part(subject: Subject, switching: Range) -> dict[str, Any]:
+    found = subject.switching(*switching)
+    if found.requirement.reason:
+        return certificate_part(found.requirement) | {"lo": list(switching[0]), "hi": list(switching[1])}
+    return switching_part(found, subject.G, *switching)
 
 
 def _stiffest_part(found: Stiffest) -> dict[str, Any]:
@@ -164,7 +176,21 @@ def _remarks(report: dict[str, Any]) -> list[str]:
         enough = "enough" if helping["certified"] else "not enough alone"
         need = f"{helping['condition']} then needs {_list(helping['required_damping'])} N s/m, {enough}"
         lines.append(f"What helps: {helping['change']} ({need}).")
+    if (part := report["jitter-proof"]) is not None:
+        lines += _switching_remarks(part)
     return [*lines, report["not_covered"]]
+
+
+def _switching_remarks(part: dict[str, Any]) -> list[str]:
+    span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))
+    proof = ", proved exactly" if part["proof"] == "rational" else ""
+    lines = [f"Any switching of the delays ({span} samples) needs {_needs(part)}{proof}."]
+    if "playout" not in part:
+        return [*lines, f"jitter-proof: {part['reason']}."]
+    buffered = part["playout"]
+    enough = "certified" if buffered["certified"] else "not certified"
+    needs = f"{_list(buffered['required_damping'])} N s/m: {enough}"
+    return [*lines, f"A playout buffer to the constant {_list(part['hi'])} needs {needs}.", part["not_covered"]]
 
 
 def _list(values: Sequence[float | None]) -> str:

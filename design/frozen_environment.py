@@ -85,14 +85,20 @@ class Sampled:
         ratio = self.force(x, self.loop_at_conditions) / (on_circle(self.conditions) - 1)[:, None, None]
         need = -hermitian(self.root[:, None] * ratio * self.root)
         room = 1 - SAMPLED_RESERVE - np.linalg.eigvalsh(need)[:, -1]
-        if not any(self.spec.psi):
-            return room
+        return np.append(room, self.stability(x)) if any(self.spec.psi) else room
+
+    def stability(self, x: Array) -> float:
+        """By how much more than CLOSEST_POLE the poles keep away from the circle."""
         F = force_map(self.spec.environment, self.coupling(x), self.spec.theta, self.spec.psi)
-        return np.append(room, 1 - CLOSEST_POLE - np.abs(F.poles()).max(initial=0.0))
+        return float(1 - CLOSEST_POLE - np.abs(F.poles()).max(initial=0.0))
 
     def search(self, x: Array) -> OptimizeResult:
+        return self.minimised(x, [])
+
+    def minimised(self, x: Array, more: list[tuple[float, float]]) -> OptimizeResult:
+        """The local optimum from x; `more` bounds the unknowns behind the gains."""
         N = self.spec.channels
-        bounds = [(np.log(SOFTEST), np.log(STIFFEST))] * N + [(0.0, 20.0)] * N
+        bounds = [(np.log(SOFTEST), np.log(STIFFEST))] * N + [(0.0, 20.0)] * N + more
         condition = {"type": "ineq", "fun": self.room}
         options = {"maxiter": 100, "ftol": 1e-7}
         return minimize(self.square_mismatch, x, method="SLSQP", bounds=bounds, constraints=condition, options=options)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from functools import partial
 
 import cvxpy as cp
 import numpy as np
@@ -25,23 +26,32 @@ from design.result import Design
 from design.shaping import Shaping
 from design.solve import solve, solved
 from design.specification import RESERVE, Specification
+from design.switching_search import least_rms_switching
 
 #: The sequence stops when a step improves the norm by less than this, relatively.
 SETTLED = 1e-6
 MOST_STEPS = 60
 
 
-def design(spec: Specification, condition: str = "theorem4", starts: Sequence[SpringDamper] = ()) -> Design:
+def design(
+    spec: Specification,
+    condition: str = "theorem4",
+    starts: Sequence[SpringDamper] = (),
+    switching: tuple[Sequence[int], Sequence[int]] | None = None,
+) -> Design:
     """The best spring-damper under `condition`; by default the starts are chosen, a start need not be feasible.
 
     theorem4: minimises ||W1 L W2||_inf (23) over the exact set; the result does not depend on the start (the first
-    one is used). closed-loop: minimises the rms mismatch in this environment from every start, local optima only.
+    one is used). closed-loop: minimises the rms mismatch in this environment from every start, local optima only; with
+    `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it (design.jitter).
     Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for closed-loop.
     """
-    if condition == "theorem4":
+    if condition == "theorem4" and switching is None:
         return _for_any_environment(spec, starts[0] if starts else None)
     if condition == "closed-loop":
-        return _for_this_environment(spec, starts)
+        return _for_this_environment(spec, starts, switching)
+    if switching:
+        raise ValueError("delays that vary are designed for by the closed-loop condition only")
     raise ValueError(f"condition is {condition!r}, expected 'theorem4' or 'closed-loop'")
 
 
@@ -65,13 +75,19 @@ def _for_any_environment(spec: Specification, start: SpringDamper | None) -> Des
     return Design(coupling, "theorem4", "loop-norm", norm, requirement, sdps, time.perf_counter() - started, phi)
 
 
-def _for_this_environment(spec: Specification, starts: Sequence[SpringDamper]) -> Design:
-    started = time.perf_counter()
-    coupling, rms, searches = least_rms(spec, starts or _default_starts(spec))
+def _for_this_environment(
+    spec: Specification, starts: Sequence[SpringDamper], switching: tuple[Sequence[int], Sequence[int]] | None
+) -> Design:
+    started, starts = time.perf_counter(), starts or _default_starts(spec)
+    search = partial(least_rms_switching, spec, *switching) if switching else partial(least_rms, spec)
+    coupling, rms, searches = search(starts)
     if coupling is None:
+        certifies = "the closed-loop condition certifies"
+        if switching:
+            certifies += f" under any switching from {tuple(switching[0])} to {tuple(switching[1])} samples"
         line = (
-            f"no spring-damper was found that the closed-loop condition certifies for theta = {spec.theta}, psi = "
-            f"{spec.psi}, delta = {spec.delta}: use more device damping, less delay, or other starts"
+            f"no spring-damper was found that {certifies} for theta = {spec.theta}, psi = {spec.psi}, "
+            f"delta = {spec.delta}: use more device damping, less delay, or other starts"
         )
         raise DesignFailed(None, (), line)
     F = force_map(spec.environment, coupling, spec.theta, spec.psi)

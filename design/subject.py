@@ -15,6 +15,8 @@ from controller.environment import GROUND, Network, Spring, environment
 from controller.lti import Lti, SingularLoop
 from controller.process import force_map
 from design.assess import closed_loop_of, theorem4_of
+from design.jitter import JitterProof, jitter_proof, jitter_refusal
+from design.jitter_part import switching_requirement
 from design.margin import Requirement, closed_loop, refusal
 from design.store import Condition
 
@@ -67,6 +69,21 @@ class Subject:
         (K,), (B,) = self.coupling.K.tolist(), self.coupling.B.tolist()
         clamped = Network(("contact",), (Spring(("contact", GROUND), K, B),))
         return force_map(environment(clamped, self.T), NoCoupling(), self.theta, self.psi)
+
+    @property
+    def G(self) -> Lti:
+        """The forces as they leave for the devices: F without Theta. Raises SingularLoop."""
+        return replace(self, theta=(0,) * self.channels).F
+
+    def switching(self, lo: Sequence[int], hi: Sequence[int]) -> JitterProof:
+        """The damping that any switching of the forces' delays within [lo, hi] [samples] asks of the devices."""
+        try:
+            G = self.G
+        except SingularLoop as error:
+            return jitter_refusal(self.delta, str(error))
+        if self.network is None:
+            return jitter_proof(G, lo, hi, self.delta)
+        return switching_requirement(self.coupling, self.network, G, self.psi, lo, hi, self.delta)
 
     def requirement(self, condition: Condition) -> Requirement:
         """The damping that the condition asks of the devices."""

@@ -112,6 +112,21 @@ def numbers(option: str, text: str, kind: Callable[[str], Number], count: int) -
     return values
 
 
+def ranges(option: str, text: str, count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """'1,2' as the range of all channels, '1-2,0-3' as one per channel: (lows, highs). Raises InputError."""
+    parts = [part.split("-") for part in text.split(",")]
+    if len(parts) == 2 and all(len(part) == 1 for part in parts):
+        parts = [[parts[0][0], parts[1][0]]]
+    try:
+        pairs = [(int(lo), int(hi)) for lo, hi in parts]
+    except ValueError:
+        raise InputError(f"{option} is {text!r}, expected LO,HI or LO-HI,LO-HI,.. in whole samples") from None
+    if len(pairs) not in (1, count):
+        raise InputError(f"{option} has {len(pairs)} ranges, expected {count} (one per channel) or 1")
+    lows, highs = zip(*(pairs * count if len(pairs) == 1 else pairs), strict=True)
+    return lows, highs
+
+
 def seed_from(args: argparse.Namespace) -> int:
     """The seed, checked. Raises InputError."""
     (seed,) = numbers("--seed", args.seed, int, 1)

@@ -21,6 +21,7 @@ from sim.population import crowds_of
 from sim.scenario import Scenario
 from sim.simulate import Assembly, assemble
 from sim.stability import ClosedLoop
+from sim.switching_crowd import Switched, switched_crowd
 from sim.verdicts import disagree, dominant_modes, exact_loops, mujoco_loops
 
 BATCH = 125  # humans that are decided together; always the same ones, so that shards repeat the single run exactly
@@ -65,13 +66,16 @@ class Findings:
     settling: Array  # (n,) rms speed of the handles, last quarter over second quarter, exact trace
     mass: Array  # (n,) [kg] per set: geometric mean over channels of all mass
     damping: Array  # (n,) [N s/m] likewise of the least damping
+    switching: Array  # (n,) [1/s] growth of the linear loop under delays that vary; nan where they do not
+    switching_mujoco: Array  # (n,) [1/s] the same on MuJoCo's trace; nan also where that was clipped
     simulated: float  # [s] in all traces
     interrupted: bool = False
 
     @property
     def disagreements(self) -> NDArray[np.bool_]:
         """(n,) whether MuJoCo, on its map or on a trace, contradicts the exact loop."""
-        return disagree(self.exact, self.mujoco) | disagree(self.exact, self.trace)
+        switching = disagree(self.switching, self.switching_mujoco)
+        return disagree(self.exact, self.mujoco) | disagree(self.exact, self.trace) | switching
 
 
 def examine(question: Question, indices: Sequence[int], ticked: Callable[[int], None] = lambda ticks: None) -> Findings:
@@ -107,6 +111,11 @@ def _group(
     traces = _traces(question, assembly, held_by, loops, ticked) if question.ticks else []
     exact = next((t for name, t in traces if name == "exact"), None)
     last = traces[-1][1] if traces else None
+    switched = Switched(nowhere, nowhere)
+    if scenario.switches:
+        with_mujoco = question.engine != "exact" and question.ticks > 0
+        arguments = (held_by, index, question.seed, question.duration, with_mujoco, question.threads)
+        switched = switched_crowd(assembly, question.coupling, *arguments)
     return Findings(
         index=index,
         radius=modes.spectral_radius,
@@ -120,6 +129,8 @@ def _group(
         settling=exact.settling if exact else nowhere,
         mass=np.exp(np.log(crowd.links[..., 0].sum(axis=2)).mean(axis=1)),
         damping=np.exp(np.log(crowd.links[..., 1].min(axis=2)).mean(axis=1)),
+        switching=switched.exact,
+        switching_mujoco=switched.mujoco,
         simulated=sum(t.simulated for _, t in traces),
     )
 

@@ -21,9 +21,7 @@ class ManyProcesses(Tape):
         self._together = _linear(processes) if walls == 0 else _one_wall(processes) if walls == 1 else _each(processes)
 
     def tick(self, k: int) -> None:
-        if self._quantised:
-            self._quantise(self._measured[k])
-        self._together(self._input[k], self._output[k])
+        self._together(self.seen(k), self._output[k])
 
 
 def _linear(processes: Sequence[Process]) -> Transition:

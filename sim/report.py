@@ -13,7 +13,7 @@ from design.promises import ANY, CAVEATS, finite
 from sim.loop import Record
 from sim.one_period import frozen_modes, worst_mode
 from sim.simulate import Assembly
-from sim.stability import clipped_ticks, close, dominant_mode, measured_growth, verdict
+from sim.stability import Mode, clipped_ticks, close, dominant_mode, measured_growth, verdict
 
 
 def stability_part(assembly: Assembly, record: Record) -> dict[str, Any]:
@@ -34,14 +34,21 @@ def stability_part(assembly: Assembly, record: Record) -> dict[str, Any]:
         "verdict": "unstable" if record.diverged else None if growth is None else verdict(growth),
         "clipped_ticks": int(clipped_ticks(record, limit).sum()),
         "growth_rate_per_s": growth,
-        "frequency_hz": _dominant_frequency(record, assembly.scenario.T),
+        "frequency_hz": dominant_frequency(record, assembly.scenario.T),
+        **eigenvalue_part(mode),
+    }
+    part |= {"contact": contact} if contact else {}
+    return part | ({"reason": reason} if reason else {})
+
+
+def eigenvalue_part(mode: Mode) -> dict[str, Any]:
+    """What the eigenvalues of the exact loop say."""
+    return {
         "exact_verdict": mode.verdict,
         "exact_growth_rate_per_s": finite(mode.growth),
         "exact_frequency_hz": mode.frequency_hz,
         "spectral_radius": mode.spectral_radius,
     }
-    part |= {"contact": contact} if contact else {}
-    return part | ({"reason": reason} if reason else {})
 
 
 def contact_part(assembly: Assembly, record: Record) -> dict[str, Any]:
@@ -65,15 +72,21 @@ def contact_part(assembly: Assembly, record: Record) -> dict[str, Any]:
     }
 
 
-def error_part(record: Record, exact: Record | None, assembly: Assembly) -> dict[str, Any]:
-    """Device positions against the exact engine's closed loop, where there is one."""
+def error_part(
+    record: Record, exact: Record | None, assembly: Assembly, unstable: bool | None = None
+) -> dict[str, Any]:
+    """Device positions against the exact engine's closed loop, where there is one.
+
+    `unstable` where its eigenvalues do not say it.
+    """
     if exact is None:
         reason = "the exact engine is linear and has no Coulomb friction to compare with"
         return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
     limit, m = assembly.process.force_limit, assembly.process.channels
     n = min(record.s.shape[0], exact.s.shape[0])
     clipped = clipped_ticks(exact, limit)[:n] | clipped_ticks(record, limit)[:n]
-    unstable = worst_mode(assembly).verdict == "unstable"
+    if unstable is None:
+        unstable = worst_mode(assembly).verdict == "unstable"
     linear = int(np.argmax(clipped)) if unstable and clipped.any() else n
     relative, largest = _distance(record.s[:linear, :m], exact.s[:linear, :m])
     if linear == n:
@@ -103,6 +116,8 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
     for part in outcome["certificates"].values():
         if "reason" in part:
             lines.append(f"{part['condition']}: {part['reason']}.")
+    if outcome.get("jitter"):
+        lines.append(f"Delays that vary: {outcome['jitter']['covers']}.")
     return [*lines, CAVEATS]
 
 
@@ -113,7 +128,7 @@ def _distance(a: Array, b: Array) -> tuple[float | None, float | None]:
     return float(np.sqrt(np.mean((a - b) ** 2))) / size, float(np.abs(a - b).max())
 
 
-def _dominant_frequency(record: Record, T: float) -> float | None:
+def dominant_frequency(record: Record, T: float) -> float | None:
     """The strongest line above 10 Hz in the last quarter of the forces: what one hears and feels."""
     tail = record.f[-(record.f.shape[0] // 4) :, :, 0]
     if tail.shape[0] < 64:
@@ -169,7 +184,10 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     rows.append(("growth, eigenvalues", _growth(stability)))
     growth = stability["growth_rate_per_s"]
     measured = "-" if growth is None else f"{growth:+.4f} 1/s"
-    rows.append(("growth, simulated trace", f"{measured}: {_verdict(stability['verdict'])}"))
+    how = "growth, switching" if (report.get("jitter") or {}).get("verdict") else "growth, simulated trace"
+    rows.append((how, f"{measured}: {_verdict(stability['verdict'])}"))
+    if jitter := report.get("jitter"):
+        rows += varying(jitter)
     run = report["run"]
     if "contact" in stability:
         contact = stability["contact"]
@@ -202,6 +220,30 @@ def _walls(touching: list[int]) -> str:
     if not touching:
         return "no wall touching"
     return f"wall{'s' if len(touching) > 1 else ''} {', '.join(map(str, touching))} touching"
+
+
+def varying(jitter: dict[str, Any]) -> list[tuple[str, str]]:
+    """Rows about delays that vary, of a run or of a validation."""
+    spans = ", ".join(f"{lo} to {hi}" for lo, hi in zip(jitter["lo"], jitter["hi"], strict=True))
+    how = jitter["pattern"] + (", played out at the largest" if jitter["playout"] else "")
+    rows = [("delays", f"{spans} samples, {how}" + (f", {100 * jitter['loss']:g} % lost" if jitter["loss"] else ""))]
+    if age := jitter.get("age"):
+        met = zip(age["least"], age["largest"], age["mean"], strict=True)
+        rows.append(("age of the forces", "; ".join(f"{a} to {b}, mean {c:.2f}" for a, b, c in met) + " samples"))
+    if period := jitter.get("period"):
+        growth = f"{period['growth_rate_per_s']:+.4f} 1/s"
+        rows.append(
+            (
+                "worst switching found",
+                f"{growth} with a period of {period['ticks']} ticks: {_verdict(period['verdict'])}",
+            )
+        )
+    if proof := jitter.get("jitter_proof"):
+        exact = ", proved exactly" if proof["proof"] == "rational" else ""
+        word = f"[green]certified[/]{exact}" if proof["certified"] else "[red]not certified[/]"
+        needs = f"needs {_list(proof['required_damping'])} of {_list(proof['available_damping'])} N s/m: {word}"
+        rows.append(("damping, any switching", needs))
+    return [*rows, ("these delays covered", "[green]yes[/]" if jitter["covered"] else "[yellow]no[/]")]
 
 
 def _verdict(word: str | None) -> str:

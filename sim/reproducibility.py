@@ -13,7 +13,7 @@ Row = dict[str, str]
 
 def table(scenario: Scenario, case: str, outcome: dict[str, Any]) -> list[Row]:
     """Rows of {what, paper, here, why}; empty where the loop is not the paper's."""
-    if scenario.loop(case) != load().loop(case):
+    if scenario.jitter or scenario.loop(case) != load().loop(case):
         return []
     figure = _figure(case, outcome["stability"])
     return [figure] if case == "none" else [*_gains(scenario, case, outcome), _tau(case), figure]

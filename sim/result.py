@@ -43,7 +43,8 @@ class Result:
         s = record.s[:, :, 0]
         n = s.shape[1] // 2
         t = np.arange(s.shape[0]) * assembly.scenario.T
-        return cls(t, s[:, :m], record.f[:, :, 0], s[:, handles], s[:, n:][:, handles], record.w[:, :, 0], meta)
+        x = assembly.process.measured(s[:, :m])
+        return cls(t, x, record.f[:, :, 0], s[:, handles], s[:, n:][:, handles], record.w[:, :, 0], meta)
 
     def save_npz(self, path: Path) -> Path:
         """Arrays and metadata (as JSON text), compressed, without pickle."""

@@ -14,7 +14,7 @@ from design.assess import CONDITIONS, assess
 from design.promises import certificate_part, promise_of
 from design.summary import coupling_part, transparency_part
 from design.transparency import transparency
-from sim import report, reproducibility
+from sim import jitter_report, report, reproducibility
 from sim.command import (
     DONE,
     INTERRUPTED,
@@ -30,20 +30,23 @@ from sim.command import (
     seed_from,
 )
 from sim.couplings import NAMES, Chosen, choose
+from sim.drawn import switching
 from sim.files import write, write_json
 from sim.human_file import load_humans
+from sim.jitter_options import add_jitter_options, with_jitter
 from sim.loop import Record
 from sim.mujoco_engine import INTEGRATORS, LEAPFROG
 from sim.result import Result
 from sim.scenario import InputError
 from sim.simulate import ENGINES, Assembly, assemble, simulate
 from sim.substeps import LEAST, MOST, check_substeps, default_substeps
+from sim.worst_switching import Period
 
 
 def main(argv: list[str]) -> int:
     """Simulate and report. 0: the run was completed, stable or not; 130: interrupted."""
     args = _parser().parse_args(argv)
-    scenario = scenario_from(args)
+    scenario = with_jitter(args, scenario_from(args))
     if args.duration is not None:
         scenario = scenario.replace(duration=numbers("--duration", args.duration, float, 1)[0])
     if args.human is not None:
@@ -51,9 +54,11 @@ def main(argv: list[str]) -> int:
         scenario = scenario.replace(human=people.human, person=people.person)
     asked, seed, out = _substeps(args), seed_from(args), out_folder(args, "run")
     chosen = choose(scenario, args.case, args.coupling, args.condition)
-    assembly = assemble(scenario, chosen.coupling)
+    assembly, period = assemble(scenario, chosen.coupling), None
     if args.engine == "exact" and assembly.friction:
         raise InputError("--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco")
+    if scenario.switches:
+        assembly, period = switching(assembly, chosen.coupling, seed, scenario.samples)
     substeps, warnings = _settled(args, assembly, asked)
 
     with (bar := progress_bar("simulating"))[0]:
@@ -62,7 +67,7 @@ def main(argv: list[str]) -> int:
         wall = time.perf_counter() - begin
     exact = record if args.engine == "exact" else _exact(assembly, record)
 
-    outcome = _outcome(args, chosen, assembly, record, exact, wall)
+    outcome = _outcome(args, chosen, assembly, period, record, exact, wall)
     outcome["run"] |= {"substeps": substeps, "seed": seed}
     outcome["remarks"] = [*warnings, *outcome["remarks"]]
     outcome["files"] = [str(p) for p in _save(args, out, assembly, record, outcome)]
@@ -82,6 +87,7 @@ def _parser() -> Parser:
         "sim.run", "Close the loop once and report stability, transparency and error.", "python -m sim.run --case none"
     )
     add_loop_options(parser)
+    add_jitter_options(parser)
     names = ", ".join(NAMES)
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
@@ -120,13 +126,24 @@ def _settled(args: argparse.Namespace, assembly: Assembly, asked: int | None) ->
 
 
 def _outcome(
-    args: argparse.Namespace, chosen: Chosen, assembly: Assembly, record: Record, exact: Record | None, wall: float
+    args: argparse.Namespace,
+    chosen: Chosen,
+    assembly: Assembly,
+    period: Period | None,
+    record: Record,
+    exact: Record | None,
+    wall: float,
 ) -> dict[str, Any]:
     scenario, samples = assembly.scenario, record.s.shape[0]
     loop = scenario.loop(args.case)
     requirements = assess(loop, chosen.coupling, chosen.phi)
     certificates = {name: certificate_part(requirement) for name, requirement in requirements.items()}
     simulated = samples * scenario.T
+    certified = any(requirement.certified for requirement in requirements.values())
+    jitter, stability, unstable = jitter_report.part(assembly, chosen.coupling, period, samples, certified), None, None
+    if jitter and scenario.switches:
+        stability = jitter_report.stability_part(assembly, record, jitter)
+        unstable = stability["verdict"] == "unstable"
     mujoco = args.engine == "mujoco"
     outcome = {
         "case": args.case,
@@ -136,7 +153,8 @@ def _outcome(
         "certificates": certificates,
         "promise": promise_of(requirements, loop),
         "transparency": transparency_part(transparency(assembly.felt, assembly.E, loop.lam)),
-        "stability": report.stability_part(assembly, record),
+        "stability": stability or report.stability_part(assembly, record),
+        "jitter": jitter,
         "run": {
             "engine": args.engine,
             "integrator": args.integrator if mujoco else None,
@@ -151,7 +169,7 @@ def _outcome(
             "interrupted": record.interrupted,
             "scenario_digest": scenario.digest,
         },
-        "error": report.error_part(record, exact, assembly),
+        "error": report.error_part(record, exact, assembly, unstable),
     }
     outcome["reproducibility"] = reproducibility.table(scenario, args.case, outcome)
     return outcome | {"remarks": [*chosen.notes, *report.remarks(outcome)]}
@@ -172,6 +190,8 @@ def _save(
         stability = outcome["stability"]
         with_what = "no virtual coupling" if args.case == "none" else f"{outcome['coupling']['kind']} coupling"
         growth = f"growth {stability['exact_growth_rate_per_s']:+.3f} 1/s at {stability['exact_frequency_hz']:.1f} Hz"
+        if assembly.scenario.jitter and assembly.scenario.switches:
+            growth = f"{outcome['jitter']['pattern']} delays, {stability['verdict']}"
         title = f"{outcome['scenario']}, case {args.case}, {with_what}: {growth}"
         files.append(plot_run(result, out / "figure.png", title, stability["exact_frequency_hz"]))
     files.append(out / "report.json")

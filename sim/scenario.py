@@ -13,6 +13,7 @@ from typing import Any, Self, get_args
 import msgspec
 
 from controller.environment import Network, Spring, Wall, environment
+from controller.jitter import Jitter
 from design.store import Loop
 from models.device import Device, passivity_level, with_damping
 from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
@@ -59,6 +60,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tap: Tap | None = None
     duration: float = 15.0  # [s]
     population: Population = Population()  # who `validate` draws
+    jitter: Jitter | None = None  # how the delays of the forces vary around theta; None where they do not
 
     def __post_init__(self) -> None:
         require("T", self.T, 1e-6, 0.1, "s")
@@ -75,12 +77,30 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 total = self.theta[i] + self.psi[i]
                 raise ValueError(f"lam[{i}] is {lam}, allowed are 0 to theta + psi = {total} samples")
         check_holds(self.person, self.channels)
+        if self.jitter:
+            self._check_jitter(self.jitter)
         if self.tap and not 1 <= self.tap.channel <= self.channels:
             raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
+
+    def _check_jitter(self, jitter: Jitter) -> None:
+        if jitter.channels != self.channels:
+            raise ValueError(f"jitter has {jitter.channels} ranges for {self.channels} channels")
+        if self.environment.walls:
+            raise ValueError("jitter and environment.walls: what switching delays do is judged for linear loops only")
+        for i, (n, lo, hi) in enumerate(zip(self.theta, jitter.lo, jitter.hi, strict=True)):
+            if jitter.playout and n != hi:
+                raise ValueError(f"theta[{i}] is {n}, but jitter.playout makes it the largest delay, {hi}")
+            if not lo <= n <= hi:
+                raise ValueError(f"theta[{i}] is {n}, outside of its jitter, {lo} to {hi} samples")
 
     @property
     def channels(self) -> int:
         return len(self.environment.contacts)
+
+    @property
+    def switches(self) -> bool:
+        """Whether the delay of the forces is anything but the constant theta."""
+        return self.jitter is not None and not self.jitter.steady
 
     @property
     def delta(self) -> tuple[float, ...]:
@@ -185,4 +205,6 @@ def _hint(what: str) -> str:
     return ""
 
 
-_STRUCTS = (Scenario, Tap, Human, Link, Voluntary, Person, Cross, Population, Network, Spring, Wall, *get_args(Device))
+_STRUCTS = (
+    Scenario, Tap, Jitter, Human, Link, Voluntary, Person, Cross, Population, Network, Spring, Wall, *get_args(Device)
+)  # fmt: skip

@@ -13,7 +13,7 @@ from design.assess import CONDITIONS, assess
 from design.margin import Requirement
 from design.promises import certificate_part
 from design.summary import coupling_part
-from sim import verdict_report
+from sim import jitter_report, verdict_report
 from sim.adversary import Worst, search
 from sim.cluster import validate_on_cluster
 from sim.command import (
@@ -36,6 +36,7 @@ from sim.couplings import NAMES, Chosen, choose
 from sim.examine import ENGINES, Findings, Question
 from sim.files import write_json
 from sim.human_file import save_humans
+from sim.jitter_options import add_jitter_options, with_jitter
 from sim.population import MIXED, crowd_of
 from sim.scenario import InputError, Scenario
 from sim.shards import validate
@@ -47,7 +48,7 @@ LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 def main(argv: list[str]) -> int:
     """Meet random humans. 0: the claims hold, 1: not, 130: interrupted."""
     args = _parser().parse_args(argv)
-    scenario = scenario_from(args)
+    scenario = with_jitter(args, scenario_from(args))
     require_linear(scenario, "sim.validate")
     humans, shards = _whole(args, "humans", 1_000_000), _shards(args)
     seed, duration, generations = seed_from(args), _duration(args, scenario), _whole(args, "generations", 10_000)
@@ -66,6 +67,9 @@ def main(argv: list[str]) -> int:
             findings = validate(question, shards, bar[1])
         wall = time.perf_counter() - begin
     outcome = _outcome(args, scenario, chosen, requirements, question, findings, certified, wall)
+    if scenario.jitter:
+        outcome["switching"] = _switching(scenario, chosen, findings, certified)
+        outcome["holds"] = outcome["holds"] and outcome["switching"]["holds"]
     worst = (
         _attack(scenario, chosen, seed, generations, outcome) if args.adversary and not findings.interrupted else None
     )
@@ -89,6 +93,7 @@ def _parser() -> Parser:
         "python -m sim.validate --case I --humans 200 --adversary",
     )
     add_loop_options(parser)
+    add_jitter_options(parser)
     names = ", ".join(NAMES)
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
@@ -136,6 +141,13 @@ def _attack(scenario: Scenario, chosen: Chosen, seed: int, generations: int, out
     except KeyboardInterrupt:
         outcome["interrupted"] = True
         return None
+
+
+def _switching(scenario: Scenario, chosen: Chosen, findings: Findings, certified: bool) -> dict[str, Any]:
+    """What delays that vary did to these humans, and whether that contradicts what is certified of them."""
+    assert scenario.jitter is not None
+    covered = jitter_report.certified_part(assemble(scenario, chosen.coupling), chosen.coupling, certified)
+    return verdict_report.switching_part(findings, jitter_report.range_part(scenario.jitter) | covered)
 
 
 def _outcome(

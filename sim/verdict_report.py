@@ -15,6 +15,7 @@ from models.human import Human, Person
 from sim.adversary import Worst
 from sim.examine import Findings, Question
 from sim.population import MIXED, crowd_of
+from sim.report import varying
 from sim.verdicts import unstable
 
 ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
@@ -49,6 +50,22 @@ def outcome(question: Question, findings: Findings, certified: bool, wall: float
         part["energy_audit"] = _energy(findings)
         part["holds"] = part["holds"] and part["energy_audit"]["holds"]
     return part
+
+
+def switching_part(findings: Findings, covered: dict[str, Any]) -> dict[str, Any]:
+    """How many humans grow under delays that vary; it holds unless certificates cover these delays and one grows."""
+    exact, mujoco = findings.switching, findings.switching_mujoco
+    seen = np.isfinite(exact) | np.isinf(exact)
+    unstable, also = int((exact[seen] > 0).sum()), mujoco[~np.isnan(mujoco)]
+    worst = int(np.nanargmax(exact)) if seen.any() else None
+    return covered | {
+        "unstable": {"exact": unstable, "mujoco": int((also > 0).sum()) if also.size else None},
+        "humans": int(seen.sum()),
+        "mujoco_unclipped": int(also.size),
+        "largest_growth_per_s": None if worst is None else finite(float(exact[worst])),
+        "worst_index": None if worst is None else int(findings.index[worst]),
+        "holds": not (covered["covered"] and unstable),
+    }
 
 
 def adversary_part(worst: Worst, ratio: float, certified: bool) -> dict[str, Any]:
@@ -135,6 +152,8 @@ def print_verdicts(report: dict[str, Any], console: Console) -> None:
     for name, value in _rows(report):
         table.add_row(name, value)
     console.print(table)
+    if switching := report.get("switching"):
+        console.print(f"[dim]·[/] Delays that vary: {switching['covers']}.")
 
 
 def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
@@ -165,6 +184,8 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
                 f"{audit['audited'] - audit['violated']} of {audit['audited']}, {audit['clipped']} clipped left out",
             )
         )
+    if switching := report.get("switching"):
+        rows += _switching_rows(switching)
     if adversary := report.get("adversary"):
         found = (
             f"a human that grows at {adversary['growth_rate_per_s']:+.4g} 1/s"
@@ -177,4 +198,16 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     rows.append(("certified", "yes" if report["certified"] else "no"))
     rows.append(("holds", "[green]yes[/]" if report["holds"] else "[red]no[/]"))
     rows.append(("time", f"{report['wall_s']:.1f} s, {report['simulated_s_per_s']:.0f} simulated seconds per second"))
+    return rows
+
+
+def _switching_rows(switching: dict[str, Any]) -> list[tuple[str, str]]:
+    rows = varying(switching)
+    if switching["humans"]:
+        mujoco = switching["unstable"]["mujoco"]
+        also = "" if mujoco is None else f", MuJoCo {mujoco} of {switching['mujoco_unclipped']} unclipped"
+        growth = switching["largest_growth_per_s"]
+        worst = "" if growth is None else f"; worst {growth:+.4g} 1/s (index {switching['worst_index']})"
+        grow = f"{switching['unstable']['exact']} of {switching['humans']} exact{also}{worst}"
+        rows.append(("grow while delays vary", grow))
     return rows

@@ -102,6 +102,15 @@ def test_encoders_round_to_whole_steps():
     np.testing.assert_allclose(f[:, 0], [0.0, 1.0, -2.0], atol=1e-12)
 
 
+def test_encoders_do_not_move_the_device():
+    """What the loop sees is rounded, where the device is stays: else a free device would creep from step to step."""
+    tape = Tape(process(wall(1000.0), step=1e-3), 2, 2)
+    tape.x[0] = 0.6e-3
+    tape.tick(0)
+    assert tape.f[0, 0, 0] == pytest.approx(1.0)
+    assert tape.x[0, 0, 0] == 0.6e-3
+
+
 @pytest.mark.parametrize(
     ("build", "message"),
     [
