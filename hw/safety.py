@@ -1,0 +1,134 @@
+"""What the host never does to a device, whatever the controller says: pure functions, no clock, no port.
+
+Order matters. A number that is not finite is found before any clamping, because max(-12, min(12, nan)) is +12.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from controller.lti import Array
+from models.quantity import require
+
+
+class Phase(StrEnum):
+    """Where a session stands. From the last five there is no way back but a new session."""
+
+    CONNECTING = "connecting"  # HELLO sent, no INFO yet
+    CONFIGURING = "configuring"  # CONFIG sent, no ACK yet
+    MEASURING = "measuring"  # zero force: the age of every answer is collected
+    MEASURED = "measured"  # zero force: waiting for a coupling that is certified for what was measured
+    DISARMED = "disarmed"  # zero force: waiting for a person
+    ARMING = "arming"  # the gain rises
+    ARMED = "armed"
+    DISARMING = "disarming"  # the gain falls
+    FINISHED = "finished"  # ended as planned
+    REFUSED = "refused"  # this device, link or coupling may not be armed
+    STOPPED = "stopped"  # a fault
+    LOST = "lost"  # the device does not answer, or is gone
+    ESTOP = "e-stop"
+
+
+ENDED = frozenset({Phase.FINISHED, Phase.REFUSED, Phase.STOPPED, Phase.LOST, Phase.ESTOP})
+DRIVING = frozenset({Phase.ARMING, Phase.ARMED, Phase.DISARMING})
+
+
+class Fault(Exception):
+    """A reason to stop, in the words of the log."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The host's own limits; the device has the same ones in its firmware."""
+
+    cap: tuple[float, ...]  # (m,) [N] largest force
+    slew: float = 2000.0  # [N/s] fastest change of a force
+    jump: float = 3e-3  # [m] largest displacement from tick to tick: 2.5 m/s at T = 1.2 ms
+    watchdog_us: int = 6000  # [us] longest silence of a device that is streaming
+    ramp_in: float = 0.25  # [s] in which the gain rises from 0 to 1
+    ramp_out: float = 0.1  # [s] in which it falls
+
+    def __post_init__(self) -> None:
+        for i, cap in enumerate(self.cap):
+            require(f"cap[{i}]", cap, 1e-3, 12.0, "N")
+        require("slew", self.slew, 1.0, 2000.0, "N/s")
+        require("jump", self.jump, 1e-6, 3e-3, "m")
+        require("watchdog_us", self.watchdog_us, 1000, 20000, "us")
+        require("ramp_in", self.ramp_in, 0.1, 0.25, "s")
+        require("ramp_out", self.ramp_out, 0.1, 0.25, "s")
+
+
+@dataclass(frozen=True)
+class Shaped:
+    """A force that may be sent, and what had to be done to it."""
+
+    force: Array  # (m,) [N]
+    clipped: bool  # at the cap
+    slowed: bool  # at the slew limit
+
+
+def require_finite(force: Array) -> None:
+    """Raise Fault where a force is not a number or infinite."""
+    if not np.isfinite(force).all():
+        raise Fault(f"the controller asked for {_list(force)} N, which is no force")
+
+
+def shape(asked: Array, previous: Array, gain: float, limits: Limits, T: float) -> Shaped:
+    """The force to send in place of `asked` (m,) [N], after `previous` (m,) [N], at a gain within [0, 1].
+
+    Raises Fault where `asked` is not finite; that is looked at first, and the result is looked at again.
+    """
+    require_finite(asked)
+    if not 0.0 <= gain <= 1.0:
+        raise Fault(f"the gain is {gain}, expected a number within [0, 1]")
+    cap, step = np.array(limits.cap), limits.slew * T
+    wanted = gain * asked
+    capped = np.clip(wanted, -cap, cap)
+    force = np.clip(capped, previous - step, previous + step)
+    require_finite(force)
+    return Shaped(force, bool((np.abs(wanted) > cap).any()), bool((np.abs(capped - previous) > step).any()))
+
+
+def check_jump(x: Array, previous: Array, ticks: int, limits: Limits) -> None:
+    """Raise Fault where an encoder moved further in `ticks` ticks than a hand can: x, previous (m,) [m]."""
+    moved = np.abs(x - previous)
+    if (moved > limits.jump * ticks).any():
+        i = int(np.argmax(moved))
+        allowed = f"{1e3 * limits.jump * ticks:g} mm in {ticks} tick{'s' if ticks > 1 else ''}"
+        raise Fault(f"encoder {i + 1} jumped by {1e3 * moved[i]:.3g} mm, allowed are {allowed}")
+
+
+def check_range(x: Array, reach: Array) -> None:
+    """Raise Fault where a displacement x (m,) [m] is outside of what the device can reach: +-reach (m,) [m]."""
+    if (np.abs(x) > reach).any():
+        i = int(np.argmax(np.abs(x) - reach))
+        raise Fault(f"encoder {i + 1} is at {1e3 * x[i]:.4g} mm, its range is +-{1e3 * reach[i]:.4g} mm")
+
+
+@dataclass
+class Gain:
+    """The factor in front of every force. It moves linearly in time, never jumps, and starts at 0.
+
+    Any gain within [0, 1] keeps a certificate: the conditions ask He[g F/(z-1)] > -Delta_D/T, and g F does so if F does.
+    """
+
+    limits: Limits
+    T: float  # [s]
+    value: float = 0.0
+
+    def rise(self, ticks: int = 1) -> float:
+        """The gain `ticks` ticks later, on its way to 1."""
+        self.value = min(1.0, self.value + ticks * self.T / self.limits.ramp_in)
+        return self.value
+
+    def fall(self, ticks: int = 1) -> float:
+        """The gain `ticks` ticks later, on its way to 0."""
+        self.value = max(0.0, self.value - ticks * self.T / self.limits.ramp_out)
+        return self.value
+
+
+def _list(values: Array) -> str:
+    return ", ".join(f"{v:g}" for v in values)
