@@ -14,7 +14,7 @@ from controller.lti import Array
 from models.quantity import require
 
 
-class Phase(StrEnum):
+class Stage(StrEnum):
     """Where a session stands. From the last five there is no way back but a new session."""
 
     CONNECTING = "connecting"  # HELLO sent, no INFO yet
@@ -32,8 +32,8 @@ class Phase(StrEnum):
     ESTOP = "e-stop"
 
 
-ENDED = frozenset({Phase.FINISHED, Phase.REFUSED, Phase.STOPPED, Phase.LOST, Phase.ESTOP})
-DRIVING = frozenset({Phase.ARMING, Phase.ARMED, Phase.DISARMING})
+ENDED = frozenset({Stage.FINISHED, Stage.REFUSED, Stage.STOPPED, Stage.LOST, Stage.ESTOP})
+DRIVING = frozenset({Stage.ARMING, Stage.ARMED, Stage.DISARMING})
 
 
 class Fault(Exception):
