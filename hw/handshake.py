@@ -39,9 +39,9 @@ class Units:
         """Forces fed back f (m,) [N], from what the motors do."""
         return -np.array(steps) * self.force_step
 
-    def steps(self, f: Array) -> tuple[int, ...]:
-        """What the motors are to do for the forces fed back f (m,) [N]: rounded towards zero."""
-        return tuple(int(n) for n in -f / self.force_step)
+    def steps(self, f: Array, cap: tuple[int, ...]) -> tuple[int, ...]:
+        """What the motors are to do for the forces fed back f (m,) [N]: whole steps, at most `cap`."""
+        return tuple(max(-c, min(c, round(n))) for n, c in zip((-f / self.force_step).tolist(), cap, strict=True))
 
 
 def wire_time(baud: int, axes: int) -> tuple[float, str]:
