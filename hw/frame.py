@@ -81,6 +81,8 @@ def wire_bytes(kind: type, axes: int) -> int:
 
 def encode(message: Message) -> bytes:
     """The frame of a message. Raises ValueError that names the field, what it held and what it may hold."""
+    if type(message) in CHECKED:
+        check(message)
     payload = pack(message)
     raw = payload + crc32(payload).to_bytes(4, "little")
     return b"".join([CODES[len(block)] + block for block in raw.split(b"\0")]) + b"\0"
@@ -94,8 +96,6 @@ def pack(message: Message) -> bytes:
     """The payload of a message."""
     kind = type(message)
     layout = LAYOUTS[kind]
-    if kind in CHECKED:
-        check(message)
     values: Any = message
     if isinstance(message, Info):
         values = (message.version, message.firmware.encode("ascii"), *message[2:])
