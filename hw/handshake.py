@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
-from controller.lti import Array
 from hw.frame import Config, Force, Info, State, wire_bytes
 from hw.message import MAX_RELEASE_NS, MAX_THETA, PROTOCOL
 from hw.safety import Limits
@@ -18,30 +16,34 @@ LARGEST_MARGIN_US = 30_000  # an age is read from a margin, which is an i16 in m
 HOLD, RAMP_US = 4, 5000  # what the device does without answers: ticks held, then microseconds to zero
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Units:
     """Integers of the wire to SI units and back. The wire carries what the motor does, -f."""
 
-    encoder_step: Array  # (m,) [m]
-    force_step: Array  # (m,) [N]
-    reach: Array  # (m,) [m]
+    encoder_step: tuple[float, ...]  # (m,) [m]
+    force_step: tuple[float, ...]  # (m,) [N]
+    reach: tuple[float, ...]  # (m,) [m]
 
     @classmethod
     def of(cls, info: Info) -> Units:
-        encoder = 1e-12 * np.array(info.encoder_step, dtype=float)
-        return cls(encoder, 1e-6 * np.array(info.force_step, dtype=float), encoder * np.array(info.range))
+        encoder = tuple(1e-12 * step for step in info.encoder_step)
+        reach = tuple(step * counts for step, counts in zip(encoder, info.range, strict=True))
+        return cls(encoder, tuple(1e-6 * step for step in info.force_step), reach)
 
-    def positions(self, counts: tuple[int, ...]) -> Array:
+    def positions(self, counts: tuple[int, ...]) -> tuple[float, ...]:
         """Displacements (m,) [m]."""
-        return np.array(counts) * self.encoder_step
+        return tuple(n * step for n, step in zip(counts, self.encoder_step, strict=True))
 
-    def forces(self, steps: tuple[int, ...]) -> Array:
+    def forces(self, steps: tuple[int, ...]) -> tuple[float, ...]:
         """Forces fed back f (m,) [N], from what the motors do."""
-        return -np.array(steps) * self.force_step
+        return tuple(-n * step for n, step in zip(steps, self.force_step, strict=True))
 
-    def steps(self, f: Array, cap: tuple[int, ...]) -> tuple[int, ...]:
+    def steps(self, f: Sequence[float], cap: tuple[int, ...]) -> tuple[int, ...]:
         """What the motors are to do for the forces fed back f (m,) [N]: whole steps, at most `cap`."""
-        return tuple(max(-c, min(c, round(n))) for n, c in zip((-f / self.force_step).tolist(), cap, strict=True))
+        return tuple(
+            max(-most, min(most, round(-force / step)))
+            for force, step, most in zip(f, self.force_step, cap, strict=True)
+        )
 
 
 def wire_time(baud: int, axes: int) -> tuple[float, str]:
@@ -89,14 +91,14 @@ def configuration(info: Info, limits: Limits, theta: int) -> Config:
     """What the device is told: never more than the host allows itself, nor than the device can do."""
     T_ns = info.period_ns
     hold = min(HOLD, (MAX_RELEASE_NS - 1000 * RAMP_US) // T_ns)
-    step = 1e-6 * np.array(info.force_step, dtype=float)
-    cap = np.minimum(np.floor(np.array(limits.cap) / step + 1e-9), info.hard_limit).astype(int)
-    slew = np.clip(np.ceil(limits.slew * 1e-9 * T_ns / step), 1, 0xFFFF).astype(int)
+    steps = [1e-6 * step for step in info.force_step]
+    most = [int(cap / step + 1e-9) for cap, step in zip(limits.cap, steps, strict=True)]
+    slew = [min(0xFFFF, math.ceil(limits.slew * 1e-9 * T_ns / step)) for step in steps]
     return Config(
         theta=theta,
         hold=max(0, hold),
         ramp=max(1, min(0xFF, math.ceil(1000 * RAMP_US / T_ns))),
         ramp_in=min(0xFFFF, math.ceil(1e9 * limits.ramp_in / T_ns)),
-        cap=tuple(int(n) for n in cap),
-        slew=tuple(int(n) for n in slew),
+        cap=tuple(map(min, info.hard_limit, most)),
+        slew=tuple(slew),
     )

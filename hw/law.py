@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
@@ -19,7 +20,7 @@ class Law:
         self._input, self._output = np.zeros(n + m), np.zeros(n + F.outputs)
         self._order = n
 
-    def step(self, x: Array) -> Array:
+    def step(self, x: Sequence[float]) -> Array:
         """Forces (m,) [N] for the displacements x (m,) [m]; the state moves on by one tick."""
         n = self._order
         self._input[n:] = x
@@ -32,11 +33,10 @@ class Law:
         return type(self)(self.F)
 
 
-def fill(previous: Array, x: Array, ticks: int) -> list[Array]:
+def fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tuple[float, ...]]:
     """Displacements for `ticks` ticks of which only the last was received: a straight line from `previous` to x.
 
     A step would look to a damper like a blow of (dx/T) times its B.
     """
-    if ticks == 1:
-        return [x]
-    return [previous + (x - previous) * (i / ticks) for i in range(1, ticks)] + [x]
+    line = [tuple(a + (b - a) * (i / ticks) for a, b in zip(previous, x, strict=True)) for i in range(1, ticks)]
+    return [*line, tuple(x)]

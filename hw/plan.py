@@ -18,6 +18,7 @@ from design.failure import DesignFailed
 from design.margin import Requirement
 from design.promises import certificate_part, promise_of
 from design.summary import coupling_part
+from hw.message import MAX_THETA
 from hw.safety import Fault
 from sim.couplings import Chosen, choose
 from sim.scenario import InputError, Scenario
@@ -79,6 +80,8 @@ def rung(scenario: Scenario, case: str, name: str | None, condition: str | None,
 
     Raises Fault where no coupling is certified for it, InputError where the request contradicts itself.
     """
+    if link > MAX_THETA:
+        raise Fault(f"the link takes {link} ticks, the protocol carries at most theta = {MAX_THETA}")
     slower = scenario.replace(theta=tuple(max(n, link) for n in scenario.theta))
     least = min(slower.theta)
     try:

@@ -5,12 +5,11 @@ Order matters. A number that is not finite is found before any clamping, because
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-import numpy as np
-
-from controller.lti import Array
 from models.quantity import require
 
 
@@ -65,18 +64,18 @@ class Limits:
 class Shaped:
     """A force that may be sent, and what had to be done to it."""
 
-    force: Array  # (m,) [N]
+    force: tuple[float, ...]  # (m,) [N]
     clipped: bool  # at the cap
     slowed: bool  # at the slew limit
 
 
-def require_finite(force: Array) -> None:
+def require_finite(force: Sequence[float]) -> None:
     """Raise Fault where a force is not a number or infinite."""
-    if not np.isfinite(force).all():
-        raise Fault(f"the controller asked for {_list(force)} N, which is no force")
+    if not all(map(math.isfinite, force)):
+        raise Fault(f"the controller asked for {', '.join(f'{f:g}' for f in force)} N, which is no force")
 
 
-def shape(asked: Array, previous: Array, gain: float, limits: Limits, T: float) -> Shaped:
+def shape(asked: Sequence[float], previous: Sequence[float], gain: float, limits: Limits, T: float) -> Shaped:
     """The force to send in place of `asked` (m,) [N], after `previous` (m,) [N], at a gain within [0, 1].
 
     Raises Fault where `asked` is not finite; that is looked at first, and the result is looked at again.
@@ -84,35 +83,37 @@ def shape(asked: Array, previous: Array, gain: float, limits: Limits, T: float) 
     require_finite(asked)
     if not 0.0 <= gain <= 1.0:
         raise Fault(f"the gain is {gain}, expected a number within [0, 1]")
-    cap, step = np.array(limits.cap), limits.slew * T
-    wanted = gain * asked
-    capped = np.clip(wanted, -cap, cap)
-    force = np.clip(capped, previous - step, previous + step)
+    step, clipped, slowed, force = limits.slew * T, False, False, []
+    for wanted, last, cap in zip(asked, previous, limits.cap, strict=True):
+        capped = max(-cap, min(cap, gain * wanted))
+        sent = max(last - step, min(last + step, capped))
+        clipped |= capped != gain * wanted
+        slowed |= sent != capped
+        force.append(sent)
     require_finite(force)
-    return Shaped(force, bool((np.abs(wanted) > cap).any()), bool((np.abs(capped - previous) > step).any()))
+    return Shaped(tuple(force), clipped, slowed)
 
 
-def check_jump(x: Array, previous: Array, ticks: int, limits: Limits) -> None:
+def check_jump(x: Sequence[float], previous: Sequence[float], ticks: int, limits: Limits) -> None:
     """Raise Fault where an encoder moved further in `ticks` ticks than a hand can: x, previous (m,) [m]."""
-    moved = np.abs(x - previous)
-    if (moved > limits.jump * ticks).any():
-        i = int(np.argmax(moved))
-        allowed = f"{1e3 * limits.jump * ticks:g} mm in {ticks} tick{'s' if ticks > 1 else ''}"
-        raise Fault(f"encoder {i + 1} jumped by {1e3 * moved[i]:.3g} mm, allowed are {allowed}")
+    for i, (now, before) in enumerate(zip(x, previous, strict=True), start=1):
+        if not abs(now - before) <= limits.jump * ticks:
+            allowed = f"{1e3 * limits.jump * ticks:g} mm in {ticks} tick{'s' if ticks > 1 else ''}"
+            raise Fault(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
 
 
-def check_range(x: Array, reach: Array) -> None:
+def check_range(x: Sequence[float], reach: Sequence[float]) -> None:
     """Raise Fault where a displacement x (m,) [m] is outside of what the device can reach: +-reach (m,) [m]."""
-    if (np.abs(x) > reach).any():
-        i = int(np.argmax(np.abs(x) - reach))
-        raise Fault(f"encoder {i + 1} is at {1e3 * x[i]:.4g} mm, its range is +-{1e3 * reach[i]:.4g} mm")
+    for i, (now, most) in enumerate(zip(x, reach, strict=True), start=1):
+        if not abs(now) <= most:
+            raise Fault(f"encoder {i} is at {1e3 * now:.4g} mm, its range is +-{1e3 * most:.4g} mm")
 
 
 @dataclass
 class Gain:
     """The factor in front of every force. It moves linearly in time, never jumps, and starts at 0.
 
-    Any gain within [0, 1] keeps a certificate: the conditions ask He[g F/(z-1)] > -Delta_D/T, and g F does so if F does.
+    Any constant gain within [0, 1] keeps a certificate: He[g F/(z-1)] > -Delta_D/T holds for g F if it does for F.
     """
 
     limits: Limits
@@ -128,7 +129,3 @@ class Gain:
         """The gain `ticks` ticks later, on its way to 0."""
         self.value = max(0.0, self.value - ticks * self.T / self.limits.ramp_out)
         return self.value
-
-
-def _list(values: Array) -> str:
-    return ", ".join(f"{v:g}" for v in values)

@@ -13,15 +13,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-
-from controller.lti import Array
+from hw.drive import Drive, Row
 from hw.frame import Ack, Config, Decoder, Force, Hello, Info, Message, State, Stop, config_crc, encode
 from hw.handshake import Units, configuration, objections, probe_delay
-from hw.law import Law, fill
 from hw.message import Command, Phase, Reason, Refused
 from hw.plan import Ages, Rung
-from hw.safety import DRIVING, ENDED, Fault, Gain, Limits, Stage, check_jump, check_range, shape
+from hw.safety import DRIVING, ENDED, Fault, Limits, Stage
 from hw.watch import FRESH, Counters, LinkWatch
 from sim.scenario import Scenario
 
@@ -49,22 +46,10 @@ class Event(NamedTuple):
     cause: str
 
 
-class Row(NamedTuple):
-    """One tick of a trace. Where `received` is False, x is filled in and nothing was sent."""
-
-    tick: int
-    received: bool
-    x: Array  # (m,) [m]
-    asked: Array  # (m,) [N] by the controller
-    gain: float
-    sent: tuple[int, ...]  # [steps]
-    state: State | None
-
-
 class Session:
     """The host's side of the link."""
 
-    def __init__(self, scenario: Scenario, limits: Limits, settings: Settings = Settings()) -> None:  # noqa: B008 (frozen)
+    def __init__(self, scenario: Scenario, limits: Limits, settings: Settings = Settings()) -> None:
         if len(limits.cap) != scenario.channels:
             raise ValueError(f"cap has {len(limits.cap)} entries for {scenario.channels} channels")
         self.scenario, self.limits, self.settings = scenario, limits, settings
@@ -81,12 +66,14 @@ class Session:
         self.config: Config | None = None
         self.record: Callable[[Row], None] = lambda row: None
         self.now = self.asked_at = self.entered = self.heard = 0
-        self.x = np.zeros(scenario.channels)
-        self.force = np.zeros(scenario.channels)
-        self.gain = Gain(limits, scenario.T)
+        self.drive: Drive | None = None
         self._reason = Reason.DONE
-        self._next = ""  # what follows a planned ramp-out: "" for the end, else why a softer coupling is loaded
-        self._sent: dict[int, tuple[int, ...]] = {}
+        self._after: Stage | None = Stage.FINISHED  # what a ramp-out ends in; None: with a softer coupling, disarmed
+
+    @property
+    def gain(self) -> float:
+        """The factor in front of every force; 0 unless forces act."""
+        return self.drive.gain.value if self.drive else 0.0
 
     # what a person or the driver does
 
@@ -115,9 +102,10 @@ class Session:
         """A person's wish to feel forces; does nothing unless the session is disarmed."""
         self.now = now
         if self.stage == Stage.DISARMED:
-            assert self.rung is not None
-            self.law = Law(self.rung.law())
-            self.gain.value, self._sent = 0.0, {}
+            assert self.rung
+            assert self.config
+            F = self.rung.law()
+            self.drive = Drive(F, self.units, self.config, self.limits, self.counters, self.record)
             self._enter(Stage.ARMING, "asked to")
         return b""
 
@@ -126,12 +114,11 @@ class Session:
         self.now = now
         if self.stage in ENDED:
             return b""
-        if self.stage == Stage.ARMED or (self.stage == Stage.ARMING and self.gain.value > 0):
-            self._next = ""
-            self._enter(Stage.DISARMING, cause)
-            return b""
         if self.stage == Stage.DISARMING:
-            self._next, self.cause = "", cause
+            self._after = self._after or Stage.FINISHED
+            return b""
+        if self.stage == Stage.ARMED or (self.stage == Stage.ARMING and self.gain > 0):
+            self._ramp_out(Stage.FINISHED, cause)
             return b""
         return self._end(Stage.FINISHED, cause, Reason.DONE)
 
@@ -174,7 +161,7 @@ class Session:
             return b""
         if self.stage in (Stage.CONNECTING, Stage.CONFIGURING):
             return self._ask_again()
-        if self.stage == Stage.ARMING and self.gain.value == 0 and now - self.entered > ARMING_US:
+        if self.stage == Stage.ARMING and self.gain == 0 and now - self.entered > ARMING_US:
             return self._end(Stage.STOPPED, f"the device did not arm within {ARMING_US // 1000} ms")
         silence = now - self.heard
         if silence > self.limits.watchdog_us and self.stage != Stage.MEASURED:
@@ -189,7 +176,7 @@ class Session:
         if self.now - self.asked_at < RESEND_US:
             return b""
         self.asked_at = self.now
-        return encode(Hello()) if self.stage == Stage.CONNECTING else encode(self.config)
+        return encode(self.config if self.stage == Stage.CONFIGURING and self.config else Hello())
 
     def _understand(self, message: Message) -> bytes:
         match message:
@@ -223,6 +210,8 @@ class Session:
         if ack.crc != config_crc(self.config):
             self.counters.unexpected += 1
             return b""
+        if ack.refused == Refused.RUNNING:
+            return b""  # it is still on its way to zero force, and will be asked again
         if ack.refused:
             known = [r.name.lower() for r in Refused if r == ack.refused]
             return self._end(Stage.REFUSED, f"the device refuses the configuration: {(known or [ack.refused])[0]}")
@@ -250,92 +239,62 @@ class Session:
         verdict, ticks = self.watch.order(state)
         if verdict != FRESH:
             return b""
-        previous, first = self.x, self.watch.last is None
         self.heard = self.now
         self.watch.note(state)
-        self.x = self.units.positions(state.counts)
+        if state.phase == Phase.ESTOP:
+            return self.estop(f"pressed, {state.cause.name.lower()}", self.now)
         self._check_device(state)
-        if self.stage not in DRIVING:
-            self._measure(state)
-            return b"" if self.stage == Stage.MEASURED else self._answer(state, Command.IDLE)
-        check_range(self.x, self.units.reach)
-        if not first:
-            check_jump(self.x, previous, ticks, self.limits)
-        return self._drive(state, previous, ticks)
+        if self.stage in DRIVING:
+            return self._on_driving(state, ticks)
+        if self.stage == Stage.MEASURING:
+            return self._measure(state)
+        return self._answer(state, Command.IDLE)
+
+    def _on_driving(self, state: State, ticks: int) -> bytes:
+        assert self.drive is not None
+        ready = state.phase != Phase.DISARMED
+        direction = (-1 if self.stage == Stage.DISARMING else 1) if ready else 0
+        steps = self.drive.step(state, ticks, direction)
+        if self.stage == Stage.ARMING and self.gain == 1.0:
+            self._enter(Stage.ARMED, "full gain")
+        if self.stage == Stage.DISARMING and self.gain == 0.0:
+            return self._ramped_out()
+        self._judge()
+        return self._answer(state, Command.RUN if ready else Command.ARM, steps)
 
     def _check_device(self, state: State) -> None:
         assert self.config is not None
         strongest = max(abs(a) - c for a, c in zip(state.applied, self.config.cap, strict=True))
         if strongest > 0:
             raise Fault(f"the device applies {state.applied} steps, the cap is {self.config.cap}")
-        if state.phase in (Phase.STOPPED, Phase.ESTOP, Phase.RAMP, Phase.SILENT):
+        if state.phase in (Phase.STOPPED, Phase.RAMP, Phase.SILENT):
             raise Fault(f"the device is in {state.phase.name.lower()}, cause {state.cause.name.lower()}")
         armed = state.phase in (Phase.ARMED, Phase.HOLDING)
         if armed and self.stage not in DRIVING:
             raise Fault("the device is armed, and nobody asked it to")
-        if not armed and (self.stage in (Stage.ARMED, Stage.DISARMING) or self.gain.value > 0):
+        if not armed and (self.stage in (Stage.ARMED, Stage.DISARMING) or self.gain > 0):
             raise Fault("the device has disarmed itself")
 
-    def _measure(self, state: State) -> None:
+    def _measure(self, state: State) -> bytes:
         margin, T_us = self.watch.margins[-1], 1e6 * self.scenario.T
-        if self.stage != Stage.MEASURING:
-            return
         if not self.ages:
             self._clock = (state.t_us, state.tick)
         if margin is not None:
             self.ages.append(round(self.probe * T_us) - margin)
         if len(self.ages) < self.settings.measure:
-            return
+            return self._answer(state, Command.IDLE)
         elapsed = (state.t_us - self._clock[0]) & 0xFFFFFFFF
         ticks = (state.tick - self._clock[1]) & 0xFFFF
         if ticks and abs(elapsed / (ticks * T_us) - 1) > PERIOD_TOLERANCE:
-            raise Fault(f"a tick of the device lasts {elapsed / ticks:.1f} us by its own clock, T is {T_us:g} us")
+            clock = f"a tick of the device lasts {elapsed / ticks:.1f} us by its own clock, T is {T_us:g} us"
+            return self._end(Stage.REFUSED, clock)
         self._enter(Stage.MEASURED, f"{len(self.ages)} answers, median age {Ages(tuple(self.ages)).quantile(0.5)} us")
+        return b""
 
     def _answer(self, state: State, command: Command, steps: tuple[int, ...] | None = None) -> bytes:
         assert self.config is not None
         apply_at = (state.tick + self.config.theta) & 0xFFFF
         return encode(Force(command, apply_at, state.tick, steps or (0,) * state.axes))
-
-    def _drive(self, state: State, previous: Array, ticks: int) -> bytes:
-        assert self.config is not None
-        ready = state.phase != Phase.DISARMED
-        positions = fill(previous, self.x, ticks) if self._sent else [self.x]
-        for x in positions[:-1]:
-            self.record(Row(self._tick(state, x, positions), False, x, self.law.step(x), self.gain.value, (), None))
-        asked = self.law.step(self.x)
-        self._compare(state)
-        if ready:
-            self._move_gain(ticks)
-        shaped = shape(asked, self.force, self.gain.value, self.limits, self.scenario.T)
-        self.force = shaped.force
-        self.counters.clipped += shaped.clipped
-        self.counters.slowed += shaped.slowed
-        steps = self.units.steps(shaped.force, self.config.cap)
-        self._sent[(state.tick + self.config.theta) & 0xFFFF] = steps
-        self.record(Row(state.tick, True, self.x, asked, self.gain.value, steps, state))
-        if self.stage == Stage.DISARMING and self.gain.value == 0.0:
-            return self._ramped_out()
-        self._judge()
-        return self._answer(state, Command.RUN if ready else Command.ARM, steps)
-
-    def _tick(self, state: State, x: Array, positions: list[Array]) -> int:
-        back = next(i for i, p in enumerate(reversed(positions)) if p is x)
-        return (state.tick - back) & 0xFFFF
-
-    def _move_gain(self, ticks: int) -> None:
-        if self.stage == Stage.DISARMING:
-            self.gain.fall(ticks)
-        elif self.gain.rise(ticks) == 1.0 and self.stage == Stage.ARMING:
-            self._enter(Stage.ARMED, "full gain")
-
-    def _compare(self, state: State) -> None:
-        """Whether the device does what it was told; frames that it missed are its own count."""
-        told = self._sent.pop(state.tick, None)
-        if len(self._sent) > 64:
-            self._sent.pop(next(iter(self._sent)))
-        if told is not None and state.phase == Phase.ARMED and self.gain.value == 1.0:
-            self.counters.unlike += told != state.applied
 
     def _judge(self) -> None:
         """Whether the link still is what the coupling was certified for."""
@@ -343,22 +302,22 @@ class Session:
             return
         assert self.rung is not None
         late, missed = self.watch.late_part, self.watch.missed_part
-        index = self.rungs.index(self.rung)
+        if missed > self.settings.missed + late:
+            raise Fault(f"{100 * missed:.0f} % of the last {self.settings.window} ticks had no answer in time")
         if late > self.settings.late:
             word = f"{100 * late:.0f} % of the last {self.settings.window} answers were late"
-            self._next = word if index + 1 < len(self.rungs) else ""
-            self._enter(Stage.DISARMING, word + ("" if self._next else ", and there is no softer coupling"))
-            self._slow = not self._next
-        elif missed > self.settings.missed:
-            raise Fault(f"{100 * missed:.0f} % of the last {self.settings.window} ticks had no answer in time")
+            softer = self.rungs.index(self.rung) + 1 < len(self.rungs)
+            self._ramp_out(None if softer else Stage.STOPPED, word + ("" if softer else ", and nothing softer is left"))
+
+    def _ramp_out(self, after: Stage | None, cause: str) -> None:
+        self._after = after
+        self._enter(Stage.DISARMING, cause)
 
     def _ramped_out(self) -> bytes:
-        if not self._next:
-            slow = getattr(self, "_slow", False)
-            return self._end(Stage.STOPPED if slow else Stage.FINISHED, self.cause, Reason.DONE)
+        if self._after:
+            return self._end(self._after, self.cause, Reason.DONE)
         assert self.rung is not None
-        why, self._next = self._next, ""
-        return encode(Stop(Reason.DONE)) + self._take(self.rungs.index(self.rung) + 1, f"softer, {why}")
+        return encode(Stop(Reason.DONE)) + self._take(self.rungs.index(self.rung) + 1, f"softer, since {self.cause}")
 
     # stages
 
@@ -370,7 +329,6 @@ class Session:
         self.log.append(Event(self.now, self.stage, cause))
 
     def _end(self, stage: Stage, cause: str, reason: Reason = Reason.FAULT) -> bytes:
-        self._reason, self.gain.value = reason, 0.0
-        self.force = np.zeros_like(self.force)
+        self._reason, self.drive = reason, None
         self._enter(stage, cause)
         return encode(Stop(reason))
