@@ -48,7 +48,7 @@ class Device:
             if self.phase != Phase.DISARMED:
                 self.latch(frame)
             elif frame is not None and frame.command == Command.ARM:
-                self.phase, self.run, self.held = Phase.ARMED, 0, 0
+                self.phase = Phase.ARMED
         if self.phase == Phase.RAMP:
             self.ramp_down()
         return self.applied, self.speak(counts)
@@ -57,10 +57,10 @@ class Device:
         """The force for this tick, or without one the last one held, for `hold` ticks."""
         assert self.config is not None
         if frame is None:
-            self.held += 1
             self.phase = Phase.HOLDING
-            if self.held > self.config.hold:
+            if self.held >= self.config.hold:
                 self.halt(Cause.WATCHDOG)
+            self.held += 1
         elif frame.command == Command.IDLE:
             self.halt(Cause.COMMAND)
         else:
