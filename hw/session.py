@@ -23,6 +23,7 @@ from hw.watch import FRESH, Counters, LinkWatch
 from sim.scenario import Scenario
 
 RESEND_US, PATIENCE_US = 100_000, 2_000_000  # a question is asked again, and then given up
+QUIET_US = 1_000_000  # longest silence of a device that has no force to take away
 ARMING_US = 500_000  # in which a device must follow ARM
 PERIOD_TOLERANCE = 0.01  # of the device's clock against T, over the measurement
 
@@ -67,6 +68,7 @@ class Session:
         self.record: Callable[[Row], None] = lambda row: None
         self.now = self.asked_at = self.entered = self.heard = 0
         self.drive: Drive | None = None
+        self.missed_while_driving = 0
         self._reason = Reason.DONE
         self._after: Stage | None = Stage.FINISHED  # what a ramp-out ends in; None: with a softer coupling, disarmed
 
@@ -163,8 +165,8 @@ class Session:
             return self._ask_again()
         if self.stage == Stage.ARMING and self.gain == 0 and now - self.entered > ARMING_US:
             return self._end(Stage.STOPPED, f"the device did not arm within {ARMING_US // 1000} ms")
-        silence = now - self.heard
-        if silence > self.limits.watchdog_us and self.stage != Stage.MEASURED:
+        silence, allowed = now - self.heard, self.limits.watchdog_us if self.stage in DRIVING else QUIET_US
+        if silence > allowed and self.stage != Stage.MEASURED:
             return self._end(Stage.LOST, f"no new STATE for {silence / 1000:.1f} ms")
         return b""
 
@@ -252,6 +254,7 @@ class Session:
 
     def _on_driving(self, state: State, ticks: int) -> bytes:
         assert self.drive is not None
+        self.missed_while_driving += self.watch.missed[-1]
         ready = state.phase != Phase.DISARMED
         direction = (-1 if self.stage == Stage.DISARMING else 1) if ready else 0
         steps = self.drive.step(state, ticks, direction)
