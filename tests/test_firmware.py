@@ -147,14 +147,14 @@ class Traffic:
     def between_ticks(self, now: int) -> list[tuple]:
         """Operations ("R", now, bytes), ("E",), ("F",)."""
         rng, d, ops, data = self.rng, self.device, [], b""
-        if d.phase in (Phase.SILENT, Phase.STOPPED) and rng.random() < 0.3:
+        if d.phase in (Phase.SILENT, Phase.STOPPED, Phase.ESTOP) and rng.random() < 0.3:
             data += encode(self.config())
         if rng.random() >= self.loss:
             data += encode(self.force())
         if rng.random() < self.trouble:
             data += self.oddity() if rng.random() < 0.9 else encode(Stop(rng.choice((0, 1, 2, 77))))
-        if rng.random() < (0.05 if d.phase == Phase.ESTOP else self.trouble / 30):
-            ops.append(rng.choice([("E",), ("F",), ("F",), ("R", now, encode(Stop(Reason.ESTOP)))]))
+        if rng.random() < (0.05 if d.phase == Phase.ESTOP else self.trouble / 10):
+            ops.append(rng.choice([("E",), ("F",), ("F",), ("F",), ("R", now, encode(Stop(Reason.ESTOP)))]))
         cut = rng.randint(0, len(data))
         return [("R", now + rng.randint(0, 300), data[:cut]), *ops, ("R", now + rng.randint(300, 3000), data[cut:])]
 
@@ -248,7 +248,11 @@ def test_the_traffic_visits_every_state_cause_and_refusal(episodes):
     states = [m for m in messages if isinstance(m, State)]
     assert any(m.margin_us > 0 for m in states)
     assert any(-0x7FFF < m.margin_us < 0 for m in states)
-    assert max(m.crc_errors for m in states) > 50
+    last = [m for _, sent in episodes[-1][2] for m in Decoder().feed(sent) if isinstance(m, State)]
+    ticks = [m.tick for m in last if m.phase == Phase.ARMED]
+    assert max(ticks) == 0xFFFF
+    assert min(ticks) < 10
+    assert max(m.crc_errors for m in states) > 20
     assert any(isinstance(m, Info) for m in messages)
     assert sum(any(forces) for forces, _ in answers) > 2000
 
