@@ -6,7 +6,7 @@ from typing import NamedTuple
 PROTOCOL = 1
 MAX_AXES = 8
 MAX_THETA = 15
-MAX_RELEASE_NS = 20_000_000  # longest hold and ramp together: in 20 ms a free 0.25 kg device reaches 0.65 m/s
+MAX_RELEASE_NS = 20_000_000  # longest hold and ramp together: 12 N for 20 ms bring a free 0.25 kg to 1 m/s
 NO_MARGIN = -32768  # in State.margin_us: no FORCE came since the STATE before
 
 

@@ -1,6 +1,7 @@
 """hw/firmware against hw/device.py, byte for byte, and the example sketch on a board that is only memory."""
 
 import ctypes
+import os
 import random
 import re
 import shutil
@@ -12,7 +13,7 @@ from zlib import crc32
 import pytest
 
 from hw.device import Device
-from hw.frame import Ack, Config, Decoder, Force, Hello, Info, State, Stop, encode, pack
+from hw.frame import LAYOUTS, Ack, Config, Decoder, Force, Hello, Info, State, Stop, encode, pack
 from hw.message import Cause, Command, Phase, Reason, Refused
 
 ROOT = Path(__file__).parent.parent
@@ -118,18 +119,23 @@ class Traffic:
             lambda: encode(self.config()),
             lambda: framed(self.config()._replace(theta=rng.choice((0, 16, 255)))),
             lambda: framed(self.config()._replace(ramp=rng.choice((0, 200)))),
-            lambda: framed(self.config()._replace(cap=(rng.choice((0, 24001, 65535)),) * d.info.axes)),
+            lambda: framed(self.config()._replace(cap=(rng.choice((0, 65535)),) * d.info.axes)),
+            lambda: encode(self.config()._replace(cap=tuple(c + rng.randint(0, 1) for c in d.info.hard_limit))),
             lambda: framed(self.config()._replace(slew=(0,) * d.info.axes)),
             lambda: encode(Config(1, 4, 4, 0, (100,) * axes, (100,) * axes)),
             lambda: encode(Hello(rng.randint(0, 255))),
             lambda: encode(good._replace(apply_at=shifted(good.apply_at, late), source=shifted(good.source, late))),
             lambda: encode(good._replace(apply_at=shifted(good.apply_at, late))),
-            lambda: encode(good._replace(command=rng.randint(0, 255), force=(rng.randint(-9, 9),) * d.info.axes)),
+            lambda: encode(
+                good._replace(command=rng.choice((0, 1, 2, 3, 255)), force=(rng.randint(-9, 9),) * d.info.axes)
+            ),
             lambda: encode(good._replace(force=(0,) * axes)),
             lambda: encode(good) + encode(good._replace(force=(0,) * d.info.axes)),
             lambda: encode(State(rng.choice((1, 0x22, 0x77)), 1, 1, 1, 1, 1, 1, (1,) * axes, (1,) * axes)),
             lambda: encode(Ack(rng.getrandbits(32), 0)),
             lambda: d.info_frame,
+            lambda: enclosed(bytes([rng.randint(0, 8)] * (n := rng.randint(0, 50))) + rng.randbytes(n % 2)),
+            lambda: enclosed(bytes([LAYOUTS[Config].code]) + rng.randbytes(5 + 4 * rng.randint(8, 10))),
             lambda: rng.randbytes(rng.randint(1, 400)),
             lambda: rng.randbytes(rng.choice((174, 175, 176, 177, 600))).replace(b"\0", b"\1"),
             lambda: bytes(rng.randint(0, 3)),
@@ -141,14 +147,14 @@ class Traffic:
     def between_ticks(self, now: int) -> list[tuple]:
         """Operations ("R", now, bytes), ("E",), ("F",)."""
         rng, d, ops, data = self.rng, self.device, [], b""
-        if d.phase in (Phase.SILENT, Phase.STOPPED) and rng.random() < 0.3:
+        if d.phase in (Phase.SILENT, Phase.STOPPED, Phase.ESTOP) and rng.random() < 0.3:
             data += encode(self.config())
         if rng.random() >= self.loss:
             data += encode(self.force())
         if rng.random() < self.trouble:
             data += self.oddity() if rng.random() < 0.9 else encode(Stop(rng.choice((0, 1, 2, 77))))
-        if rng.random() < self.trouble / 30:
-            ops.append(rng.choice([("E",), ("F",), ("F",), ("R", now, encode(Stop(Reason.ESTOP)))]))
+        if rng.random() < (0.05 if d.phase == Phase.ESTOP else self.trouble / 10):
+            ops.append(rng.choice([("E",), ("F",), ("F",), ("F",), ("R", now, encode(Stop(Reason.ESTOP)))]))
         cut = rng.randint(0, len(data))
         return [("R", now + rng.randint(0, 300), data[:cut]), *ops, ("R", now + rng.randint(300, 3000), data[cut:])]
 
@@ -158,8 +164,12 @@ def shifted(tick: int, by: int) -> int:
 
 
 def framed(message) -> bytes:
-    """encode() without its checks, and with the stuffing written out."""
-    payload = pack(message)
+    """encode() without its checks."""
+    return enclosed(pack(message))
+
+
+def enclosed(payload: bytes) -> bytes:
+    """A frame around any payload."""
     blocks = (payload + struct.pack("<I", crc32(payload))).split(b"\0")
     return b"".join(bytes([len(block) + 1]) + block for block in blocks) + b"\0"
 
@@ -218,7 +228,8 @@ def described(answer) -> str:
     return f"{answer[0]} {Decoder().feed(answer[1])} {answer[1].hex(' ')}"
 
 
-EPISODES = [(seed, 400, 0) for seed in range(50)] + [(100, 1500, 64_800)]  # the last one crosses tick 65535
+EPISODES = [(seed, 400, 0) for seed in range(int(os.environ.get("HAPTIC_FUZZ_EPISODES", "50")))]
+EPISODES.append((1_000_000, 1500, 64_800))  # crosses tick 65535
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +248,11 @@ def test_the_traffic_visits_every_state_cause_and_refusal(episodes):
     states = [m for m in messages if isinstance(m, State)]
     assert any(m.margin_us > 0 for m in states)
     assert any(-0x7FFF < m.margin_us < 0 for m in states)
-    assert max(m.crc_errors for m in states) > 50
+    last = [m for _, sent in episodes[-1][2] for m in Decoder().feed(sent) if isinstance(m, State)]
+    ticks = [m.tick for m in last if m.phase == Phase.ARMED]
+    assert max(ticks) == 0xFFFF
+    assert min(ticks) < 10
+    assert max(m.crc_errors for m in states) > 20
     assert any(isinstance(m, Info) for m in messages)
     assert sum(any(forces) for forces, _ in answers) > 2000
 
