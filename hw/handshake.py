@@ -90,14 +90,14 @@ def probe_delay(T: float) -> int:
 def configuration(info: Info, limits: Limits, theta: int) -> Config:
     """What the device is told: never more than the host allows itself, nor than the device can do."""
     T_ns = info.period_ns
-    hold = min(HOLD, (MAX_RELEASE_NS - 1000 * RAMP_US) // T_ns)
+    ramp = max(1, min(0xFF, math.ceil(1000 * RAMP_US / T_ns)))
     steps = [1e-6 * step for step in info.force_step]
     most = [int(cap / step + 1e-9) for cap, step in zip(limits.cap, steps, strict=True)]
     slew = [min(0xFFFF, math.ceil(limits.slew * 1e-9 * T_ns / step)) for step in steps]
     return Config(
         theta=theta,
-        hold=max(0, hold),
-        ramp=max(1, min(0xFF, math.ceil(1000 * RAMP_US / T_ns))),
+        hold=max(0, min(HOLD, MAX_RELEASE_NS // T_ns - ramp)),
+        ramp=ramp,
         ramp_in=min(0xFFFF, math.ceil(1e9 * limits.ramp_in / T_ns)),
         cap=tuple(map(min, info.hard_limit, most)),
         slew=tuple(slew),
