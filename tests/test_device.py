@@ -203,6 +203,16 @@ def test_the_watchdog_holds_four_ticks_then_ramps_to_zero():
     assert rig.at == (Phase.STOPPED, Cause.WATCHDOG)
 
 
+def test_holding_keeps_the_force_as_it_is_even_on_its_way():
+    """The slew rate was still letting it rise: nothing moves without a fresh frame."""
+    rig = armed(slew=(100, 100))
+    rig.answer((1000, -1000))
+    rig.tick()
+    for _ in range(4):
+        rig.tick()
+        assert rig.forces == (100, -100)
+
+
 def test_a_frame_in_time_ends_the_holding():
     rig = armed()
     for _ in range(20):

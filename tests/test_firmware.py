@@ -153,7 +153,7 @@ class Traffic:
             data += encode(self.force())
         if rng.random() < self.trouble:
             data += self.oddity() if rng.random() < 0.9 else encode(Stop(rng.choice((0, 1, 2, 77))))
-        if rng.random() < (0.05 if d.phase == Phase.ESTOP else self.trouble / 10):
+        if rng.random() < (0.2 if d.phase == Phase.ESTOP else self.trouble / 10):
             ops.append(rng.choice([("E",), ("F",), ("F",), ("F",), ("R", now, encode(Stop(Reason.ESTOP)))]))
         cut = rng.randint(0, len(data))
         return [("R", now + rng.randint(0, 300), data[:cut]), *ops, ("R", now + rng.randint(300, 3000), data[cut:])]
