@@ -87,6 +87,7 @@ class Clockwork:
                 self.late += 1
                 self._lost += now - due
             self._send(self.emulator.tick(round(due)), due)
+            self.emulator.advance()
             due = max(due + self._period, self.emulator.stalled_until)
             if self.emulator.unplugged and unplugged_at is None:
                 unplugged_at = due

@@ -62,7 +62,7 @@ class Emulator:
             self.device.receive(data, now)
 
     def tick(self, now: int) -> bytes:
-        """One period: sample, latch, answer; then the plant moves on. `now` is the device's clock [us]."""
+        """A period begins: sample, latch, answer. `now` is the device's clock [us]; advance() goes with every tick."""
         self._misbehave(now)
         counts = tuple(
             max(-FARTHEST, min(FARTHEST, n + o)) for n, o in zip(self.plant.counts(), self._offset, strict=True)
@@ -72,8 +72,11 @@ class Emulator:
             self.armed_at = now
         self._wake_person()
         self.applied = np.array(steps) * self.force_step
-        self.plant.advance(-self.applied)
         return b"" if self.unplugged else data
+
+    def advance(self) -> None:
+        """The plant moves on by a period, while the answer is on its way."""
+        self.plant.advance(-self.applied)
 
     def _wake_person(self) -> None:
         config = self.device.config

@@ -93,6 +93,7 @@ class Rehearsal:
         if clock < emulator.stalled_until:  # late once, and then in step again: no catching up
             return self._at(emulator.stalled_until, "tick", None)
         data = emulator.tick(clock)
+        emulator.advance()
         self.moments.append(Moment(clock, emulator.device.phase, emulator.applied))
         self._at(now + self._period, "tick", None)
         if emulator.unplugged and not self._gone:

@@ -37,6 +37,8 @@ class LinkWatch:
     last: State | None = None
     margins: deque[int | None] = field(default_factory=deque)  # per fresh tick; None: no answer came
     missed: deque[int] = field(default_factory=deque)
+    _late: int = 0  # in the window, kept as sums: adding up the window would take longer than all the rest of a tick
+    _missed: int = 0
 
     def order(self, state: State) -> tuple[str, int]:
         """FRESH, DUPLICATE or STALE, and by how many ticks a fresh one is ahead."""
@@ -61,12 +63,15 @@ class LinkWatch:
         margin = None if state.margin_us == NO_MARGIN else state.margin_us
         self.counters.states += 1
         self.counters.misses += missed
-        self.counters.late += margin is not None and margin < 0
+        late = _is_late(margin)
+        self.counters.late += late
         self.margins.append(margin)
         self.missed.append(missed)
+        self._late += late
+        self._missed += missed
         if len(self.margins) > self.window:
-            self.margins.popleft()
-            self.missed.popleft()
+            self._late -= _is_late(self.margins.popleft())
+            self._missed -= self.missed.popleft()
         self.last = state
 
     def restart(self) -> None:
@@ -74,6 +79,7 @@ class LinkWatch:
         self.last = None
         self.margins.clear()
         self.missed.clear()
+        self._late = self._missed = 0
 
     @property
     def full(self) -> bool:
@@ -82,9 +88,13 @@ class LinkWatch:
     @property
     def late_part(self) -> float:
         """The part of the window's answers that came too late."""
-        return sum(m is not None and m < 0 for m in self.margins) / max(1, len(self.margins))
+        return self._late / max(1, len(self.margins))
 
     @property
     def missed_part(self) -> float:
         """The part of the window's ticks without an answer in time, late or lost."""
-        return min(1.0, sum(self.missed) / max(1, len(self.missed)))
+        return min(1.0, self._missed / max(1, len(self.missed)))
+
+
+def _is_late(margin: int | None) -> bool:
+    return margin is not None and margin < 0
