@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from controller.lti import Array, Lti
+from controller.lti import Array
 from hw.frame import Config, State
 from hw.handshake import Units
-from hw.law import Law, fill
+from hw.law import Controller, fill
 from hw.message import Phase
 from hw.safety import Gain, Limits, check_jump, check_range, shape
 from hw.watch import Counters
@@ -31,12 +31,18 @@ class Drive:
     """The coupling at work, from one arming to the next end."""
 
     def __init__(
-        self, F: Lti, units: Units, config: Config, limits: Limits, counters: Counters, record: Callable[[Row], None]
+        self,
+        law: Controller,
+        units: Units,
+        config: Config,
+        limits: Limits,
+        counters: Counters,
+        record: Callable[[Row], None],
     ) -> None:
-        self.law, self.units, self.config, self.limits = Law(F), units, config, limits
-        self.T = F.T
-        self.gain = Gain(limits, F.T)
-        self.force = (0.0,) * F.outputs  # [N] the last one sent
+        self.law, self.units, self.config, self.limits = law, units, config, limits
+        self.T = law.T
+        self.gain = Gain(limits, law.T)
+        self.force = (0.0,) * config.axes  # [N] the last one sent
         self.x: tuple[float, ...] | None = None  # [m] of the last STATE
         self._counters, self._record = counters, record
         self._sent: dict[int, tuple[int, ...]] = {}

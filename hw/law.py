@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Self
+from typing import Protocol, Self
 
 import numpy as np
 
 from controller.lti import Array, Lti
 
 
+class Controller(Protocol):
+    """What answers a displacement with a force, tick by tick."""
+
+    T: float  # [s]
+
+    def step(self, x: Sequence[float]) -> Array:
+        """Forces fed back (m,) [N] for the displacements x (m,) [m]."""
+        ...
+
+
 class Law:
     """[f; z+] = [C D; A B] [z; x], from rest. Allocates nothing per tick but the force that it returns."""
 
     def __init__(self, F: Lti) -> None:
-        self.F = F
+        self.F, self.T = F, F.T
         n, m = F.order, F.inputs
         self._product = np.ascontiguousarray(np.block([[F.A, F.B], [F.C, F.D]]))
         self._input, self._output = np.zeros(n + m), np.zeros(n + F.outputs)

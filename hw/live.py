@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Protocol
 
-from hw.plan import Ages, Rung
+from hw.plan import Ages, Program
 from hw.port import PortLost
 from hw.safety import ENDED, Fault, Stage
 from hw.session import Session
@@ -41,7 +41,7 @@ class Live:
         self,
         session: Session,
         port: Wire,
-        plan: Callable[[Ages], Sequence[Rung]],
+        plan: Callable[[Ages], Sequence[Program]],
         auto_arm: bool,
         seconds: float,
         keyboard: int | None = None,  # a file descriptor with single keys

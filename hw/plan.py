@@ -8,7 +8,7 @@ as the link is no slower, and longer ones where it is.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 from controller.environment import environment
 from controller.lti import Lti
@@ -18,6 +18,7 @@ from design.failure import DesignFailed
 from design.margin import Requirement
 from design.promises import certificate_part, promise_of
 from design.summary import coupling_part
+from hw.law import Controller, Law
 from hw.message import MAX_THETA
 from hw.safety import Fault
 from sim.couplings import Chosen, choose
@@ -42,6 +43,29 @@ def link_delay(ages: Ages, T_us: float, quantile: float, guard_us: float) -> int
     return max(1, int(-(-needed // T_us)))
 
 
+class Program(Protocol):
+    """What a session can be armed with."""
+
+    @property
+    def link(self) -> int:
+        """Ticks from a sample to the latch of its force."""
+        ...
+
+    @property
+    def certified(self) -> bool:
+        """Whether every passive human is safe with it."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """For the log."""
+        ...
+
+    def controller(self) -> Controller:
+        """A fresh one, at rest."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Rung:
     """A coupling with the delay that it is certified for."""
@@ -55,6 +79,13 @@ class Rung:
     @property
     def certified(self) -> bool:
         return any(requirement.certified for requirement in self.requirements.values())
+
+    @property
+    def name(self) -> str:
+        return f"{self.chosen.kind} for theta = {list(self.scenario.theta)}"
+
+    def controller(self) -> Controller:
+        return Law(self.law())
 
     def law(self) -> Lti:
         """F as the host runs it: the link adds the remaining delay."""

@@ -16,7 +16,7 @@ import numpy as np
 from controller.lti import Array
 from hw.emulator_core import Emulator
 from hw.message import Phase
-from hw.plan import Ages, Rung
+from hw.plan import Ages, Program
 from hw.safety import ENDED, Fault, Stage
 from hw.session import Session
 from hw.upset import Line, Upset
@@ -25,7 +25,7 @@ POLL_US = 1000
 GRACE_US = 20_000  # after the end
 LATENCY_US = 60  # one way, and as long for the host to answer: the measured median age of 130 us
 
-Plan = Callable[[Ages], Sequence[Rung]]
+Plan = Callable[[Ages], Sequence[Program]]
 
 
 class Moment(NamedTuple):

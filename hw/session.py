@@ -17,7 +17,7 @@ from hw.drive import Drive, Row
 from hw.frame import Ack, Config, Decoder, Force, Hello, Info, Message, State, Stop, config_crc, encode
 from hw.handshake import Units, configuration, objections, probe_delay
 from hw.message import Command, Phase, Reason, Refused
-from hw.plan import Ages, Rung
+from hw.plan import Ages, Program
 from hw.safety import DRIVING, ENDED, Fault, Limits, Stage
 from hw.watch import FRESH, Counters, LinkWatch
 from sim.scenario import Scenario
@@ -61,8 +61,8 @@ class Session:
         self.stage, self.cause = Stage.CONNECTING, ""
         self.log: list[Event] = []
         self.ages: list[int] = []
-        self.rungs: tuple[Rung, ...] = ()
-        self.rung: Rung | None = None
+        self.rungs: tuple[Program, ...] = ()
+        self.rung: Program | None = None
         self.info: Info | None = None
         self.config: Config | None = None
         self.record: Callable[[Row], None] = lambda row: None
@@ -85,7 +85,7 @@ class Session:
         self._log("HELLO")
         return encode(Hello())
 
-    def load(self, rungs: Sequence[Rung], now: int) -> bytes:
+    def load(self, rungs: Sequence[Program], now: int) -> bytes:
         """Take the couplings for the measured delay, the fastest first; the device is told its theta."""
         self.now = now
         if self.stage != Stage.MEASURED:
@@ -106,8 +106,8 @@ class Session:
         if self.stage == Stage.DISARMED:
             assert self.rung
             assert self.config
-            F = self.rung.law()
-            self.drive = Drive(F, self.units, self.config, self.limits, self.counters, self.record)
+            law = self.rung.controller()
+            self.drive = Drive(law, self.units, self.config, self.limits, self.counters, self.record)
             self._enter(Stage.ARMING, "asked to")
         return b""
 
@@ -224,8 +224,7 @@ class Session:
 
     def _take(self, index: int, cause: str) -> bytes:
         self.rung = self.rungs[index]
-        coupling = self.rung.chosen.kind
-        return self._configure(self.rung.link, f"{coupling} for theta = {list(self.rung.scenario.theta)}: {cause}")
+        return self._configure(self.rung.link, f"{self.rung.name}: {cause}")
 
     # the stream
 

@@ -29,7 +29,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int) -> di
     """Stage, cause and log; the coupling with its certificates; what the link did, as a report without a verdict."""
     begin = session.log[0].t_us if session.log else 0
     log = [{"t_s": 1e-6 * (e.t_us - begin), "stage": str(e.stage), "cause": e.cause} for e in session.log]
-    parts = session.rung.part() if session.rung else {}
+    parts = session.rung.part() if isinstance(session.rung, Rung) else {}
     empty = {"coupling": None, "certificate": None, "certificates": None, "promise": None, "theta": None}
     return {
         "case": case,
@@ -116,7 +116,7 @@ def save(out: Path, session: Session, recorder: Recorder, report: dict[str, Any]
     """The trace (where forces acted), its picture, and the report."""
     files = []
     if len(recorder):
-        assert session.rung
+        assert isinstance(session.rung, Rung)
         replay = {
             "scenario": json.loads(msgspec.json.encode(session.rung.scenario)),
             "coupling": json.loads(msgspec.json.encode(data_of(session.rung.chosen.coupling))),
