@@ -6,7 +6,7 @@ import argparse
 import select
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from sim.scenario import InputError
@@ -17,11 +17,11 @@ PASSED_ON = ("case", "scenario", "theta", "psi", "lam", "delta", "T")
 
 
 @contextmanager
-def spawned(args: argparse.Namespace, seed: int, seconds: float) -> Iterator[str]:
+def spawned(args: argparse.Namespace, seed: int, seconds: float, extra: Sequence[str] = ()) -> Iterator[str]:
     """The path of an emulator with the same loop and the faults of --fault, for as long as it is needed."""
     options = [f"--{name}={getattr(args, name)}" for name in PASSED_ON if getattr(args, name) is not None]
     options += [f"--fault={fault}" for fault in args.fault]
-    options += [f"--seed={seed}", f"--duration={seconds + SPARE:g}"]
+    options += [f"--seed={seed}", f"--duration={seconds + SPARE:g}", *extra]
     child = subprocess.Popen(
         [sys.executable, "-m", "hw.emulator", *options],
         stdin=subprocess.DEVNULL,

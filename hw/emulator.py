@@ -22,6 +22,7 @@ from contextlib import suppress
 from itertools import count
 from typing import Any
 
+from hw.emulated_plant import nobody
 from hw.emulator_core import Emulator
 from hw.upset import DEVICE, LINE, Line, Upset
 from sim.command import DONE, INTERRUPTED, Parser, add_loop_options, execute, numbers, scenario_from, seed_from
@@ -138,8 +139,11 @@ def main(argv: list[str]) -> int:
     seconds = numbers("--duration", args.duration, float, 1)[0]
     if not 0 < seconds <= 1e6:
         raise InputError(f"--duration is {seconds:g}, allowed are numbers above 0 up to 1000000 s")
+    coulomb = numbers("--coulomb", args.coulomb, float, 1)[0]
+    if not 0 <= coulomb <= 10:
+        raise InputError(f"--coulomb is {coulomb:g}, allowed are 0 to 10 N")
     try:
-        emulator = Emulator(scenario, upsets)
+        emulator = Emulator(nobody(scenario) if args.nobody else scenario, upsets, coulomb=coulomb)
     except ValueError as error:
         raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
     terminal, stops = Terminal(), []
@@ -177,6 +181,8 @@ def _parser() -> argparse.ArgumentParser:
     what = "KIND[=VALUE][@START[+DURATION]], times in seconds after arming; up: or down: in front for one direction"
     parser.add_argument("--fault", action="append", default=[], metavar="FAULT", help=f"{what}; KIND is {kinds}")
     parser.add_argument("--duration", default="1000000", metavar="SECONDS", help="default: until interrupted")
+    parser.add_argument("--nobody", action="store_true", help="no person at the handles")
+    parser.add_argument("--coulomb", default="0", metavar="NEWTON", help="dry friction at every motor (default 0)")
     parser.add_argument("--seed", metavar="N", default="0", help="for the faults (default 0)")
     return parser
 

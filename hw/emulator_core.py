@@ -38,10 +38,12 @@ def info_of(scenario: Scenario) -> Info:
 class Emulator:
     """Ticks when it is told to. Knows no clock of its own."""
 
-    def __init__(self, scenario: Scenario, upsets: tuple[Upset, ...] = (), info: Info | None = None) -> None:
+    def __init__(
+        self, scenario: Scenario, upsets: tuple[Upset, ...] = (), info: Info | None = None, coulomb: float = 0.0
+    ) -> None:
         self.info = info or info_of(scenario)
         self.device = Device(self.info)
-        self.plant = EmulatedPlant(scenario, 1e-12 * np.array(self.info.encoder_step, dtype=float))
+        self.plant = EmulatedPlant(scenario, 1e-12 * np.array(self.info.encoder_step, dtype=float), coulomb)
         self.force_step = 1e-6 * np.array(self.info.force_step, dtype=float)
         self.armed_at: int | None = None  # [us] of the first arming: faults are timed from here
         self.begun_at: int | None = None  # tick at which the person began to move

@@ -10,17 +10,21 @@ sandwich (J'J)^-1 J' R J (J'J)^-1 with Bartlett weights (Newey and West 1987).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from scipy.linalg import expm
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
 from controller.lti import Array
 
 SLIP = 0.01  # [m/s] speed at which Coulomb friction is at 3/4
 BANDWIDTH = 60  # [ticks] over which residuals may be correlated
+EVALUATIONS = 100  # of a search, without those for derivatives
 ONE_SIDED_95 = 1.6449  # normal quantile
-MODES_HZ = np.geomspace(30.0, 200.0, 24)  # where a transmission mode is looked for first
+MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a transmission mode is looked for first
+PARTS = (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mass, that the motor may have
+SPECTRUM = 250  # frequencies that are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,22 +50,49 @@ def identify(x: Array, force: Array, used: Array, T: float, step: float, rigid: 
     """
     if np.ptp(x[used]) < 20 * step:
         raise ValueError(f"the axis moved by {np.ptp(x[used]) / step:.0f} encoder steps, at least 20 are needed")
-    model = _Model(x, force, used, T, rigid)
-    starts = [np.array([np.log(mass), 0.0, 0.0])] if rigid else _starts(model, mass)
-    fit = least_squares(model.residual, starts[0], x_scale="jac", max_nfev=60)
+    whole = _Model(x, force, used, T, rigid=True)
+    fit = _search(whole, np.array([np.log(mass), 0.0, 0.0]))
+    if rigid:
+        return _settled(whole, fit, step)
+    model = _Model(x, force, used, T, rigid=False)
+    return _settled(model, _search(model, _start(model, fit.x)), step)
+
+
+def _search(model: _Model, start: Array) -> OptimizeResult:
+    """The nearest parameters within a factor of twenty of the start."""
+    reach = np.where(np.arange(start.size) == 2, 10.0, 3.0)  # Coulomb friction is in newtons, the rest are logarithms
+    bounds = (start - reach, start + reach)
+    return least_squares(model.residual, start, x_scale="jac", bounds=bounds, max_nfev=EVALUATIONS)
+
+
+def _settled(model: _Model, fit: OptimizeResult, step: float) -> Estimate:
     if not fit.success:
         raise ValueError(f"the fit did not converge: {fit.message}")
     return _estimate(model, fit.x, fit.fun, fit.jac, step)
 
 
-def _starts(model: _Model, mass: float) -> list[Array]:
-    """Starting points of the compliant model, the best transmission mode first."""
-    points = []
-    for hz in MODES_HZ:
-        m1, m2 = 0.3 * mass, 0.7 * mass
+def _start(model: _Model, whole: Array) -> Array:
+    """Where to begin with a transmission: the mode and the split of the mass that fit the spectrum best.
+
+    A search in time alone stops at any mode but the right one. The spectrum is that of the steps x[k+1] - x[k], which
+    begin and end at rest, over that of the forces; it is compared in decibels, where the force had something to say.
+    """
+    n = len(model.force)
+    force, moved = np.fft.rfft(model.force), np.fft.rfft(np.diff(model.x, append=model.x[-1]))
+    z = np.exp(2j * np.pi * np.arange(force.size) / n)
+    loud = np.flatnonzero(np.abs(force) > 0.2 * np.abs(force).max())
+    loud = loud[:: max(1, loud.size // SPECTRUM)]
+    measured, z = np.log(np.abs(moved[loud] / force[loud]) + 1e-12), z[loud]
+    points, mass = [], float(np.exp(whole[0]))
+    for hz, part in product(MODES_HZ, PARTS):
+        m1, m2 = part * mass, (1 - part) * mass
         k = (2 * np.pi * hz) ** 2 * m1 * m2 / mass
-        points.append(np.array([np.log(m1), 0.0, 0.0, np.log(m2), np.log(k)]))
-    return sorted(points, key=lambda p: float(np.square(model.residual(p)).sum()))
+        point = np.array([np.log(m1), max(whole[1], -2.0), 0.0, np.log(m2), np.log(k)])
+        A, B = model.matrices(point)
+        G = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, np.broadcast_to(B[:, None], (z.size, len(A), 1)))
+        apart = np.log(np.abs((z - 1) * G[:, 0, 0]) + 1e-12) - measured
+        points.append((float(np.abs(apart).mean()), point))  # absolute: a few bins of a resonance may lie far apart
+    return min(points, key=lambda entry: entry[0])[1]
 
 
 class _Model:
