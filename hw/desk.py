@@ -56,7 +56,8 @@ def check_link(args: argparse.Namespace) -> Settings:
 def number(args: argparse.Namespace, name: str, low: float, high: float, default: float | None = None) -> float:
     """One option as a number within its range. Raises InputError."""
     text = getattr(args, name)
-    value = default if text is None and default is not None else numbers(f"--{name}", text, float, 1)[0]
+    value = default if text is None else numbers(f"--{name}", text, float, 1)[0]
+    assert value is not None
     if not low <= value <= high:
         raise InputError(f"--{name} is {value:g}, allowed are {low:g} to {high:g}")
     return value

@@ -14,10 +14,13 @@ from itertools import product
 from math import tanh
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.optimize import OptimizeResult, least_squares
 
 from controller.lti import Array
+
+Flags = NDArray[np.bool_]
 
 COULOMB = 2  # where Coulomb friction is among the parameters
 UNEXPLAINED = 0.7  # encoder steps rms; rounding alone leaves 0.29
@@ -28,6 +31,7 @@ EVALUATIONS = 60  # of a search, without those for derivatives
 ONE_SIDED_95 = 1.6449  # normal quantile
 MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a transmission mode is looked for first
 PARTS = (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mass, that the motor may have
+FRICTIONS = (1e-5, 0.01, 0.05)  # Coulomb friction that a search begins with, of the force's span
 STARTS = 3  # of the search in time
 REACH = 3.0  # of a search, in logarithms
 SPECTRUM = 250  # frequencies that are compared
@@ -49,7 +53,7 @@ class Estimate:
     steps: float  # the same in encoder steps
 
 
-def identify(x: Array, force: Array, used: Array, T: float, step: float, rigid: bool, mass: float = 0.25) -> Estimate:
+def identify(x: Array, force: Array, used: Flags, T: float, step: float, rigid: bool, mass: float = 0.25) -> Estimate:
     """Fit one axis: displacements x (N,) [m], what the motor did (N,) [N], which samples count (N,), encoder step [m].
 
     `mass` is where the search begins. Raises ValueError where the device did not move or no model fits.
@@ -59,10 +63,10 @@ def identify(x: Array, force: Array, used: Array, T: float, step: float, rigid: 
     whole = _Model(x, force, used, T, rigid=True)
     smooth = _without_coulomb(whole, np.array([np.log(mass), 0.0]))
     if rigid:
-        return _settled(whole, _with_coulomb(whole, smooth.x), step)
+        return _settled(whole, _with_coulomb(whole, smooth.x, step), step)
     model = _Model(x, force, used, T, rigid=False)
     tries = [_without_coulomb(model, start) for start in _starts(model, smooth.x)]
-    return _settled(model, _with_coulomb(model, min(tries, key=lambda fit: fit.cost).x), step)
+    return _settled(model, _with_coulomb(model, min(tries, key=lambda fit: fit.cost).x, step), step)
 
 
 def _without_coulomb(model: _Model, start: Array) -> OptimizeResult:
@@ -78,22 +82,27 @@ def _without_coulomb(model: _Model, start: Array) -> OptimizeResult:
     return least_squares(residual, start, x_scale="jac", bounds=bounds, max_nfev=EVALUATIONS)
 
 
-def _with_coulomb(model: _Model, near: Array) -> OptimizeResult:
-    """All parameters, from a start that lacks c."""
+def _with_coulomb(model: _Model, near: Array, step: float) -> OptimizeResult:
+    """All parameters, from a start that lacks c: hardly any at first, then more as long as much is unexplained."""
     strongest = np.ptp(model.force)
-    start = np.insert(near, COULOMB, 0.01 * strongest)
-    free = np.arange(start.size) != COULOMB
-    bounds = (np.where(free, start - REACH, 0.0), np.where(free, start + REACH, strongest))
-    # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
-    options = {"x_scale": "jac", "max_nfev": EVALUATIONS, "diff_step": 1e-5, "ftol": 1e-6}
-    return least_squares(model.residual, start, bounds=bounds, **options)
+    free = np.arange(near.size + 1) != COULOMB
+    fits = []
+    for part in FRICTIONS:
+        start = np.insert(near, COULOMB, part * strongest)
+        bounds = (np.where(free, start - REACH, 0.0), np.where(free, start + REACH, strongest))
+        # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
+        options = {"x_scale": "jac", "max_nfev": EVALUATIONS, "diff_step": 1e-5, "ftol": 1e-6}
+        fits.append(least_squares(model.residual, start, bounds=bounds, **options))
+        if np.sqrt(2 * fits[-1].cost / fits[-1].fun.size) <= UNEXPLAINED * step:
+            break
+    return min(fits, key=lambda fit: fit.cost)
 
 
 def _settled(model: _Model, fit: OptimizeResult, step: float) -> Estimate:
     estimate = _estimate(model, fit.x, fit.fun, fit.jac, step)
     if estimate.steps > UNEXPLAINED:
         raise ValueError(
-            f"the model leaves {estimate.steps:.2g} encoder steps rms unexplained, a bound takes at most {UNEXPLAINED:g} "
+            f"the model leaves {estimate.steps:.2g} encoder steps rms unexplained, {UNEXPLAINED:g} at most give a bound "
             "(friction of another kind, a hand at the handle, gravity, or a slipping drive?)"
         )
     return estimate
@@ -129,7 +138,7 @@ def _starts(model: _Model, whole: Array) -> list[Array]:
 class _Model:
     """p = [log m1, log b, c, log m2, log k] -> simulated displacement."""
 
-    def __init__(self, x: Array, force: Array, used: Array, T: float, rigid: bool) -> None:
+    def __init__(self, x: Array, force: Array, used: Flags, T: float, rigid: bool) -> None:
         self.x, self.force, self.used, self.T, self.rigid = x, force, used, T, rigid
 
     def matrices(self, p: Array, T: float) -> tuple[Array, Array]:
@@ -143,7 +152,7 @@ class _Model:
             a[0, 2] = a[1, 3] = 1.0
             a[2] = [-k / m1, k / m1, -b / m1, 0.0, 1 / m1]
             a[3, :2] = [k / m2, -k / m2]
-        step = expm(a * T)
+        step: Array = expm(a * T)
         return step[:-1, :-1], step[:-1, -1]
 
     def simulate(self, p: Array) -> Array:

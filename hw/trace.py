@@ -69,7 +69,8 @@ def result_of(recorder: Recorder, units: Units, T: float, meta: dict[str, Any]) 
     last = np.maximum.accumulate(np.where(link["received"], np.arange(n), 0))  # a force is held until the next is known
     f = -link["applied"][last] * np.array(units.force_step)
     unknown = np.full((n, m), np.nan)
-    return Result(np.arange(n) * T, link["x"], f, unknown, unknown, np.zeros((n, 0)), meta)
+    t = np.arange(n, dtype=float) * T
+    return Result(t, link["x"], f, unknown, unknown, np.zeros((n, 0)), meta)
 
 
 def save_npz(path: Path, result: Result, recorder: Recorder) -> Path:
