@@ -102,7 +102,7 @@ def _settled(model: _Model, fit: OptimizeResult, step: float) -> Estimate:
     estimate = _estimate(model, fit.x, fit.fun, fit.jac, step)
     if estimate.steps > UNEXPLAINED:
         raise ValueError(
-            f"the model leaves {estimate.steps:.2g} encoder steps rms unexplained, {UNEXPLAINED:g} at most give a bound "
+            f"the model leaves {estimate.steps:.2g} encoder steps rms unexplained, over {UNEXPLAINED:g} gives no bound "
             "(friction of another kind, a hand at the handle, gravity, or a slipping drive?)"
         )
     return estimate
@@ -152,7 +152,7 @@ class _Model:
             a[0, 2] = a[1, 3] = 1.0
             a[2] = [-k / m1, k / m1, -b / m1, 0.0, 1 / m1]
             a[3, :2] = [k / m2, -k / m2]
-        step: Array = expm(a * T)
+        step = np.array(expm(a * T))
         return step[:-1, :-1], step[:-1, -1]
 
     def simulate(self, p: Array) -> Array:
