@@ -52,7 +52,7 @@ def main(argv: list[str]) -> int:
         return rungs
 
     live = hold_session(args, session, plan, seconds, seed)
-    outcome = session_report.outcome(args.case, session, recorder, live.dropped)
+    outcome = session_report.outcome(args.case, session, recorder, live.dropped, float(args.pace))
     outcome["files"] = [str(p) for p in session_report.save(out, session, recorder, outcome, not args.no_plot)]
     session_report.print_session(outcome, console(args))
     if args.json:

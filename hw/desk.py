@@ -12,6 +12,7 @@ from typing import Any
 
 from hw.dashboard import Dashboard
 from hw.emulate import spawned
+from hw.emulator import pace_from
 from hw.live import Live
 from hw.plan import Ages, Program, link_delay
 from hw.port import Port
@@ -29,6 +30,9 @@ def add_link_options(parser: argparse.ArgumentParser) -> None:
     link.add_argument("--port", metavar="PATH", help="serial port of the device, /dev/ttyACM0 or an emulator's")
     link.add_argument("--emulate", action="store_true", help="start hw.emulator and drive that; it arms by itself")
     link.add_argument("--fault", action="append", default=[], metavar="FAULT", help="for --emulate, see hw.emulator")
+    link.add_argument(
+        "--pace", default="1", metavar="P", help="slow motion for --emulate on a busy machine (default 1)"
+    )
     link.add_argument("--arm", action="store_true", help="arm without being asked; else press a")
     link.add_argument("--baud", default="921600", metavar="N", help="default 921600; checked against T")
     link.add_argument("--quantile", default="0.99", metavar="Q", help="of the ages that theta covers (default 0.99)")
@@ -42,6 +46,8 @@ def check_link(args: argparse.Namespace) -> Settings:
         raise InputError("give either --port PATH or --emulate")
     if args.fault and not args.emulate:
         raise InputError("--fault is for --emulate; a device behind --port has its own")
+    if pace_from(args) != 1 and not args.emulate:
+        raise InputError("--pace is for --emulate: a device has its own timer")
     if args.port and not args.arm and not sys.stdin.isatty():
         raise InputError("no keyboard to arm with: give --arm, if nobody can get hurt")
     number(args, "quantile", 0.5, 1.0)
@@ -89,7 +95,7 @@ def hold_session(
         path = args.port or stack.enter_context(spawned(args, seed, seconds, extra))
         port = stack.enter_context(Port(path, int(args.baud)))
         keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
-        live = Live(session, port, plan, args.arm or args.emulate, seconds, keyboard, _view(stack))
+        live = Live(session, port, plan, args.arm or args.emulate, seconds, keyboard, _view(stack), float(args.pace))
         live.run()
     return live
 

@@ -59,10 +59,10 @@ class Terminal:
 class Clockwork:
     """The emulator in real time."""
 
-    def __init__(self, emulator: Emulator, terminal: Terminal, up: Line, down: Line, T: float) -> None:
+    def __init__(self, emulator: Emulator, terminal: Terminal, up: Line, down: Line, T: float, pace: float) -> None:
         self.emulator, self.terminal = emulator, terminal
         self._up, self._down = up, down
-        self._period = 1e6 * T
+        self._period, self._pace = 1e6 * T, pace
         self._start = time.monotonic_ns()
         self._lost = 0.0  # [us] that this process was held up
         self.late = 0  # ticks that began more than half a period late
@@ -72,7 +72,7 @@ class Clockwork:
 
     def now(self) -> float:
         """The device's clock [us]."""
-        return (time.monotonic_ns() - self._start) / 1000 - self._lost
+        return (time.monotonic_ns() - self._start) * self._pace / 1000 - self._lost
 
     def run(self, seconds: float, asked_to_stop: Callable[[], bool]) -> None:
         """Tick until the time is over, the cable is pulled or somebody stops it."""
@@ -99,7 +99,7 @@ class Clockwork:
     def _wait(self, due: float) -> None:
         """Until the next tick is due or bytes come or go, and see to those first."""
         first = min(due, self._queue[0][0]) if self._queue else due
-        timeout = max(0.0, 1e-6 * (first - self.now()))
+        timeout = max(0.0, 1e-6 * (first - self.now()) / self._pace)
         if self.emulator.unplugged:
             time.sleep(timeout)
             return
@@ -142,6 +142,7 @@ def main(argv: list[str]) -> int:
     coulomb = numbers("--coulomb", args.coulomb, float, 1)[0]
     if not 0 <= coulomb <= 10:
         raise InputError(f"--coulomb is {coulomb:g}, allowed are 0 to 10 N")
+    pace = pace_from(args)
     try:
         emulator = Emulator(nobody(scenario) if args.nobody else scenario, upsets, coulomb=coulomb)
     except ValueError as error:
@@ -150,13 +151,22 @@ def main(argv: list[str]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, frame: stops.append(received))
     print(terminal.path, flush=True)
-    clockwork = Clockwork(emulator, terminal, Line("up", upsets, seed), Line("down", upsets, seed), scenario.T)
+    up, down = (Line(direction, upsets, seed) for direction in ("up", "down"))
+    clockwork = Clockwork(emulator, terminal, up, down, scenario.T, pace)
     gc.collect()
     gc.freeze()
     gc.disable()
     clockwork.run(seconds, lambda: bool(stops))
     print(json.dumps(_summary(clockwork)), file=sys.stderr)
     return INTERRUPTED if signal.SIGINT in stops else DONE
+
+
+def pace_from(args: argparse.Namespace) -> float:
+    """Seconds of the device's clock per second. Raises InputError."""
+    pace = numbers("--pace", args.pace, float, 1)[0]
+    if not 0.01 <= pace <= 1:
+        raise InputError(f"--pace is {pace:g}, allowed are 0.01 to 1")
+    return pace
 
 
 def _summary(clockwork: Clockwork) -> dict[str, Any]:
@@ -183,6 +193,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--duration", default="1000000", metavar="SECONDS", help="default: until interrupted")
     parser.add_argument("--nobody", action="store_true", help="no person at the handles")
     parser.add_argument("--coulomb", default="0", metavar="NEWTON", help="dry friction at every motor (default 0)")
+    parser.add_argument("--pace", default="1", metavar="P", help="slow motion for busy machines (default 1; host too)")
     parser.add_argument("--seed", metavar="N", default="0", help="for the faults (default 0)")
     return parser
 

@@ -23,7 +23,7 @@ from controller.lti import Array
 Flags = NDArray[np.bool_]
 
 COULOMB = 2  # where Coulomb friction is among the parameters
-UNEXPLAINED = 0.7  # encoder steps rms; rounding alone leaves 0.29
+UNEXPLAINED = 0.7, 5e-4  # encoder steps rms (rounding alone leaves 0.29), or this part of the motion's rms
 SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
 SUBSTEPS = 4  # per tick for which it is held
 BANDWIDTH = 60  # [ticks] over which residuals may be correlated
@@ -93,16 +93,17 @@ def _with_coulomb(model: _Model, near: Array, step: float) -> OptimizeResult:
         # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
         options = {"x_scale": "jac", "max_nfev": EVALUATIONS, "diff_step": 1e-5, "ftol": 1e-6}
         fits.append(least_squares(model.residual, start, bounds=bounds, **options))
-        if np.sqrt(2 * fits[-1].cost / fits[-1].fun.size) <= UNEXPLAINED * step:
+        if np.sqrt(2 * fits[-1].cost / fits[-1].fun.size) <= model.allowed(step):
             break
     return min(fits, key=lambda fit: fit.cost)
 
 
 def _settled(model: _Model, fit: OptimizeResult, step: float) -> Estimate:
     estimate = _estimate(model, fit.x, fit.fun, fit.jac, step)
-    if estimate.steps > UNEXPLAINED:
+    allowed = model.allowed(step)
+    if estimate.rms > allowed:
         raise ValueError(
-            f"the model leaves {estimate.steps:.2g} encoder steps rms unexplained, over {UNEXPLAINED:g} gives no bound "
+            f"the model leaves {estimate.steps:.2g} encoder steps rms unexplained, at most {allowed / step:.2g} may be "
             "(friction of another kind, a hand at the handle, gravity, or a slipping drive?)"
         )
     return estimate
@@ -161,6 +162,10 @@ class _Model:
         A, B = self.matrices(p, self.T / substeps)
         play = _play_rigid if self.rigid else _play_compliant
         return np.array(play(A.tolist(), B.tolist(), float(p[COULOMB]), self.force.tolist(), substeps))
+
+    def allowed(self, step: float) -> float:
+        """What a fit may leave unexplained [m] rms, at `step` [m] of the encoder."""
+        return max(UNEXPLAINED[0] * step, UNEXPLAINED[1] * float(np.std(self.x[self.used])))
 
     def residual(self, p: Array) -> Array:
         """Measured less simulated (used,) [m]; where the origin lies is not known."""

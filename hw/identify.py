@@ -70,7 +70,7 @@ def main(argv: list[str]) -> int:
 
     played = 1.5 * seconds + 0.1  # from full gain on: the lead has the ramp
     live = hold_session(args, session, plan, played, seed, ["--nobody", f"--coulomb={coulomb}"])
-    outcome, estimates = _outcome(session, recorder, scenario, live.dropped)
+    outcome, estimates = _outcome(session, recorder, scenario, live.dropped, float(args.pace))
     outcome["files"] = [str(p) for p in _save(out, session, recorder, scenario, estimates, outcome)]
     _print(outcome, console(args))
     if args.json:
@@ -97,9 +97,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _outcome(
-    session: Session, recorder: Recorder, scenario: Scenario, dropped: int
+    session: Session, recorder: Recorder, scenario: Scenario, dropped: int, pace: float
 ) -> tuple[dict[str, Any], list[Estimate]]:
-    outcome = session_report.outcome("identify", session, recorder, dropped)
+    outcome = session_report.outcome("identify", session, recorder, dropped, pace)
     estimates: list[Estimate] = []
     if session.stage == Stage.FINISHED and len(recorder):
         try:

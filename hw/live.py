@@ -46,19 +46,19 @@ class Live:
         seconds: float,
         keyboard: int | None = None,  # a file descriptor with single keys
         glance: Callable[[Session], None] = lambda session: None,  # called a few times a second
+        pace: float = 1.0,  # seconds of the session per second; 1 with any real device
     ) -> None:
         self.session, self.port, self._plan = session, port, plan
         self._auto_arm, self._seconds = auto_arm, seconds
-        self._keyboard, self._glance = keyboard, glance
+        self._keyboard, self._glance, self._pace = keyboard, glance, pace
         self.signals: list[int] = []
         self.dropped = 0  # bytes that the port would not take at once
         self._armed_at: int | None = None
         self._glanced = 0
 
-    @staticmethod
-    def now() -> int:
-        """[us]"""
-        return time.monotonic_ns() // 1000
+    def now(self) -> int:
+        """The session's clock [us]."""
+        return int(time.monotonic_ns() * self._pace) // 1000
 
     def run(self) -> Session:
         """From HELLO to the end. Whatever is raised in between, the device is stopped first."""

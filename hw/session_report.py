@@ -25,7 +25,7 @@ from sim.files import write_json
 PERCENTILES = (50, 90, 99, 100)
 
 
-def outcome(case: str, session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
+def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> dict[str, Any]:
     """Stage, cause and log; the coupling with its certificates; what the link did, as a report without a verdict."""
     begin = session.log[0].t_us if session.log else 0
     log = [{"t_s": 1e-6 * (e.t_us - begin), "stage": str(e.stage), "cause": e.cause} for e in session.log]
@@ -42,6 +42,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int) -> di
             "duration_s": len(recorder) * session.scenario.T,
             "T_s": session.scenario.T,
             "scenario_digest": session.scenario.digest,
+            "pace": pace,  # below 1: slow motion, in which a link looks faster than it is
         },
     }
 

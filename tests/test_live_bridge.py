@@ -145,6 +145,8 @@ def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
         (["--emulate", "--guard", "nan"], "--guard is nan"),
         (["--emulate", "--measure", "1"], "--measure is 1"),
         (["--emulate", "--duration", "0"], "--duration is 0"),
+        (["--emulate", "--pace", "2"], "--pace is 2, allowed are 0.01 to 1"),
+        (["--port", "x", "--pace", "0.5"], "--pace is for --emulate"),
         (["--emulate", "--T", "0.05"], "T is 0.05 s"),
         (["--emulate", "--fault", "nonsense"], "the emulator did not start: --fault is 'nonsense'"),
     ],
