@@ -23,7 +23,7 @@ from controller.lti import Array
 Flags = NDArray[np.bool_]
 
 COULOMB = 2  # where Coulomb friction is among the parameters
-UNEXPLAINED = 0.7, 5e-4  # encoder steps rms (rounding alone leaves 0.29), or this part of the motion's rms
+UNEXPLAINED = 0.7, 1.5e-3  # encoder steps rms (rounding alone leaves 0.29), or this part of the motion's rms
 SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
 SUBSTEPS = 4  # per tick for which it is held
 BANDWIDTH = 60  # [ticks] over which residuals may be correlated
