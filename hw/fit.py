@@ -153,7 +153,7 @@ class _Model:
             a[0, 2] = a[1, 3] = 1.0
             a[2] = [-k / m1, k / m1, -b / m1, 0.0, 1 / m1]
             a[3, :2] = [k / m2, -k / m2]
-        step = np.array(expm(a * T))
+        step = np.asarray(expm(a * T), dtype=np.float64)
         return step[:-1, :-1], step[:-1, -1]
 
     def simulate(self, p: Array) -> Array:
