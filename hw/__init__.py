@@ -1,0 +1,1 @@
+"""The serial link: protocol, device state machine, bridge and emulator."""

@@ -1,0 +1,121 @@
+"""What the commands at a port share: its options, the keyboard, and the session from HELLO to the end."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import termios
+import tty
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+from hw.dashboard import Dashboard
+from hw.emulate import spawned
+from hw.emulator import pace_from
+from hw.live import Live
+from hw.plan import Ages, Program, link_delay
+from hw.port import Port
+from hw.safety import Limits
+from hw.session import Session, Settings
+from sim.command import numbers
+from sim.scenario import InputError, Scenario
+
+STRONGEST = 12.0  # [N] whatever a scenario allows
+
+
+def add_link_options(parser: argparse.ArgumentParser) -> None:
+    """Which device, over which line, and how its delay is judged."""
+    link = parser.add_argument_group("the link")
+    link.add_argument("--port", metavar="PATH", help="serial port of the device, /dev/ttyACM0 or an emulator's")
+    link.add_argument("--emulate", action="store_true", help="start hw.emulator and drive that; it arms by itself")
+    link.add_argument("--fault", action="append", default=[], metavar="FAULT", help="for --emulate, see hw.emulator")
+    link.add_argument(
+        "--pace", default="1", metavar="P", help="slow motion for --emulate on a busy machine (default 1)"
+    )
+    link.add_argument("--arm", action="store_true", help="arm without being asked; else press a")
+    link.add_argument("--baud", default="921600", metavar="N", help="default 921600; checked against T")
+    link.add_argument("--quantile", default="0.99", metavar="Q", help="of the ages that theta covers (default 0.99)")
+    link.add_argument("--guard", default="1e-4", metavar="SECONDS", help="added to it (default 1e-4)")
+    link.add_argument("--measure", default="800", metavar="N", help="answers that are timed (default 800)")
+
+
+def check_link(args: argparse.Namespace) -> Settings:
+    """The settings of a session. Raises InputError where the options contradict each other."""
+    if bool(args.port) == args.emulate:
+        raise InputError("give either --port PATH or --emulate")
+    if args.fault and not args.emulate:
+        raise InputError("--fault is for --emulate; a device behind --port has its own")
+    if pace_from(args) != 1 and not args.emulate:
+        raise InputError("--pace is for --emulate: a device has its own timer")
+    if args.port and not args.arm and not sys.stdin.isatty():
+        raise InputError("no keyboard to arm with: give --arm, if nobody can get hurt")
+    number(args, "quantile", 0.5, 1.0)
+    number(args, "guard", 0.0, 0.1)
+    baud, measure = numbers("--baud", args.baud, int, 1)[0], numbers("--measure", args.measure, int, 1)[0]
+    for name, value, low, high in (("baud", baud, 1200, 20_000_000), ("measure", measure, 50, 100_000)):
+        if not low <= value <= high:
+            raise InputError(f"--{name} is {value}, allowed are {low} to {high}")
+    return Settings(baud=baud, measure=measure)
+
+
+def number(args: argparse.Namespace, name: str, low: float, high: float, default: float | None = None) -> float:
+    """One option as a number within its range. Raises InputError."""
+    text = getattr(args, name)
+    value = default if text is None else numbers(f"--{name}", text, float, 1)[0]
+    assert value is not None
+    if not low <= value <= high:
+        raise InputError(f"--{name} is {value:g}, allowed are {low:g} to {high:g}")
+    return value
+
+
+def session_for(scenario: Scenario, settings: Settings, cap: float = STRONGEST) -> Session:
+    """A session that never asks for more than `cap` [N]. Raises InputError where T is none for a serial link."""
+    try:
+        return Session(scenario, Limits(tuple(min(cap, d.force_limit) for d in scenario.device)), settings)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+def measured_link(args: argparse.Namespace, ages: Ages, T: float) -> int:
+    """Ticks of delay for the ages that were measured, by --quantile and --guard."""
+    return link_delay(ages, 1e6 * T, float(args.quantile), 1e6 * float(args.guard))
+
+
+def hold_session(
+    args: argparse.Namespace,
+    session: Session,
+    plan: Callable[[Ages], Sequence[Program]],
+    seconds: float,
+    seed: int,
+    extra: Sequence[str] = (),
+) -> Live:
+    """From opening the port, or starting an emulator with the options `extra`, to the end of the session."""
+    with ExitStack() as stack:
+        path = args.port or stack.enter_context(spawned(args, seed, seconds, extra))
+        port = stack.enter_context(Port(path, int(args.baud)))
+        keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
+        live = Live(session, port, plan, args.arm or args.emulate, seconds, keyboard, _view(stack), float(args.pace))
+        live.run()
+    return live
+
+
+def _view(stack: ExitStack) -> Callable[[Session], None]:
+    """The dashboard, on a terminal."""
+    if not sys.stderr.isatty():
+        return lambda session: None
+    dashboard = Dashboard()
+    stack.callback(dashboard.close)
+    return dashboard
+
+
+@contextmanager
+def _keys() -> Iterator[int]:
+    """Standard input, key by key."""
+    keyboard = sys.stdin.fileno()
+    before: list[Any] = termios.tcgetattr(keyboard)
+    tty.setcbreak(keyboard, termios.TCSANOW)
+    try:
+        yield keyboard
+    finally:
+        termios.tcsetattr(keyboard, termios.TCSANOW, before)

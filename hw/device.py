@@ -1,0 +1,178 @@
+"""The device's side of the link: safety states, and forces latched at tick k + theta; no clock and no port of its own.
+
+The same machine as hw/firmware/haptic_link.h, integer for integer and byte for byte (tests/test_firmware.py). Its rules
+are in docs/protocol.md. Forces are in steps, per axis, as tuples.
+"""
+
+from hw.frame import Ack, Config, Decoder, Force, Hello, Info, Message, State, Stop, config_crc, distance, encode
+from hw.message import MAX_RELEASE_NS, MAX_THETA, NO_MARGIN, Cause, Command, Phase, Reason, Refused
+
+SLOTS = 16  # forces that wait for their tick: a power of two above MAX_THETA
+RUNNING = (Phase.ARMED, Phase.HOLDING, Phase.RAMP)  # the motors may carry a force
+
+
+class Device:
+    """One microcontroller. Call tick() once per period, receive() when bytes come, estop() and fault() at any time."""
+
+    def __init__(self, info: Info) -> None:
+        """Raises ValueError where `info` cannot travel."""
+        self.info = info
+        self.info_frame = encode(info)
+        self.decoder = Decoder()
+        self.unexpected = 0  # well-formed frames that this device has no use for
+        self.phase, self.cause = Phase.SILENT, Cause.NONE
+        self.config: Config | None = None
+        self.k, self.now = 0, 0  # this tick, and the clock at it [us]
+        self.zero = (0,) * info.axes
+        self.asked, self.ack = False, b""  # what to say at the next tick
+        self.clear()
+        self.misses = 0
+
+    def clear(self) -> None:
+        """Forget every force."""
+        self.slots: list[Force | None] = [None] * SLOTS
+        self.applied = self.ramp_from = self.zero
+        self.held = self.ramp_left = self.run = 0
+        self.echo, self.margin = 0, NO_MARGIN
+
+    @property
+    def status(self) -> int:
+        return self.phase | self.cause << 4
+
+    def tick(self, now_us: int, counts: tuple[int, ...]) -> tuple[tuple[int, ...], bytes]:
+        """A period begins: the forces that act from now on, and the bytes to send. `counts` was sampled just before."""
+        self.k, self.now = (self.k + 1) & 0xFFFF, now_us & 0xFFFFFFFF
+        frame, self.slots[self.k % SLOTS] = self.slots[self.k % SLOTS], None
+        if self.phase in (Phase.DISARMED, Phase.ARMED, Phase.HOLDING):
+            self.misses += frame is None
+            if self.phase != Phase.DISARMED:
+                self.latch(frame)
+            elif frame is not None and frame.command == Command.ARM:
+                self.phase = Phase.ARMED
+        if self.phase == Phase.RAMP:
+            self.ramp_down()
+        return self.applied, self.speak(counts)
+
+    def latch(self, frame: Force | None) -> None:
+        """The force for this tick, or without one the last one held, for `hold` ticks."""
+        assert self.config is not None
+        if frame is None:
+            self.phase = Phase.HOLDING
+            if self.held >= self.config.hold:
+                self.halt(Cause.WATCHDOG)
+            self.held += 1
+        elif frame.command == Command.IDLE:
+            self.halt(Cause.COMMAND)
+        else:
+            self.phase, self.held = Phase.ARMED, 0
+            self.run = min(self.run + 1, self.config.ramp_in)
+            self.applied = tuple(map(self.limited, frame.force, self.applied, self.config.cap, self.config.slew))
+
+    def limited(self, force: int, last: int, cap: int, slew: int) -> int:
+        """A force within the cap, which grows after arming, and within the slew rate of the last one."""
+        assert self.config is not None
+        if self.config.ramp_in:
+            cap = cap * self.run // self.config.ramp_in
+        force = max(-cap, min(cap, force))
+        return last + max(-slew, min(slew, force - last))
+
+    def ramp_down(self) -> None:
+        assert self.config is not None
+        self.ramp_left -= 1
+        self.applied = tuple(scaled(f, self.ramp_left, self.config.ramp) for f in self.ramp_from)
+        if self.ramp_left == 0:
+            self.phase = Phase.STOPPED
+
+    def halt(self, cause: Cause) -> None:
+        """To zero force, for a named cause: by a ramp while armed, at once before. The first cause stays."""
+        if self.phase in (Phase.ARMED, Phase.HOLDING):
+            assert self.config is not None
+            self.phase, self.cause = Phase.RAMP, cause
+            self.ramp_from, self.ramp_left = self.applied, self.config.ramp
+        elif self.phase == Phase.DISARMED:
+            self.phase, self.cause = Phase.STOPPED, cause
+
+    def fault(self) -> None:
+        """The firmware found a fault of its own (an encoder, a driver)."""
+        self.halt(Cause.DEVICE)
+
+    def estop(self, cause: Cause = Cause.ESTOP_DEVICE) -> None:
+        """Zero force at once, until the device is reset."""
+        if self.phase != Phase.ESTOP:
+            self.clear()
+            self.phase, self.cause = Phase.ESTOP, cause
+
+    def speak(self, counts: tuple[int, ...]) -> bytes:
+        """INFO where asked for and the motors rest, then ACK, then STATE once configured."""
+        out, self.ack = self.ack, b""
+        if self.asked and self.phase not in RUNNING:
+            out, self.asked = self.info_frame + out, False
+        if self.config is None:
+            return out
+        errors, misses = (self.decoder.rejected + self.unexpected) & 0xFF, self.misses & 0xFF
+        state = State(self.status, self.k, self.echo, self.margin, errors, misses, self.now, counts, self.applied)
+        self.margin = NO_MARGIN
+        return out + encode(state)
+
+    def receive(self, data: bytes, now_us: int) -> None:
+        """Bytes that came at `now_us`, in any pieces."""
+        for message in self.decoder.feed(data):
+            self.understand(message, now_us)
+
+    def understand(self, message: Message, now_us: int) -> None:
+        if isinstance(message, Force):
+            self.accept(message, now_us)
+        elif isinstance(message, Config):
+            self.configure(message)
+        elif isinstance(message, Hello):
+            self.asked = True
+        elif isinstance(message, Stop) and message.reason == Reason.ESTOP:
+            self.estop(Cause.ESTOP_HOST)
+        elif isinstance(message, Stop):
+            self.halt(Cause.HOST)
+        else:
+            self.unexpected += 1
+
+    def accept(self, frame: Force, now_us: int) -> None:
+        """A force waits for its tick where that is ahead, answers the right tick, and is the first for it."""
+        known = frame.command == Command.RUN or (frame.command in (Command.IDLE, Command.ARM) and not any(frame.force))
+        if frame.axes != self.info.axes or not known:
+            self.unexpected += 1
+            return
+        if self.config is None or distance(frame.apply_at, frame.source) != self.config.theta:
+            return
+        ahead, slot = distance(frame.apply_at, self.k), frame.apply_at % SLOTS
+        if ahead > self.config.theta or (ahead > 0 and self.slots[slot] is not None):
+            return
+        since = (now_us - self.now) & 0xFFFFFFFF
+        margin = scaled(ahead, self.info.period_ns, 1000) - since
+        self.echo, self.margin = frame.source, max(-0x7FFF, min(0x7FFF, margin))
+        if ahead > 0:
+            self.slots[slot] = frame
+
+    def configure(self, config: Config) -> None:
+        refused = self.refuse(config)
+        self.ack = encode(Ack(config_crc(config), refused))
+        if not refused:
+            self.clear()
+            self.config, self.phase, self.cause = config, Phase.DISARMED, Cause.NONE
+
+    def refuse(self, config: Config) -> Refused:
+        """Why this CONFIG cannot be taken, ACCEPTED where it can."""
+        release = (config.hold + config.ramp) * self.info.period_ns
+        reasons = (
+            (self.phase == Phase.ESTOP, Refused.ESTOP),
+            (self.phase in RUNNING, Refused.RUNNING),
+            (config.axes != self.info.axes, Refused.AXES),
+            (not 1 <= config.theta <= MAX_THETA, Refused.THETA),
+            (config.ramp == 0 or release > MAX_RELEASE_NS, Refused.RELEASE),
+            (any(not 1 <= c <= most for c, most in zip(config.cap, self.info.hard_limit, strict=False)), Refused.CAP),
+            (0 in config.slew, Refused.SLEW),
+        )
+        return next((reason for wrong, reason in reasons if wrong), Refused.ACCEPTED)
+
+
+def scaled(value: int, by: int, over: int) -> int:
+    """value * by / over, rounded towards zero as C does."""
+    size = abs(value) * by // over
+    return size if value >= 0 else -size

@@ -1,0 +1,88 @@
+"""From a STATE to the force that answers it, while forces act: law, gain, limits, steps, record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from controller.lti import Array
+from hw.frame import Config, State
+from hw.handshake import Units
+from hw.law import Controller, fill
+from hw.message import Phase
+from hw.safety import Gain, Limits, check_jump, check_range, shape
+from hw.watch import Counters
+
+REMEMBERED = 64  # forces on their way, of which at most theta matter
+
+
+class Row(NamedTuple):
+    """One tick of a trace. Where `state` is None no STATE came: x is filled in and nothing was sent."""
+
+    tick: int  # modulo 2^16
+    x: tuple[float, ...]  # (m,) [m]
+    asked: Array  # (m,) [N] by the controller
+    gain: float
+    sent: tuple[int, ...]  # [steps]
+    state: State | None
+
+
+class Drive:
+    """The coupling at work, from one arming to the next end."""
+
+    def __init__(
+        self,
+        law: Controller,
+        units: Units,
+        config: Config,
+        limits: Limits,
+        counters: Counters,
+        record: Callable[[Row], None],
+    ) -> None:
+        self.law, self.units, self.config, self.limits = law, units, config, limits
+        self.T = law.T
+        self.gain = Gain(limits, law.T)
+        self.force = (0.0,) * config.axes  # [N] the last one sent
+        self.x: tuple[float, ...] | None = None  # [m] of the last STATE
+        self._counters, self._record = counters, record
+        self._sent: dict[int, tuple[int, ...]] = {}
+
+    def step(self, state: State, ticks: int, direction: int) -> tuple[int, ...]:
+        """The force [steps] that answers `state`, which came `ticks` after the one before.
+
+        The gain rises (direction 1), falls (-1) or stays (0). Raises Fault where an encoder or the controller is out of
+        bounds.
+        """
+        x = self.units.positions(state.counts)
+        check_range(x, self.units.reach)
+        if self.x is None:
+            positions = [x]
+        else:
+            check_jump(x, self.x, ticks, self.limits)
+            positions = fill(self.x, x, ticks)
+        self._compare(state)
+        self._miss(state, positions[:-1])
+        asked = self.law.step(x)
+        if direction:
+            (self.gain.rise if direction > 0 else self.gain.fall)(ticks)
+        shaped = shape(asked.tolist(), self.force, self.gain.value, self.limits, self.T)
+        self.x, self.force = x, shaped.force
+        self._counters.clipped += shaped.clipped
+        self._counters.slowed += shaped.slowed
+        steps = self.units.steps(shaped.force, self.config.cap)
+        self._sent[(state.tick + self.config.theta) & 0xFFFF] = steps
+        self._record(Row(state.tick, x, asked, self.gain.value, steps, state))
+        return steps
+
+    def _miss(self, state: State, positions: list[tuple[float, ...]]) -> None:
+        """The law moves on through ticks of which no STATE came."""
+        for back, x in zip(range(len(positions), 0, -1), positions, strict=True):
+            self._record(Row((state.tick - back) & 0xFFFF, x, self.law.step(x), self.gain.value, (), None))
+
+    def _compare(self, state: State) -> None:
+        """Whether the device does what it was told in time."""
+        told = self._sent.pop(state.tick, None)
+        if len(self._sent) > REMEMBERED:
+            self._sent.pop(next(iter(self._sent)))
+        if told is not None and state.phase == Phase.ARMED and self.gain.value == 1.0:
+            self._counters.unlike += told != state.applied

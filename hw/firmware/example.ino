@@ -1,0 +1,112 @@
+/* A two-axis device on the serial link: quadrature encoders, PWM and direction to two motor drivers, an enable line and
+ * an emergency stop. For boards with native USB (Teensy 4, Due, Zero, Portenta): their write buffer holds an INFO and a
+ * STATE at once. Put haptic_link.h beside it.
+ *
+ * Yours to change: the pins, the numbers of INFO (measure them; docs/protocol.md says what the host does with each), and
+ * the five functions. Everything that keeps hands whole is in haptic_link.h: leave it as it is. */
+#include <Arduino.h>
+
+#include "haptic_link.h"
+
+static const uint8_t AXES = 2;
+static const uint32_t PERIOD_US = 1200;
+static const uint8_t ENCODER_A[AXES] = {2, 4}, ENCODER_B[AXES] = {3, 5};
+static const uint8_t MOTOR_PWM[AXES] = {9, 10}, MOTOR_DIRECTION[AXES] = {7, 8};
+static const uint8_t ENABLE = 6;       /* of both drivers; pulled down outside: an unpowered board means no force */
+static const uint8_t STOP_BUTTON = 11; /* normally closed, to ground: pressed, unplugged and broken all read HIGH */
+static const uint16_t FULL_FORCE = 24000; /* steps of 500 uN at PWM 255, here 12 N: from your motor's constant */
+
+static hl_device device;
+static volatile int32_t position[AXES];
+static uint32_t due;
+
+static void edge(uint8_t axis) /* one count for every edge of channel A */
+{
+  bool same = digitalRead(ENCODER_A[axis]) == digitalRead(ENCODER_B[axis]);
+  position[axis] = position[axis] + (same ? 1 : -1);
+}
+static void edge0() { edge(0); }
+static void edge1() { edge(1); }
+
+/* ---- the five functions: what only you know --------------------------------------------------------------------- */
+
+static void readEncoders(int32_t *counts)
+{
+  noInterrupts();
+  for (uint8_t a = 0; a < AXES; a++) counts[a] = position[a];
+  interrupts();
+}
+
+/* A force in steps, positive towards growing counts. */
+static void writeForces(const int16_t *force)
+{
+  for (uint8_t a = 0; a < AXES; a++) {
+    int32_t size = force[a] < 0 ? -(int32_t)force[a] : force[a];
+    digitalWrite(MOTOR_DIRECTION[a], force[a] < 0 ? HIGH : LOW);
+    analogWrite(MOTOR_PWM[a], (int)(size * 255 / FULL_FORCE));
+  }
+  digitalWrite(ENABLE, hl_running(&device) ? HIGH : LOW);
+}
+
+/* The next byte, -1 where none waits. */
+static int serialRead() { return Serial.available() > 0 ? Serial.read() : -1; }
+
+/* All or nothing, and never waiting: a device that waits for its host has no watchdog. */
+static void serialWrite(const uint8_t *data, size_t n)
+{
+  if (Serial.availableForWrite() >= (int)n) Serial.write(data, n);
+}
+
+static uint32_t timeUs() { return (uint32_t)micros(); }
+
+/* ---- the loop: leave as it is ----------------------------------------------------------------------------------- */
+
+void setup()
+{
+  hl_info info = {"example 1", 1, PERIOD_US * 1000, AXES, {}};
+  for (uint8_t a = 0; a < AXES; a++) {
+    /* damping [uN s/m], pm per count, uN per step, largest force [steps], workspace [counts] */
+    hl_axis axis = {1370000, 10000000, 500, FULL_FORCE, 8000};
+    info.axis[a] = axis;
+    pinMode(ENCODER_A[a], INPUT_PULLUP);
+    pinMode(ENCODER_B[a], INPUT_PULLUP);
+    pinMode(MOTOR_PWM[a], OUTPUT);
+    pinMode(MOTOR_DIRECTION[a], OUTPUT);
+  }
+  pinMode(ENABLE, OUTPUT);
+  digitalWrite(ENABLE, LOW);
+  pinMode(STOP_BUTTON, INPUT_PULLUP);
+  attachInterrupt(digitalPinToInterrupt(ENCODER_A[0]), edge0, CHANGE);
+  attachInterrupt(digitalPinToInterrupt(ENCODER_A[1]), edge1, CHANGE);
+  Serial.begin(2000000); /* boards with native USB ignore the rate */
+  if (!hl_init(&device, &info)) /* a number above is impossible: ENABLE stays low */
+    for (;;) delay(1000);
+  due = timeUs() + PERIOD_US;
+}
+
+void loop()
+{
+  int byte = 0;
+  for (uint8_t n = 0; n < 64 && (byte = serialRead()) >= 0; n++) /* a flood of bytes must not keep the tick waiting */
+    hl_receive(&device, (uint8_t)byte, timeUs());
+  if (digitalRead(STOP_BUTTON) == HIGH) {
+    digitalWrite(ENABLE, LOW);
+    hl_estop(&device);
+  }
+
+  uint32_t late = timeUs() - due;
+  if (late >= 0x80000000u) return; /* not due yet */
+  if (late > PERIOD_US) {          /* a whole period was lost: say so, and do not catch up */
+    hl_fault(&device);
+    due += late;
+  }
+  due += PERIOD_US;
+
+  int32_t counts[AXES];
+  int16_t force[AXES];
+  uint8_t out[HL_MAX_OUT];
+  readEncoders(counts);
+  size_t n = hl_tick(&device, timeUs(), counts, force, out);
+  writeForces(force);
+  serialWrite(out, n);
+}

@@ -1,0 +1,233 @@
+"""Mass, friction and transmission of one axis from a record of forces and displacements.
+
+The model is the device's: motor (m1) with viscous friction b and Coulomb friction c, transmission spring k, handle
+(m2); the rigid one has the motor alone. Between ticks it is exact for a held force (expm); Coulomb friction is
+c tanh(v/v0), held for a quarter of a tick. Output error: the parameters whose simulated displacement is nearest to the
+encoder's, in the least-squares sense. Residuals are correlated (rounding, friction that the model has not), so the
+covariance is the sandwich (J'J)^-1 J' R J (J'J)^-1 with Bartlett weights (Newey and West 1987).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from math import tanh
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+from scipy.optimize import OptimizeResult, least_squares
+
+from controller.lti import Array
+
+Flags = NDArray[np.bool_]
+
+COULOMB = 2  # where Coulomb friction is among the parameters
+UNEXPLAINED = 0.7, 1.5e-3  # encoder steps rms (rounding alone leaves 0.29), or this part of the motion's rms
+SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
+SUBSTEPS = 4  # per tick for which it is held
+BANDWIDTH = 60  # [ticks] over which residuals may be correlated
+EVALUATIONS = 60  # of a search, without those for derivatives
+ONE_SIDED_95 = 1.6449  # normal quantile
+MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a transmission mode is looked for first
+PARTS = (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mass, that the motor may have
+FRICTIONS = (1e-5, 0.01, 0.05)  # Coulomb friction that a search begins with, of the force's span
+STARTS = 3  # of the search in time
+REACH = 3.0  # of a search, in logarithms
+SPECTRUM = 250  # frequencies that are compared
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """One axis, with standard errors."""
+
+    mass: float  # [kg] in all
+    motor_mass: float  # [kg]
+    viscous: float  # b [N s/m]
+    coulomb: float  # c [N]
+    stiffness: float | None  # k [N/m] of the transmission, None for a rigid device
+    mode_hz: float | None  # the transmission mode, free at both ends
+    errors: dict[str, float]  # standard errors of mass, viscous, coulomb
+    delta: float  # [N s/m] 95 % lower confidence bound of b
+    rms: float  # [m] of the residual
+    steps: float  # the same in encoder steps
+
+
+def identify(x: Array, force: Array, used: Flags, T: float, step: float, rigid: bool, mass: float = 0.25) -> Estimate:
+    """Fit one axis: displacements x (N,) [m], what the motor did (N,) [N], which samples count (N,), encoder step [m].
+
+    `mass` is where the search begins. Raises ValueError where the device did not move or no model fits.
+    """
+    if np.ptp(x[used]) < 20 * step:
+        raise ValueError(f"the axis moved by {np.ptp(x[used]) / step:.0f} encoder steps, at least 20 are needed")
+    whole = _Model(x, force, used, T, rigid=True)
+    smooth = _without_coulomb(whole, np.array([np.log(mass), 0.0]))
+    if rigid:
+        return _settled(whole, _with_coulomb(whole, smooth.x, step), step)
+    model = _Model(x, force, used, T, rigid=False)
+    tries = [_without_coulomb(model, start) for start in _starts(model, smooth.x)]
+    return _settled(model, _with_coulomb(model, min(tries, key=lambda fit: fit.cost).x, step), step)
+
+
+def _without_coulomb(model: _Model, start: Array) -> OptimizeResult:
+    """The nearest parameters within a factor of twenty of the start, which lacks c as the result does.
+
+    Coulomb friction bends the sum of squares so sharply that a search from afar with it does not arrive.
+    """
+
+    def residual(p: Array) -> Array:
+        return model.residual(np.insert(p, COULOMB, 0.0))
+
+    bounds = (start - REACH, start + REACH)
+    return least_squares(residual, start, x_scale="jac", bounds=bounds, max_nfev=EVALUATIONS)
+
+
+def _with_coulomb(model: _Model, near: Array, step: float) -> OptimizeResult:
+    """All parameters, from a start that lacks c: hardly any at first, then more as long as much is unexplained."""
+    strongest = np.ptp(model.force)
+    free = np.arange(near.size + 1) != COULOMB
+    fits = []
+    for part in FRICTIONS:
+        start = np.insert(near, COULOMB, part * strongest)
+        bounds = (np.where(free, start - REACH, 0.0), np.where(free, start + REACH, strongest))
+        # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
+        options = {"x_scale": "jac", "max_nfev": EVALUATIONS, "diff_step": 1e-5, "ftol": 1e-6}
+        fits.append(least_squares(model.residual, start, bounds=bounds, **options))
+        if np.sqrt(2 * fits[-1].cost / fits[-1].fun.size) <= model.allowed(step):
+            break
+    return min(fits, key=lambda fit: fit.cost)
+
+
+def _settled(model: _Model, fit: OptimizeResult, step: float) -> Estimate:
+    estimate = _estimate(model, fit.x, fit.fun, fit.jac, step)
+    allowed = model.allowed(step)
+    if estimate.rms > allowed:
+        raise ValueError(
+            f"the model leaves {estimate.steps:.2g} encoder steps rms unexplained, at most {allowed / step:.2g} may be "
+            "(friction of another kind, a hand at the handle, gravity, or a slipping drive?)"
+        )
+    return estimate
+
+
+def _starts(model: _Model, whole: Array) -> list[Array]:
+    """Where to begin with a transmission: the modes and splits of the mass that fit the spectrum best.
+
+    A search in time alone stops at any mode but the right one. The spectrum is that of the steps x[k+1] - x[k], which
+    begin and end at rest, over that of the forces; it is compared in decibels, where the force had something to say.
+    """
+    n = len(model.force)
+    force, moved = np.fft.rfft(model.force), np.fft.rfft(np.diff(model.x, append=model.x[-1]))
+    z = np.exp(2j * np.pi * np.arange(force.size) / n)
+    loud = np.flatnonzero(np.abs(force) > 0.2 * np.abs(force).max())
+    loud = loud[:: max(1, loud.size // SPECTRUM)]
+    measured, z = np.log(np.abs(moved[loud] / force[loud]) + 1e-12), z[loud]
+    points, mass = [], float(np.exp(whole[0]))
+    for hz, part in product(MODES_HZ, PARTS):
+        m1, m2 = part * mass, (1 - part) * mass
+        k = (2 * np.pi * hz) ** 2 * m1 * m2 / mass
+        point = np.array([np.log(m1), max(whole[1], -2.0), 0.0, np.log(m2), np.log(k)])
+        A, B = model.matrices(point, model.T)
+        G = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, np.broadcast_to(B[:, None], (z.size, len(A), 1)))
+        apart = np.log(np.abs((z - 1) * G[:, 0, 0]) + 1e-12) - measured
+        points.append((float(np.abs(apart).mean()), point))  # absolute: a few bins of a resonance may lie far apart
+    best: dict[float, Array] = {}
+    for _, point in sorted(points, key=lambda entry: entry[0]):
+        best.setdefault(round(float(point[0]), 6), np.delete(point, COULOMB))  # the best mode of every split
+    return list(best.values())[:STARTS]
+
+
+class _Model:
+    """p = [log m1, log b, c, log m2, log k] -> simulated displacement."""
+
+    def __init__(self, x: Array, force: Array, used: Flags, T: float, rigid: bool) -> None:
+        self.x, self.force, self.used, self.T, self.rigid = x, force, used, T, rigid
+
+    def matrices(self, p: Array, T: float) -> tuple[Array, Array]:
+        """The plant held for T: s+ = A s + B u with s = [positions; velocities]."""
+        m1, b = np.exp(p[0]), np.exp(p[1])
+        if self.rigid:
+            a = np.array([[0.0, 1.0, 0.0], [0.0, -b / m1, 1 / m1], [0.0, 0.0, 0.0]])
+        else:
+            m2, k = np.exp(p[3]), np.exp(p[4])
+            a = np.zeros((5, 5))
+            a[0, 2] = a[1, 3] = 1.0
+            a[2] = [-k / m1, k / m1, -b / m1, 0.0, 1 / m1]
+            a[3, :2] = [k / m2, -k / m2]
+        step = np.asarray(expm(a * T), dtype=np.float64)
+        return step[:-1, :-1], step[:-1, -1]
+
+    def simulate(self, p: Array) -> Array:
+        """Displacement (N,) [m] from rest."""
+        substeps = SUBSTEPS if p[COULOMB] else 1
+        A, B = self.matrices(p, self.T / substeps)
+        play = _play_rigid if self.rigid else _play_compliant
+        return np.array(play(A.tolist(), B.tolist(), float(p[COULOMB]), self.force.tolist(), substeps))
+
+    def allowed(self, step: float) -> float:
+        """What a fit may leave unexplained [m] rms, at `step` [m] of the encoder."""
+        return max(UNEXPLAINED[0] * step, UNEXPLAINED[1] * float(np.std(self.x[self.used])))
+
+    def residual(self, p: Array) -> Array:
+        """Measured less simulated (used,) [m]; where the origin lies is not known."""
+        error = (self.x - self.simulate(p))[self.used]
+        return np.nan_to_num(error - error.mean(), nan=1e3, posinf=1e3, neginf=-1e3)
+
+
+def _play_rigid(A: list[list[float]], B: list[float], c: float, force: list[float], substeps: int) -> list[float]:
+    """Displacements of one mass; plain floats, since a product of so few numbers is nothing but overhead to NumPy."""
+    (_, xv), (_, vv) = A
+    bx, bv = B
+    x, v, out = 0.0, 0.0, []
+    for f in force:
+        out.append(x)
+        for _ in range(substeps):
+            u = f - c * tanh(v / SLIP)
+            x, v = x + xv * v + bx * u, vv * v + bv * u
+    return out
+
+
+def _play_compliant(A: list[list[float]], B: list[float], c: float, force: list[float], substeps: int) -> list[float]:
+    """Displacements of the motor of two masses."""
+    (a00, a01, a02, a03), (a10, a11, a12, a13), (a20, a21, a22, a23), (a30, a31, a32, a33) = A
+    b0, b1, b2, b3 = B
+    x, y, v, w, out = 0.0, 0.0, 0.0, 0.0, []
+    for f in force:
+        out.append(x)
+        for _ in range(substeps):
+            u = f - c * tanh(v / SLIP)
+            x, y, v, w = (
+                a00 * x + a01 * y + a02 * v + a03 * w + b0 * u,
+                a10 * x + a11 * y + a12 * v + a13 * w + b1 * u,
+                a20 * x + a21 * y + a22 * v + a23 * w + b2 * u,
+                a30 * x + a31 * y + a32 * v + a33 * w + b3 * u,
+            )
+    return out
+
+
+def _estimate(model: _Model, p: Array, residual: Array, jacobian: Array, step: float) -> Estimate:
+    covariance = _sandwich(jacobian, residual)
+    m1, b = np.exp(p[0]), np.exp(p[1])
+    gradient = np.zeros(p.size)
+    gradient[0], mass, k, mode = m1, m1, None, None
+    if not model.rigid:
+        m2, k = np.exp(p[3]), float(np.exp(p[4]))
+        mass, gradient[3] = m1 + m2, m2
+        mode = float(np.sqrt(k * mass / (m1 * m2)) / (2 * np.pi))
+    errors = {
+        "mass": float(np.sqrt(gradient @ covariance @ gradient)),
+        "viscous": float(b * np.sqrt(covariance[1, 1])),
+        "coulomb": float(np.sqrt(covariance[2, 2])),
+    }
+    rms = float(np.sqrt(np.mean(residual**2)))
+    delta = max(0.0, float(b) - ONE_SIDED_95 * errors["viscous"])
+    return Estimate(float(mass), float(m1), float(b), float(p[2]), k, mode, errors, delta, rms, rms / step)
+
+
+def _sandwich(J: Array, residual: Array) -> Array:
+    scores = J * residual[:, None]
+    middle = scores.T @ scores
+    for lag in range(1, min(BANDWIDTH, len(scores) - 1)):
+        shared = scores[lag:].T @ scores[:-lag]
+        middle += (1 - lag / BANDWIDTH) * (shared + shared.T)
+    bread = np.linalg.pinv(J.T @ J)
+    return bread @ middle @ bread

@@ -1,0 +1,104 @@
+"""Is this the device that the scenario is about, and can the line carry it? Asked before anything moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from hw.frame import Config, Force, Info, State, wire_bytes
+from hw.message import MAX_RELEASE_NS, MAX_THETA, PROTOCOL
+from hw.safety import Limits
+from sim.scenario import Scenario
+
+BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
+LARGEST_MARGIN_US = 30_000  # an age is read from a margin, which is an i16 in microseconds
+HOLD, RAMP_US = 4, 5000  # what the device does without answers: ticks held, then microseconds to zero
+
+
+@dataclass(frozen=True)
+class Units:
+    """Integers of the wire to SI units and back. The wire carries what the motor does, -f."""
+
+    encoder_step: tuple[float, ...]  # (m,) [m]
+    force_step: tuple[float, ...]  # (m,) [N]
+    reach: tuple[float, ...]  # (m,) [m]
+
+    @classmethod
+    def of(cls, info: Info) -> Units:
+        encoder = tuple(1e-12 * step for step in info.encoder_step)
+        reach = tuple(step * counts for step, counts in zip(encoder, info.range, strict=True))
+        return cls(encoder, tuple(1e-6 * step for step in info.force_step), reach)
+
+    def positions(self, counts: tuple[int, ...]) -> tuple[float, ...]:
+        """Displacements (m,) [m]."""
+        return tuple(n * step for n, step in zip(counts, self.encoder_step, strict=True))
+
+    def forces(self, steps: tuple[int, ...]) -> tuple[float, ...]:
+        """Forces fed back f (m,) [N], from what the motors do."""
+        return tuple(-n * step for n, step in zip(steps, self.force_step, strict=True))
+
+    def steps(self, f: Sequence[float], cap: tuple[int, ...]) -> tuple[int, ...]:
+        """What the motors are to do for the forces fed back f (m,) [N]: whole steps, at most `cap`."""
+        return tuple(
+            max(-most, min(most, round(-force / step)))
+            for force, step, most in zip(f, self.force_step, cap, strict=True)
+        )
+
+
+def wire_time(baud: int, axes: int) -> tuple[float, str]:
+    """Seconds for one STATE and one FORCE, and the arithmetic as text."""
+    up, down = wire_bytes(State, axes), wire_bytes(Force, axes)
+    seconds = (up + down) * BITS_PER_BYTE / baud
+    return seconds, f"({up} + {down}) bytes x {BITS_PER_BYTE} bits / {baud} baud = {1e6 * seconds:.0f} us"
+
+
+def objections(info: Info, scenario: Scenario, limits: Limits, baud: int | None) -> list[str]:
+    """Why this device may not run this scenario over this line; empty where nothing is wrong. baud None: no UART."""
+    if info.version != PROTOCOL:
+        return [f"the device speaks version {info.version} of the protocol, this host version {PROTOCOL}"]
+    m = scenario.channels
+    if info.axes != m:
+        return [f"the device has {info.axes} ax{'i' if info.axes == 1 else 'e'}s, the scenario {m} channels"]
+    reasons = []
+    period_ns = round(1e9 * scenario.T)
+    if info.period_ns != period_ns:
+        reasons.append(f"the device ticks every {info.period_ns} ns, the scenario's T is {period_ns} ns")
+    if baud is not None:
+        seconds, arithmetic = wire_time(baud, m)
+        if seconds > scenario.T:
+            reasons.append(f"one STATE and one FORCE take {arithmetic}, more than T = {1e6 * scenario.T:g} us")
+    for i in range(m):
+        damping, strongest = 1e-6 * info.osp_damping[i], 1e-6 * info.hard_limit[i] * info.force_step[i]
+        if damping < scenario.delta[i] * (1 - 1e-6):
+            reasons.append(
+                f"axis {i + 1} guarantees {damping:g} N s/m, the certificate needs delta = {scenario.delta[i]:g}"
+            )
+        if strongest < limits.cap[i] * (1 - 1e-3):
+            reasons.append(f"axis {i + 1} can do {strongest:g} N, the force limit is {limits.cap[i]:g} N")
+    return reasons
+
+
+def probe_delay(T: float) -> int:
+    """The theta to measure with: the longest whose margin can be told. Raises ValueError where T is too long."""
+    theta = min(MAX_THETA, int(LARGEST_MARGIN_US / (1e6 * T)))
+    if theta < 1:
+        raise ValueError(f"T is {T:g} s, a serial link is for at most {1e-6 * LARGEST_MARGIN_US:g} s")
+    return theta
+
+
+def configuration(info: Info, limits: Limits, theta: int) -> Config:
+    """What the device is told: never more than the host allows itself, nor than the device can do."""
+    T_ns = info.period_ns
+    ramp = max(1, min(0xFF, math.ceil(1000 * RAMP_US / T_ns)))
+    steps = [1e-6 * step for step in info.force_step]
+    most = [int(cap / step + 1e-9) for cap, step in zip(limits.cap, steps, strict=True)]
+    slew = [min(0xFFFF, math.ceil(limits.slew * 1e-9 * T_ns / step)) for step in steps]
+    return Config(
+        theta=theta,
+        hold=max(0, min(HOLD, MAX_RELEASE_NS // T_ns - ramp)),
+        ramp=ramp,
+        ramp_in=min(0xFFFF, math.ceil(1e9 * limits.ramp_in / T_ns)),
+        cap=tuple(map(min, info.hard_limit, most)),
+        slew=tuple(slew),
+    )

@@ -1,0 +1,170 @@
+"""A session in real time: one port, one clock, one thread that never waits for anything but the port.
+
+Python holds up a loop by itself: a full garbage collection takes 40 ms with MuJoCo and cvxpy loaded. So what is loaded
+is frozen and the collector is off while forces act.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import select
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Protocol
+
+from hw.plan import Ages, Program
+from hw.port import PortLost
+from hw.safety import ENDED, Fault, Stage
+from hw.session import Session
+
+LONGEST_WAIT = 1e-3  # [s] between two looks at the time-outs
+GRACE_US = 50_000  # after the end, in which a STOP that was lost is repeated
+KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
+
+
+class Wire(Protocol):
+    """What a session needs of a port."""
+
+    def fileno(self) -> int: ...
+    def read(self) -> bytes: ...
+    def write(self, data: bytes) -> int: ...
+    def discard(self) -> None: ...
+
+
+class Live:
+    """Moves bytes between a port and a session until the session has ended."""
+
+    def __init__(
+        self,
+        session: Session,
+        port: Wire,
+        plan: Callable[[Ages], Sequence[Program]],
+        auto_arm: bool,
+        seconds: float,
+        keyboard: int | None = None,  # a file descriptor with single keys
+        glance: Callable[[Session], None] = lambda session: None,  # called a few times a second
+        pace: float = 1.0,  # seconds of the session per second; 1 with any real device
+    ) -> None:
+        self.session, self.port, self._plan = session, port, plan
+        self._auto_arm, self._seconds = auto_arm, seconds
+        self._keyboard, self._glance, self._pace = keyboard, glance, pace
+        self.signals: list[int] = []
+        self.dropped = 0  # bytes that the port would not take at once
+        self._armed_at: int | None = None
+        self._glanced = 0
+
+    def now(self) -> int:
+        """The session's clock [us]."""
+        return int(time.monotonic_ns() * self._pace) // 1000
+
+    def run(self) -> Session:
+        """From HELLO to the end. Whatever is raised in between, the device is stopped first."""
+        session = self.session
+        with _signals(self.signals), _no_collections():
+            try:
+                self._write(session.start(self.now()))
+                while session.stage not in ENDED:
+                    self._step()
+                    self._steer()
+                ended = self.now()
+                while session.stage != Stage.LOST and self.now() - ended < GRACE_US:
+                    self._step()
+            except PortLost as lost:
+                session.lost(str(lost), self.now())
+            except BaseException as error:
+                self._write_at_last(session.fail(f"{type(error).__name__} in the bridge: {error}", self.now()))
+                raise
+        return session
+
+    def _step(self) -> None:
+        """Wait for bytes or for a millisecond, and answer."""
+        sources = [self.port] if self._keyboard is None else [self.port, self._keyboard]
+        ready = select.select(sources, [], [], LONGEST_WAIT)[0]
+        if self.port in ready:
+            self._write(self.session.receive(self.port.read(), self.now()))
+        else:
+            self._write(self.session.poll(self.now()))
+        if self._keyboard in ready:
+            self._pressed(os.read(self._keyboard, 64).decode(errors="replace"))
+
+    def _steer(self) -> None:
+        """What is not an answer: couplings for the measured delay, arming, the planned end, signals."""
+        session, now = self.session, self.now()
+        if session.stage == Stage.MEASURED:
+            self._load()
+        elif session.stage == Stage.DISARMED and self._auto_arm:
+            if self._armed_at is None:
+                self._write(session.arm(now))
+            else:  # a softer coupling is ready, and nobody is there to arm it
+                self._write(session.refuse(f"nobody to arm the softer coupling ({session.cause})", now))
+        if session.stage == Stage.ARMED and self._armed_at is None:
+            self._armed_at = now
+        if self._armed_at is not None and now - self._armed_at > 1e6 * self._seconds:
+            self._write(session.stop("the time is over", now))
+        if self.signals:
+            name = signal.Signals(self.signals[0]).name
+            self._write(session.stop(name, now) if len(self.signals) == 1 else session.fail(f"{name} again", now))
+        if now - self._glanced > 100_000:
+            self._glanced = now
+            self._glance(session)
+
+    def _load(self) -> None:
+        """Design while the device rests at zero force; what it says meanwhile is of no use."""
+        session = self.session
+        try:
+            rungs = self._plan(Ages(tuple(session.ages)))
+        except Fault as fault:
+            self._write(session.refuse(str(fault), self.now()))
+            return
+        gc.collect()  # the solver is loaded now
+        gc.freeze()
+        self.port.discard()
+        self._write(session.load(rungs, self.now()))
+
+    def _pressed(self, keys: str) -> None:
+        for key in keys:
+            match KEYS.get(key):
+                case "arm":
+                    self._armed_at = None
+                    self._write(self.session.arm(self.now()))
+                case "stop":
+                    self._write(self.session.stop(f"key {key}", self.now()))
+                case "estop":
+                    self._write(self.session.estop("space bar", self.now()))
+
+    def _write(self, data: bytes) -> None:
+        if data:
+            self.dropped += len(data) - self.port.write(data)
+
+    def _write_at_last(self, data: bytes) -> None:
+        with suppress(PortLost):
+            self._write(data)
+
+
+@contextmanager
+def _signals(received: list[int]) -> Iterator[None]:
+    """SIGINT and SIGTERM are noted, and dealt with between two ticks."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    before = {number: signal.signal(number, lambda got, frame: received.append(got)) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _no_collections() -> Iterator[None]:
+    gc.collect()
+    gc.freeze()
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+        if was_on:
+            gc.enable()

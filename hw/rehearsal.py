@@ -1,0 +1,170 @@
+"""A whole session in virtual time: the bridge's session and the emulated device, with a line between them.
+
+Nothing waits and nothing is random but by seed, so a session of seconds runs in a fraction of one and always the same.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from controller.lti import Array
+from hw.emulator_core import Emulator
+from hw.message import Phase
+from hw.plan import Ages, Program
+from hw.safety import ENDED, Fault, Stage
+from hw.session import Session
+from hw.upset import Line, Upset
+
+POLL_US = 1000
+GRACE_US = 20_000  # after the end
+LATENCY_US = 60  # one way, and as long for the host to answer: the measured median age of 130 us
+
+Plan = Callable[[Ages], Sequence[Program]]
+
+
+class Moment(NamedTuple):
+    """One tick of the device."""
+
+    t_us: int
+    phase: Phase
+    applied: Array  # (m,) [N]
+
+
+@dataclass
+class Rehearsal:
+    """What happens, in order of time; `actions` are what a person does: (seconds after arming, call)."""
+
+    session: Session
+    emulator: Emulator
+    plan: Plan
+    upsets: tuple[Upset, ...] = ()
+    seed: int = 0
+    actions: Sequence[tuple[float, Callable[[Session, int], bytes]]] = ()
+    host_stalls: Sequence[tuple[float, float]] = ()  # (seconds after arming, seconds) in which the host is frozen
+    arm: bool = True
+    latency_us: float = LATENCY_US
+    clock: float = 1.0  # how long a tick of the device lasts, in T
+    moments: list[Moment] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._up = Line("up", self.upsets, self.seed, self.latency_us)
+        self._down = Line("down", self.upsets, self.seed, self.latency_us)
+        self._queue: list[tuple[float, int, str, Any]] = []
+        self._number = count()
+        self._done: set[int] = set()
+        self._gone = False
+        self._ended = 0.0
+        self._period = 1e6 * self.session.scenario.T * self.clock
+        self._at(0, "tick", 0)
+        self._at(500, "start", None)
+        self._at(POLL_US, "poll", None)
+
+    def run(self, seconds: float) -> Session:
+        """Until `seconds` of virtual time are over. Returns the session."""
+        while self._queue[0][0] <= 1e6 * seconds:
+            self._next()
+        return self.session
+
+    def run_until_armed(self, seconds: float) -> Session:
+        """Until `seconds` after arming, or a little longer than a session that is never armed."""
+        while self.armed_us is None and not (
+            self.session.stage in ENDED and self._queue[0][0] > self._ended + GRACE_US
+        ):
+            self._next()
+        return self.run(1e-6 * self.armed_us + seconds) if self.armed_us is not None else self.session
+
+    def _next(self) -> None:
+        now, _, what, data = heapq.heappop(self._queue)
+        getattr(self, f"_on_{what}")(now, data)
+        if self.session.stage not in ENDED:
+            self._ended = now + self._period
+
+    def _at(self, when: float, what: str, data: Any) -> None:
+        heapq.heappush(self._queue, (when, next(self._number), what, data))
+
+    def _on_tick(self, now: float, due: float) -> None:
+        emulator, clock = self.emulator, round(now)
+        if clock < emulator.stalled_until:  # late once, and then in step again: no catching up
+            return self._at(emulator.stalled_until, "tick", None)
+        data = emulator.tick(clock)
+        emulator.advance()
+        self.moments.append(Moment(clock, emulator.device.phase, emulator.applied))
+        self._at(now + self._period, "tick", None)
+        if emulator.unplugged and not self._gone:
+            self._gone = True
+            self._at(now + self.latency_us, "gone", None)
+        for when, part in self._up.send(data, now, emulator.since_armed(clock)) if data else []:
+            self._at(when, "host", part)
+        return None
+
+    def _on_host(self, now: float, data: bytes) -> None:
+        if (frozen := self._frozen(now)) > now:
+            return self._at(frozen, "host", data)
+        session = self.session
+        self._send(session.receive(data, round(now)), now)
+        if session.stage == Stage.MEASURED:
+            try:
+                rungs = self.plan(Ages(tuple(session.ages)))
+            except Fault as fault:
+                return self._send(session.refuse(str(fault), round(now)), now)
+            return self._send(session.load(rungs, round(now)), now)
+        if session.stage == Stage.DISARMED and self.arm and session.rung is session.rungs[0]:
+            self._send(session.arm(round(now)), now)  # once: a softer coupling waits for a person
+        return None
+
+    def _on_start(self, now: float, _: None) -> None:
+        self._send(self.session.start(round(now)), now)
+
+    def _on_poll(self, now: float, _: None) -> None:
+        if (frozen := self._frozen(now)) > now:  # what came in the meantime is read first
+            return self._at(frozen + 1, "poll", None)
+        self._at(now + POLL_US, "poll", None)
+        since = self.emulator.since_armed(round(now))
+        for i, (when, call) in enumerate(self.actions):
+            if since is not None and since >= when and i not in self._done:
+                self._done.add(i)
+                self._send(call(self.session, round(now)), now)
+        return self._send(self.session.poll(round(now)), now)
+
+    def _on_gone(self, now: float, _: None) -> None:
+        self.session.lost("the port is gone", round(now))
+
+    def _on_device(self, now: float, data: bytes) -> None:
+        self.emulator.receive(data, round(now))
+
+    def _send(self, data: bytes, now: float) -> None:
+        since = self.emulator.since_armed(round(now))
+        for frame in data.split(b"\0")[:-1]:
+            for when, part in self._down.send(frame + b"\0", now + self.latency_us / 6, since):
+                self._at(when, "device", part)
+
+    def _frozen(self, now: float) -> float:
+        since = self.emulator.since_armed(round(now))
+        if since is not None:
+            for start, lasts in self.host_stalls:
+                if start <= since < start + lasts:
+                    return now + 1e6 * (start + lasts - since) + 1
+        return now
+
+    # what came of it
+
+    @property
+    def armed_us(self) -> int | None:
+        return self.emulator.armed_at
+
+    def zero_after(self, seconds: float) -> float | None:
+        """Seconds from `seconds` after arming to the tick from which on no motor does anything; None: never."""
+        assert self.armed_us is not None
+        begin = self.armed_us + 1e6 * seconds
+        driving = [m.t_us for m in self.moments if np.any(m.applied)]
+        last = max(driving, default=0)
+        if last < begin:
+            return 0.0
+        quiet = next((m.t_us for m in self.moments if m.t_us > last), None)
+        return None if quiet is None else 1e-6 * (quiet - begin)

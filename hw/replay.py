@@ -1,0 +1,124 @@
+"""python -m hw.replay: a recorded session through the controller again, and the forces compared bit by bit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from rich.table import Table
+
+from controller.environment import environment
+from controller.lti import Array, Lti
+from controller.process import force_map
+from design.store import CouplingData
+from hw.handshake import Units
+from hw.law import Law
+from hw.safety import Limits, shape
+from hw.trace import load
+from sim.command import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute
+from sim.files import write_json
+from sim.result import Result
+from sim.scenario import InputError, Scenario
+
+
+class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a trace says of the controller that made it."""
+
+    scenario: Scenario
+    coupling: CouplingData
+    link_delay: int
+    limits: dict[str, Any]
+    force_step: tuple[float, ...]
+    cap: tuple[int, ...]
+
+    def law(self) -> Lti:
+        """F as the host ran it."""
+        scenario = self.scenario
+        E = environment(scenario.environment, scenario.T)
+        host = [n - self.link_delay for n in scenario.theta]
+        return force_map(E, self.coupling.build(scenario.T), host, scenario.psi)
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Where the replay differs from the record."""
+
+    asked: NDArray[np.bool_]  # (N,) the controller's forces, as 64-bit floats
+    sent: NDArray[np.bool_]  # (N,) what was put on the wire, as integers
+    largest: float  # [N] between the controller's forces
+
+    @property
+    def identical(self) -> bool:
+        return not (self.asked.any() or self.sent.any())
+
+
+def recipe_of(result: Result) -> Recipe:
+    """The recipe in a trace. Raises InputError where there is none."""
+    try:
+        return msgspec.convert(result.meta.get("replay"), Recipe)
+    except (msgspec.ValidationError, ValueError) as error:
+        raise InputError(f"the trace cannot be replayed: {error}") from None
+
+
+def replay(result: Result, link: dict[str, Array]) -> Comparison:
+    """Feed the recorded displacements through law, gain, limits and rounding."""
+    recipe = recipe_of(result)
+    law, limits = Law(recipe.law()), Limits(**{**recipe.limits, "cap": tuple(recipe.limits["cap"])})
+    units = Units((1.0,) * len(recipe.cap), recipe.force_step, (1.0,) * len(recipe.cap))
+    asked, sent = np.zeros_like(link["asked"]), np.zeros_like(link["sent"])
+    force: Sequence[float] = (0.0,) * len(recipe.cap)
+    for k, x in enumerate(result.x):
+        asked[k] = law.step(x)
+        if link["received"][k]:
+            force = shape(asked[k].tolist(), force, float(link["gain"][k]), limits, recipe.scenario.T).force
+            sent[k] = units.steps(force, recipe.cap)
+    different = asked.view(np.int64) != link["asked"].view(np.int64)
+    largest = float(np.abs(asked - link["asked"]).max(initial=0.0))
+    return Comparison(different.any(axis=1), (sent != link["sent"]).any(axis=1), largest)
+
+
+def main(argv: list[str]) -> int:
+    """Replay a trace. 0: every force is the recorded one bit by bit, 1: not."""
+    parser = Parser(
+        "hw.replay",
+        "Feed a recorded session through the controller again and compare the forces bit by bit.",
+        "python -m hw.replay out/bridge-I/trace.npz",
+    )
+    parser.add_argument("trace", metavar="TRACE.npz", help="written by hw.bridge")
+    parser.add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
+    args = parser.parse_args(argv)
+    check_json(args)
+    result, link = load(Path(args.trace))
+    compared = replay(result, link)
+    ticks, received = result.t.size, int(link["received"].sum())
+    outcome = {
+        "trace": args.trace,
+        "ticks": ticks,
+        "filled_in": ticks - received,
+        "asked_differ": int(compared.asked.sum()),
+        "sent_differ": int(compared.sent.sum()),
+        "largest_difference_n": compared.largest,
+        "first_difference_s": _first(compared, result),
+        "identical": compared.identical,
+    }
+    table = Table(title=args.trace, show_header=False)
+    for name, value in outcome.items():
+        table.add_row(name.replace("_", " "), "-" if value is None else str(value))
+    console(args).print(table)
+    if args.json:
+        write_json(args.json, outcome)
+    return DONE if compared.identical else DOES_NOT_HOLD
+
+
+def _first(compared: Comparison, result: Result) -> float | None:
+    different = compared.asked | compared.sent
+    return float(result.t[np.argmax(different)]) if different.any() else None
+
+
+if __name__ == "__main__":
+    execute(main)

@@ -1,0 +1,148 @@
+"""What a session came to: one dictionary for machines, tables for people, and the files of sim.run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from design.promises import CAVEATS
+from design.store import data_of
+from hw.message import NO_MARGIN
+from hw.plan import Ages, Rung
+from hw.safety import Stage
+from hw.session import Session
+from hw.trace import Recorder, result_of, save_npz
+from sim.files import write_json
+
+PERCENTILES = (50, 90, 99, 100)
+
+
+def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> dict[str, Any]:
+    """Stage, cause and log; the coupling with its certificates; what the link did, as a report without a verdict."""
+    begin = session.log[0].t_us if session.log else 0
+    log = [{"t_s": 1e-6 * (e.t_us - begin), "stage": str(e.stage), "cause": e.cause} for e in session.log]
+    parts = session.rung.part() if isinstance(session.rung, Rung) else {}
+    empty = {"coupling": None, "certificate": None, "certificates": None, "promise": None, "theta": None}
+    return {
+        "case": case,
+        "scenario": session.scenario.name,
+        **(empty | parts),
+        "session": {"stage": str(session.stage), "cause": session.cause, "armed": len(recorder) > 0, "log": log},
+        "link": _link(session, recorder, dropped),
+        "run": {
+            "samples": len(recorder),
+            "duration_s": len(recorder) * session.scenario.T,
+            "T_s": session.scenario.T,
+            "scenario_digest": session.scenario.digest,
+            "pace": pace,  # below 1: slow motion, in which a link looks faster than it is
+        },
+    }
+
+
+def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
+    counters = asdict(session.counters) | {"host_errors": session.decoder.rejected, "host_dropped_bytes": dropped}
+    part: dict[str, Any] = {
+        "measured_age_us": _percentiles(np.array(session.ages)),
+        "age_us": None,
+        "rate_hz": None,
+        "missed_percent": None,
+        "counters": counters,
+    }
+    if len(recorder) and session.config:
+        arrays = recorder.link()
+        margins = arrays["margin_us"][arrays["received"] & (arrays["margin_us"] != NO_MARGIN)]
+        part["age_us"] = _percentiles(session.config.theta * 1e6 * session.scenario.T - margins)
+        part["rate_hz"] = float(arrays["received"].mean() / session.scenario.T)
+        answered = arrays["received"].sum()
+        part["missed_percent"] = 100 * session.missed_while_driving / answered if answered else None
+    return part
+
+
+def _percentiles(values: np.ndarray) -> dict[str, float] | None:
+    return {f"p{q}": float(np.percentile(values, q)) for q in PERCENTILES} if values.size else None
+
+
+def print_certificate(ages: Ages, link: int, rungs: Sequence[Rung], console: Console) -> None:
+    """What was measured, and what is certified for it: printed before anything is armed."""
+    console.print(
+        f"answers are {ages.quantile(0.5)} us old, {ages.quantile(0.99)} us at the 99th percentile: "
+        f"a link of {link} tick{'s' if link > 1 else ''}"
+    )
+    table = Table(title="certified for the delay measured, and softer in reserve")
+    for column in ("theta", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "promise"):
+        table.add_column(column)
+    for rung in rungs:
+        part = rung.part()
+        certificate = next(c for c in (part["certificate"], *part["certificates"].values()) if c["certified"])
+        coupling = part["coupling"]
+        table.add_row(
+            ", ".join(map(str, part["theta"])),
+            *(_list(coupling[name]) for name in "KB"),
+            f"{_list(certificate['required_damping'])} ({certificate['condition']}, {certificate['proof']})",
+            _list(certificate["available_damping"]),
+            part["promise"],
+        )
+    console.print(table)
+
+
+def print_session(report: dict[str, Any], console: Console) -> None:
+    """The log, then what the link did."""
+    table = Table(title=f"case {report['case']} · {report['scenario']}")
+    for column in ("after", "stage", "cause"):
+        table.add_column(column, justify="right" if column == "after" else "left")
+    for event in report["session"]["log"]:
+        table.add_row(f"{event['t_s']:.3f} s", _colour(event["stage"]), event["cause"])
+    console.print(table)
+    link = report["link"]
+    if link["age_us"]:
+        ages = ", ".join(f"{name} {us / 1000:.2f} ms" for name, us in link["age_us"].items())
+        console.print(
+            f"link: {link['rate_hz']:.0f} answers a second, {link['missed_percent']:.2f} % missed; age {ages}"
+        )
+    counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link["counters"].items() if n)
+    console.print(f"counted: {counted or 'nothing'}")
+    console.print(f"[dim]·[/] {CAVEATS}")
+    console.print("files: " + ", ".join(report["files"]), soft_wrap=True)
+
+
+def save(out: Path, session: Session, recorder: Recorder, report: dict[str, Any], plot: bool) -> list[Path]:
+    """The trace (where forces acted), its picture, and the report."""
+    files = []
+    if len(recorder):
+        assert isinstance(session.rung, Rung)
+        replay = {
+            "scenario": json.loads(msgspec.json.encode(session.rung.scenario)),
+            "coupling": json.loads(msgspec.json.encode(data_of(session.rung.chosen.coupling))),
+            "link_delay": session.rung.link,
+            "limits": asdict(session.limits),
+            "force_step": list(session.units.force_step),
+            "cap": list(session.config.cap) if session.config else [],
+        }
+        result = result_of(recorder, session.units, session.scenario.T, report | {"replay": replay})
+        files += [save_npz(out / "trace.npz", result, recorder), result.save_csv(out / "trace.csv")]
+        if plot:
+            from sim.plot import plot_run
+
+            title = f"{report['scenario']}, case {report['case']}: a session that ended {session.stage}"
+            files.append(plot_run(result, out / "figure.png", title, 10.0))
+    files.append(out / "report.json")
+    write_json(files[-1], report | {"files": [str(p) for p in files]})
+    return files
+
+
+def _list(values: Sequence[float | None] | None) -> str:
+    return "-" if values is None else ", ".join("inf" if v is None else f"{v:.5g}" for v in values)
+
+
+def _colour(stage: str) -> str:
+    colours = {Stage.FINISHED: "green", Stage.REFUSED: "yellow", Stage.STOPPED: "red", Stage.LOST: "red"}
+    colour = (colours | {Stage.ESTOP: "red"}).get(Stage(stage))
+    return f"[{colour}]{stage}[/]" if colour else stage

@@ -1,0 +1,399 @@
+"""Whole sessions in virtual time: every fault, the exact engine's run, the delay into the design, traces, replays."""
+
+import json
+
+import numpy as np
+import pytest
+
+from hw import replay, session_report
+from hw.emulator_core import Emulator
+from hw.faults import CASES, lively, rehearse
+from hw.frame import Decoder, Force, State, Stop, encode
+from hw.handshake import Units
+from hw.law import Law, fill
+from hw.message import Command, Phase
+from hw.plan import Ages, ladder, link_delay, rung
+from hw.rehearsal import Rehearsal
+from hw.safety import Fault, Limits, Stage
+from hw.session import Session, Settings
+from hw.trace import Recorder, load, result_of, save_npz
+from hw.upset import Upset
+from models.scene import plant
+from sim.engine import outside_forces
+from sim.exact_engine import hold
+from sim.result import Result
+from sim.scenario import InputError
+from sim.scenario import load as scenario_of
+from sim.simulate import assemble, simulate
+
+FAST = Settings(measure=100)
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return scenario_of()
+
+
+@pytest.fixture(scope="module")
+def rungs(scenario):
+    """Couplings for links of one and two ticks."""
+    return ladder(scenario, "I", None, None, 1, spare=1)
+
+
+def session_with(scenario, settings=FAST):
+    return Session(scenario, Limits(tuple(d.force_limit for d in scenario.device)), settings)
+
+
+def rehearsal_of(scenario, rungs, *faults, recorder=None, **options):
+    upsets = tuple(map(Upset.parse, faults))
+    session = session_with(scenario)
+    if recorder is not None:
+        session.record = recorder
+    return Rehearsal(session, Emulator(scenario, upsets), lambda ages: rungs, upsets, **options)
+
+
+# faults
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_every_fault_ends_where_it_must(case, scenario, rungs):
+    """Stage, cause, time to zero force, counters, no force above the cap, no second arming: hw/faults.py says which."""
+    assert rehearse(case, lively(scenario), rungs).wrong == ()
+
+
+def test_there_are_enough_faults():
+    assert len(CASES) >= 30
+    assert len({case.name for case in CASES}) == len(CASES)
+
+
+def test_faults_that_do_not_stop_leave_the_forces_alone(scenario, rungs):
+    """A frame that comes twice, on either side, changes no force."""
+    plain = rehearsal_of(lively(scenario), rungs)
+    twice = rehearsal_of(lively(scenario), rungs, "duplicate=0.5@0.3")
+    for rehearsal in (plain, twice):
+        rehearsal.run_until_armed(0.8)
+    assert twice.session.counters.duplicates > 50
+    np.testing.assert_array_equal([m.applied for m in plain.moments], [m.applied for m in twice.moments])
+
+
+def test_a_device_that_repeats_itself_is_lost_while_its_bytes_keep_coming(scenario, rungs):
+    """Time-outs are looked at between bytes: the same STATE for ever is no life."""
+    rehearsal = rehearsal_of(scenario, rungs)
+    session = rehearsal.run_until_armed(0.5)
+    assert session.stage == Stage.ARMED
+    assert session.watch.last
+    again, now = encode(session.watch.last), session.now
+    for _ in range(100):
+        now += 100
+        session.receive(again, now)
+    assert session.stage == Stage.LOST
+    assert session.log[-1].t_us - session.heard <= session.limits.watchdog_us + 100
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        ({"applied": (30001, 0)}, "the device applies"),
+        ({"status": Phase.DISARMED}, "has disarmed itself"),
+        ({"status": Phase.SILENT}, "is in silent"),
+    ],
+)
+def test_a_device_that_does_something_else_is_stopped(scenario, rungs, change, cause):
+    session = rehearsal_of(scenario, rungs).run_until_armed(0.5)
+    last = session.watch.last
+    assert last
+    (said,) = Decoder().feed(
+        session.receive(encode(last._replace(tick=(last.tick + 1) & 0xFFFF, **change)), session.now)
+    )
+    assert isinstance(said, Stop)
+    assert session.stage == Stage.STOPPED
+    assert cause in session.cause
+
+
+def test_a_device_that_arms_by_itself_is_stopped(scenario, rungs):
+    rehearsal = rehearsal_of(scenario, rungs, arm=False)
+    session = rehearsal.run(1.0)
+    assert session.stage == Stage.DISARMED
+    last = session.watch.last
+    assert last
+    session.receive(encode(last._replace(tick=(last.tick + 1) & 0xFFFF, status=Phase.ARMED)), session.now)
+    assert (session.stage, session.cause) == (Stage.STOPPED, "the device is armed, and nobody asked it to")
+
+
+def test_without_arming_no_force_is_ever_asked_for(scenario, rungs):
+    rehearsal = rehearsal_of(lively(scenario), rungs, arm=False)
+    rehearsal.emulator.plant.begin()  # the person moves all the same
+    sent = []
+    receive = rehearsal.emulator.receive
+    rehearsal.emulator.receive = lambda data, now: (sent.append(data), receive(data, now))
+    session = rehearsal.run(1.5)
+    forces = [m for m in Decoder().feed(b"".join(sent)) if isinstance(m, Force)]
+    assert session.stage == Stage.DISARMED
+    assert len(forces) > 1000
+    assert all(m.command == Command.IDLE and not any(m.force) for m in forces)
+
+
+def test_a_stop_that_is_lost_is_said_again(scenario, rungs):
+    session = rehearsal_of(scenario, rungs).run_until_armed(0.5)
+    last = session.watch.last
+    assert last
+    session.fail("a test", session.now)
+    for ahead in (1, 2):
+        answer = session.receive(encode(last._replace(tick=(last.tick + ahead) & 0xFFFF)), session.now)
+        assert [type(m) for m in Decoder().feed(answer)] == [Stop]
+
+
+def test_random_bytes_move_nothing(scenario):
+    """A megabyte of noise, and real frames with one byte changed: no crash, no stage but waiting, no FORCE."""
+    rng = np.random.default_rng(5)
+    session = session_with(scenario)
+    session.start(0)
+    state = encode(State(Phase.ARMED, 1, 0, 0, 0, 0, 0, (5, 5), (0, 0)))
+    said = b""
+    for now in range(250):
+        said += session.receive(rng.bytes(4000), now)
+        broken = bytearray(state)
+        broken[int(rng.integers(len(state)))] ^= int(rng.integers(1, 256))
+        said += session.receive(bytes(broken), now)
+    assert session.stage == Stage.CONNECTING
+    assert said == b""
+
+
+# the exact engine
+
+
+def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
+    """Both devices over the whole link against sim's exact engine with ideal encoders and forces.
+
+    Tolerances: positions to one encoder step (rounding is half of one; what rounded forces add stays below the other
+    half), forces to K of one encoder step, B of half a step per tick twice over, and one force step.
+    """
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(scenario, rungs, recorder=recorder)
+    rehearsal.run_until_armed(2.5)
+    emulator = rehearsal.emulator
+    link, begun = recorder.link(), emulator.begun_at
+    first = int(np.argmax(link["tick"] == begun))
+    assert link["received"].all()
+    assert (link["gain"][first:] == 1.0).all()
+    n = len(recorder) - first
+    exact = simulate(assemble(scenario, rungs[0].chosen.coupling), "exact", samples=n)
+    step, coupling = 1e-6, rungs[0].chosen.coupling
+    assert n > 1800
+    assert np.abs(exact.s[:, :2, 0]).max() > 5e-3  # the people do move
+    assert np.abs(link["x"][first:] - exact.s[:, :2, 0]).max() < step
+    forces = -link["applied"][first:] * 4e-4
+    bound = max(coupling.K) * step + max(coupling.B) * step / scenario.T + 4e-4
+    assert np.abs(forces - exact.f[:, :, 0]).max() < bound
+
+
+def test_the_same_to_the_last_bit_but_for_rounded_forces(scenario, rungs):
+    """An independent loop: held plant by expm, encoders rounded, F of the whole delay, forces rounded to steps."""
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(scenario, rungs, recorder=recorder)
+    rehearsal.run_until_armed(1.5)
+    link = recorder.link()
+    first = int(np.argmax(link["tick"] == rehearsal.emulator.begun_at))
+    assembly = assemble(scenario, rungs[0].chosen.coupling)
+    held = hold(plant(assembly.scene.model), scenario.T)
+    n = len(recorder) - first
+    w, law = outside_forces(scenario, assembly.scene, 0, n), Law(assembly.F)
+    s, counts, applied = np.zeros(held.A.shape[0]), [], []
+    for k in range(n):
+        x = np.round(s[:2] / 1e-6)
+        f = np.round(law.step(x * 1e-6) / 4e-4)
+        s = held.A @ s + held.B @ np.concatenate([w[k], f * 4e-4])
+        counts.append(x)
+        applied.append(-f)
+    # a rounding of a force may fall the other way where the sums are associated otherwise: none did in this run
+    np.testing.assert_array_equal(applied, link["applied"][first:])
+    np.testing.assert_allclose(np.array(counts) * 1e-6, link["x"][first:], rtol=0, atol=1e-15)
+
+
+# delay into design
+
+
+@pytest.mark.parametrize(
+    ("ages", "expected"),
+    [([130] * 100, 1), ([1150] * 100, 2), ([130] * 995 + [9000] * 5, 1), ([130] * 900 + [2000] * 100, 2)],
+)
+def test_theta_is_a_quantile_with_a_guard_not_the_maximum(ages, expected):
+    assert link_delay(Ages(tuple(ages)), 1200.0, 0.99, 100.0) == expected
+
+
+def test_softer_couplings_are_softer_and_certified(scenario, rungs):
+    fast, soft = rungs
+    assert (fast.scenario.theta, soft.scenario.theta) == ((1, 2), (2, 2))
+    assert (fast.link, soft.link) == (1, 2)
+    assert fast.certified
+    assert soft.certified
+    assert max(soft.chosen.coupling.K) < max(fast.chosen.coupling.K)
+
+
+def test_the_host_and_the_link_share_the_delay(scenario, rungs):
+    """What the host runs, delayed by the link, is the F that was certified."""
+    z = np.exp(1j * np.linspace(0.01, 3, 50))
+    F = assemble(rungs[0].scenario, rungs[0].chosen.coupling).F
+    on_host = rungs[0].law().at(z) * z[:, None, None] ** -rungs[0].link
+    np.testing.assert_allclose(on_host, F.at(z), rtol=1e-9, atol=1e-9)  # two orders of the same sums
+
+
+def test_nothing_uncertified_is_loaded(scenario, rungs):
+    with pytest.raises(Fault, match=r"published is not certified for theta = \[1, 2\]: theorem4 needs 7.629"):
+        rung(scenario, "I", "published", None, 1)
+    with pytest.raises(Fault, match="at most theta = 15"):
+        rung(scenario, "I", None, None, 16)
+    session = session_with(scenario)
+    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: ())
+    rehearsal.run_until_armed(0.1)
+    assert (session.stage, session.cause) == (Stage.REFUSED, "the coupling is not certified")
+
+
+def test_a_softer_coupling_takes_over_once_a_person_arms_it(scenario, rungs):
+    """10 % late answers: ramp-out, the coupling for one tick more, disarmed; only arm() brings the forces back."""
+    upsets = (Upset.parse("down:jitter=0.0007@0.45"),)
+    rehearsal = Rehearsal(session_with(lively(scenario)), Emulator(lively(scenario)), lambda ages: rungs, upsets)
+    session = rehearsal.run_until_armed(1.2)
+    assert session.stage == Stage.DISARMED
+    assert session.rung is rungs[1]
+    rehearsal.run(3.0)
+    assert session.stage == Stage.DISARMED
+    assert not any(np.any(m.applied) for m in rehearsal.moments[-800:])
+    session.arm(session.now)
+    rehearsal.run(4.0)
+    assert session.stage == Stage.ARMED
+    assert session.config
+    assert session.config.theta == 2
+    assert any(np.any(m.applied) for m in rehearsal.moments[-100:])
+
+
+# traces
+
+
+def test_missing_samples_are_filled_by_a_straight_line():
+    assert fill((0.0, 3.0), (3.0, 0.0), 3) == [(1.0, 2.0), (2.0, 1.0), (3.0, 0.0)]
+    assert fill((0.0,), (1.0,), 1) == [(1.0,)]
+
+
+@pytest.fixture(scope="module")
+def trace(scenario, rungs, tmp_path_factory):
+    """A session over a line that loses STATEs, as files."""
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(lively(scenario), rungs, "up:drop=0.05@0.3", recorder=recorder)
+    session = rehearsal.run_until_armed(1.0)
+    session.stop("enough", session.now)
+    rehearsal.run(2.5)
+    outcome = session_report.outcome("I", session, recorder, 0)
+    out = tmp_path_factory.mktemp("trace")
+    return session_report.save(out, session, recorder, outcome | {"files": []}, plot=True), recorder
+
+
+def test_a_trace_is_one_of_sim_run(trace):
+    files, recorder = trace
+    result = Result.load_npz(files[0])
+    assert result.t.size == len(recorder)
+    np.testing.assert_array_equal(np.diff(recorder.link()["tick"]) & 0xFFFF, 1)  # a row for every tick
+    assert np.isfinite(result.f).all()
+    assert {path.name for path in files} == {"trace.npz", "trace.csv", "figure.png", "report.json"}
+
+
+def test_a_replay_is_identical_bit_by_bit(trace):
+    result, link = load(trace[0][0])
+    assert 10 < (~link["received"]).sum() < 200
+    compared = replay.replay(result, link)
+    assert compared.identical
+    assert np.abs(link["sent"]).max() > 1000
+
+
+def test_a_replay_finds_one_changed_bit(trace):
+    result, link = load(trace[0][0])
+    changed = link["asked"].copy()
+    changed.view(np.int64)[100, 1] ^= 1
+    compared = replay.replay(result, link | {"asked": changed})
+    assert np.flatnonzero(compared.asked).tolist() == [100]
+    assert not compared.sent.any()
+    x = result.x.copy()
+    x[200, 0] += 1e-6
+    moved = Result(result.t, x, result.f, result.x_handle, result.v_handle, result.w, result.meta)
+    assert np.flatnonzero(replay.replay(moved, link).asked)[0] == 200
+
+
+def test_the_replay_command(trace, capsys):
+    path = trace[0][0]
+    assert replay.main([str(path), "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["identical"] is True
+    with pytest.raises(InputError, match="No such file"):
+        replay.main(["nowhere.npz"])
+
+
+def test_a_trace_of_sim_run_is_no_session(scenario, rungs, tmp_path):
+    assembly = assemble(scenario, rungs[0].chosen.coupling)
+    plain = Result.from_record(assembly, simulate(assembly, "exact", samples=10), {})
+    path = plain.save_npz(tmp_path / "trace.npz")
+    with pytest.raises(InputError, match="not of a bridge's session"):
+        load(path)
+
+
+def test_a_trace_whose_recipe_is_broken_is_bad_input(trace, tmp_path):
+    result, _ = load(trace[0][0])
+    broken = Result(
+        result.t, result.x, result.f, result.x_handle, result.v_handle, result.w, result.meta | {"replay": {}}
+    )
+    path = save_npz(tmp_path / "trace.npz", broken, trace[1])
+    with pytest.raises(InputError, match="cannot be replayed"):
+        replay.replay(*load(path))
+
+
+def test_the_report_is_json_and_names_its_end(trace):
+    report = json.loads(trace[0][-1].read_text())
+    assert report["session"]["stage"] == "finished"
+    assert [e["stage"] for e in report["session"]["log"]][-2:] == ["disarming", "finished"]
+    assert report["link"]["counters"]["gaps"] > 10
+    assert report["link"]["age_us"]["p50"] == pytest.approx(130, abs=1)  # what the rehearsal's line takes
+    assert report["certificate"]["certified"]
+
+
+def test_results_of_nothing():
+    recorder = Recorder(2)
+    assert recorder.link()["x"].shape == (0, 2)
+
+
+# faults to order
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("drop=0.1", Upset("drop", 0.1)),
+        ("up:flip=0.02@1+2", Upset("flip", 0.02, "up", 1.0, 2.0)),
+        ("unplug@1", Upset("unplug", 0.0, "both", 1.0)),
+    ],
+)
+def test_faults_are_read(text, expected):
+    assert Upset.parse(text) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("dorp=0.1", "KIND one of flip, drop"),
+        ("drop=2", "allowed are 0 to 1"),
+        ("drop=x", "could not convert"),
+        ("up:unplug", "happens to the device"),
+        ("drop=nan", "allowed are 0 to 1"),
+        ("drop@-1", "START"),
+    ],
+)
+def test_a_wrong_fault_is_one_line(text, words):
+    with pytest.raises(InputError, match=words) as error:
+        Upset.parse(text)
+    assert "\n" not in str(error.value)
+
+
+def test_result_of_holds_the_last_known_force(trace):
+    """Where no STATE came, the trace shows the force that was known last."""
+    _, recorder = trace
+    link = recorder.link()
+    result = result_of(recorder, Units((1e-6,) * 2, (4e-4,) * 2, (0.1,) * 2), 1.2e-3, {})
+    k = int(np.flatnonzero(~link["received"])[0])
+    np.testing.assert_array_equal(result.f[k], result.f[k - 1])

@@ -1,0 +1,159 @@
+"""The bridge in real time, through pyserial and a pseudo-terminal, with the emulator in its own process.
+
+Nothing here judges timing: on a busy machine a session may end because the link was too slow, which is an end like
+any other. What must hold on every machine: a named end with its cause, no armed device left behind, a true trace.
+"""
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from hw import bridge, replay
+from hw.live import Live
+from hw.plan import ladder, rung
+from hw.port import Port
+from hw.safety import ENDED, Limits, Stage
+from hw.session import Session, Settings
+from sim.scenario import InputError
+from sim.scenario import load as scenario_of
+
+pytest.importorskip("serial", reason="pyserial is not installed (extra hw)")
+ROOT = Path(__file__).parent.parent
+AT_REST = ("silent", "disarmed", "stopped", "estop", "ramp")
+
+
+class EmulatorProcess:
+    """hw.emulator as a stranger starts it."""
+
+    def __init__(self, *options):
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "hw.emulator", "--duration=300", *options],
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert select.select([self.process.stdout], [], [], 120)[0]
+        self.path = self.process.stdout.readline().strip()
+
+    def end(self, patience=0.0):
+        """What it says of its device at the end, which comes by itself where the cable was pulled."""
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(patience)
+        self.process.terminate()
+        said = self.process.communicate()[1]
+        return json.loads(said.splitlines()[-1])
+
+
+@pytest.fixture(scope="module")
+def emulator():
+    """One device for several sessions, one after the other."""
+    emulator = EmulatorProcess()
+    yield emulator
+    assert emulator.end()["phase"] in AT_REST
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return scenario_of()
+
+
+@pytest.fixture(scope="module")
+def rungs(scenario):
+    return ladder(scenario, "I", None, None, 1, spare=0)
+
+
+def run(emulator, scenario, plan, seconds=1.0, glance=lambda session: None):
+    session = Session(scenario, Limits((12.0, 12.0)), Settings(measure=100))
+    with Port(emulator.path, 921_600) as port:
+        live = Live(session, port, plan, True, seconds, glance=glance)
+        live.run()
+    return session, live
+
+
+def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
+    """What docs/hardware.md begins with: a session, a report, a trace that replays bit by bit."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    code = bridge.main(["--emulate", "--case", "I", "--duration", "0.3", "--measure", "100", "--json", "-"])
+    report = json.loads(capsys.readouterr().out)
+    stage = report["session"]["stage"]
+    assert Stage(stage) in ENDED
+    assert report["session"]["cause"]
+    assert code == (0 if stage == "finished" else 1)
+    assert report["link"]["counters"]["states"] > 50
+    if report["session"]["armed"]:
+        assert report["certificate"]["certified"]
+        assert replay.main(["out/bridge-I/trace.npz"]) == 0
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_a_signal_ends_a_session_at_zero_force(emulator, scenario, rungs, name):
+    def glance(session):
+        if session.stage == Stage.MEASURING and not sent:
+            sent.append(name)
+            signal.raise_signal(getattr(signal, name))
+
+    sent = []
+    session, live = run(emulator, scenario, lambda ages: rungs, glance=glance)
+    assert (session.stage, session.cause) == (Stage.FINISHED, name)
+    assert live.signals == [getattr(signal, name)]
+
+
+def test_an_exception_stops_the_device_first(emulator, scenario):
+    def plan(ages):
+        raise ZeroDivisionError("a mistake of ours")
+
+    with pytest.raises(ZeroDivisionError):
+        run(emulator, scenario, plan)
+
+
+def test_a_coupling_that_is_not_certified_is_not_armed(emulator, scenario):
+    def plan(ages):
+        return [rung(scenario, "I", "published", None, 1)]
+
+    session, _ = run(emulator, scenario, plan)
+    assert session.stage == Stage.REFUSED
+    assert "not certified" in session.cause
+
+
+def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
+    emulator = EmulatorProcess("--fault=unplug@0.05")
+    session, _ = run(emulator, scenario, lambda ages: rungs, seconds=60.0)
+    assert session.stage in (Stage.LOST, Stage.STOPPED)
+    assert session.cause
+    assert emulator.end(patience=5.0)["phase"] in AT_REST
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ([], "either --port PATH or --emulate"),
+        (["--emulate", "--port", "x"], "either --port PATH or --emulate"),
+        (["--port", "/dev/null", "--fault", "drop"], "--fault is for --emulate"),
+        (["--port", "/nowhere", "--arm"], "--port /nowhere"),
+        (["--emulate", "--case", "none"], "no coupling"),
+        (["--emulate", "--baud", "5"], "--baud is 5, allowed are"),
+        (["--emulate", "--quantile", "2"], "--quantile is 2"),
+        (["--emulate", "--guard", "nan"], "--guard is nan"),
+        (["--emulate", "--measure", "1"], "--measure is 1"),
+        (["--emulate", "--duration", "0"], "--duration is 0"),
+        (["--emulate", "--pace", "2"], "--pace is 2, allowed are 0.01 to 1"),
+        (["--port", "x", "--pace", "0.5"], "--pace is for --emulate"),
+        (["--emulate", "--T", "0.05"], "T is 0.05 s"),
+        (["--emulate", "--fault", "nonsense"], "the emulator did not start: --fault is 'nonsense'"),
+    ],
+)
+def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    with pytest.raises(InputError) as error:
+        bridge.main(options)
+    assert words in str(error.value)

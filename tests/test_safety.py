@@ -1,0 +1,164 @@
+"""What the host never does: limits, finite numbers, jumps, gains; and the arithmetic of the line."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hw.frame import Force, Info, State, encode
+from hw.handshake import Units, configuration, objections, probe_delay, wire_time
+from hw.message import MAX_RELEASE_NS
+from hw.safety import DRIVING, ENDED, Fault, Gain, Limits, Stage, check_jump, check_range, shape
+from sim.scenario import load
+
+LIMITS = Limits((12.0, 6.0))
+T = 1.2e-3
+numbers = st.floats(allow_nan=True, allow_infinity=True)
+INFO = Info(1, "test", 7, 1_200_000, (1_370_000,) * 2, (10**6,) * 2, (400,) * 2, (30000,) * 2, (10**5,) * 2)
+
+
+@given(st.tuples(numbers, numbers), st.tuples(numbers, numbers), st.floats(0, 1))
+def test_no_force_leaves_that_is_not_finite_and_within_the_cap(asked, previous, gain):
+    """Python's max and min let nan through as the cap: shape never does, whatever comes."""
+    before = tuple(
+        max(-cap, min(cap, p)) if math.isfinite(p) else 0.0 for p, cap in zip(previous, LIMITS.cap, strict=True)
+    )
+    if not all(map(math.isfinite, asked)):
+        with pytest.raises(Fault, match="which is no force"):
+            shape(asked, before, gain, LIMITS, T)
+        return
+    shaped = shape(asked, before, gain, LIMITS, T)
+    for force, last, cap in zip(shaped.force, before, LIMITS.cap, strict=True):
+        assert abs(force) <= cap
+        assert abs(force - last) <= LIMITS.slew * T * (1 + 1e-12)  # one rounding of last +- step
+
+
+def test_the_trap_that_the_order_of_checks_avoids():
+    assert max(-12.0, min(12.0, math.nan)) == 12.0
+    with pytest.raises(Fault, match="asked for nan, 0 N, which is no force"):
+        shape((math.nan, 0.0), (0.0, 0.0), 0.0, LIMITS, T)
+
+
+def test_a_force_within_the_limits_is_left_alone():
+    shaped = shape((1.0, -2.0), (0.5, -1.0), 1.0, LIMITS, T)
+    assert shaped.force == (1.0, -2.0)
+    assert (shaped.clipped, shaped.slowed) == (False, False)
+
+
+@pytest.mark.parametrize("gain", [math.nan, -0.01, 1.01])
+def test_an_impossible_gain_is_a_fault(gain):
+    with pytest.raises(Fault, match="the gain is"):
+        shape((1.0, 1.0), (0.0, 0.0), gain, LIMITS, T)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("slew", 2001.0),
+        ("jump", 4e-3),
+        ("watchdog_us", 50_000),
+        ("ramp_in", 0.01),
+        ("ramp_out", 1.0),
+        ("slew", math.nan),
+    ],
+)
+def test_limits_cannot_be_loosened(field, value):
+    with pytest.raises(ValueError, match=field):
+        Limits((12.0,), **{field: value})
+
+
+def test_no_cap_above_twelve_newtons():
+    with pytest.raises(ValueError, match=r"cap\[1\] is 13"):
+        Limits((12.0, 13.0))
+
+
+@pytest.mark.parametrize(("moved", "ticks", "fault"), [(2.9e-3, 1, False), (3.1e-3, 1, True), (5.9e-3, 2, False)])
+def test_jumps_are_measured_per_tick(moved, ticks, fault):
+    if fault:
+        with pytest.raises(Fault, match=r"encoder 2 jumped by 3\.1 mm, allowed are 3 mm in 1 tick"):
+            check_jump((0.0, moved), (0.0, 0.0), ticks, LIMITS)
+    else:
+        check_jump((0.0, moved), (0.0, 0.0), ticks, LIMITS)
+
+
+@pytest.mark.parametrize("x", [math.nan, math.inf])
+def test_a_displacement_that_is_no_number_never_passes(x):
+    with pytest.raises(Fault):
+        check_jump((x,), (0.0,), 1, LIMITS)
+    with pytest.raises(Fault):
+        check_range((x,), (0.1,))
+
+
+def test_the_gain_takes_its_time():
+    gain = Gain(LIMITS, T)
+    ticks = 0
+    while gain.value < 1:
+        gain.rise()
+        ticks += 1
+    assert ticks == math.ceil(LIMITS.ramp_in / T)
+    while gain.value > 0:
+        gain.fall()
+        ticks -= 1
+    assert ticks == math.ceil(LIMITS.ramp_in / T) - math.ceil(LIMITS.ramp_out / T)
+
+
+def test_no_stage_is_both_an_end_and_driving():
+    assert not ENDED & DRIVING
+    assert Stage.DISARMED not in ENDED | DRIVING
+
+
+@pytest.mark.parametrize(
+    ("baud", "microseconds"), [(921_600, 520.8), (2_000_000, 240.0), (115_200, 4166.7)]
+)  # section 14's figures
+def test_wire_time_is_what_the_frames_take(baud, microseconds):
+    seconds, text = wire_time(baud, 2)
+    assert 1e6 * seconds == pytest.approx(microseconds, abs=0.1)
+    state = State(0, 0, 0, 0, 0, 0, 0, (0, 0), (0, 0))
+    bits = 10 * (len(encode(state)) + len(encode(Force(0, 0, 0, (0, 0)))))  # what really goes over the wire
+    assert seconds == bits / baud
+    assert f"{microseconds:.0f} us" in text
+
+
+def test_115200_baud_is_refused_with_the_arithmetic():
+    reasons = objections(INFO, load(), Limits((12.0, 12.0)), 115_200)
+    assert reasons == [
+        "one STATE and one FORCE take (32 + 16) bytes x 10 bits / 115200 baud = 4167 us, more than T = 1200 us"
+    ]
+
+
+def test_a_fitting_device_meets_no_objection():
+    assert objections(INFO, load(), Limits((12.0, 12.0)), 921_600) == []
+
+
+def test_every_objection_is_named():
+    poor = INFO._replace(period_ns=10**6, osp_damping=(1_370_000, 10**6), hard_limit=(15000, 30000))
+    reasons = objections(poor, load(), Limits((12.0, 12.0)), 115_200)
+    assert len(reasons) == 4
+    for reason, word in zip(reasons, ("1000000 ns", "baud", "axis 1 can do 6 N", "axis 2 guarantees 1"), strict=True):
+        assert word in reason
+
+
+@given(st.integers(100_000, 20_000_000))
+def test_the_configuration_never_exceeds_the_protocol(period_ns):
+    config = configuration(INFO._replace(period_ns=period_ns), LIMITS, 1)
+    encode(config)  # raises where a field cannot travel
+    assert config.cap == (30000, 15000)  # 12 N and 6 N in steps of 0.4 mN
+    assert (config.hold + config.ramp) * period_ns <= MAX_RELEASE_NS
+
+
+def test_the_wire_carries_what_the_motor_does():
+    """The device gets -f, in whole steps, and never more than the cap."""
+    units = Units.of(INFO)
+    assert units.steps((1.0, -2.0), (30000, 30000)) == (-2500, 5000)
+    assert units.steps((100.0, -100.0), (30000, 15000)) == (-30000, 15000)
+    assert units.forces((-2500, 5000)) == pytest.approx((1.0, -2.0))
+    assert units.positions((1000, -1)) == pytest.approx((1e-3, -1e-6))
+    assert units.reach == pytest.approx((0.1, 0.1))
+
+
+def test_the_probe_is_the_longest_delay_whose_margin_can_be_told():
+    assert probe_delay(1.2e-3) == 15
+    assert probe_delay(5e-3) == 6
+    with pytest.raises(ValueError, match=r"T is 0\.05 s"):
+        probe_delay(0.05)
