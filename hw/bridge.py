@@ -24,6 +24,7 @@ from sim.command import (
     console,
     execute,
     out_folder,
+    require_linear,
     scenario_from,
     seed_from,
 )
@@ -38,6 +39,7 @@ def main(argv: list[str]) -> int:
     """One session. 0: it ended as planned, 1: refused, stopped, lost or e-stop, 130: interrupted, after a ramp."""
     args = _parser().parse_args(argv)
     scenario, seed, settings = scenario_from(args), seed_from(args), check_link(args)
+    require_linear(scenario, "hw.bridge")
     seconds = number(args, "duration", 0.1, LONGEST, scenario.duration)
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")

@@ -26,7 +26,7 @@ class EmulatedPlant:
     def __init__(self, scenario: Scenario, encoder_step: Array, coulomb: float = 0.0) -> None:
         self.coulomb, self._substeps = coulomb, SUBSTEPS if coulomb else 1
         self.scenario, self.encoder_step = scenario, encoder_step
-        self.scene = build(scenario.device, scenario.human)
+        self.scene = build(scenario.device, scenario.human, scenario.person)
         held = hold(plant(self.scene.model), scenario.T / self._substeps)
         self._product = np.hstack([held.A, held.B])
         self.s = np.zeros(held.A.shape[0])

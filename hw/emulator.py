@@ -135,6 +135,7 @@ def main(argv: list[str]) -> int:
     """Emulate until told to stop. 0: the time was over or the cable was pulled, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, seed = scenario_from(args), seed_from(args)
+    require_linear(scenario, "hw.emulator")
     upsets = tuple(Upset.parse(text) for text in args.fault)
     seconds = numbers("--duration", args.duration, float, 1)[0]
     if not 0 < seconds <= 1e6:

@@ -101,7 +101,7 @@ class Rung:
             "coupling": coupling_part(self.chosen.kind, self.chosen.coupling, self.scenario.T),
             "certificate": certificate_part(self.requirements[self.chosen.condition]),
             "certificates": {name: certificate_part(r) for name, r in self.requirements.items()},
-            "promise": promise_of(self.requirements, self.scenario.psi),
+            "promise": promise_of(self.requirements, self.scenario.loop(self.case)),
             "remarks": list(self.chosen.notes),
         }
 

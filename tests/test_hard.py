@@ -109,25 +109,19 @@ def test_saturation_breaks_a_certificate_and_damped_hands_mend_it():
     assert sustained(0.1)[:2] == (0, 0)
 
 
-def test_encoder_steps_hum_but_do_not_grow():
-    """Steps of 1e-5 m: the trace stays within a few steps of the ideal one, yet left alone it never comes to rest.
-
-    The hum is a matter of the coupling's damper, which sees steps: the soft coupling of Theorem 4 hums within 2 steps.
-    """
+def test_encoder_steps_move_the_trace_by_less_than_a_step():
+    """Steps of 1e-5 m: both engines stay within one step of the ideal encoder, and left alone the devices come to rest."""
     scenario = load().replace(duration=5.0)
     coarse = scenario.replace(device=tuple(CompliantDevice(encoder_step=1e-5) for _ in range(2)))
     ideal, stepped = (simulate(assemble(s, CASE_I), "exact") for s in (scenario, coarse))
     distance = np.abs(ideal.s[:, :2] - stepped.s[:, :2]).max()
     print(f"encoder steps of 1e-5 m: at most {distance:.1e} m from the ideal encoder")
-    assert distance < 3e-4
-    assert np.abs(simulate(assemble(coarse, CASE_I)).s[:, :2] - stepped.s[:, :2]).max() < 3e-4
-    for coupling, steps in ((CASE_I, 8), (SpringDamper(np.array([878.0, 551.0]), np.array([0.386, 0.521])), 2)):
-        free = simulate(assemble(coarse, coupling), "exact", voluntary=False).s[-1000:]
-        smooth = simulate(assemble(scenario, coupling), "exact", voluntary=False).s[-1000:]
-        hum = np.abs(free[:, :2]).max() / 1e-5
-        print(f"left alone, B = {coupling.B.tolist()}: {hum:.0f} steps, {free[:, 4:].std():.1e} m/s")
-        assert 1 <= round(hum) <= steps
-        assert free[:, 4:].std() > 100 * smooth[:, 4:].std()
+    assert 0 < distance < 1e-5
+    # rounding is discontinuous: a difference of 1e-9 m between engines can become one step, not more
+    assert np.abs(simulate(assemble(coarse, CASE_I)).s[:, :2] - stepped.s[:, :2]).max() < 1e-5
+    free = simulate(assemble(coarse, CASE_I), "exact", voluntary=False).s[-1000:]
+    print(f"left alone: {np.abs(free[:, :2]).max():.1e} m, {free[:, 4:].std():.1e} m/s")
+    assert np.abs(free[:, :2]).max() < 1e-5
 
 
 def test_one_simulated_hour_does_not_drift():
