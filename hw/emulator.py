@@ -25,7 +25,17 @@ from typing import Any
 from hw.emulated_plant import nobody
 from hw.emulator_core import Emulator
 from hw.upset import DEVICE, LINE, Line, Upset
-from sim.command import DONE, INTERRUPTED, Parser, add_loop_options, execute, numbers, scenario_from, seed_from
+from sim.command import (
+    DONE,
+    INTERRUPTED,
+    Parser,
+    add_loop_options,
+    execute,
+    numbers,
+    require_linear,
+    scenario_from,
+    seed_from,
+)
 from sim.scenario import InputError
 
 LINGER_US = 50_000  # after the cable was pulled: the device comes to rest by itself

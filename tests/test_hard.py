@@ -110,7 +110,7 @@ def test_saturation_breaks_a_certificate_and_damped_hands_mend_it():
 
 
 def test_encoder_steps_move_the_trace_by_less_than_a_step():
-    """Steps of 1e-5 m: both engines stay within one step of the ideal encoder, and left alone the devices come to rest."""
+    """Steps of 1e-5 m: both engines stay within one of the ideal encoder; left alone the devices come to rest."""
     scenario = load().replace(duration=5.0)
     coarse = scenario.replace(device=tuple(CompliantDevice(encoder_step=1e-5) for _ in range(2)))
     ideal, stepped = (simulate(assemble(s, CASE_I), "exact") for s in (scenario, coarse))

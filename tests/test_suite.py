@@ -48,7 +48,7 @@ def test_the_report_begins_with_verdicts_and_every_number_has_its_command(tmp_pa
     found = json.loads((tmp_path / "none" / "report.json").read_text())
     assert outcome["checks"][0]["report"] == found
     assert f"| unstable with | {found['unstable']['exact']} (exact), - (MuJoCo) |" in text
-    assert "| handle of 1 g, no human damping | -0.1670 | 1 | 24 |" in text
+    assert "| handle of 1 g, no human damping | -0.1670 | RK4 x 1: refused | RK4 x 48 |" in text
     pictures = re.findall(r"!\[.*?\]\((.*?)\)", text)
     assert pictures == ["none/population.png"]
     assert all((tmp_path / picture).stat().st_size > 10_000 for picture in pictures)
