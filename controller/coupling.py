@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from controller.lti import Array, Lti, frozen
 
@@ -120,7 +120,7 @@ class InternalModel:
         return environment @ (Lti.constant(np.eye(m), T) - self.parameter(T) @ environment)
 
 
-def basis(poles: Array, z: Array) -> Array:
+def basis(poles: Array, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """b_0 = 1 and b_k = (1 - a_k)/(z - a_k) prod_{j<k} (1 - a_j z)/(z - a_j), k = 1..n; shape z.shape + (n + 1,).
 
     Takenaka-Malmquist functions up to their lengths: all-pass sections in a row, each with a tap. Poles at zero make

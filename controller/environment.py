@@ -151,7 +151,7 @@ def realise(
     T: Any,
     inverse: Callable[[Array], Array],
     across: NDArray[np.int64] | None = None,
-) -> list[Array]:
+) -> tuple[Array, Array, Array, Array]:
     """A, B, C, D of the network (M, D, K) whose first `c` nodes are contacts; see `environment`.
 
     With `across` (w, nodes) there are w more inputs, forces that push the displacements `across q` back, and w more
@@ -178,8 +178,8 @@ def realise(
 
     after, inputs = np.vstack([q, v, x, vx]), c + w
     keep = _remembered(after, force, inputs)
-    states = [after[keep][:, inputs:][:, keep], after[keep][:, :inputs]]
-    return [*states, force[:, inputs:][:, keep], force[:, :inputs]]
+    kept = after[keep]
+    return kept[:, inputs:][:, keep], kept[:, :inputs], force[:, inputs:][:, keep], force[:, :inputs]
 
 
 def _quarters(c: int) -> tuple[tuple[slice, slice], ...]:

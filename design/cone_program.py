@@ -38,7 +38,7 @@ class Block:
     def padded(self, more: int) -> Block:
         """The same inequalities with `more` unknowns at the end, which do not enter."""
         k, _, r, _ = self.slope.shape
-        return Block(self.constant, np.concatenate([self.slope, np.zeros((k, more, r, r))], axis=1))
+        return Block(self.constant, np.concatenate([self.slope, np.zeros((k, more, r, r), dtype=complex)], axis=1))
 
     def changed(self, basis: Array) -> Block:
         """The same inequalities in y, where x = basis y."""

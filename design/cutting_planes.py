@@ -45,7 +45,7 @@ def cut(Q: FreeParameter, wish: Wish, worlds: Sequence[World], delta: Array) -> 
     Raises Infeasible where the inequalities contradict each other, DesignFailed where they still fail after all rounds.
     """
     problem = Problem.of(Q, wish, worlds, delta)
-    imposed = [one.imposed for one in problem.inequalities]
+    imposed, missed = [one.imposed for one in problem.inequalities], []
     for rounds in range(1, MOST_ROUNDS + 1):
         x, shared = problem.optimum(imposed)
         coupling = Q.coupling(x)
@@ -94,7 +94,7 @@ class Problem:
         A, b = square_mismatch(self.worlds[0], self.Q)
         size, shared = self.Q.size, len(names)
         basis = _coordinates([A, *(block.rows()[1].reshape(-1, size + shared)[:, :size] for block in blocks)])
-        change = block_diag(basis, np.eye(shared))
+        change: Array = np.asarray(block_diag(basis, np.eye(shared)), dtype=float)
         A = np.hstack([A, np.zeros((A.shape[0], shared))]) @ change
         E = np.hstack([self.Q.asymmetry(), np.zeros((self.Q.asymmetry().shape[0], shared))]) @ change
         program = ConeProgram(

@@ -90,7 +90,7 @@ def loop_force(E: Complex, Q: Response) -> Response:
     return E - E @ constant @ E, -E[:, None] @ slope @ E[:, None]
 
 
-def affine(response: Response, constant: Complex, linear: Callable[[Complex], Complex]) -> Block:
+def affine(response: Response, constant: Array | Complex, linear: Callable[[Complex], Complex]) -> Block:
     """constant + He[linear(response)] >= 0, for a linear map that accepts further leading axes."""
     value, slope = response
     return Block(constant + hermitian(linear(value)), np.moveaxis(hermitian(linear(np.moveaxis(slope, 1, 0))), 0, 1))

@@ -38,7 +38,7 @@ def closed_loop_ratios(
     condition holds by itself.
     """
     X = None if environment is None else delay(psi, gains.T) @ environment
-    poles = np.linalg.eigvals(force_maps(gains, environment, theta, psi).A)
+    poles = np.linalg.eigvals(force_maps(gains, environment, theta, psi).A).astype(np.complex128)
 
     def needed(w: Array) -> Array:
         return _needed(gains, X, on_circle(w), theta, delta)
@@ -48,7 +48,7 @@ def closed_loop_ratios(
 
 
 def theorem4_ratios(
-    gains: Gains, theta: Sequence[int], delta: Sequence[float], phi: Sequence[float] | None = None
+    gains: Gains, theta: Sequence[int], delta: Sequence[float], phi: Sequence[float] | Array | None = None
 ) -> Array:
     """Required over available damping by theorem4 on the worst channel, (n,); `phi` [N s/m] is needed for psi >= 1."""
     worst = np.zeros(len(gains))
@@ -90,7 +90,7 @@ def _closed(X: Complex, v: Complex) -> Complex:
         det = X[..., 0, 0] * X[..., 1, 1] - X[..., 0, 1] * X[..., 1, 0]
         whole = 1 + v * (X[..., 0, 0] + X[..., 1, 1]) + v**2 * det
         return (X + (v * det)[..., None, None] * np.eye(2)) / whole[..., None, None]
-    return np.linalg.solve(np.eye(m) + v[..., None, None] * X, X)
+    return np.linalg.solve(np.eye(m) + v[..., None, None] * X, X).astype(np.complex128, copy=False)
 
 
 def _largest_eigenvalue(H: Complex) -> Array:

@@ -40,7 +40,7 @@ class Inequality:
         """The inequality at w in the unknowns of Q followed by the shared ones of these names."""
         block = self.block(w, Q)
         more = [self.shared.get(name, np.zeros(block.constant.shape[1:])) for name in names]
-        columns = [np.broadcast_to(matrix, block.constant.shape)[:, None] for matrix in more]
+        columns = [np.broadcast_to(matrix.astype(complex), block.constant.shape)[:, None] for matrix in more]
         return Block(block.constant, np.concatenate([block.slope, *columns], axis=1))
 
     def missed(self, given: GivenParameter, shared: Mapping[str, float], slack: float) -> Array:

@@ -13,20 +13,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from controller.lti import Lti
 from design.demand import closed_loop_demand, theorem4_demand
-from design.store import Condition
 from design.sweep import frequencies, supremum
+
+C = TypeVar("C", bound=str)  # the name of a condition: design.store.Condition, or that of design.jitter
 
 
 @dataclass(frozen=True)
-class Requirement:
+class Requirement(Generic[C]):
     """The damping that a condition asks of the devices, against what they have."""
 
-    condition: Condition
+    condition: C
     required: tuple[float, ...]  # (m,) [N s/m]; inf when no damping helps
     available: tuple[float, ...]  # (m,) [N s/m]
     frequency_hz: float | None  # where it binds
@@ -104,12 +106,12 @@ def theorem4_per_channel(V: Sequence[Lti], theta: Sequence[int], delta: Sequence
     return Requirement("theorem4", required, available, worst.frequency_hz, worst.reason)
 
 
-def from_ratio(condition: Condition, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement:
+def from_ratio(condition: C, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement[C]:
     """The requirement of `ratio` times what is available, on every channel."""
     return Requirement(condition, tuple(ratio * delta for delta in available), available, frequency_hz)
 
 
-def refusal(condition: Condition, available: tuple[float, ...], reason: str) -> Requirement:
+def refusal(condition: C, available: tuple[float, ...], reason: str) -> Requirement[C]:
     """The requirement that no damping satisfies."""
     return Requirement(condition, (np.inf,) * len(available), available, None, reason)
 

@@ -53,7 +53,7 @@ class Crowd:
     def persons(self, i: int) -> tuple[Person, ...]:
         """Set i, those who hold several devices."""
         pairs = zip(self.holds, self.bodies[i].tolist(), strict=True)
-        return tuple(Person(holds, *body[:3], Cross(*body[3:])) for holds, body in pairs)
+        return tuple(Person(holds, m, b, k, Cross(*cross)) for holds, (m, b, k, *cross) in pairs)
 
 
 @dataclass(frozen=True, eq=False)

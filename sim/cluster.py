@@ -74,7 +74,7 @@ def _client(address: str, patience: float) -> Iterator[Client]:
     """A client of the cluster, checked to be there. Raises InputError."""
     try:
         from distributed import Client
-        from distributed.comm import connect
+        from distributed.comm.core import connect
         from distributed.core import coerce_to_address
         from distributed.security import Security
     except ImportError:

@@ -67,7 +67,8 @@ def make_grid(
                 raise InputError(f"--mark has {name} = {mark:g}, outside --{name}-range {low:g},{high:g}")
         ends.append((low, high))
     spread = np.linspace if scale == "linear" else np.geomspace
-    return Grid(spread(*ends[0], n), spread(*ends[1], n), scale)
+    along_K, along_B = (spread(low, high, n) for low, high in ends)
+    return Grid(along_K, along_B, scale)
 
 
 def _with_room(usual: Range, marked: Sequence[float]) -> Range:

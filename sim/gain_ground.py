@@ -80,7 +80,7 @@ class Ground:
 
     def process(self, gains: Gains, i: int, devices: tuple[Device, ...]) -> Process:
         """What the computer does every T with coupling i; limits and encoder steps are those of `devices`."""
-        limits = [np.array([getattr(d, name) for d in devices]) for name in ("force_limit", "encoder_step")]
+        limits = np.array([d.force_limit for d in devices]), np.array([d.encoder_step for d in devices])
         if self.walled is None:
             return Process(self.force_maps(gains.take([i]))[0][0], *limits)
         walls: Contact = contact(self.walled, gains.compliance(i, self.channels), self.theta, self.psi, self.T)

@@ -219,7 +219,7 @@ def _points(
     shape = (cells.size, -1)
     shown = np.where(lasting, amplitude + 1e9, amplitude).reshape(shape).argmax(axis=1)[:, None]
     pick = lambda values: np.take_along_axis(values.reshape(shape), shown, axis=1)[:, 0]  # noqa: E731
-    return Points(cells, lasting.reshape(shape).any(axis=1), pick(amplitude), pick(frequency), growth)
+    return Points(cells, np.any(lasting.reshape(shape), axis=1), pick(amplitude), pick(frequency), growth)
 
 
 def _joined(parts: Sequence[Points]) -> Points:

@@ -53,7 +53,7 @@ def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
     amplitude = np.take_along_axis(shown, at, axis=0)[0]
     frequency = np.take_along_axis(line.reshape(-1, x.shape[2]), at, axis=0)[0]
     return Oscillation(
-        lasting.any(axis=(0, 1)) | diverged,
+        np.any(lasting, axis=(0, 1)) | diverged,
         np.where(diverged, np.inf, amplitude),
         np.where(diverged, np.nan, frequency),
     )

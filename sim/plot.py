@@ -15,7 +15,7 @@ from sim.result import Result
 mpl.use("Agg")
 
 #: Okabe and Ito's palette, with a line style each
-STYLES = (
+STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#0072B2", "linestyle": "-"},
     {"color": "#D55E00", "linestyle": "--"},
     {"color": "#009E73", "linestyle": ":"},

@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from controller.lti import Array
+from design.store import Condition
 from sim.files import write
 from sim.gain_map import UNDECIDED, Map
 from sim.plot import STYLES
@@ -20,7 +21,7 @@ from sim.stability import MARGINAL
 
 STABLE, UNSTABLE = "#DDEBF4", "#F6D9C6"
 #: the broken line lies on the other, so that both are seen where they are the same
-LINES = {
+LINES: dict[Condition, dict[str, Any]] = {
     "closed-loop": {"color": STYLES[2]["color"], "linestyle": "-", "linewidth": 3.6},
     "theorem4": {"color": STYLES[0]["color"], "linestyle": "--", "linewidth": 1.8},
 }

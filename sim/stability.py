@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,8 @@ from scipy.linalg import eig
 from controller.lti import Array, Lti
 from sim.exact_engine import HeldPlant
 from sim.loop import Record
+
+Complex = NDArray[np.complex128]
 
 #: growth rates up to this [1/s] count as stable: eigenvalues at 1 (a free loop that drifts) come out at 1e-12
 MARGINAL = 1e-9
@@ -69,7 +72,7 @@ def close(plant: HeldPlant, F: Lti) -> ClosedLoop:
 
 def dominant_mode(loop: ClosedLoop) -> Mode:
     """The mode of the largest modulus: its growth decides."""
-    values, left, _ = eig(loop.A, left=True)
+    values, left = cast("tuple[Complex, Complex]", eig(loop.A, left=True)[:2])  # how many it returns is an option of it
     k = int(np.argmax(np.abs(values)))
     return Mode(complex(values[k]), left[:, k], loop.T)
 
@@ -99,7 +102,7 @@ def measured_growth(
 
 def clipped_ticks(record: Record, force_limit: Array) -> NDArray[np.bool_]:
     """(N,) whether any force was at its limit at a tick."""
-    return (np.abs(record.f) >= force_limit[:, None]).any(axis=(1, 2))
+    return np.any(np.abs(record.f) >= force_limit[:, None], axis=(1, 2))
 
 
 def growth_rate(eigenvalue: complex, T: float) -> float:
