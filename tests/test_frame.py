@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from hw.device import Device
@@ -94,7 +94,6 @@ axes = st.integers(1, 8)
 messages = st.one_of(small, *[axes.flatmap(kind) for kind in (states, forces, configs, infos)])
 
 
-@settings(deadline=None)
 @given(messages)
 def test_what_is_sent_is_what_arrives(message):
     frame, decoder = encode(message), Decoder()
@@ -124,7 +123,6 @@ def test_two_axes_fit_the_periods_they_should():
     assert [round(both * 10 / baud * 1e6) for baud in (115_200, 921_600, 2_000_000)] == [4167, 521, 240]
 
 
-@settings(deadline=None)
 @given(st.binary(max_size=250))
 def test_stuffing_and_crc_equal_their_definitions(data):
     """Any payload framed by the tests' own code is read; if it is no message it is unknown, not damaged."""
@@ -185,7 +183,6 @@ def test_what_cannot_travel_is_refused_by_name(message, text):
         encode(message)
 
 
-@settings(deadline=None)
 @given(st.lists(messages, max_size=6), st.randoms(use_true_random=False))
 def test_the_pieces_do_not_matter(sent, rng):
     stream, decoder, got = b"".join(map(encode, sent)), Decoder(), []

@@ -1,6 +1,5 @@
 """The spring-damper designs: known optima, independence of the start, exactness of the set, and refusals."""
 
-import time
 
 import cvxpy as cp
 import numpy as np
@@ -82,11 +81,9 @@ def test_no_certified_gains_do_better(case):
     assert tried > 10
 
 
-def test_the_design_is_fast():
-    spec = specification()
-    design(spec)
-    fastest = min(_timed(lambda: design(spec)) for _ in range(5))
-    assert fastest < 0.3
+def test_a_handful_of_convex_problems_suffices():
+    """What the design costs, counted: tests/benchmarks/test_design_cost.py has the seconds."""
+    assert design(specification()).sdps <= 4
 
 
 @pytest.mark.parametrize(("theta", "K"), list(enumerate([2283.0, 878.86, 551.94, 405.1, 320.8])))
@@ -238,9 +235,3 @@ def test_an_unknown_condition_is_refused():
 def test_too_much_damping_leaves_no_stiffness():
     with pytest.raises(Infeasible, match=r"B = 3 N s/m leaves no stiffness with delta = 1\.37"):
         stiffest_at(3.0, 1, 1.37, T)
-
-
-def _timed(call):
-    started = time.perf_counter()
-    call()
-    return time.perf_counter() - started

@@ -1,0 +1,13 @@
+"""What holds for every test: one BLAS thread, and no verdict on how fast the machine is."""
+
+import os
+
+# The matrices here are small: a pool of BLAS threads costs more than it saves, most of all on a busy machine.
+# To be set before NumPy is loaded; the commands that tests start inherit it.
+for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
+from hypothesis import HealthCheck, settings  # noqa: E402
+
+settings.register_profile("no-clock", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("no-clock")
