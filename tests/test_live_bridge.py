@@ -83,7 +83,9 @@ def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
     """What docs/hardware.md begins with: a session, a report, a trace that replays bit by bit."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    code = bridge.main(["--emulate", "--case", "I", "--duration", "0.1", "--measure", "60", "--pace", "0.3", "--json", "-"])
+    code = bridge.main(
+        ["--emulate", "--case", "I", "--duration", "0.1", "--measure", "60", "--pace", "0.3", "--json", "-"]
+    )
     report = json.loads(capsys.readouterr().out)
     stage = report["session"]["stage"]
     assert Stage(stage) in ENDED

@@ -1,6 +1,5 @@
 """The spring-damper designs: known optima, independence of the start, exactness of the set, and refusals."""
 
-
 import cvxpy as cp
 import numpy as np
 import pytest

@@ -1,0 +1,74 @@
+"""Every command's --help ends with an example of that command, and its arguments are what the command takes."""
+
+import importlib
+import shlex
+from pathlib import Path
+
+import pytest
+
+from sim.command import Parser
+
+ROOT = Path(__file__).parent.parent
+LAUNCH = "execute(main)"  # how a file says that it is a command
+
+
+class Parsed(Exception):
+    """Raised in place of the command's work once its arguments are understood."""
+
+
+def modules():
+    """Every command as python -m names it."""
+    files = [path for folder in ("design", "sim", "hw") for path in sorted((ROOT / folder).rglob("*.py"))]
+    found = [path.relative_to(ROOT).with_suffix("").parts for path in files if LAUNCH in path.read_text()]
+    return [".".join(parts).removesuffix(".__main__") for parts in found]
+
+
+def main_of(module):
+    package = (ROOT / module.replace(".", "/")).is_dir()
+    return importlib.import_module(f"{module}.__main__" if package else module).main
+
+
+def help_of(module, capsys):
+    with pytest.raises(SystemExit) as end:
+        main_of(module)(["--help"])
+    assert end.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_the_commands_are_found():
+    assert {"design", "design.audit", "sim.run", "sim.validate", "hw.bridge"} <= set(modules())
+
+
+@pytest.mark.parametrize("module", modules())
+def test_the_example_of_help_is_understood(module, capsys, monkeypatch):
+    text = help_of(module, capsys)
+    lines = text.partition("\nexample:\n")[2].splitlines()
+    assert lines, f"the help of {module} ends without an example"
+    parse = Parser.parse_args
+
+    def understood(self, *args, **kwargs):
+        raise Parsed(parse(self, *args, **kwargs))
+
+    monkeypatch.setattr(Parser, "parse_args", understood)
+    for line in lines:
+        words = shlex.split(line, comments=True)
+        assert words[:3] == ["python", "-m", module]
+        with pytest.raises(Parsed):
+            main_of(module)(words[3:])
+
+
+@pytest.mark.parametrize("module", modules())
+def test_help_says_what_every_option_is(module, capsys, monkeypatch):
+    """No option without a word on what it does."""
+    parse = Parser.parse_args
+    seen = []
+
+    def noted(self, *args, **kwargs):
+        seen.extend(self._actions)
+        return parse(self, *args, **kwargs)
+
+    monkeypatch.setattr(Parser, "parse_args", noted)
+    help_of(module, capsys)
+    silent = [action.option_strings or action.dest for action in seen if not action.help]
+    assert seen
+    assert not silent
