@@ -91,9 +91,7 @@ def _parser() -> Parser:
     names = ", ".join(NAMES)
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
-    parser.add_argument(
-        "--engine", choices=ENGINES, default="mujoco", help="who simulates: MuJoCo, or the exact solution"
-    )
+    parser.add_argument("--engine", choices=ENGINES, default="mujoco", help="MuJoCo, or the exact solution")
     parser.add_argument("--integrator", choices=(*INTEGRATORS, LEAPFROG), default="RK4", help="of MuJoCo (default RK4)")
     parser.add_argument("--substeps", metavar="N", help="MuJoCo steps per period (default 4, more where needed)")
     parser.add_argument("--duration", metavar="SECONDS", help="default: the scenario's")
