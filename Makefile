@@ -1,11 +1,13 @@
 # make run    the paper's case I, from a fresh clone to a picture
 # make test   the whole test suite
+# make lint   ruff and pyright, without a finding: to be run, with make test, before anything is committed
+# make coverage  the whole test suite again, slower, and the lines that it does not reach
 # make validate  every check that a verdict rests on: a report in out/validate/report.md, under five minutes
 # make figures  the pictures that README and docs show
 PYTHON ?= python3
 PY := .venv/bin/python
 
-.PHONY: run test validate lint bench figures clean
+.PHONY: run test validate lint coverage bench figures clean
 
 run: .venv/ready
 	$(PY) -m sim.run --case I
@@ -19,6 +21,10 @@ validate: .venv/ready
 lint: .venv/ready
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
+	$(PY) -m pyright
+
+coverage: .venv/ready
+	$(PY) -m pytest --cov --cov-report=term:skip-covered
 
 figures: .venv/ready
 	$(PY) -m sim.run --case none --out out/figure-5
@@ -40,4 +46,4 @@ bench: .venv/ready
 	@touch $@
 
 clean:
-	rm -rf .venv out build *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv out build *.egg-info .pytest_cache .ruff_cache .hypothesis .coverage*
