@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,9 +15,8 @@ import msgspec
 import numpy as np
 from rich.table import Table
 
-from controller.lti import Array
 from hw.emulator_core import Emulator, info_of
-from hw.frame import Info
+from hw.fault_cases import CASES, WHEN, Case
 from hw.plan import Ages, Rung, ladder, link_delay
 from hw.rehearsal import Plan, Rehearsal
 from hw.safety import ENDED, Limits, Stage
@@ -28,141 +26,7 @@ from sim.command import DOES_NOT_HOLD, DONE, Parser, check_json, console, execut
 from sim.files import write_json
 from sim.scenario import Scenario, load
 
-WHEN = 0.45  # [s] after arming: the gain is 1 after 0.25 s, the person moves after 0.31 s
-LASTS = 0.75  # [s] after arming that a case is watched
 MEASURED = 100  # answers whose age is measured: enough for a line that does not vary
-T_MS = 1.2
-
-#: bounds on the time to zero [ms], each with one tick for the sampling of the fault
-AT_ONCE = 2 * T_MS  # an e-stop is taken at the next tick
-STOP = 8 * T_MS  # the frame that shows it, the STOP, 5 ticks of ramp
-WATCHDOG = 12 * T_MS  # theta, 4 ticks held, 5 of ramp, one to notice
-SILENCE = 6.0 + 1.0 + 8 * T_MS  # the host's time-out, looked at every millisecond, then a STOP
-
-Call = Callable[[Session, int], bytes]
-
-
-@dataclass(frozen=True)
-class Case:
-    """A fault, the stage it must end in, and words that must be in the cause."""
-
-    name: str
-    stage: Stage
-    cause: str = ""  # a regular expression
-    upsets: tuple[str, ...] = ()
-    within: float | None = None  # [ms] from the fault to zero force; None: forces go on
-    action: Call | None = None  # done at WHEN
-    host_stall: float = 0.0  # [s] at WHEN
-    info: Callable[[Info], Info] | None = None  # a device that says something else of itself
-    baud: int | None = None
-    coupling: str | None = None
-    designed: bool = False  # the coupling for the measured delay, in place of one made beforehand
-    counted: tuple[str, ...] = ()  # counters that must not be zero
-    first_tick: int = 0
-    period: float = 1.0  # of the device's clock, in T
-    lasts: float = LASTS  # [s] after arming
-
-
-def spoiled(force: float) -> Call:
-    """A controller that from now on asks for `force` [N]."""
-
-    def call(session: Session, now: int) -> bytes:
-        def step(x: Sequence[float]) -> Array:
-            if np.isneginf(force):
-                raise ZeroDivisionError("division by zero")
-            return np.full(len(x), force)
-
-        assert session.drive is not None
-        session.drive.law.step = step
-        return b""
-
-    return call
-
-
-def person(what: str) -> Call:
-    """What a person asks for: stop or estop."""
-    return lambda session, now: getattr(session, what)("asked to", now)
-
-
-def at(text: str) -> tuple[str, ...]:
-    """The fault `text` from WHEN on."""
-    return tuple(f"{part}@{WHEN}" for part in text.split())
-
-
-G, A = Stage, Stage.ARMED
-LATE = at("down:jitter=0.0007")
-CASES = (
-    Case("nothing", A),
-    Case("ticks wrap around", A, first_tick=65000),
-    # the line, a little
-    Case("5 % of STATEs lost", A, upsets=at("up:drop=0.05"), counted=("gaps", "misses")),
-    Case("5 % of FORCEs lost", A, upsets=at("down:drop=0.05"), counted=("misses",)),
-    Case("bits of STATEs flipped", A, upsets=at("up:flip=0.05"), counted=("gaps", "host_errors")),
-    Case("bits of FORCEs flipped", A, upsets=at("down:flip=0.05"), counted=("misses", "device_errors")),
-    Case("STATEs cut short", A, upsets=at("up:truncate=0.03"), counted=("gaps", "host_errors")),
-    Case("FORCEs cut short", A, upsets=at("down:truncate=0.03"), counted=("misses", "device_errors")),
-    Case("a little garbage", A, upsets=at("garbage=0.03"), counted=("gaps", "host_errors", "device_errors")),
-    Case("STATEs twice", A, upsets=at("up:duplicate=0.3"), counted=("duplicates",)),
-    Case("FORCEs twice", A, upsets=at("down:duplicate=0.3")),
-    Case("STATEs out of order", A, upsets=at("up:reorder=0.03"), counted=("stale", "gaps")),
-    Case("FORCEs out of order", A, upsets=at("down:reorder=0.03"), counted=("late", "misses")),
-    Case("0.5 ms later both ways", A, upsets=at("delay=0.0005")),
-    Case("device freezes for 4 ms", A, upsets=at("stall=0.004")),
-    Case("host freezes for 4 ms", A, host_stall=0.004, counted=("misses",)),
-    Case("handshake over a bad line", A, upsets=("drop=0.04", "flip=0.01"), counted=("gaps",)),
-    # the line, too much
-    Case("no STATE arrives", G.LOST, "no new STATE", at("up:drop=1"), SILENCE),
-    Case("no FORCE arrives", G.STOPPED, "cause watchdog", at("down:drop=1"), WATCHDOG),
-    Case("nothing arrives", G.LOST, "no new STATE", at("drop=1"), WATCHDOG),
-    Case("every STATE damaged", G.LOST, "no new STATE", at("up:flip=1"), SILENCE),
-    Case("every FORCE damaged", G.STOPPED, "cause watchdog", at("down:flip=1"), WATCHDOG),
-    Case("every frame cut short", G.LOST, "no new STATE", at("truncate=1"), WATCHDOG),
-    Case("noise all the time", G.LOST, "no new STATE", at("up:garbage=60"), SILENCE),
-    Case("noise at the device", G.STOPPED, "cause watchdog", at("down:garbage=60"), WATCHDOG),
-    Case("40 % of FORCEs lost", G.STOPPED, "no answer in time|watchdog", at("down:drop=0.4"), 300.0),
-    Case("2 ms later both ways", G.STOPPED, "cause watchdog", at("delay=0.002"), WATCHDOG + 4.0),
-    Case("host freezes for 20 ms", G.STOPPED, "in ramp|in stopped", within=WATCHDOG, host_stall=0.02),
-    Case("cable pulled", G.LOST, "port is gone", at("unplug"), WATCHDOG),
-    # the delay
-    Case("answers get late", G.DISARMED, "theta = 2", LATE, 500.0, designed=True, counted=("late",), lasts=1.2),
-    Case("late, nothing softer", G.STOPPED, "nothing softer", LATE, 500.0, counted=("late",), lasts=1.2),
-    Case("a slow link from the start", A, upsets=("delay=0.004",), designed=True),
-    Case("a link too slow", G.REFUSED, "at most theta = 15", ("delay=0.012",), designed=True),
-    Case("a coupling not certified", G.REFUSED, "published is not certified", coupling="published", designed=True),
-    Case("no coupling", G.REFUSED, "without coupling is not certified", coupling="none", designed=True),
-    # the device
-    Case("device freezes for 20 ms", G.LOST, "no new STATE", at("stall=0.02"), 20.0 + WATCHDOG),
-    Case("device resets", G.LOST, "no new STATE", at("reset"), AT_ONCE),
-    Case("encoder jumps by 2 mm", A, upsets=at("jump=2")),
-    Case("encoder jumps by 5 mm", G.STOPPED, "encoder 1 jumped by", at("jump=5"), STOP),
-    Case("encoder out of its range", G.STOPPED, "its range is", ("jump=200",)),
-    Case("e-stop at the device", G.ESTOP, "estop_device", at("estop"), AT_ONCE),
-    Case("e-stop at the device before", G.REFUSED, "refuses the configuration: estop", ("estop",)),
-    Case("firmware finds a fault", G.STOPPED, "cause device", at("trip"), STOP),
-    Case("device clock runs 5 % fast", G.REFUSED, "by its own clock", period=1.05),
-    # the controller
-    Case("controller asks for nan", G.STOPPED, "nan, nan N, which is no force", within=STOP, action=spoiled(np.nan)),
-    Case("controller asks for inf", G.STOPPED, "inf, inf N, which is no force", within=STOP, action=spoiled(np.inf)),
-    Case("controller raises", G.STOPPED, "ZeroDivisionError", within=STOP, action=spoiled(-np.inf)),
-    Case("controller asks for 100 N", A, action=spoiled(100.0), counted=("clipped", "slowed")),
-    # people
-    Case("planned stop", G.FINISHED, "asked to", within=100.0 + STOP, action=person("stop")),
-    Case("e-stop at the host", G.ESTOP, "asked to", within=AT_ONCE, action=person("estop")),
-    # the handshake
-    Case("another protocol", G.REFUSED, "version 2", info=lambda i: i._replace(version=2)),
-    Case(
-        "one axis",
-        G.REFUSED,
-        "1 axis, the scenario 2",
-        info=lambda i: i._replace(**{n: getattr(i, n)[:1] for n in i._fields[4:]}),
-    ),
-    Case("another period", G.REFUSED, "every 1000000 ns", info=lambda i: i._replace(period_ns=1_000_000)),
-    Case("a weak motor", G.REFUSED, "can do 6 N", info=lambda i: i._replace(hard_limit=(30000, 15000))),
-    Case("little damping", G.REFUSED, "guarantees 1 N s/m", info=lambda i: i._replace(osp_damping=(10**6, 10**6))),
-    Case("115200 baud", G.REFUSED, "4167 us, more than T = 1200 us", baud=115200),
-    Case("921600 baud", A, baud=921600),
-    Case("nobody there", G.LOST, "no answer to HELLO", ("up:drop=1",)),
-)
 
 
 @dataclass(frozen=True)
@@ -228,7 +92,7 @@ def _wrong(case: Case, rehearsal: Rehearsal, to_zero: float | None) -> list[str]
     for name in case.counted:
         if not counted(session, name):
             wrong.append(f"nothing counted as {name}")
-    if session.stage != A and np.any(rehearsal.moments[-1].applied):
+    if session.stage != Stage.ARMED and np.any(rehearsal.moments[-1].applied):
         wrong.append("a motor still has a force")
     cap = max(session.limits.cap)
     if any(np.abs(m.applied).max() > cap for m in rehearsal.moments):

@@ -15,7 +15,8 @@ from matplotlib.patches import Patch
 from controller.lti import Array
 from design.store import Condition
 from sim.files import write
-from sim.gain_map import UNDECIDED, Map
+from sim.gain_map import Map
+from sim.gain_simulation import UNDECIDED
 from sim.plot import STYLES
 from sim.stability import MARGINAL
 

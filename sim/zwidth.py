@@ -30,10 +30,12 @@ from sim.command import (
 from sim.files import write_json
 from sim.gain_grid import Grid, Range, make_grid
 from sim.gain_ground import Ground, one_sided
-from sim.gain_map import Effects, Map, Plan, draw_map
+from sim.gain_map import Map, draw_map
 from sim.gain_marks import look, truth
 from sim.gain_population import holders
+from sim.gain_simulation import Effects, Plan
 from sim.scenario import InputError, Scenario
+from sim.zwidth_text import print_map
 
 EXAMPLE = """python -m sim.zwidth --theta 1 --grid 30
   python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0
@@ -68,7 +70,7 @@ def main(argv: list[str]) -> int:
         zwidth_report.add_truth(outcome, {name: truth(ground, drawn, name) for name in drawn.ratio})
         zwidth_report.add_marks(outcome, [look(ground, crowd, *mark, grid.K) for mark in marks])
     _save(args, ground, drawn, outcome, out)
-    zwidth_report.print_map(outcome, console(args))
+    print_map(outcome, console(args))
     if args.json:
         write_json(args.json, outcome)
     if drawn.interrupted:

@@ -7,7 +7,8 @@ import pytest
 
 from hw import replay, session_report
 from hw.emulator_core import Emulator
-from hw.faults import CASES, lively, rehearse
+from hw.fault_cases import CASES
+from hw.faults import lively, rehearse
 from hw.frame import Decoder, Force, State, Stop, encode
 from hw.handshake import Units
 from hw.law import Law, fill

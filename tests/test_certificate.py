@@ -154,10 +154,10 @@ def test_environment_delay_is_proved_by_the_closed_loop_condition_only():
 
 
 def test_the_proof_succeeds_exactly_where_the_sweep_says_so():
-    """100 random loops; between 1 - 1e-4 and 1 either outcome is fair."""
+    """60 random loops; between 1 - 1e-4 and 1 either outcome is fair."""
     rng = np.random.default_rng(7)
     outcomes = []
-    for _ in range(100):
+    for _ in range(60):
         loop, coupling = random_case(rng)
         ratio = required_damping(loop, coupling, "closed-loop").ratio
         try:
@@ -166,7 +166,7 @@ def test_the_proof_succeeds_exactly_where_the_sweep_says_so():
             proved = False
         outcomes.append(proved)
         assert proved == (ratio < 1) or 1 - 1e-4 <= ratio <= 1
-    assert 25 < sum(outcomes) < 75
+    assert 15 < sum(outcomes) < 45
 
 
 def random_case(rng: np.random.Generator) -> tuple[Loop, SpringDamper]:

@@ -163,10 +163,10 @@ def test_2_as_printed_is_strictly_infeasible_for_v_hat():
 
 
 def test_analysis_agrees_with_the_frequency_condition():
-    """200 couplings near the boundary, of both signs, from one to three channels, diagonal and coupled."""
+    """80 couplings near the boundary, of both signs, from one to three channels, diagonal and coupled."""
     rng = np.random.default_rng(7)
     verdicts = []
-    for trial in range(200):
+    for trial in range(80):
         m = int(rng.integers(1, 4))
         walls = Network(
             contacts=tuple(f"c{i}" for i in range(m)),
@@ -184,7 +184,7 @@ def test_analysis_agrees_with_the_frequency_condition():
             continue
         verdicts.append(ratio < 1)
         assert analysis(V, E, theta, [0] * m, delta).feasible == verdicts[-1], (trial, ratio)
-    assert 40 < sum(verdicts) < len(verdicts) - 40
+    assert 16 < sum(verdicts) < len(verdicts) - 16
 
 
 def scalar_theorem4(V, E, theta, psi, delta):
@@ -202,7 +202,7 @@ def scalar_theorem4(V, E, theta, psi, delta):
 def test_analysis_with_environment_delay_agrees_with_lemma_4_by_hand():
     rng = np.random.default_rng(3)
     verdicts = []
-    for _ in range(100):
+    for _ in range(50):
         network = Network(contacts=("c",), springs=(Spring(("c", "ground"), rng.uniform(5, 300), rng.uniform(0, 0.2)),))
         E = environment(network, T)
         theta, psi, delta = int(rng.integers(0, 3)), int(rng.integers(1, 3)), rng.uniform(0.5, 3)
@@ -212,7 +212,7 @@ def test_analysis_with_environment_delay_agrees_with_lemma_4_by_hand():
             continue
         verdicts.append(room > 0)
         assert analysis(V, E, [theta], [psi], [delta]).feasible == (room > 0), (theta, psi, delta, room)
-    assert 15 < sum(verdicts) < len(verdicts) - 15
+    assert 8 < sum(verdicts) < len(verdicts) - 8
 
 
 def test_separate_channels_have_the_smallest_margin():

@@ -24,8 +24,9 @@ from sim.cells import in_slices
 from sim.command import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
 from sim.gain_grid import Grid, make_grid
 from sim.gain_ground import Ground, one_sided
-from sim.gain_map import Effects, Plan, draw_map
+from sim.gain_map import draw_map
 from sim.gain_population import holders
+from sim.gain_simulation import Effects, Plan
 from sim.many_processes import ManyProcesses
 from sim.mujoco_engine import discretised
 from sim.oscillation import oscillation, slowest_seen
