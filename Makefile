@@ -6,6 +6,8 @@
 # make figures  the pictures that README and docs show
 PYTHON ?= python3
 PY := .venv/bin/python
+# a file of tests stays on one core: its tests share fixtures, and those of the documentation files
+PARALLEL := -n auto --dist loadfile
 
 .PHONY: run test validate lint coverage bench figures clean
 
@@ -13,7 +15,7 @@ run: .venv/ready
 	$(PY) -m sim.run --case I
 
 test: .venv/ready
-	$(PY) -m pytest
+	$(PY) -m pytest $(PARALLEL)
 
 validate: .venv/ready
 	$(PY) -m sim.suite --out out/validate
@@ -24,7 +26,7 @@ lint: .venv/ready
 	$(PY) -m pyright
 
 coverage: .venv/ready
-	$(PY) -m pytest --cov --cov-report=term:skip-covered
+	$(PY) -m pytest $(PARALLEL) --cov --cov-report=term:skip-covered
 
 figures: .venv/ready
 	$(PY) -m sim.run --case none --out out/figure-5

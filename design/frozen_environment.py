@@ -7,7 +7,8 @@ violated in between, that frequency is added and the search resumed. What is ret
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import partial
 
 import numpy as np
 from scipy.optimize import OptimizeResult, minimize
@@ -104,11 +105,20 @@ class Sampled:
         return minimize(self.square_mismatch, x, method="SLSQP", bounds=bounds, constraints=condition, options=options)
 
 
-def least_rms(spec: Specification, starts: Iterable[SpringDamper]) -> tuple[SpringDamper | None, float, int]:
-    """(gains, rms mismatch as a ratio, searches) of the best certified local optimum; gains None if none was found."""
+Optimum = Callable[[SpringDamper], tuple[SpringDamper | None, int]]  # start -> (gains or None, searches)
+
+
+def least_rms(
+    spec: Specification, starts: Iterable[SpringDamper], optimum: Optimum | None = None
+) -> tuple[SpringDamper | None, float, int]:
+    """(gains, rms mismatch as a ratio, searches) of the best local optimum; gains None if none was found.
+
+    `optimum` searches from one start; the default finds what closed-loop certifies.
+    """
+    optimum = optimum or partial(_certified_optimum, spec)
     best, least, searches = None, np.inf, 0
     for start in starts:
-        coupling, runs = _certified_optimum(spec, start)
+        coupling, runs = optimum(start)
         searches += runs
         if coupling is None:
             continue

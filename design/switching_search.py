@@ -14,12 +14,11 @@ from scipy.optimize import OptimizeResult
 from controller.coupling import SpringDamper
 from controller.lti import Array
 from controller.process import force_map
-from design.frozen_environment import MOST_ROUNDS, SAMPLED_RESERVE, STUCK, Sampled
+from design.frozen_environment import MOST_ROUNDS, SAMPLED_RESERVE, STUCK, Sampled, least_rms
 from design.jitter import half_widths, jitter_proof, nominal_over_step
 from design.sampled import Complex
 from design.specification import RESERVE, Specification
 from design.sweep import hermitian, on_circle
-from design.transparency import transparency
 
 FIRST = 0.5  # the multiplier alpha T/delta that a search begins with where the start has none
 MULTIPLIERS = (1e-4, 10.0)  # ... and its bounds
@@ -74,17 +73,7 @@ def least_rms_switching(
     spec: Specification, lo: Sequence[int], hi: Sequence[int], starts: Iterable[SpringDamper]
 ) -> tuple[SpringDamper | None, float, int]:
     """(gains, rms mismatch as a ratio, searches) of the best local optimum that is safe under any switching."""
-    best, least, searches = None, np.inf, 0
-    for start in starts:
-        coupling, runs = _safe_optimum(SwitchingSampled(spec, lo, hi), start)
-        searches += runs
-        if coupling is None:
-            continue
-        F = force_map(spec.environment, coupling, spec.theta, spec.psi)
-        rms = transparency(F, spec.environment, spec.lam).rms_mismatch
-        if rms < least:
-            best, least = coupling, rms
-    return best, least, searches
+    return least_rms(spec, starts, lambda start: _safe_optimum(SwitchingSampled(spec, lo, hi), start))
 
 
 def _safe_optimum(sampled: SwitchingSampled, start: SpringDamper) -> tuple[SpringDamper | None, int]:

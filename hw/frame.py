@@ -6,6 +6,7 @@ before stuffing, so COBS costs exactly one byte and the size of a frame does not
 """
 
 from itertools import chain
+from operator import index
 from struct import Struct, error
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -132,10 +133,13 @@ def check(message: Message) -> None:
                 check_integer(f"{name}.{field}[{axis}]", entry, limits)
 
 
-def check_integer(name: str, value: object, limits: tuple[int, int]) -> None:
-    if not hasattr(value, "__index__"):
-        raise ValueError(f"{name}: {value!r}; integers only")
-    if not limits[0] <= int(value) <= limits[1]:  # type: ignore[call-overload]
+def check_integer(name: str, value: Any, limits: tuple[int, int]) -> None:
+    """Raises ValueError naming the field unless the value is an integer from limits[0] to limits[1]."""
+    try:
+        number = index(value)
+    except TypeError:
+        raise ValueError(f"{name}: {value!r}; integers only") from None
+    if not limits[0] <= number <= limits[1]:
         raise ValueError(f"{name}: {value}; {limits[0]} to {limits[1]}")
 
 
