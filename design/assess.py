@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from controller.box import members, shrunk
 from controller.coupling import Compliance, Coupling, SpringDamper
 from controller.environment import environment
 from controller.lti import Array, Lti
@@ -19,11 +20,24 @@ CONDITIONS: tuple[Condition, ...] = ("theorem4", "closed-loop")
 
 def specification(loop: Loop) -> Specification:
     """The loop as a request for a design. Raises ValueError naming the field that is wrong."""
-    return Specification(environment(loop.environment, loop.T), loop.theta, loop.psi, loop.lam, loop.delta)
+    E = environment(loop.environment, loop.T)
+    if loop.box is None:
+        return Specification(E, loop.theta, loop.psi, loop.lam, loop.delta)
+    box = loop.box
+
+    def others(factor: float = 1.0) -> dict[str, Lti]:
+        _, *vertices = members(loop.environment, box if factor == 1 else shrunk(loop.environment, box, factor))
+        return {vertex.name: environment(vertex.network, loop.T) for vertex in vertices}
+
+    return Specification(E, loop.theta, loop.psi, loop.lam, loop.delta, others=others(), shrunk=others)
 
 
 def assess(loop: Loop, coupling: Coupling, phi: Array | None = None) -> dict[str, Requirement]:
-    """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any."""
+    """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
+
+    closed-loop is about the nominal environment alone: design.set_check asks for the rest of its box.
+    """
+    loop = loop.at(loop.environment)
     E = environment(loop.environment, loop.T)
     any_environment = theorem4_requirement(coupling, E, loop.theta, loop.psi, loop.delta, phi)
     this_environment = closed_loop(force_map(E, coupling, loop.theta, loop.psi), loop.delta)

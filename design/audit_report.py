@@ -9,7 +9,7 @@ from typing import Any, get_args
 from rich.console import Console
 from rich.table import Table
 
-from controller.coupling import Compliance, NoCoupling, SpringDamper
+from controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
 from design.audit_figures import Stiffest, Tolerance, stiffest, tolerance
 from design.audit_remedies import remedies
 from design.margin import Requirement
@@ -17,7 +17,12 @@ from design.promises import CAVEATS, certificate_part, promise
 from design.store import Condition
 from design.subject import Subject
 
-KINDS = {NoCoupling: "none", SpringDamper: "spring-damper", Compliance: "compliance"}
+KINDS = {
+    NoCoupling: "none",
+    SpringDamper: "spring-damper",
+    Compliance: "compliance",
+    InternalModel: "internal-model",
+}
 
 
 def report(subject: Subject) -> dict[str, Any]:

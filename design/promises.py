@@ -8,7 +8,7 @@ from typing import Any
 
 from design.margin import Requirement
 
-ANY, HERE, WALL = "any passive environment", "this environment", "a rigid wall only"
+ANY, SET, HERE, WALL = "any passive environment", "a set", "this environment", "a rigid wall only"
 
 #: What no certificate covers.
 CAVEATS = (
@@ -36,14 +36,19 @@ def certificate_part(requirement: Requirement) -> dict[str, Any]:
     return part | ({"reason": requirement.reason} if requirement.reason else {})
 
 
-def promise(theorem4: bool, closed_loop: bool, rigid: bool = False) -> str | None:
-    """For which environments a coupling is certified, given which conditions hold; `rigid` if E is a wall."""
+def promise(theorem4: bool, closed_loop: bool, rigid: bool = False, whole_set: bool = False) -> str | None:
+    """For which environments a coupling is certified, given which conditions hold.
+
+    `rigid` if E is a wall; `whole_set` if closed-loop is proved at every vertex of a box around E.
+    """
     if theorem4:
         return ANY
+    if whole_set:
+        return SET
     return (WALL if rigid else HERE) if closed_loop else None
 
 
-def promise_of(requirements: dict[str, Requirement], psi: Sequence[int]) -> str | None:
+def promise_of(requirements: dict[str, Requirement], psi: Sequence[int], whole_set: bool = False) -> str | None:
     """The promise of a coupling by its requirements; the multiplier that psi >= 1 takes is of one environment."""
     held = {name: requirement.certified for name, requirement in requirements.items()}
-    return promise(held["theorem4"] and not any(psi), any(held.values()))
+    return promise(held["theorem4"] and not any(psi), any(held.values()), whole_set=whole_set)

@@ -12,6 +12,7 @@ from typing import Any, Self, get_args
 
 import msgspec
 
+from controller.box import Box, UncertainSpring
 from controller.environment import Network, Spring, environment
 from design.store import Loop
 from models.device import Device, passivity_level, with_damping
@@ -54,6 +55,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     device: tuple[Device, ...]
     human: tuple[Human, ...]
     environment: Network
+    box: Box | None = None  # what else the environment may be
     lam: Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
     tap: Tap | None = None
     duration: float = 15.0  # [s]
@@ -73,6 +75,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if lam > self.theta[i] + self.psi[i]:
                 total = self.theta[i] + self.psi[i]
                 raise ValueError(f"lam[{i}] is {lam}, allowed are 0 to theta + psi = {total} samples")
+        self.loop("I")  # raises ValueError where the box does not fit the environment
         if self.tap and not 1 <= self.tap.channel <= self.channels:
             raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
 
@@ -104,7 +107,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def loop(self, case: str) -> Loop:
         """All that a design may know: no device but its damping, no human."""
-        return Loop(self.T, self.theta, self.psi, self.reference_delays(case), self.delta, self.environment)
+        return Loop(self.T, self.theta, self.psi, self.reference_delays(case), self.delta, self.environment, self.box)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping."""
@@ -183,4 +186,4 @@ def _hint(what: str) -> str:
     return ""
 
 
-_STRUCTS = (Scenario, Tap, Human, Link, Voluntary, Population, Network, Spring, *get_args(Device))
+_STRUCTS = (Scenario, Tap, Human, Link, Voluntary, Population, Network, Spring, Box, UncertainSpring, *get_args(Device))
