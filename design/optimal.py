@@ -16,6 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from controller.coupling import InternalModel
 from controller.lti import Lti
 from controller.process import force_map
 from design.cutting_planes import SLACK, cut, sketch
@@ -30,6 +31,7 @@ from design.transparency import transparency
 from design.wish import Wish
 
 USUAL = Wish()
+ADDED, MOST_ADDITIONS = 4, 5  # points inside a box that become environments at a time, and how often at most
 EASIER = (1.5, 2, 3, 5, 10, 20, 50)  # times the damping, tried to say how far a request is from having a solution
 
 
@@ -40,7 +42,7 @@ def design(spec: Specification, wish: Wish = USUAL) -> Design:
     """
     started = time.perf_counter()
     try:
-        coupling, rounds = cut(parameter(spec, wish), wish, worlds(spec), np.asarray(spec.delta))
+        coupling, spec, rounds = searched(spec, wish)
     except Infeasible as error:
         raise Infeasible(error.problem, error.results, advice(spec, wish)) from error
     maps = [force_map(E, coupling, spec.theta, spec.psi) for E in environments(spec)]
@@ -52,6 +54,27 @@ def design(spec: Specification, wish: Wish = USUAL) -> Design:
     value = np.sqrt(np.mean(squares)) if wish.objective == "rms" else max(f.relative_mismatch for f in figures)
     wall = time.perf_counter() - started
     return Design(coupling, "closed-loop", wish.objective, float(value), requirement, rounds, wall)
+
+
+def searched(spec: Specification, wish: Wish) -> tuple[InternalModel, Specification, int]:
+    """(coupling, the specification with the points of the box that had to be added, rounds).
+
+    Between the vertices of a box nothing is convex: the coupling is tried at points inside, and those where it violates
+    the condition become further environments, the worst first.
+    """
+    total = 0
+    for _ in range(MOST_ADDITIONS):
+        coupling, rounds = cut(parameter(spec, wish), wish, worlds(spec), np.asarray(spec.delta))
+        total += rounds
+        ratios = {
+            name: closed_loop(force_map(E, coupling, spec.theta, spec.psi), spec.delta).ratio
+            for name, E in spec.inside.items()
+        }
+        violated = sorted((n for n, ratio in ratios.items() if ratio > 1 - wish.margin / 2), key=ratios.__getitem__)
+        if not violated:
+            break
+        spec = replace(spec, others={**spec.others, **{name: spec.inside[name] for name in violated[-ADDED:]}})
+    return coupling, spec, total
 
 
 def parameter(spec: Specification, wish: Wish) -> FreeParameter:

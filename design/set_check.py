@@ -31,12 +31,12 @@ class SetCheck:
     at_samples: tuple[Requirement, ...]
     seed: int
     certificate: Certificate | None  # of the whole set, with the promise "a set"
-    reason: str | None  # why there is none
+    reason: str | None  # why the set is not promised
 
     @property
     def proved(self) -> bool:
-        """At the environment and every vertex, in exact arithmetic."""
-        return self.certificate is not None
+        """At the environment and every vertex, in exact arithmetic, and nothing found inside speaks against it."""
+        return self.certificate is not None and all(r.certified for r in self.at_samples)
 
     @property
     def worst(self) -> tuple[Member, Requirement]:
@@ -55,6 +55,8 @@ def check_set(loop: Loop, coupling: Coupling, seed: int = 0, samples: int = SAMP
     except NotProved as error:
         certificate, reason = None, str(error)
     at_members, at_samples = in_each(loop, coupling, members), in_each(loop, coupling, drawn)
+    if certificate and not all(r.certified for r in at_samples):
+        reason = f"proved at the vertices, but violated inside, at {drawn[worst(at_samples)].name}"
     return SetCheck(members, tuple(at_members), drawn, tuple(at_samples), seed, certificate, reason)
 
 
@@ -67,7 +69,7 @@ def set_part(check: SetCheck) -> dict[str, Any]:
         "required_damping": [finite(d) for d in requirement.required],
         "available_damping": list(requirement.available),
         "worst": member.name,
-        "proof": "rational" if check.proved else "sampled",
+        "proof": "rational" if check.certificate else "sampled",
         "certified": check.proved,
         "inside": _inside_part(check),
         "what": WHAT_IS_PROVED,

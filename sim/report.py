@@ -10,6 +10,7 @@ from rich.table import Table
 
 from controller.lti import Array
 from design.promises import CAVEATS, finite
+from design.set_check import set_rows
 from sim.loop import Record
 from sim.simulate import Assembly
 from sim.stability import clipped_ticks, close, dominant_mode, measured_growth, verdict
@@ -126,6 +127,7 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(
             (f"damping, {part['condition']}", f"needs {need} of {_list(part['available_damping'])} N s/m: {word}")
         )
+    rows += set_rows(report["set"]) if report["set"] else []
     rows.append(("promise", f"holds for {report['promise']}" if report["promise"] else "none"))
     rows.append(
         ("relative mismatch", f"{_db(transparent['relative_mismatch_db'])} (rms {_db(transparent['rms_mismatch_db'])})")
@@ -137,6 +139,8 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     measured = "-" if growth is None else f"{growth:+.4f} 1/s"
     rows.append(("growth, simulated trace", f"{measured}: {_verdict(stability['verdict'])}"))
     run = report["run"]
+    if report["set"]:
+        rows.append(("simulated in", run["environment"]))
     rows.append(("clipped ticks", f"{stability['clipped_ticks']} of {run['samples']}"))
     engine = run["engine"] + (f" {run['integrator']} x {run['substeps']}" if run["integrator"] else "")
     rows.append(
