@@ -161,8 +161,12 @@ def _price(args: argparse.Namespace, loop: Loop, design: Design, options: dict[s
     """The coupling over the box; an optimal one beside the one for the nominal environment alone."""
     couplings = {args.coupling: design.coupling}
     if args.coupling == "optimal":
-        alone = design_coupling(specification(loop.at(loop.environment)), "optimal", None, **options)
-        couplings = {"nominal only": alone.coupling, "whole set": design.coupling}
+        couplings = {"whole set": design.coupling}
+        try:
+            alone = design_coupling(specification(loop.at(loop.environment)), "optimal", None, **options)
+            couplings = {"nominal only": alone.coupling, **couplings}
+        except DesignFailed:  # the set is given another basis by default
+            pass
     return [cost_part(row) for row in price(loop, couplings)]
 
 

@@ -15,7 +15,7 @@ from design.margin import Requirement, closed_loop, refusal, theorem4, theorem4_
 from design.specification import Specification
 from design.store import Condition, Loop, data_of
 
-TRIED, TRIAL_SEED = 128, 0xB0C5  # points of a box where a design is tried; a seed that no check is likely to draw from
+TRIED, TRIAL_SEED = 64, 0xB0C5  # points of a box where a design is tried; a seed that no check is likely to draw from
 
 CONDITIONS: tuple[Condition, ...] = ("theorem4", "closed-loop")
 
