@@ -30,12 +30,14 @@ def set_advice(
         why = f"beside the nominal environment there is none with {hopeless[0]}{more}"
     else:
         why = "each vertex has one beside the nominal environment, but not all of them and the points inside together"
-    helpful = [words for words, other in changes.items() if feasible(spec, other)]
+    hopeful = [words for words, other in changes.items() if feasible(spec, other)]
     assert spec.shrunk  # a box came with it
-    smaller = ((f, replace(spec, others=spec.shrunk(f))) for f in SMALLER)
+    smaller = ((f, replace(spec, others=spec.shrunk(f), inside={})) for f in SMALLER)
     share = next((f for f, less in smaller if solvable(less, wish)), None)
-    if share:
-        helpful.append(f"ranges of {share:.0%} of their width around the nominal values")
-    limit = "the limit above 100 Hz" if "no limit above 100 Hz" in helpful else "the closed-loop condition"
-    remedy = f"there seem to be some with {', or '.join(helpful)}" if helpful else "shrink the box, or have less delay"
+    limit = "the limit above 100 Hz" if "no limit above 100 Hz" in hopeful else "the closed-loop condition"
+    remedies = [
+        f"there is one for ranges of {share:.0%} of their width around the nominal values" if share else "",
+        f"worth a try: {', or '.join(hopeful)}" if hopeful else "",
+    ]
+    remedy = "; ".join(filter(None, remedies)) or "leave out a contact that may be absent, or have less delay"
     return f"{request}: {why}; {limit} binds; {remedy}"
