@@ -181,7 +181,7 @@ def by_hand(network: Network, coupling, w):
     return late * (E - E @ Q @ E)
 
 
-def least_room(network: Network, coupling, points: int = 4000) -> float:
+def least_room(network: Network, coupling, points: int = 2000) -> float:
     """min over frequency of the least eigenvalue of T/delta He[F/(z-1)] + I: positive where the condition holds."""
     w = np.concatenate([np.geomspace(1e-4, np.pi, points), np.linspace(1e-3, np.pi, points)])
     H = by_hand(network, coupling, w) / (np.exp(1j * w) - 1)[:, None, None]
