@@ -154,7 +154,7 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
         corners.append(absent)
 
     def draw(rng: np.random.Generator) -> Spring:
-        k, d, coin = rng.uniform(*stiffness), rng.uniform(*damping), rng.random()
+        k, d, coin = rng.uniform(stiffness[0], stiffness[1]), rng.uniform(damping[0], damping[1]), rng.random()
         return absent if uncertain.absent and coin < 0.5 else Spring(own.between, k, d)
 
     return _Part(f"{a}-{b}", tuple(corners), own, draw)
@@ -167,7 +167,7 @@ def _mass_part(network: Network, node: str, limits: Range) -> _Part:
     _require_inside(f"box.masses.{node}", limits, own, "kg")
     if limits[0] == limits[1]:
         raise ValueError(f"box.masses.{node} is {limits[0]:g} to {limits[1]:g} kg: nothing is uncertain")
-    return _Part(node, limits, own, lambda rng: rng.uniform(*limits))
+    return _Part(node, limits, own, lambda rng: rng.uniform(limits[0], limits[1]))
 
 
 def _member(name: str, network: Network, parts: Sequence[_Part], values: Sequence[Spring | float]) -> Member:
