@@ -8,7 +8,6 @@ from typing import Protocol
 
 import numpy as np
 
-from controller.delay import delay
 from controller.lti import Array, Lti
 from design.cone_program import Block, Complex
 from design.free_parameter import GivenParameter, Response, affine, bordered, loop_force
@@ -68,22 +67,27 @@ class World:
 
     def delayed(self, z: Complex) -> Complex:
         """Psi E."""
-        return delay(self.psi, self.T).at(z) @ self.environment.at(z)
+        return late(self.psi, z) * self.environment.at(z)
 
     def force(self, z: Complex, Q: Parameter) -> Response:
         """F = Theta (Psi E - Psi E Q Psi E)."""
         constant, slope = loop_force(self.delayed(z), Q.at(z))
-        theta = delay(self.theta, self.T).at(z)
-        return theta @ constant, theta[:, None] @ slope
+        theta = late(self.theta, z)
+        return theta * constant, theta[:, None] * slope
 
     def mismatch(self, z: Complex, Q: Parameter) -> Response:
         """M = F - Lambda E (8)."""
         constant, slope = self.force(z, Q)
-        return constant - delay(self.lam, self.T).at(z) @ self.environment.at(z), slope
+        return constant - late(self.lam, z) * self.environment.at(z), slope
 
     def size(self, z: Complex) -> Array:
         """sigma_max(E), (k,)."""
         return np.linalg.norm(self.environment.at(z), 2, axis=(1, 2))
+
+
+def late(steps: Sequence[int], z: Complex) -> Complex:
+    """z^-n of each channel, as factors of the rows of a matrix, shape (k, m, 1)."""
+    return z[:, None, None] ** -np.array(steps)[:, None]
 
 
 def passivity(world: World, delta: Array) -> Inequality:

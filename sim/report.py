@@ -10,6 +10,7 @@ from rich.table import Table
 
 from controller.lti import Array
 from design.promises import ANY, CAVEATS, finite
+from design.set_check import set_rows
 from sim.loop import Record
 from sim.one_period import frozen_modes, worst_mode
 from sim.simulate import Assembly
@@ -176,6 +177,7 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(
             (f"damping, {part['condition']}", f"needs {need} of {_list(part['available_damping'])} N s/m: {word}")
         )
+    rows += set_rows(report["set"]) if report["set"] else []
     rows.append(("promise", f"holds for {report['promise']}" if report["promise"] else "none"))
     rows.append(
         ("relative mismatch", f"{_db(transparent['relative_mismatch_db'])} (rms {_db(transparent['rms_mismatch_db'])})")
@@ -193,6 +195,8 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         contact = stability["contact"]
         rows.append(("contact", f"made {contact['made']} times, lasting {contact['ticks']} of {run['samples']} ticks"))
         rows += [(f"growth, {_walls(state['touching'])}", _growth(state)) for state in contact["frozen"]]
+    if report["set"]:
+        rows.append(("simulated in", run["environment"]))
     rows.append(("clipped ticks", f"{stability['clipped_ticks']} of {run['samples']}"))
     engine = run["engine"] + (f" {run['integrator']} x {run['substeps']}" if run["integrator"] else "")
     rows.append(
