@@ -21,6 +21,8 @@ from design.specification import Specification
 from design.store import Condition, Loop, data_of
 from design.transparency import decibels, transparency
 
+PRINTED = {"I": "(27)", "II": "(28)"}  # the paper's equations for its gains
+
 Progress = Callable[[int, int], None]  # (designs done, designs in all)
 
 
@@ -101,7 +103,7 @@ def rung(case: str, loop: Loop, entry: Entry) -> Rung:
         coupling, design = _made(spec, case, entry)
     except DesignFailed as error:
         wall = time.perf_counter() - begin
-        return Rung(entry.name, case, None, False, entry.condition, None, None, None, wall, 0.0, str(error))
+        return Rung(_name(entry, case), case, None, False, entry.condition, None, None, None, wall, 0.0, str(error))
     wall = time.perf_counter() - begin
     F = force_map(spec.environment, coupling, loop.theta, loop.psi)
     requirement = closed_loop(F, loop.delta)
@@ -117,7 +119,11 @@ def rung(case: str, loop: Loop, entry: Entry) -> Rung:
     mismatch = finite(decibels(figures.relative_mismatch)), finite(decibels(figures.rms_mismatch))
     proof_s = time.perf_counter() - begin
     certified = requirement.certified
-    return Rung(entry.name, case, required, certified, entry.condition, *mismatch, proof, wall, proof_s, reason)
+    return Rung(_name(entry, case), case, required, certified, entry.condition, *mismatch, proof, wall, proof_s, reason)
+
+
+def _name(entry: Entry, case: str) -> str:
+    return f"{entry.name} {PRINTED[case]}" if entry.kind == "published" else entry.name
 
 
 def _made(spec: Specification, case: str, entry: Entry) -> tuple[Coupling, Design | None]:

@@ -14,12 +14,13 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
+from controller.coupling import NoCoupling
 from controller.lti import Array
 from controller.process import force_map
 from design.assess import specification
 from design.designs import design_coupling
 from design.failure import DesignFailed
-from design.margin import closed_loop
+from design.margin import Requirement, closed_loop
 from design.promises import finite
 from design.store import Condition, Loop, digest
 from design.transparency import decibels, transparency
@@ -39,10 +40,10 @@ class Axis:
 
 
 AXES = {
-    "damping": Axis("damping of the devices (the least)", "N s/m", 0.5, 4.0),
+    "damping": Axis("damping of the devices (the least)", "N s/m", 0.5, 1.4),
     "delay": Axis("transmission delay (the largest)", "samples", math.nan, math.nan),
-    "period": Axis("sampling period", "s", 0.25, 2.0),
-    "order": Axis("basis functions of each entry of Q", "functions", 0.25, 2.0),
+    "period": Axis("sampling period", "s", 0.5, 2.5),
+    "order": Axis("basis functions of each entry of Q", "functions", 0.2, 1.6),
 }
 
 
@@ -99,6 +100,7 @@ class Limit:
     relative_mismatch_db: float | None
     required_damping: tuple[float | None, ...] | None  # closed-loop, [N s/m]
     dc_ratio: float | None  # share of the static stiffness that is felt
+    bare_damping: tuple[float | None, ...]  # what the loop without any coupling requires, closed-loop [N s/m]
     wall_s: float
     reason: str | None = None  # why there is no design
 
@@ -122,8 +124,9 @@ def measured(setting: Setting, kind: str, condition: Condition | None, options: 
     """One design and its figures, from the coupling alone; a request without a solution gives its reason."""
     loop, begin = setting.loop, time.perf_counter()
     figures: dict[str, Any] = dict.fromkeys(("rms_mismatch_db", "relative_mismatch_db", "required_damping", "dc_ratio"))
+    spec = specification(loop)
+    bare = closed_loop(force_map(spec.environment, NoCoupling(), loop.theta, loop.psi), loop.delta)
     try:
-        spec = specification(loop)
         coupling = design_coupling(spec, kind, condition, **options).coupling
     except DesignFailed as error:
         figures["reason"] = str(error)
@@ -133,12 +136,17 @@ def measured(setting: Setting, kind: str, condition: Condition | None, options: 
         figures = {
             "rms_mismatch_db": finite(decibels(transparent.rms_mismatch)),
             "relative_mismatch_db": finite(decibels(transparent.relative_mismatch)),
-            "required_damping": tuple(finite(b) for b in closed_loop(F, loop.delta).required),
+            "required_damping": _damping(closed_loop(F, loop.delta)),
             "dc_ratio": finite(transparent.dc_ratio),
         }
     functions = setting.wish.functions if kind == "optimal" else None
     wall = time.perf_counter() - begin
-    return Limit(setting.value, loop.delta, loop.theta, loop.T, functions, **figures, wall_s=wall)
+    place = (setting.value, loop.delta, loop.theta, loop.T, functions)
+    return Limit(*place, **figures, bare_damping=_damping(bare), wall_s=wall)
+
+
+def _damping(requirement: Requirement) -> tuple[float | None, ...]:
+    return tuple(finite(b) for b in requirement.required)
 
 
 def remembered(designer: Designer, whole: bool) -> Designer:

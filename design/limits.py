@@ -36,6 +36,7 @@ from sim.scenario import InputError
 
 BESIDE = {"none": (), "theorem4": ("theorem4",), "closed-loop": ("closed-loop",), "both": ("theorem4", "closed-loop")}
 MOST_POINTS = 100
+EXACT_DB = -60.0  # below it the difference to the environment is the solver's
 
 
 def main(argv: list[str]) -> int:
@@ -60,7 +61,7 @@ def main(argv: list[str]) -> int:
     outcome = head | {
         "here": {"delta": list(loop.delta), "theta": list(loop.theta), "psi": list(loop.psi), "T_s": loop.T},
         "sweeps": {name: _sweep(name, plan[name], rows) for name, rows in curves.items()},
-        "gains": [line for name, rows in curves.items() for line in _gains(name, plan[name], rows, wish)],
+        "gains": _gains(plan, curves, loop, wish),
         "wall_s": time.perf_counter() - begin,
         "interrupted": interrupted,
     }
@@ -97,12 +98,12 @@ def _parser() -> Parser:
         help="every design side by side, cases I and II (full: minutes)",
     )
     wish = parser.add_argument_group("the optimal coupling")
-    wish.add_argument("--functions", metavar="N", default="8", help="basis functions of each entry of Q (default 8)")
-    wish.add_argument("--filter", choices=FILTERS, default="auto", help="poles of the basis (default by the delays)")
+    wish.add_argument("--functions", metavar="N", default="10", help="basis functions of each entry of Q (default 10)")
+    wish.add_argument("--filter", choices=FILTERS, default="mixed", help="poles of the basis (default mixed)")
     wish.add_argument("--objective", choices=OBJECTIVES, default="rms", help="the mismatch minimised and drawn")
     wish.add_argument("--high-gain", metavar="G", default="1.5", help="of |F|/|E| above 100 Hz, or none (default 1.5)")
     wish.add_argument("--margin", metavar="SHARE", default="0.005", help="of the damping that stays unused")
-    wish.add_argument("--full", action="store_true", help="Q across channels (default: diagonal)")
+    wish.add_argument("--diagonal", action="store_true", help="Q of separate channels (default: full)")
     add_output_options(parser)
     return parser
 
@@ -112,7 +113,7 @@ def _wish(args: argparse.Namespace) -> Wish:
     (functions,) = numbers("--functions", args.functions, int, 1)
     (margin,) = numbers("--margin", args.margin, float, 1)
     try:
-        return Wish(functions, args.filter, not args.full, args.objective, high_gain, margin)
+        return Wish(functions, args.filter, args.diagonal, args.objective, high_gain, margin)
     except ValueError as error:
         raise InputError(str(error)) from None
 
@@ -173,19 +174,39 @@ def _sweep(name: str, along: Sequence[Setting], rows: dict[str, list[Limit]]) ->
     return {"label": axis.label, "unit": axis.unit, "values": [s.value for s in along]} | points
 
 
-def _gains(name: str, along: Sequence[Setting], rows: dict[str, list[Limit]], wish: Wish) -> list[str]:
-    """What the best end of a sweep gains over the other, in one line."""
-    found = [(limit, _figure(limit, wish.objective)) for limit in rows["optimal"]]
-    found = [(limit, figure) for limit, figure in found if figure is not None]
-    if len(found) < 2:
-        return []
-    best, worst = min(found, key=lambda pair: pair[1]), max(found, key=lambda pair: pair[1])
-    ends = [f"{pair[1]:.1f} dB at {pair[0].value:.4g}" for pair in (worst, best)]
-    return [f"{name}: {ends[0]}, {ends[1]} {AXES[name].unit}: {worst[1] - best[1]:.1f} dB to gain"]
+def _gains(plan: dict[str, list[Setting]], curves: Curves, loop: Loop, wish: Wish) -> list[str]:
+    """What there is to gain, in a line per sweep."""
+    lines = []
+    for name, rows in curves.items():
+        found = [(limit, _figure(limit, wish.objective)) for limit in rows["optimal"]]
+        known = [(limit, figure) for limit, figure in found if figure is not None]
+        if len(known) < 2:
+            continue
+        here = next((s.value for s in plan[name] if s.loop == loop and s.wish == wish), None)
+        words = [
+            f"{_decibels(figure)} at {limit.value:.4g}" + (" (here)" if limit.value == here else "")
+            for limit, figure in known
+            if limit in (known[0][0], known[-1][0]) or limit.value == here
+        ]
+        lines.append(f"{name} in {AXES[name].unit}: {', '.join(words)}")
+    bare = next((limit for rows in curves.values() for limit in rows["optimal"] if _is(limit, loop)), None)
+    if bare and None not in bare.bare_damping:
+        need = ", ".join(f"{b:.4g}" for b in bare.bare_damping)
+        lines.append(f"without any coupling this loop needs {need} N s/m: devices with more need none")
+    return lines
+
+
+def _is(limit: Limit, loop: Loop) -> bool:
+    return (limit.delta, limit.theta, limit.T_s) == (loop.delta, loop.theta, loop.T)
 
 
 def _figure(limit: Limit, objective: str) -> float | None:
     return limit.rms_mismatch_db if objective == "rms" else limit.relative_mismatch_db
+
+
+def _decibels(value: float) -> str:
+    """In case I a loop that needs no coupling reaches minus infinity, of which a solver finds some -60 to -120 dB."""
+    return f"below {EXACT_DB:g} dB" if value < EXACT_DB else f"{value:.2f} dB"
 
 
 def _save(args: argparse.Namespace, out: Path, outcome: dict[str, Any]) -> list[str]:
@@ -202,10 +223,12 @@ def _print(outcome: dict[str, Any], args: argparse.Namespace) -> None:
     screen, reasons = console(args), []
     beside = BESIDE[args.beside]
     for name, sweep in outcome["sweeps"].items():
-        table = Table(title=f"{name} · {outcome['scenario']}, case {outcome['case']} · mismatch {outcome['objective']}")
+        table = Table(
+            title=f"{outcome['objective']} mismatch over {name} · {outcome['scenario']}, case {outcome['case']}"
+        )
         table.add_column(sweep["unit"], justify="right")
         table.add_column("theta")
-        for column in ("optimal", *(f"s-d {kind}" for kind in beside), "s"):
+        for column in ("optimal", *beside, "seconds"):
             table.add_column(column, justify="right", no_wrap=True)
         for i, row in enumerate(sweep["optimal"]):
             others = [sweep[kind][i] if i < len(sweep[kind]) else None for kind in beside]
@@ -213,6 +236,8 @@ def _print(outcome: dict[str, Any], args: argparse.Namespace) -> None:
             table.add_row(f"{row['value']:.4g}", ",".join(map(str, row["theta"])), *shown, f"{row['wall_s']:.1f}")
             reasons += [f"{name} {row['value']:.4g}: {row['reason']}"] if row["reason"] else []
         screen.print(table)
+    if beside:
+        reasons = [f"beside the optimum: the designed spring-damper by {' and by '.join(beside)}", *reasons]
     for line in (*reasons, *outcome["gains"]):
         screen.print(f"[dim]·[/] {line}")
     screen.print(f"{outcome['wall_s']:.1f} s; files: {', '.join(outcome['files'])}", soft_wrap=True)
@@ -222,7 +247,7 @@ def _shown(limit: dict[str, Any] | None, objective: str) -> str:
     if limit is None:
         return ""
     value = limit["rms_mismatch_db" if objective == "rms" else "relative_mismatch_db"]
-    return "infeasible" if value is None else f"{value:.2f} dB"
+    return "infeasible" if value is None else _decibels(value)
 
 
 def _ladder(args: argparse.Namespace, loops: dict[str, Loop], head: dict[str, Any]) -> int:

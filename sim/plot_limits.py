@@ -17,6 +17,8 @@ CURVES = {
     "closed-loop": ("spring-damper, closed-loop", {"color": "#D55E00", "linestyle": "--", "marker": "s"}),
     "theorem4": ("spring-damper, theorem4", {"color": "#009E73", "linestyle": ":", "marker": "^"}),
 }
+#: the floor of the picture [dB]: in case I a loop that needs no coupling has minus infinity
+FLOOR = -60.0
 FIGURES = {"rms": "rms_mismatch_db", "sup": "relative_mismatch_db"}
 
 
@@ -56,9 +58,14 @@ def _panel(axis: Any, name: str, sweep: dict[str, Any], figure: str, here: float
     scale, unit = (1e3, "ms") if sweep["unit"] == "s" else (1.0, sweep["unit"])
     handles: dict[str, Any] = {}
     for kind, (words, style) in CURVES.items():
-        points = [(scale * row["value"], row[figure]) for row in sweep.get(kind, []) if row[figure] is not None]
-        if points:
+        known = [(scale * row["value"], row[figure]) for row in sweep.get(kind, []) if row[figure] is not None]
+        if known:
+            points = [(x, max(y, FLOOR)) for x, y in known]
             (handles[words],) = axis.plot(*zip(*points, strict=True), markersize=5, **style)
+        exact = [x for x, y in known if y <= FLOOR]
+        if exact and kind == "optimal":
+            low = [FLOOR] * len(exact)
+            (handles[f"{FLOOR:g} dB or less"],) = axis.plot(exact, low, "v", color="black", markersize=9, zorder=3)
     top = axis.get_xaxis_transform()
     nothing = [scale * row["value"] for row in sweep["optimal"] if row[figure] is None]
     if nothing:
