@@ -130,6 +130,7 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     rows.append(
         ("relative mismatch", f"{_db(transparent['relative_mismatch_db'])} (rms {_db(transparent['rms_mismatch_db'])})")
     )
+    rows.append(("force error", _force_error(report["ideal_force"])))
     rows.append(("static stiffness felt", f"{100 * transparent['dc_ratio']:.1f} %" if transparent["dc_ratio"] else "-"))
     exact = f"{stability['exact_growth_rate_per_s']:+.4f} 1/s at {stability['exact_frequency_hz']:.2f} Hz"
     rows.append(("growth, eigenvalues", f"{exact}: {_verdict(stability['exact_verdict'])}"))
@@ -153,6 +154,12 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         )
     )
     return rows
+
+
+def _force_error(part: dict[str, Any]) -> str:
+    if part["error_percent"] is None:
+        return f"- ({part['reason']})"
+    return f"{part['error_percent']:.3g} % rms, against Lambda E for the same motion"
 
 
 def _verdict(word: str | None) -> str:

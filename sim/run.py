@@ -32,6 +32,7 @@ from sim.command import (
 from sim.couplings import NAMES, Chosen, choose
 from sim.files import write, write_json
 from sim.human_file import load_humans
+from sim.ideal import Likeness, likeness
 from sim.loop import Record
 from sim.mujoco_engine import INTEGRATORS, LEAPFROG
 from sim.result import Result
@@ -59,10 +60,12 @@ def main(argv: list[str]) -> int:
         wall = time.perf_counter() - begin
     exact = record if args.engine == "exact" else simulate(assembly, "exact", samples=record.s.shape[0])
 
+    alike = likeness(assembly, record, scenario.loop(args.case).lam)
     outcome = _outcome(args, chosen, assembly, record, exact, wall)
+    outcome["ideal_force"] = alike.part()
     outcome["run"] |= {"substeps": substeps, "seed": seed}
     outcome["remarks"] = [*warnings, *outcome["remarks"]]
-    outcome["files"] = [str(p) for p in _save(args, out, assembly, record, outcome)]
+    outcome["files"] = [str(p) for p in _save(args, out, assembly, record, alike, outcome)]
     report.print_report(outcome, console(args))
     if args.json:
         write_json(args.json, outcome)
@@ -150,7 +153,12 @@ def _outcome(
 
 
 def _save(
-    args: argparse.Namespace, out: Path, assembly: Assembly, record: Record, outcome: dict[str, Any]
+    args: argparse.Namespace,
+    out: Path,
+    assembly: Assembly,
+    record: Record,
+    alike: Likeness,
+    outcome: dict[str, Any],
 ) -> list[Path]:
     result = Result.from_record(assembly, record, outcome)
     files = [
@@ -165,7 +173,8 @@ def _save(
         with_what = "no virtual coupling" if args.case == "none" else f"{outcome['coupling']['kind']} coupling"
         growth = f"growth {stability['exact_growth_rate_per_s']:+.3f} 1/s at {stability['exact_frequency_hz']:.1f} Hz"
         title = f"{outcome['scenario']}, case {args.case}, {with_what}: {growth}"
-        files.append(plot_run(result, out / "figure.png", title, stability["exact_frequency_hz"]))
+        ideal = (alike.ideal, outcome["ideal_force"]["error_percent"])
+        files.append(plot_run(result, out / "figure.png", title, stability["exact_frequency_hz"], ideal))
     files.append(out / "report.json")
     write_json(files[-1], outcome | {"files": [str(p) for p in files]})
     return files
