@@ -24,9 +24,10 @@ def optimal() -> Coupling:
     return choose(load(), "I", "optimal").coupling
 
 
-def hands(lossless: bool, n: int = HUMANS) -> Crowd:
+@cache
+def hands(lossless: bool) -> Crowd:
     population = load().population
-    links = np.stack([draw(population, 2, 11, i, 2) for i in range(n)])
+    links = np.stack([draw(population, 2, 11, i, 2) for i in range(HUMANS)])
     if lossless:
         links[..., 1] = 0.0
         # modes up to some 2000 rad/s: beyond, MuJoCo's step would decide and not the hand
@@ -36,8 +37,15 @@ def hands(lossless: bool, n: int = HUMANS) -> Crowd:
     return Crowd(links)
 
 
-def held(scenario: str, lossless: bool, n: int = HUMANS) -> Variants:
-    return variants(load(scenario).device, hands(lossless, n))
+@cache
+def held(scenario: str, lossless: bool) -> Variants:
+    return variants(load(scenario).device, hands(lossless))
+
+
+@cache
+def exact_growth(scenario: str, lossless: bool) -> np.ndarray:
+    """(HUMANS,) [1/s], with the optimal coupling."""
+    return dominant_modes(exact_loops(held(scenario, lossless), assemble(load(scenario), optimal()).F)).growth
 
 
 def test_the_same_coupling_is_designed_for_both():
@@ -49,8 +57,7 @@ def test_the_same_coupling_is_designed_for_both():
 @pytest.mark.parametrize("lossless", [False, True], ids=["random", "lossless"])
 def test_a_thousand_hands_are_stable(scenario, lossless):
     """Exact eigenvalues. A lossless hand's own slow modes stand on the circle, to the rounding of the eigenvalues."""
-    F = assemble(load(scenario), optimal()).F
-    growth = dominant_modes(exact_loops(held(scenario, lossless), F)).growth
+    growth = exact_growth(scenario, lossless)
     assert growth.size == HUMANS
     assert growth.max() < DESTABILISED
     if not lossless:
@@ -76,16 +83,14 @@ def test_the_same_hands_upset_the_loop_without_coupling(scenario):
 def test_mujoco_says_the_same(scenario, lossless):
     """The eigenvalues of MuJoCo's own one-period map, for all of them."""
     assembly = assemble(load(scenario), optimal())
-    people = held(scenario, lossless)
-    exact = dominant_modes(exact_loops(people, assembly.F)).growth
-    mujoco = dominant_modes(mujoco_loops(people, assembly.process)).growth
+    mujoco = dominant_modes(mujoco_loops(held(scenario, lossless), assembly.process)).growth
     assert mujoco.max() < DESTABILISED
-    assert not disagree(exact, mujoco).any()
+    assert not disagree(exact_growth(scenario, lossless), mujoco).any()
 
 
 @pytest.mark.parametrize("scenario", DEVICES)
 def test_no_adversary_succeeds(scenario):
     """A short search; `python -m sim.validate --coupling optimal --adversary` makes the long one."""
     place = load(scenario)
-    worst = search(place, assemble(place, optimal()).F, seed=3, generations=20)
+    worst = search(place, assemble(place, optimal()).F, seed=3, generations=8)
     assert not worst.destabilises
