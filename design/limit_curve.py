@@ -19,7 +19,6 @@ from controller.lti import Array
 from controller.process import force_map
 from design.assess import specification
 from design.designs import design_coupling
-from design.failure import DesignFailed
 from design.margin import Requirement, closed_loop
 from design.promises import finite
 from design.store import Condition, Loop, digest
@@ -35,15 +34,17 @@ class Axis:
 
     label: str
     unit: str
-    low: float  # times what there is
+    low: float  # times what there is; nan where it is not a factor
     high: float
+    least: float  # what may be asked for
+    most: float
 
 
 AXES = {
-    "damping": Axis("damping of the devices (the least)", "N s/m", 0.5, 1.4),
-    "delay": Axis("transmission delay (the largest)", "samples", math.nan, math.nan),
-    "period": Axis("sampling period", "s", 0.5, 2.5),
-    "order": Axis("basis functions of each entry of Q", "functions", 0.2, 1.6),
+    "damping": Axis("damping of the devices (the least)", "N s/m", 0.5, 1.4, 1e-3, 1e3),
+    "delay": Axis("transmission delay (the largest)", "samples", math.nan, math.nan, 0, 100),
+    "period": Axis("sampling period", "s", 0.5, 2.5, 1e-5, 0.1),
+    "order": Axis("basis functions of each entry of Q", "functions", 0.2, 1.6, 1, 200),
 }
 
 
@@ -64,6 +65,11 @@ def settings(
     damping: all devices scaled alike. delay: the same number of samples more or less on every channel. period: `kept`
     says what stays of the delays. Lambda keeps what it lacks of Theta Psi. `span` is in the axis' unit.
     """
+    if axis not in AXES:
+        raise ValueError(f"axis is {axis!r}, allowed are {', '.join(AXES)}")
+    least, most, unit = AXES[axis].least, AXES[axis].most, AXES[axis].unit
+    if span and not least <= span[0] < span[1] <= most:
+        raise ValueError(f"the range {span[0]:g}:{span[1]:g} is none between {least:g} and {most:g} {unit}")
     if axis == "damping":
         least = min(loop.delta)
         values = _spread(least, AXES[axis], points, span)
@@ -80,11 +86,8 @@ def settings(
         return [Setting(float(n), _delayed(loop, n - longest), wish) for n in steps]
     if axis == "period":
         return [Setting(T, _sampled(loop, T, kept), wish) for T in _spread(loop.T, AXES[axis], points, span).tolist()]
-    if axis == "order":
-        low, high = span or (AXES[axis].low * wish.functions, AXES[axis].high * wish.functions)
-        counts = sorted({max(1, n) for n in np.rint(_spread(wish.functions, AXES[axis], points, (low, high))).tolist()})
-        return [Setting(float(n), loop, replace(wish, functions=int(n))) for n in counts]
-    raise ValueError(f"axis is {axis!r}, allowed are {', '.join(AXES)}")
+    counts = {max(1, round(n)) for n in _spread(wish.functions, AXES[axis], points, span).tolist()}
+    return [Setting(float(n), loop, replace(wish, functions=n)) for n in sorted(counts)]
 
 
 @dataclass(frozen=True)
@@ -124,11 +127,12 @@ def measured(setting: Setting, kind: str, condition: Condition | None, options: 
     """One design and its figures, from the coupling alone; a request without a solution gives its reason."""
     loop, begin = setting.loop, time.perf_counter()
     figures: dict[str, Any] = dict.fromkeys(("rms_mismatch_db", "relative_mismatch_db", "required_damping", "dc_ratio"))
-    spec = specification(loop)
-    bare = closed_loop(force_map(spec.environment, NoCoupling(), loop.theta, loop.psi), loop.delta)
+    bare: tuple[float | None, ...] = (None,) * len(loop.delta)
     try:
+        spec = specification(loop)
+        bare = _damping(closed_loop(force_map(spec.environment, NoCoupling(), loop.theta, loop.psi), loop.delta))
         coupling = design_coupling(spec, kind, condition, **options).coupling
-    except DesignFailed as error:
+    except ValueError as error:  # no such design, or a loop that cannot be
         figures["reason"] = str(error)
     else:
         F = force_map(spec.environment, coupling, loop.theta, loop.psi)
@@ -142,7 +146,7 @@ def measured(setting: Setting, kind: str, condition: Condition | None, options: 
     functions = setting.wish.functions if kind == "optimal" else None
     wall = time.perf_counter() - begin
     place = (setting.value, loop.delta, loop.theta, loop.T, functions)
-    return Limit(*place, **figures, bare_damping=_damping(bare), wall_s=wall)
+    return Limit(*place, **figures, bare_damping=bare, wall_s=wall)
 
 
 def _damping(requirement: Requirement) -> tuple[float | None, ...]:
@@ -165,8 +169,6 @@ def remembered(designer: Designer, whole: bool) -> Designer:
 def _spread(base: float, axis: Axis, points: int, span: tuple[float, float] | None) -> Array:
     """`points` values, even in their logarithm; the nearest to what there is becomes that, if it lies between."""
     low, high = span or (axis.low * base, axis.high * base)
-    if not 0 < low < high:
-        raise ValueError(f"the range {low:g}:{high:g} is none, expected 0 < low < high")
     values = np.geomspace(low, high, points)
     if low <= base <= high:
         values[np.argmin(np.abs(np.log(values / base)))] = base
@@ -174,8 +176,8 @@ def _spread(base: float, axis: Axis, points: int, span: tuple[float, float] | No
 
 
 def _whole(low: float, high: float, points: int) -> Sequence[int]:
-    if low != int(low) or high != int(high) or not 0 <= low <= high:
-        raise ValueError(f"the range {low:g}:{high:g} is none, expected whole numbers of samples from 0")
+    if low != int(low) or high != int(high):
+        raise ValueError(f"the range {low:g}:{high:g} is none, expected whole numbers of samples")
     return sorted({round(n) for n in np.linspace(low, high, points)})
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from rich.table import Table
 
+from design.assess import specification
 from design.designs import FILTERS, OBJECTIVES
 from design.ladder import LADDERS, Rung, climb
 from design.limit_curve import AXES, Designer, Limit, Setting, optimum, remembered, settings, spring_damper
@@ -50,6 +51,10 @@ def main(argv: list[str]) -> int:
     if args.ladder:
         return _ladder(args, {case: scenario.loop(case) for case in ("I", "II")}, head)
     loop = scenario.loop(args.case)
+    try:
+        specification(loop)
+    except ValueError as error:
+        raise InputError(str(error)) from None
     plan = _plan(args, loop, wish)
     out = out_folder(args, "limits")
     beside = BESIDE[args.beside]
