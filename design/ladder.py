@@ -54,10 +54,11 @@ class Rung:
 
 
 def _optimal(functions: int, **options: Any) -> Entry:
+    """The optimal coupling of so many functions per entry of Q; `HF` is what devices may feel above 100 Hz."""
     kind = "full" if options.get("diagonal") is False else "diagonal"
-    words = [f"optimal, {kind}, {functions} functions"]
+    words = [f"optimal, {kind} {functions}"]
     words += [options["objective"]] if "objective" in options else []
-    words += ["no limit above 100 Hz"] if "high_gain" in options else []
+    words += ["no HF limit"] if "high_gain" in options else []
     return Entry(", ".join(words), "optimal", "closed-loop", {"functions": functions, **options})
 
 

@@ -197,7 +197,8 @@ def _gains(plan: dict[str, list[Setting]], curves: Curves, loop: Loop, wish: Wis
     bare = next((limit for rows in curves.values() for limit in rows["optimal"] if _is(limit, loop)), None)
     if bare and None not in bare.bare_damping:
         need = ", ".join(f"{b:.4g}" for b in bare.bare_damping)
-        lines.append(f"without any coupling this loop needs {need} N s/m: devices with more need none")
+        share = max(b / d for b, d in zip(bare.bare_damping, loop.delta, strict=True))
+        lines.append(f"without any coupling: needs {need} N s/m, {share:.3g} times what the devices have")
     return lines
 
 
@@ -270,6 +271,7 @@ def _ladder(args: argparse.Namespace, loops: dict[str, Loop], head: dict[str, An
     for row in rows:
         if row.reason:
             screen.print(f"[dim]·[/] {row.design}, case {row.case}: {row.reason}")
+    screen.print("[dim]·[/] no HF limit: without |F| <= 1.5 |E| above 100 Hz, which the default design keeps.")
     screen.print(f"{outcome['wall_s']:.1f} s; files: {', '.join(outcome['files'])}", soft_wrap=True)
     if args.json:
         write_json(args.json, outcome)
@@ -278,11 +280,11 @@ def _ladder(args: argparse.Namespace, loops: dict[str, Loop], head: dict[str, An
 
 def _rungs(case: str, rows: Sequence[Rung], scenario: str) -> Table:
     table = Table(title=f"the ladder · {scenario}, case {case}")
-    for i, column in enumerate(("design", "needs [N s/m]", "mismatch [dB]", "rms [dB]", "proof", "s")):
-        table.add_column(column, justify="left" if i in (0, 4) else "right")
+    for i, column in enumerate(("design", "needs N s/m", "sup dB", "rms dB", "proof", "s")):
+        table.add_column(column, justify="left" if i in (0, 4) else "right", no_wrap=i > 0)
     for row in rows:
         need = "inf" if row.required_damping is None else f"{max(row.required_damping):.4f}"
-        need += "" if row.certified else " (not met)"
+        need += "" if row.certified else " (no)"
         figures = ["exact" if v is None else f"{v:.2f}" for v in (row.relative_mismatch_db, row.rms_mismatch_db)]
         if row.reason and row.required_damping is None:
             need, figures = "-", ["-", "-"]

@@ -126,7 +126,7 @@ def test_the_command_draws_and_reports(tmp_path):
     assert len(damping["theorem4"]) == 3
     assert "closed-loop" not in damping
     assert any("(here)" in line for line in report["gains"])
-    assert any("without any coupling this loop needs 1.723" in line for line in report["gains"])
+    assert any("without any coupling: needs 1.723, 1.723 N s/m, 1.26 times" in line for line in report["gains"])
     assert (tmp_path / "out" / "limits.png").read_bytes().startswith(b"\x89PNG")
     assert not report["interrupted"]
 
@@ -199,7 +199,7 @@ def test_a_picture_of_every_number_of_panels(tmp_path):
 
 
 def test_rungs_are_the_designs_that_they_name():
-    """Against figures of their own: required damping and mismatch of the tables in docs/theory.md."""
+    """Against figures of their own: required damping and mismatch of the other commands."""
     by_name = {entry.name: entry for entry in SHORT}
     published = rung("I", LOOP, by_name["published"])
     E = environment(LOOP.environment, LOOP.T)
@@ -213,7 +213,7 @@ def test_rungs_are_the_designs_that_they_name():
     assert theorem4.required_damping == pytest.approx([0.7145] * 2, abs=1e-4)
     assert theorem4.condition == "theorem4"
     assert theorem4.proof == "rational"
-    optimal = rung("I", LOOP, by_name["optimal, diagonal, 4 functions, no limit above 100 Hz"])
+    optimal = rung("I", LOOP, by_name["optimal, diagonal 4, no HF limit"])
     assert optimal.relative_mismatch_db <= -16.9
     assert optimal.proof == "rational"
     assert optimal.certified

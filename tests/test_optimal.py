@@ -55,6 +55,12 @@ def made(name: str) -> Design:
     return design(*REQUESTS[name])
 
 
+def q_of(design: Design) -> InternalModel:
+    """The coupling, which is a Q."""
+    assert isinstance(design.coupling, InternalModel)
+    return design.coupling
+
+
 def force(spec: Specification, coupling: InternalModel) -> Lti:
     return force_map(spec.environment, coupling, spec.theta, spec.psi)
 
@@ -88,7 +94,7 @@ def he(X: np.ndarray) -> np.ndarray:
 )
 def test_figures_are_reached(name, sup, rms):
     spec, _ = REQUESTS[name]
-    figures = transparency(force(spec, made(name).coupling), spec.environment, spec.lam)
+    figures = transparency(force(spec, q_of(made(name))), spec.environment, spec.lam)
     assert decibels(figures.relative_mismatch) <= sup
     assert decibels(figures.rms_mismatch) <= rms
 
@@ -97,7 +103,7 @@ def test_the_sup_objective_minimises_the_sup():
     """A local check of both objectives: each is the better one by its own figure."""
     best = design(SPEC["I"], Wish(functions=4, objective="sup", high_gain=None))
     other = design(SPEC["I"], Wish(functions=4, objective="rms", high_gain=None))
-    sup, rms = (transparency(force(SPEC["I"], d.coupling), SPEC["I"].environment, SPEC["I"].lam) for d in (best, other))
+    sup, rms = (transparency(force(SPEC["I"], q_of(d)), SPEC["I"].environment, SPEC["I"].lam) for d in (best, other))
     assert best.figure == "sup"
     assert best.objective == pytest.approx(sup.relative_mismatch)
     assert sup.relative_mismatch < rms.relative_mismatch
@@ -112,7 +118,7 @@ def test_the_condition_holds_on_a_dense_independent_sweep(name):
     """He[F/(z-1)] + (1 - margin) Delta/T >= 0, to the slack of the cutting planes in units of Delta/T."""
     spec, wish = REQUESTS[name]
     w = dense()
-    F = responses(spec, made(name).coupling, w)["F"]
+    F = responses(spec, q_of(made(name)), w)["F"]
     root = np.sqrt(spec.T / np.asarray(spec.delta))
     scaled = root[:, None] * he(F / (np.exp(1j * w) - 1)[:, None, None]) * root
     ratio = -np.linalg.eigvalsh(scaled)[:, 0].min()
@@ -125,7 +131,7 @@ def test_the_condition_holds_on_a_dense_independent_sweep(name):
 @pytest.mark.parametrize("name", REQUESTS)
 def test_the_static_stiffness_is_symmetric_and_pushes_back(name):
     spec, _ = REQUESTS[name]
-    coupling = made(name).coupling
+    coupling = q_of(made(name))
     # decimals of 15 digits, so their sum is an integer multiple of 1e-15: exactly symmetric
     whole = np.array([round(q * 1e15) for q in coupling.Q.ravel()], dtype=object).reshape(coupling.Q.shape)
     static = whole.sum(axis=0)
@@ -140,7 +146,7 @@ def test_the_static_stiffness_is_symmetric_and_pushes_back(name):
 def test_V_is_stable(name):
     """V = Q (I - Psi E Q)^-1 as a block of its own, and He[I - Psi E Q] keeps its share on the circle."""
     spec, _ = REQUESTS[name]
-    coupling = made(name).coupling
+    coupling = q_of(made(name))
     Q = coupling.parameter(spec.T)
     V = Q.feedback(-spec.delayed_environment)  # positive feedback: (I - Q Psi E)^-1 Q
     assert np.abs(V.poles()).max() < 1
@@ -157,7 +163,7 @@ def test_the_devices_feel_at_most_the_limit_above_100_hz(name):
     spec, wish = REQUESTS[name]
     w = dense()
     w = w[w >= 2 * np.pi * HIGH_HZ * spec.T]
-    at = responses(spec, made(name).coupling, w)
+    at = responses(spec, q_of(made(name)), w)
     gain = (np.linalg.norm(at["F"], 2, axis=(1, 2)) / np.linalg.norm(at["E"], 2, axis=(1, 2))).max()
     if wish.high_gain is None:
         assert gain > 1.5  # it would have cost something
@@ -191,7 +197,7 @@ def test_the_square_is_the_rms_mismatch():
     spec, wish = REQUESTS["case I, no limit"]
     Q = parameter(spec, wish)
     A, b = square_mismatch(world(spec), Q)
-    coupling = made("case I, no limit").coupling
+    coupling = q_of(made("case I, no limit"))
     x = np.array([coupling.Q[entry] for entry in Q.entries]) / 1e-3
     figures = transparency(force(spec, coupling), spec.environment, spec.lam)
     assert np.linalg.norm(A @ x - b) == pytest.approx(figures.rms_mismatch, rel=0.01)
@@ -204,8 +210,8 @@ def test_no_perturbation_that_keeps_the_constraints_is_better(name):
     Q, here = parameter(spec, wish), world(spec)
     A, b = square_mismatch(here, Q)
     problem = Problem.of(Q, wish, [here], np.asarray(spec.delta))
-    x = np.array([made(name).coupling.Q[entry] for entry in Q.entries]) / 1e-3
-    timid = design(spec, replace(wish, margin=0.1)).coupling
+    x = np.array([q_of(made(name)).Q[entry] for entry in Q.entries]) / 1e-3
+    timid = q_of(design(spec, replace(wish, margin=0.1)))
     inside = np.array([timid.Q[entry] for entry in Q.entries]) / 1e-3
     least = np.linalg.norm(A @ x - b)
     w = dense()[::25]
@@ -250,7 +256,7 @@ def test_cvxpy_finds_the_same_optimum():
     )
     problem.solve(solver="CLARABEL")
     theirs = np.sqrt(problem.value)
-    x = ours.coupling.Q[:, 0, 0] / 1e-3
+    x = q_of(ours).Q[:, 0, 0] / 1e-3
     assert np.linalg.norm(A @ x - b) == pytest.approx(theirs, rel=2e-3)
     np.testing.assert_allclose(x, q.value, atol=0.02 * np.abs(x).max())
 
@@ -316,7 +322,7 @@ def test_three_unequal_devices():
     assert requirement.certified
     share = np.array(requirement.required) / np.array(THREE.delta)
     np.testing.assert_allclose(share, requirement.ratio, rtol=1e-12)
-    again = closed_loop(force(THREE, made("three channels").coupling), THREE.delta)
+    again = closed_loop(force(THREE, q_of(made("three channels"))), THREE.delta)
     assert again.ratio == requirement.ratio
 
 
