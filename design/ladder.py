@@ -112,7 +112,7 @@ def rung(case: str, loop: Loop, entry: Entry) -> Rung:
     begin, proof, reason = time.perf_counter(), None, requirement.reason
     if design or requirement.certified:
         try:
-            phi = design.phi if design else None
+            phi = None if design is None or design.phi is None else design.phi.tolist()
             proof = prove(loop, data_of(coupling), entry.condition, phi).proof
         except NotProved as error:
             reason = str(error)

@@ -9,12 +9,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
 from design.assess import specification
 from design.designs import FILTERS, OBJECTIVES
-from design.ladder import LADDERS, Rung, climb
+from design.ladder import LADDERS, climb
 from design.limit_curve import AXES, Designer, Limit, Setting, optimum, remembered, settings, spring_damper
+from design.limits_report import Curves, gains, print_curves, print_ladder
 from design.store import Loop
 from design.wish import Wish
 from sim.command import (
@@ -37,18 +36,21 @@ from sim.scenario import InputError
 
 BESIDE = {"none": (), "theorem4": ("theorem4",), "closed-loop": ("closed-loop",), "both": ("theorem4", "closed-loop")}
 MOST_POINTS = 100
-EXACT_DB = -60.0  # below it the difference to the environment is the solver's
+OF_THE_CURVE = ("over", "points", "keep", "beside", "no_plot")
+OF_THE_CURVE += ("functions", "filter", "objective", "high_gain", "margin", "diagonal")
 
 
 def main(argv: list[str]) -> int:
     """Draw the limit curve, or print the ladder. 0: done, 1: nothing could be designed, 130: interrupted."""
-    args = _parser().parse_args(argv)
+    parser = _parser()
+    args = parser.parse_args(argv)
     scenario = scenario_from(args)
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
     seed, wish = seed_from(args), _wish(args)
     head = {"scenario": scenario.name, "seed": seed}
     if args.ladder:
+        _only_the_ladder(args, parser)
         return _ladder(args, {case: scenario.loop(case) for case in ("I", "II")}, head)
     loop = scenario.loop(args.case)
     try:
@@ -66,12 +68,12 @@ def main(argv: list[str]) -> int:
     outcome = head | {
         "here": {"delta": list(loop.delta), "theta": list(loop.theta), "psi": list(loop.psi), "T_s": loop.T},
         "sweeps": {name: _sweep(name, plan[name], rows) for name, rows in curves.items()},
-        "gains": _gains(plan, curves, loop, wish),
+        "gains": gains(plan, curves, loop, wish),
         "wall_s": time.perf_counter() - begin,
         "interrupted": interrupted,
     }
     outcome["files"] = _save(args, out, outcome)
-    _print(outcome, args)
+    print_curves(outcome, BESIDE[args.beside], console(args))
     if args.json:
         write_json(args.json, outcome)
     if interrupted:
@@ -123,6 +125,15 @@ def _wish(args: argparse.Namespace) -> Wish:
         raise InputError(str(error)) from None
 
 
+def _only_the_ladder(args: argparse.Namespace, parser: Parser) -> None:
+    """Raises InputError where an option is given that the ladder would have to ignore."""
+    if args.case != parser.get_default("case"):
+        raise InputError(f"--ladder shows both cases: leave out --case {args.case}")
+    for name in OF_THE_CURVE:
+        if getattr(args, name) != parser.get_default(name):
+            raise InputError(f"--{name.replace('_', '-')} is for the curve, not for --ladder")
+
+
 def _plan(args: argparse.Namespace, loop: Loop, wish: Wish) -> dict[str, list[Setting]]:
     """The settings of every sweep that is asked for. Raises InputError."""
     (points,) = numbers("--points", args.points, int, 1)
@@ -148,9 +159,6 @@ def _span(name: str, text: str) -> tuple[float, float]:
     if not colon:
         raise InputError(f"--over {name}={text}: expected LOW:HIGH in {AXES[name].unit}")
     return numbers(f"--over {name}", low, float, 1)[0], numbers(f"--over {name}", high, float, 1)[0]
-
-
-Curves = dict[str, dict[str, list[Limit]]]  # sweep -> design -> its points
 
 
 def _curves(plan: dict[str, list[Setting]], designers: dict[str, Designer]) -> tuple[Curves, bool]:
@@ -179,42 +187,6 @@ def _sweep(name: str, along: Sequence[Setting], rows: dict[str, list[Limit]]) ->
     return {"label": axis.label, "unit": axis.unit, "values": [s.value for s in along]} | points
 
 
-def _gains(plan: dict[str, list[Setting]], curves: Curves, loop: Loop, wish: Wish) -> list[str]:
-    """What there is to gain, in a line per sweep."""
-    lines = []
-    for name, rows in curves.items():
-        found = [(limit, _figure(limit, wish.objective)) for limit in rows["optimal"]]
-        known = [(limit, figure) for limit, figure in found if figure is not None]
-        if len(known) < 2:
-            continue
-        here = next((s.value for s in plan[name] if s.loop == loop and s.wish == wish), None)
-        words = [
-            f"{_decibels(figure)} at {limit.value:.4g}" + (" (here)" if limit.value == here else "")
-            for limit, figure in known
-            if limit in (known[0][0], known[-1][0]) or limit.value == here
-        ]
-        lines.append(f"{name} in {AXES[name].unit}: {', '.join(words)}")
-    bare = next((limit for rows in curves.values() for limit in rows["optimal"] if _is(limit, loop)), None)
-    if bare and None not in bare.bare_damping:
-        need = ", ".join(f"{b:.4g}" for b in bare.bare_damping)
-        share = max(b / d for b, d in zip(bare.bare_damping, loop.delta, strict=True))
-        lines.append(f"without any coupling: needs {need} N s/m, {share:.3g} times what the devices have")
-    return lines
-
-
-def _is(limit: Limit, loop: Loop) -> bool:
-    return (limit.delta, limit.theta, limit.T_s) == (loop.delta, loop.theta, loop.T)
-
-
-def _figure(limit: Limit, objective: str) -> float | None:
-    return limit.rms_mismatch_db if objective == "rms" else limit.relative_mismatch_db
-
-
-def _decibels(value: float) -> str:
-    """In case I a loop that needs no coupling reaches minus infinity, of which a solver finds some -60 to -120 dB."""
-    return f"below {EXACT_DB:g} dB" if value < EXACT_DB else f"{value:.2f} dB"
-
-
 def _save(args: argparse.Namespace, out: Path, outcome: dict[str, Any]) -> list[str]:
     files = [out / "report.json"]
     if not args.no_plot and any(sweep["optimal"] for sweep in outcome["sweeps"].values()):
@@ -223,37 +195,6 @@ def _save(args: argparse.Namespace, out: Path, outcome: dict[str, Any]) -> list[
         files.append(plot_limits(outcome, out / "limits.png"))
     write_json(files[0], outcome | {"files": [str(p) for p in files]})
     return [str(p) for p in files]
-
-
-def _print(outcome: dict[str, Any], args: argparse.Namespace) -> None:
-    screen, reasons = console(args), []
-    beside = BESIDE[args.beside]
-    for name, sweep in outcome["sweeps"].items():
-        table = Table(
-            title=f"{outcome['objective']} mismatch over {name} · {outcome['scenario']}, case {outcome['case']}"
-        )
-        table.add_column(sweep["unit"], justify="right")
-        table.add_column("theta")
-        for column in ("optimal", *beside, "seconds"):
-            table.add_column(column, justify="right", no_wrap=True)
-        for i, row in enumerate(sweep["optimal"]):
-            others = [sweep[kind][i] if i < len(sweep[kind]) else None for kind in beside]
-            shown = [_shown(limit, outcome["objective"]) for limit in (row, *others)]
-            table.add_row(f"{row['value']:.4g}", ",".join(map(str, row["theta"])), *shown, f"{row['wall_s']:.1f}")
-            reasons += [f"{name} {row['value']:.4g}: {row['reason']}"] if row["reason"] else []
-        screen.print(table)
-    if beside:
-        reasons = [f"beside the optimum: the designed spring-damper by {' and by '.join(beside)}", *reasons]
-    for line in (*reasons, *outcome["gains"]):
-        screen.print(f"[dim]·[/] {line}")
-    screen.print(f"{outcome['wall_s']:.1f} s; files: {', '.join(outcome['files'])}", soft_wrap=True)
-
-
-def _shown(limit: dict[str, Any] | None, objective: str) -> str:
-    if limit is None:
-        return ""
-    value = limit["rms_mismatch_db" if objective == "rms" else "relative_mismatch_db"]
-    return "infeasible" if value is None else _decibels(value)
 
 
 def _ladder(args: argparse.Namespace, loops: dict[str, Loop], head: dict[str, Any]) -> int:
@@ -265,31 +206,10 @@ def _ladder(args: argparse.Namespace, loops: dict[str, Loop], head: dict[str, An
     outcome = head | {"rows": [asdict(row) for row in rows], "wall_s": time.perf_counter() - begin}
     outcome |= {"interrupted": interrupted, "files": [str(out / "report.json")]}
     write_json(out / "report.json", outcome)
-    screen = console(args)
-    for case in loops:
-        screen.print(_rungs(case, [row for row in rows if row.case == case], head["scenario"]))
-    for row in rows:
-        if row.reason:
-            screen.print(f"[dim]·[/] {row.design}, case {row.case}: {row.reason}")
-    screen.print("[dim]·[/] no HF limit: without |F| <= 1.5 |E| above 100 Hz, which the default design keeps.")
-    screen.print(f"{outcome['wall_s']:.1f} s; files: {', '.join(outcome['files'])}", soft_wrap=True)
+    print_ladder(outcome, tuple(loops), console(args))
     if args.json:
         write_json(args.json, outcome)
     return INTERRUPTED if interrupted else DONE
-
-
-def _rungs(case: str, rows: Sequence[Rung], scenario: str) -> Table:
-    table = Table(title=f"the ladder · {scenario}, case {case}")
-    for i, column in enumerate(("design", "needs N s/m", "sup dB", "rms dB", "proof", "s")):
-        table.add_column(column, justify="left" if i in (0, 4) else "right", no_wrap=i > 0)
-    for row in rows:
-        need = "inf" if row.required_damping is None else f"{max(row.required_damping):.4f}"
-        need += "" if row.certified else " (no)"
-        figures = ["exact" if v is None else f"{v:.2f}" for v in (row.relative_mismatch_db, row.rms_mismatch_db)]
-        if row.reason and row.required_damping is None:
-            need, figures = "-", ["-", "-"]
-        table.add_row(row.design, need, *figures, row.proof or "-", f"{row.wall_s:.2f}")
-    return table
 
 
 if __name__ == "__main__":
