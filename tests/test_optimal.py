@@ -44,6 +44,11 @@ REQUESTS = {
     "case I, no limit": (SPEC["I"], Wish(high_gain=None)),
     "case II, 4 taps": (SPEC["II"], Wish(functions=4)),
     "case I, full": (SPEC["I"], Wish(functions=6, diagonal=False, filter="mixed")),
+    # the one where the constraint that makes V stable binds: without it He[I - Psi E Q] comes to -0.007
+    "case II, full, sup": (
+        SPEC["II"],
+        Wish(functions=5, diagonal=False, filter="mixed", objective="sup", high_gain=None),
+    ),
     "psi = (1, 1), full": (WITHIN, Wish(functions=8, diagonal=False, filter="mixed")),
     "one channel": (ONE, Wish(functions=6)),
     "three channels": (THREE, Wish(functions=4)),
