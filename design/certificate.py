@@ -76,9 +76,7 @@ def prove(loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequenc
         raise NotProved(f"{_place(loop, condition, place)}{reason}", requirement)
     proof: dict[str, Matrix] = {}
     for name, block in _blocks(loop, coupling, condition, multiplier).items():
-        if block.order > LARGEST:
-            reason = f"a proof over {block.order} states takes minutes: up to {LARGEST} are tried"
-            raise NotProved(reason, requirement)
+        _require_size(block, requirement)
         P, reason = find_storage(block)
         if P is None:
             asked = f"the sweep asks {requirement.ratio:.9f} of the available damping"
@@ -201,6 +199,7 @@ def _block(loop: Loop, coupling: CouplingData, condition: Condition) -> Exact:
     try:
         if condition == "closed-loop":
             F = exact.force_map(exact.environment(loop.environment, T), built, loop.theta, loop.psi, T)
+            _require_size(F)  # splitting it takes minutes too
             F1, R = F.split_at_one()
             _require_static("F(1)", F1)
             return Exact(R.A, R.B, R.C, Matrix.diag(d / T for d in delta) - F1.scaled(Fraction(1, 2)))
@@ -210,6 +209,12 @@ def _block(loop: Loop, coupling: CouplingData, condition: Condition) -> Exact:
         raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
     _require_symmetric("H(1)", H1)
     return Exact(R.A, R.B, -R.C, H1.scaled(Fraction(1, 2)))
+
+
+def _require_size(block: Exact, requirement: margin.Requirement | None = None) -> None:
+    if block.order > LARGEST:
+        reason = f"a proof over {block.order} states takes minutes: up to {LARGEST} are tried"
+        raise NotProved(reason, requirement)
 
 
 def _require_symmetric(name: str, value: Matrix) -> None:

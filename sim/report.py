@@ -182,6 +182,7 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     rows.append(
         ("relative mismatch", f"{_db(transparent['relative_mismatch_db'])} (rms {_db(transparent['rms_mismatch_db'])})")
     )
+    rows.append(("force error", _force_error(report["ideal_force"])))
     rows.append(("static stiffness felt", f"{100 * transparent['dc_ratio']:.1f} %" if transparent["dc_ratio"] else "-"))
     rows.append(("growth, eigenvalues", _growth(stability)))
     growth = stability["growth_rate_per_s"]
@@ -248,6 +249,12 @@ def varying(jitter: dict[str, Any]) -> list[tuple[str, str]]:
         needs = f"needs {_list(proof['required_damping'])} of {_list(proof['available_damping'])} N s/m: {word}"
         rows.append(("damping, any switching", needs))
     return [*rows, ("these delays covered", "[green]yes[/]" if jitter["covered"] else "[yellow]no[/]")]
+
+
+def _force_error(part: dict[str, Any]) -> str:
+    if part["error_percent"] is None:
+        return f"- ({part['reason']})"
+    return f"{part['error_percent']:.3g} % rms, against Lambda E for the same motion"
 
 
 def _verdict(word: str | None) -> str:

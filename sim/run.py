@@ -34,6 +34,7 @@ from sim.couplings import NAMES, Chosen, choose
 from sim.drawn import switching
 from sim.files import write, write_json
 from sim.human_file import load_humans
+from sim.ideal import Likeness, likeness
 from sim.jitter_options import add_jitter_options, with_jitter
 from sim.loop import Record
 from sim.mujoco_engine import INTEGRATORS, LEAPFROG
@@ -70,10 +71,12 @@ def main(argv: list[str]) -> int:
         wall = time.perf_counter() - begin
     exact = record if args.engine == "exact" else _exact(assembly, record)
 
+    alike = likeness(assembly, record, scenario.loop(args.case).lam)
     outcome = _outcome(args, chosen, assembly, period, record, exact, wall, whole)
+    outcome["ideal_force"] = alike.part()
     outcome["run"] |= {"substeps": substeps, "seed": seed, "environment": where}
     outcome["remarks"] = [*warnings, *outcome["remarks"]]
-    outcome["files"] = [str(p) for p in _save(args, out, assembly, record, outcome)]
+    outcome["files"] = [str(p) for p in _save(args, out, assembly, record, alike, outcome)]
     report.print_report(outcome, console(args))
     if args.json:
         write_json(args.json, outcome)
@@ -194,7 +197,12 @@ def _outcome(
 
 
 def _save(
-    args: argparse.Namespace, out: Path, assembly: Assembly, record: Record, outcome: dict[str, Any]
+    args: argparse.Namespace,
+    out: Path,
+    assembly: Assembly,
+    record: Record,
+    alike: Likeness,
+    outcome: dict[str, Any],
 ) -> list[Path]:
     result = Result.from_record(assembly, record, outcome)
     files = [
@@ -211,7 +219,9 @@ def _save(
         if assembly.scenario.jitter and assembly.scenario.switches:
             growth = f"{outcome['jitter']['pattern']} delays, {stability['verdict']}"
         title = f"{outcome['scenario']}, case {args.case}, {with_what}: {growth}"
-        files.append(plot_run(result, out / "figure.png", title, stability["exact_frequency_hz"]))
+        apart = outcome["ideal_force"]["error_percent"]
+        ideal = None if apart is None else (alike.ideal, apart)
+        files.append(plot_run(result, out / "figure.png", title, stability["exact_frequency_hz"], ideal))
     files.append(out / "report.json")
     write_json(files[-1], outcome | {"files": [str(p) for p in files]})
     return files
