@@ -1,0 +1,94 @@
+"""MuJoCo's own viewer, passive: it shows what the session has made, and hands over keys and the mouse."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+from mujoco import viewer
+
+from controller.lti import Array
+from sim.view.events import KEYS
+from sim.view.overlay import keys_help, overlay
+from sim.view.session import Frame, Session
+from sim.view.stage import Stage
+
+RATE = 60.0  # frames per second
+PATIENCE = 30  # [s] for the display to answer
+
+# without a display the viewer's own thread dies and its caller waits for ever, so it is asked first, in a process of its own
+_PROBE = (
+    "import glfw, sys; glfw.init() or sys.exit(1); glfw.window_hint(glfw.VISIBLE, 0); "
+    "sys.exit(0 if glfw.create_window(64, 64, '', None, None) else 1)"
+)
+
+
+def display() -> bool:
+    """Whether a window can be opened here."""
+    try:
+        done = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, timeout=PATIENCE, check=False)
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode == 0
+
+
+def show(session: Session, stage: Stage, until: float | None = None) -> None:
+    """Run the session in a window until that is closed, or `until` [s] of the session's clock.
+
+    Raises RuntimeError where the platform asks for another start (mjpython on macOS).
+    """
+    with viewer.launch_passive(
+        stage.model, stage.data, key_callback=_typed(session), show_left_ui=False, show_right_ui=False
+    ) as window:
+        with window.lock():
+            stage.aim(window.cam)
+        loop(session, stage, window, time.perf_counter, time.sleep, until)
+
+
+def loop(
+    session: Session,
+    stage: Stage,
+    window: viewer.Handle,
+    clock: Callable[[], float],
+    sleep: Callable[[float], None],
+    until: float | None = None,
+) -> None:
+    """Frame after frame: the mouse to the session, the session to the window."""
+    start = clock()
+    push = np.zeros(stage.scene.channels)
+    while window.is_running():
+        begun = clock()
+        frame = session.frame(begun - start, push)
+        if until is not None and frame.t >= until:
+            return
+        push = _shown(stage, window, frame)
+        sleep(max(0.0, 1 / RATE - (clock() - begun)))
+
+
+def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Array:
+    """Show a frame, and return what the mouse does meanwhile, (m,) [N]."""
+    with window.lock():
+        stage.show(frame.q)
+        push = stage.pushed(window.perturb)
+        if window.user_scn is not None:
+            window.user_scn.ngeom = 0
+            stage.draw(window.user_scn, frame)
+    window.sync()
+    said, keys = (tuple("\n".join(c) for c in zip(*lines, strict=True)) for lines in (overlay(frame, True), keys_help()))
+    font, grid = mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos
+    window.set_texts([(font, grid.mjGRID_TOPLEFT, *said), (font, grid.mjGRID_TOPRIGHT, *keys)])
+    if window.viewport is not None:
+        window.set_figures(stage.figures(frame, window.viewport))
+    return push
+
+
+def _typed(session: Session) -> Callable[[int], None]:
+    def key(code: int) -> None:
+        if code in KEYS:
+            session.keys.put(KEYS[code][1])
+
+    return key

@@ -1,0 +1,155 @@
+"""The scene as it is shown: the loop's own bodies with shapes on them, arrows for the forces, and the mouse's force.
+
+A dressed copy only. What is simulated stays as small as models.scene builds it; the shapes have no mass and touch
+nothing, so both models have the same matrices.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from controller.lti import Array
+from models.scene import Scene
+from sim.view.layout import (
+    ALARM,
+    APART,
+    COLUMNS,
+    GREY,
+    LONGEST,
+    PLOT,
+    SIZE,
+    STEP,
+    channels,
+    colour,
+    envelope,
+    places,
+    scale,
+)
+from sim.view.session import HISTORY, Frame
+
+_BOX, _SPHERE, _ARROW, _BAR = (
+    getattr(mujoco.mjtGeom, f"mjGEOM_{name}") for name in ("BOX", "SPHERE", "ARROW", "CAPSULE")
+)
+_MASSLESS = {"mass": 0, "contype": 0, "conaffinity": 0}
+GRIP = 400.0  # [1/s^2] stiffness of the mouse's hold per kg of what it holds: as firm as the hands of the default scenario
+
+class Stage:
+    """A scene that can be looked at, and pushed with the mouse."""
+
+    def __init__(self, scene: Scene, force_limit: Array, size: tuple[int, int] = SIZE) -> None:
+        self.scene, self.force_limit = scene, force_limit
+        self.model = dressed(scene, size)
+        self.data = mujoco.MjData(self.model)
+        self.channel = channels(scene)  # joint -> channel; bodies and joints have the same order
+
+    def show(self, q: Array) -> None:
+        """Put the joints at q [m]."""
+        self.data.qpos[:] = q
+        self.data.qvel[:] = 0.0
+        mujoco.mj_forward(self.model, self.data)
+
+    def pushed(self, grip: mujoco.MjvPerturb) -> Array:
+        """(m,) force [N] of the mouse on the handles. A hand holds the handle, whichever body of a device is drawn."""
+        push = np.zeros(self.scene.channels)
+        if grip.select > 0 and (grip.active or grip.active2):
+            self.data.xfrc_applied[:] = 0.0
+            mujoco.mjv_applyPerturbForce(self.model, self.data, grip)
+            joint = int(self.model.body_jntadr[grip.select])
+            if joint >= 0:
+                push[self.channel[joint]] = self.data.xfrc_applied[grip.select, 0]
+            self.data.xfrc_applied[:] = 0.0
+        return push
+
+    def draw(self, drawn: mujoco.MjvScene, frame: Frame) -> None:
+        """Arrows: the mean force on each device, the range it has had since the last frame, and what pushes."""
+        for i, handle in enumerate(self.scene.handles):
+            own, reach = colour(i), LONGEST / self.force_limit[i]
+            at = self.data.xpos[self.model.jnt_bodyid[handle]] + (0, 0, 0.045)
+            clipped = max(-frame.low[i], frame.high[i]) >= self.force_limit[i]
+            band = (*ALARM, 0.6) if clipped else (*own, 0.35)
+            # the device feels -f
+            span = ((-frame.high[i] * reach, 0, 0), (-frame.low[i] * reach, 0, 0))
+            _connect(drawn, _BAR, 0.010, at + span[0], at + span[1], band)
+            _arrow(drawn, at, -frame.mean[i] * reach, (*own, 1.0))
+            _arrow(drawn, at + (0, 0, 0.03), frame.push[i] * reach, (0.1, 0.1, 0.1, 1.0))
+
+    def figures(self, frame: Frame, picture: mujoco.MjrRect) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
+        """The forces of the last seconds, side by side at the bottom of a picture."""
+        m = self.scene.channels
+        width, height = picture.width // m, round(PLOT * picture.height)
+        low, high = envelope(frame.history, COLUMNS, round(HISTORY / frame.setting.scenario.T))
+        top, drawn = scale(frame.history), []
+        for i in range(m):
+            place = mujoco.MjrRect(picture.left + i * width, picture.bottom, width, height)
+            drawn.append((place, _figure(i, low[:, i], high[:, i], top)))
+        return drawn
+
+    def aim(self, camera: mujoco.MjvCamera) -> None:
+        """Look at the devices from the front and above."""
+        # above the devices, so that they stand below the words
+        camera.lookat[:] = self.model.stat.center + np.array([0.0, 0.0, 0.35 * self.model.stat.extent])
+        camera.distance = 2.0 * self.model.stat.extent
+        camera.azimuth, camera.elevation = 90.0, -35.0
+
+
+def dressed(scene: Scene, size: tuple[int, int] = SIZE) -> mujoco.MjModel:
+    """The scene's model with shapes, places, a camera's distance and colours, but the same dynamics."""
+    spec = mujoco.MjSpec.from_string(scene.xml)
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = size
+    spec.visual.map.stiffness = GRIP
+    sky = {"type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mujoco.mjtBuiltin.mjBUILTIN_FLAT}
+    spec.add_texture(name="sky", width=32, height=192, rgb1=[0.93, 0.93, 0.93], rgb2=[0.93, 0.93, 0.93], **sky)
+    spec.visual.headlight.ambient = [0.5, 0.5, 0.5]
+    where = places(scene)
+    for joint, (place, channel) in enumerate(zip(where, channels(scene), strict=True)):
+        body = spec.body(scene.model.joint(joint).name)
+        body.pos = [place * STEP, channel * -APART, 0.03]
+        if place == 0:
+            body.add_geom(type=_SPHERE, size=[0.024] * 3, rgba=(*colour(channel), 1.0), **_MASSLESS)
+        else:
+            body.add_geom(type=_BOX, size=[0.022, 0.026, 0.022], rgba=(*GREY, 1.0), **_MASSLESS)
+    deepest = max(1, *where)
+    middle = [(deepest - 1) * STEP / 2, -APART * (scene.channels - 1) / 2, 0.03]
+    for channel in range(scene.channels):
+        at, rail = [middle[0], -APART * channel, 0.0], [0.5 * STEP * (deepest + 1) + 0.06, 0.012, 0.004]
+        spec.worldbody.add_geom(type=_BOX, pos=at, size=rail, rgba=[0.8, 0.8, 0.8, 1], **_MASSLESS)
+    spec.stat.center = middle
+    spec.stat.extent = 0.24 + 0.5 * STEP * deepest + 0.5 * APART * (scene.channels - 1)
+    return spec.compile()
+
+
+def _figure(channel: int, low: Array, high: Array, top: float) -> mujoco.MjvFigure:
+    """One device's forces [N], drawn from least to largest in every span."""
+    figure = mujoco.MjvFigure()
+    mujoco.mjv_defaultFigure(figure)
+    figure.title, figure.xlabel = f"force on device {channel + 1} [N]", "time [s]"
+    figure.flg_extend, figure.flg_legend = 0, 0
+    figure.gridsize = [5, 5]
+    figure.figurergba[:] = (1, 1, 1, 1)
+    figure.panergba[:] = (1, 1, 1, 1)
+    figure.textrgb[:] = (0, 0, 0)
+    figure.gridrgb[:] = (0.75, 0.75, 0.75)
+    figure.range[:] = ((-HISTORY, 0.0), (-top, top))
+    t, seen = np.linspace(-HISTORY, 0.0, low.size), np.isfinite(low)
+    points = np.stack([t, low, t, high], axis=1)[seen].reshape(-1)
+    figure.linedata[0, : points.size] = points
+    figure.linepnt[0] = points.size // 2
+    figure.linergb[0] = colour(channel)
+    return figure
+
+
+def _arrow(drawn: mujoco.MjvScene, at: Array, length: float, rgba: tuple[float, ...]) -> None:
+    if abs(length) > 1e-4:
+        _connect(drawn, _ARROW, 0.005, at, at + (length, 0, 0), rgba)
+
+
+def _connect(
+    drawn: mujoco.MjvScene, shape: mujoco.mjtGeom, width: float, a: Array, b: Array, rgba: tuple[float, ...]
+) -> None:
+    if drawn.ngeom >= drawn.maxgeom or not np.any(a != b):
+        return
+    geom = drawn.geoms[drawn.ngeom]
+    mujoco.mjv_initGeom(geom, shape, np.zeros(3), np.zeros(3), np.zeros(9), np.array(rgba, dtype=np.float32))
+    mujoco.mjv_connector(geom, shape, width, np.asarray(a, dtype=float), np.asarray(b, dtype=float))
+    drawn.ngeom += 1
