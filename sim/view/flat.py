@@ -8,7 +8,21 @@ from PIL import Image, ImageDraw, ImageFont
 
 from controller.lti import Array
 from models.scene import Scene
-from sim.view.layout import ALARM, COLUMNS, GREY, LONGEST, PLOT, SIZE, STEP, Colour, channels, colour, envelope, places, scale
+from sim.view.layout import (
+    ALARM,
+    COLUMNS,
+    GREY,
+    LONGEST,
+    PLOT,
+    SIZE,
+    STEP,
+    Colour,
+    channels,
+    colour,
+    envelope,
+    places,
+    scale,
+)
 from sim.view.overlay import overlay
 from sim.view.session import HISTORY, Frame
 
@@ -27,7 +41,7 @@ class Flat:
         """(height, width, 3): what is said of the loop, the bodies, the forces, from top to bottom."""
         image = Image.new("RGB", SIZE, "white")
         pen = ImageDraw.Draw(image)
-        width, height = SIZE
+        height = SIZE[1]
         below = round((1 - PLOT) * height)
         top = 8
         for label, value in overlay(frame, live=False):
@@ -73,7 +87,7 @@ class Flat:
         low, high = envelope(frame.history, COLUMNS, round(HISTORY / frame.setting.scenario.T))
         width = (SIZE[0] - 20) / m
         for i in range(m):
-            left, right = 50 + i * width, 10 + (i + 1) * width
+            left, right = 50 + i * width, (i + 1) * width - 2
             for value in (-most, 0.0, most):
                 y = middle - value / most * (bottom - top) / 2
                 pen.line((left, y, right, y), LIGHT)

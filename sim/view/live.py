@@ -20,11 +20,15 @@ from sim.view.stage import Stage
 RATE = 60.0  # frames per second
 PATIENCE = 30  # [s] for the display to answer
 
-# without a display the viewer's own thread dies and its caller waits for ever, so it is asked first, in a process of its own
+# without a display the viewer's thread dies and its caller waits for ever: a process of its own asks first
 _PROBE = (
     "import glfw, sys; glfw.init() or sys.exit(1); glfw.window_hint(glfw.VISIBLE, 0); "
     "sys.exit(0 if glfw.create_window(64, 64, '', None, None) else 1)"
 )
+
+
+class NoWindow(Exception):
+    """The viewer cannot open a window here."""
 
 
 def display() -> bool:
@@ -37,13 +41,19 @@ def display() -> bool:
 
 
 def show(session: Session, stage: Stage, until: float | None = None) -> None:
-    """Run the session in a window until that is closed, or `until` [s] of the session's clock.
+    """Run the session in a window until that is closed, or until it is `until` [s] old.
 
-    Raises RuntimeError where the platform asks for another start (mjpython on macOS).
+    Raises NoWindow where there is no display, or on macOS without MuJoCo's own launcher.
     """
-    with viewer.launch_passive(
-        stage.model, stage.data, key_callback=_typed(session), show_left_ui=False, show_right_ui=False
-    ) as window:
+    if not display():
+        raise NoWindow("no window can be opened: there is no display, or none with OpenGL")
+    try:
+        window = viewer.launch_passive(
+            stage.model, stage.data, key_callback=typed(session), show_left_ui=False, show_right_ui=False
+        )
+    except RuntimeError as error:
+        raise NoWindow(str(error)) from None
+    with window:
         with window.lock():
             stage.aim(window.cam)
         loop(session, stage, window, time.perf_counter, time.sleep, until)
@@ -78,7 +88,9 @@ def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Array:
             window.user_scn.ngeom = 0
             stage.draw(window.user_scn, frame)
     window.sync()
-    said, keys = (tuple("\n".join(c) for c in zip(*lines, strict=True)) for lines in (overlay(frame, True), keys_help()))
+    said, keys = (
+        tuple("\n".join(c) for c in zip(*lines, strict=True)) for lines in (overlay(frame, True), keys_help())
+    )
     font, grid = mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos
     window.set_texts([(font, grid.mjGRID_TOPLEFT, *said), (font, grid.mjGRID_TOPRIGHT, *keys)])
     if window.viewport is not None:
@@ -86,7 +98,9 @@ def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Array:
     return push
 
 
-def _typed(session: Session) -> Callable[[int], None]:
+def typed(session: Session) -> Callable[[int], None]:
+    """What the viewer calls, in its own thread, when a key is pressed."""
+
     def key(code: int) -> None:
         if code in KEYS:
             session.keys.put(KEYS[code][1])

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-LONGEST_LAG = 0.1  # [s] what may be made up in one go; more is dropped and counted
+LONGEST_LAG = 0.1  # [s] what a window may make up in one go; more is dropped and counted
 
 
 @dataclass
 class Pace:
-    """Ticks of T seconds against a clock that is read from outside."""
+    """Ticks of T seconds against a clock that is read from outside and began at 0."""
 
     T: float  # [s]
-    started: float  # [s] the clock when tick 0 was due
+    patience: float = LONGEST_LAG  # [s]
     done: int = 0  # ticks
-    overruns: int = 0  # how often the loop fell behind by more than LONGEST_LAG
+    overruns: int = 0  # how often the loop fell behind by more than `patience`
     lost: float = 0.0  # [s] clock time that no tick was made for
 
     def due(self, now: float) -> int:
         """Ticks to be made now, so that the next one lies in the future; they count as done."""
         ticks = max(0, self._owed(now))
-        most = round(LONGEST_LAG / self.T)
+        most = self.patience / self.T
         if ticks > most:
+            most = int(most)
             self.overruns += 1
             self.lost += (ticks - most) * self.T
             ticks = most
@@ -30,9 +31,8 @@ class Pace:
 
     def factor(self, now: float) -> float:
         """Simulated over clock time: 1 where nothing was lost."""
-        elapsed = now - self.started
-        return self.done * self.T / elapsed if elapsed > self.T else 1.0
+        return self.done * self.T / now if now > self.T else 1.0
 
     def _owed(self, now: float) -> int:
         # a clock that is a rounding error short of a tick has reached it
-        return int((now - self.started - self.lost) / self.T + 1e-6) - self.done
+        return int((now - self.lost) / self.T + 1e-6) - self.done

@@ -1,9 +1,9 @@
 """The running loop behind the window: a clock, keys and pushes go in, frames come out. It knows no display.
 
-What happens when the coupling or a delay is changed while the loop runs: the plant goes on from where it is, position and
-velocity; the new process begins at rest with the devices held where they are, z = A z + B x, so its delay
-lines hold the force F(1) x and nothing starts with a step in x. The force itself changes to what the new
-coupling makes of that position.
+When the coupling or a delay is changed while the loop runs, the plant goes on from where it is, position and velocity.
+The new process begins at rest with the devices held where they are, z = A z + B x: its delay lines hold the
+force F(1) x, and nothing starts with a step in x. The force changes to what the new coupling makes of that
+position; what the environment's masses had of motion is lost.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sim.engine import outside_forces
 from sim.exact_engine import ExactEngine
 from sim.loop import stretch
 from sim.view.events import Couple, Delay, Event, Push, Restart, Script, words
-from sim.view.pace import Pace
+from sim.view.pace import LONGEST_LAG, Pace
 from sim.view.setting import Setting, attempt, changed
 
 HISTORY = 4.0  # [s] of forces that are kept for the picture
@@ -49,16 +49,21 @@ class Frame:
 class Session:
     """The closed loop, advanced to wherever the clock is."""
 
-    def __init__(self, setting: Setting, executor: Executor, started: float = 0.0, script: Script = ()) -> None:
+    def __init__(
+        self, setting: Setting, executor: Executor, script: Script = (), patience: float = LONGEST_LAG
+    ) -> None:
         """`executor` makes what keys ask for, while the loop goes on; a script's loops are made here, beforehand.
+
+        The clock begins at 0; what it runs ahead by more than `patience` [s] is not made up.
 
         Raises what sim.view.setting.changed raises where an event of the script is impossible.
         """
         self.setting = setting
-        self.pace = Pace(setting.scenario.T, started)
+        self.pace = Pace(setting.scenario.T, patience)
         self.keys: SimpleQueue[Event] = SimpleQueue()
         self.clipped = 0  # ticks, since the start
-        self.log: list[tuple[float, str, Setting]] = []
+        self.log: list[tuple[float, str, Setting]] = [(0.0, "start", setting)]  # time [s], what was asked for, the loop
+        self.script_ends = script[-1][0] if script else 0.0  # [s]
         self._executor, self._latest = executor, setting
         self._wanted: list[tuple[Event, Future[Setting | str]]] = []
         self._script = _rehearsed(setting, script)

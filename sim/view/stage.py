@@ -32,7 +32,10 @@ _BOX, _SPHERE, _ARROW, _BAR = (
     getattr(mujoco.mjtGeom, f"mjGEOM_{name}") for name in ("BOX", "SPHERE", "ARROW", "CAPSULE")
 )
 _MASSLESS = {"mass": 0, "contype": 0, "conaffinity": 0}
-GRIP = 400.0  # [1/s^2] stiffness of the mouse's hold per kg of what it holds: as firm as the hands of the default scenario
+GRIP = (
+    400.0  # [1/s^2] stiffness of the mouse's hold per kg of what it holds: as firm as the hands of the default scenario
+)
+
 
 class Stage:
     """A scene that can be looked at, and pushed with the mouse."""
@@ -72,7 +75,7 @@ class Stage:
             span = ((-frame.high[i] * reach, 0, 0), (-frame.low[i] * reach, 0, 0))
             _connect(drawn, _BAR, 0.010, at + span[0], at + span[1], band)
             _arrow(drawn, at, -frame.mean[i] * reach, (*own, 1.0))
-            _arrow(drawn, at + (0, 0, 0.03), frame.push[i] * reach, (0.1, 0.1, 0.1, 1.0))
+            _arrow(drawn, at + np.array([0, 0, 0.03]), frame.push[i] * reach, (0.1, 0.1, 0.1, 1.0))
 
     def figures(self, frame: Frame, picture: mujoco.MjrRect) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
         """The forces of the last seconds, side by side at the bottom of a picture."""
@@ -87,9 +90,9 @@ class Stage:
 
     def aim(self, camera: mujoco.MjvCamera) -> None:
         """Look at the devices from the front and above."""
-        # above the devices, so that they stand below the words
-        camera.lookat[:] = self.model.stat.center + np.array([0.0, 0.0, 0.35 * self.model.stat.extent])
-        camera.distance = 2.0 * self.model.stat.extent
+        # beside and above the devices, so that they stand below and to the right of the words
+        camera.lookat[:] = self.model.stat.center + self.model.stat.extent * np.array([-0.25, 0.0, 0.32])
+        camera.distance = 1.7 * self.model.stat.extent
         camera.azimuth, camera.elevation = 90.0, -35.0
 
 
@@ -141,7 +144,7 @@ def _figure(channel: int, low: Array, high: Array, top: float) -> mujoco.MjvFigu
 
 def _arrow(drawn: mujoco.MjvScene, at: Array, length: float, rgba: tuple[float, ...]) -> None:
     if abs(length) > 1e-4:
-        _connect(drawn, _ARROW, 0.005, at, at + (length, 0, 0), rgba)
+        _connect(drawn, _ARROW, 0.005, at, at + np.array([length, 0, 0]), rgba)
 
 
 def _connect(
