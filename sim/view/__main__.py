@@ -70,7 +70,7 @@ def main(argv: list[str]) -> int:
 
 
 def _parser() -> Parser:
-    keys = ", ".join(f"{name} {word}" for name, word in keys_help())
+    keys = ", ".join(f"{name} {word}" for name, word in keys_help(given=True))
     parser = Parser("sim.view", f"Feel the loop in a window, or film it.\n\nKeys: {keys}.", EXAMPLE)
     add_loop_options(parser)
     names = ", ".join(COUPLINGS)
@@ -115,9 +115,8 @@ def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:
     told = args.video and args.coupling is None and args.case != "none"
     text = args.script if args.script is not None else SCRIPT if told else None
     script = () if text is None else parse_script(text, channels)
-    match script:
-        case ((0.0, Couple(name)), *rest):  # nothing else need be designed first
-            return name, tuple(rest)
+    if script and script[0][0] == 0 and isinstance(script[0][1], Couple):
+        return script[0][1].name, script[1:]  # nothing else need be designed first
     return label, script
 
 

@@ -15,6 +15,7 @@ from PIL import Image
 
 from sim.files import write
 from sim.scenario import InputError
+from sim.view.layout import SIZE
 
 Picture = NDArray[np.uint8]  # (height, width, 3)
 
@@ -59,25 +60,17 @@ def _gif(path: Path, pictures: Iterable[Picture], fps: float) -> int:
 
 
 def _mp4(path: Path, pictures: Iterable[Picture], fps: float) -> int:
-    """Pictures go to ffmpeg one by one; the file is written elsewhere and copied when it is complete."""
+    """ffmpeg writes elsewhere; the film is put in its place when it is complete."""
     with tempfile.TemporaryDirectory() as folder:
-        whole, count, encoder = Path(folder) / "film.mp4", 0, None
-        for picture in pictures:
-            if encoder is None:
-                encoder = _ffmpeg(whole, picture, fps)
-                assert encoder.stdin
-            encoder.stdin.write(picture.tobytes())
-            count += 1
-        assert encoder  # a film has at least one picture
-        _, complaint = encoder.communicate()
-        if encoder.returncode:
-            raise InputError(f"--video {path}: ffmpeg: {complaint.decode(errors='replace').strip()}")
+        raw, whole, count = Path(folder) / "film.rgb", Path(folder) / "film.mp4", 0
+        with raw.open("wb") as file:
+            for picture in pictures:
+                file.write(picture.tobytes())
+                count += 1
+        source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "{}x{}".format(*SIZE), "-r", f"{fps:g}", "-i", str(raw)]
+        command = ["ffmpeg", "-loglevel", "error", "-y", *source, "-pix_fmt", "yuv420p", str(whole)]
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+        if done.returncode:
+            raise InputError(f"--video {path}: ffmpeg: {done.stderr.strip() or done.returncode}")
         write(path, whole.read_bytes())
     return count
-
-
-def _ffmpeg(path: Path, picture: Picture, fps: float) -> subprocess.Popen[bytes]:
-    height, width, _ = picture.shape
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
-    command = ["ffmpeg", "-loglevel", "error", "-y", *source, "-pix_fmt", "yuv420p", str(path)]
-    return subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)

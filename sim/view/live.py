@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 
@@ -13,7 +14,7 @@ from mujoco import viewer
 
 from controller.lti import Array
 from sim.view.events import KEYS
-from sim.view.overlay import keys_help, overlay
+from sim.view.overlay import columns, keys_help, overlay
 from sim.view.session import Frame, Session
 from sim.view.stage import Stage
 
@@ -47,16 +48,21 @@ def show(session: Session, stage: Stage, until: float | None = None) -> None:
     """
     if not display():
         raise NoWindow("no window can be opened: there is no display, or none with OpenGL")
+    threads = set(threading.enumerate())
     try:
         window = viewer.launch_passive(
             stage.model, stage.data, key_callback=typed(session), show_left_ui=False, show_right_ui=False
         )
     except RuntimeError as error:
         raise NoWindow(str(error)) from None
-    with window:
-        with window.lock():
-            stage.aim(window.cam)
-        loop(session, stage, window, time.perf_counter, time.sleep, until)
+    try:
+        with window:
+            with window.lock():
+                stage.aim(window.cam, (0.0, 0.0, -0.12), 2.4)  # between the words and the plots
+            loop(session, stage, window, time.perf_counter, time.sleep, until)
+    finally:  # the viewer must have left OpenGL before Python ends
+        for thread in set(threading.enumerate()) - threads:
+            thread.join(PATIENCE)
 
 
 def loop(
@@ -72,10 +78,9 @@ def loop(
     push = np.zeros(stage.scene.channels)
     while window.is_running():
         begun = clock()
-        frame = session.frame(begun - start, push)
-        if until is not None and frame.t >= until:
+        push = _shown(stage, window, session.frame(begun - start, push))
+        if until is not None and begun - start >= until:
             return
-        push = _shown(stage, window, frame)
         sleep(max(0.0, 1 / RATE - (clock() - begun)))
 
 
@@ -88,9 +93,7 @@ def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Array:
             window.user_scn.ngeom = 0
             stage.draw(window.user_scn, frame)
     window.sync()
-    said, keys = (
-        tuple("\n".join(c) for c in zip(*lines, strict=True)) for lines in (overlay(frame, True), keys_help())
-    )
+    said, keys = columns(overlay(frame, live=True)), columns(keys_help(frame.setting.menu.given is not None))
     font, grid = mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos
     window.set_texts([(font, grid.mjGRID_TOPLEFT, *said), (font, grid.mjGRID_TOPRIGHT, *keys)])
     if window.viewport is not None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim.view.layout import PLOT, SIZE
-from sim.view.overlay import overlay
+from sim.view.overlay import columns, overlay
 from sim.view.session import Frame
 from sim.view.stage import Stage
 
@@ -57,7 +57,7 @@ class Offscreen:
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         self._option, self._grip, self._camera = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
-        stage.aim(self._camera)
+        stage.aim(self._camera, (-0.25, 0.0, 0.32), 1.7)  # they stand below and to the right of the words
 
     def picture(self, frame: Frame) -> NDArray[np.uint8]:
         """(height, width, 3): the scene with its overlay, above the forces."""
@@ -76,13 +76,12 @@ class Offscreen:
         below = round(PLOT * height)
         above = mujoco.MjrRect(0, below, width, height - below)
         mujoco.mjr_render(above, self._scene, self._context)
-        labels, values = zip(*overlay(frame, live=False), strict=True)
+        said = columns(overlay(frame, live=False))
         mujoco.mjr_overlay(
             mujoco.mjtFont.mjFONT_NORMAL,
             mujoco.mjtGridPos.mjGRID_TOPLEFT,
             above,
-            "\n".join(labels),
-            "\n".join(values),
+            *said,
             self._context,
         )
         for place, figure in stage.figures(frame, mujoco.MjrRect(0, 0, width, height)):

@@ -7,7 +7,7 @@ import textwrap
 import numpy as np
 
 from design.margin import Requirement
-from sim.view.events import KEYS, words
+from sim.view.events import GIVEN, KEYS, Couple, words
 from sim.view.session import HISTORY, Frame
 
 Lines = list[tuple[str, str]]
@@ -50,9 +50,14 @@ def needs(requirement: Requirement) -> str:
     return f"needs {need:.3f} of {have:g} N s/m: {'certified' if requirement.certified else 'NOT certified'}"
 
 
-def keys_help() -> Lines:
-    """The keys and what they ask for."""
-    return [(name, words(event)) for name, event in KEYS.values()]
+def keys_help(given: bool) -> Lines:
+    """The keys and what they ask for; `given` where there is a coupling from a file."""
+    return [(name, words(event)) for name, event in KEYS.values() if given or event != Couple(GIVEN)]
+
+
+def columns(lines: Lines) -> tuple[str, str]:
+    """Labels and values as MuJoCo's overlays take them."""
+    return "\n".join(label for label, _ in lines), "\n".join(value for _, value in lines)
 
 
 def _list(values: tuple[int, ...]) -> str:

@@ -122,7 +122,7 @@ class Session:
             except Empty:
                 return
             if isinstance(event, Couple | Delay):
-                self._note = f"{words(event)} .."
+                self._note = f"{words(event)}: being made"
                 self._wanted.append((event, self._executor.submit(self._make, event)))
             else:
                 self._happen(event)
@@ -159,7 +159,8 @@ class Session:
     def _advance(self, count: int, push: Array) -> None:
         tape, scene = self._tape, self.setting.assembly.scene
         w = outside_forces(self.setting.scenario, scene, self._tick, count)
-        np.add.at(w, (slice(None), list(scene.tapped)), push)
+        for column, force in zip(scene.tapped, push, strict=True):
+            w[:, column] += force
         tape.w[:count] = w[:, :, None]
         with np.errstate(over="ignore", invalid="ignore"):  # a process that runs away is noticed below
             stretch(tape, self._engine, count)
@@ -203,7 +204,7 @@ def rest(F: Lti, x: Array) -> Array:
 
     Where F drifts (an environment with a free mass, whose place no x decides), the shortest such z.
     """
-    return np.linalg.lstsq(np.eye(F.order) - F.A, F.B @ x, rcond=None)[0]
+    return np.asarray(np.linalg.lstsq(np.eye(F.order) - F.A, F.B @ x, rcond=None)[0], dtype=np.float64)
 
 
 def _rehearsed(setting: Setting, script: Script) -> list[tuple[int, Event, Setting | None]]:

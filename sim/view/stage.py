@@ -68,12 +68,12 @@ class Stage:
         """Arrows: the mean force on each device, the range it has had since the last frame, and what pushes."""
         for i, handle in enumerate(self.scene.handles):
             own, reach = colour(i), LONGEST / self.force_limit[i]
-            at = self.data.xpos[self.model.jnt_bodyid[handle]] + (0, 0, 0.045)
+            at = self.data.xpos[self.model.jnt_bodyid[handle]] + np.array([0, 0, 0.045])
             clipped = max(-frame.low[i], frame.high[i]) >= self.force_limit[i]
             band = (*ALARM, 0.6) if clipped else (*own, 0.35)
             # the device feels -f
-            span = ((-frame.high[i] * reach, 0, 0), (-frame.low[i] * reach, 0, 0))
-            _connect(drawn, _BAR, 0.010, at + span[0], at + span[1], band)
+            left, right = (np.array([-f * reach, 0, 0]) for f in (frame.high[i], frame.low[i]))
+            _connect(drawn, _BAR, 0.010, at + left, at + right, band)
             _arrow(drawn, at, -frame.mean[i] * reach, (*own, 1.0))
             _arrow(drawn, at + np.array([0, 0, 0.03]), frame.push[i] * reach, (0.1, 0.1, 0.1, 1.0))
 
@@ -88,11 +88,10 @@ class Stage:
             drawn.append((place, _figure(i, low[:, i], high[:, i], top)))
         return drawn
 
-    def aim(self, camera: mujoco.MjvCamera) -> None:
-        """Look at the devices from the front and above."""
-        # beside and above the devices, so that they stand below and to the right of the words
-        camera.lookat[:] = self.model.stat.center + self.model.stat.extent * np.array([-0.25, 0.0, 0.32])
-        camera.distance = 1.7 * self.model.stat.extent
+    def aim(self, camera: mujoco.MjvCamera, aside: tuple[float, float, float], back: float) -> None:
+        """Look from above at a point `aside` of the devices' middle and from `back` of it, in extents of the scene."""
+        camera.lookat[:] = self.model.stat.center + self.model.stat.extent * np.array(aside)
+        camera.distance = back * self.model.stat.extent
         camera.azimuth, camera.elevation = 90.0, -35.0
 
 
