@@ -9,11 +9,10 @@ import time
 from collections.abc import Callable
 
 import mujoco
-import numpy as np
 from mujoco import viewer
 
-from controller.lti import Array
 from sim.view.events import KEYS
+from sim.view.grip import Grip
 from sim.view.overlay import columns, keys_help, overlay
 from sim.view.session import Frame, Session
 from sim.view.stage import Stage
@@ -75,20 +74,20 @@ def loop(
 ) -> None:
     """Frame after frame: the mouse to the session, the session to the window."""
     start = clock()
-    push = np.zeros(stage.scene.channels)
+    grip = None
     while window.is_running():
         begun = clock()
-        push = _shown(stage, window, session.frame(begun - start, push))
+        grip = _shown(stage, window, session.frame(begun - start, grip))
         if until is not None and begun - start >= until:
             return
         sleep(max(0.0, 1 / RATE - (clock() - begun)))
 
 
-def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Array:
-    """Show a frame, and return what the mouse does meanwhile, (m,) [N]."""
+def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Grip | None:
+    """Show a frame, and return what the mouse holds by then."""
     with window.lock():
         stage.show(frame.q)
-        push = stage.pushed(window.perturb)
+        grip = stage.grip(window.perturb)
         if window.user_scn is not None:
             window.user_scn.ngeom = 0
             stage.draw(window.user_scn, frame)
@@ -98,7 +97,7 @@ def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Array:
     window.set_texts([(font, grid.mjGRID_TOPLEFT, *said), (font, grid.mjGRID_TOPRIGHT, *keys)])
     if window.viewport is not None:
         window.set_figures(stage.figures(frame, window.viewport))
-    return push
+    return grip
 
 
 def typed(session: Session) -> Callable[[int], None]:

@@ -20,6 +20,7 @@ from sim.engine import outside_forces
 from sim.exact_engine import ExactEngine
 from sim.loop import stretch
 from sim.view.events import Couple, Delay, Event, Push, Restart, Script, words
+from sim.view.grip import Grip, gripped
 from sim.view.pace import LONGEST_LAG, Pace
 from sim.view.setting import Setting, attempt, changed
 
@@ -70,6 +71,7 @@ class Session:
         self._tick = 0
         self._pushed = np.zeros(setting.scenario.channels)  # by the script
         self._history = np.zeros((max(1, round(HISTORY / setting.scenario.T)), setting.scenario.channels))
+        self._grip: Grip | None = None
         self._note = ""
         self._enter(setting, np.zeros(setting.assembly.plant.A.shape[0]))
 
@@ -88,13 +90,16 @@ class Session:
         """Whether something that was asked for is still being made."""
         return bool(self._wanted)
 
-    def frame(self, now: float, push: Array | None = None) -> Frame:
-        """Take what has been asked for, then advance to `now` [s] with `push` (m,) [N] held on the handles."""
+    def frame(self, now: float, grip: Grip | None = None) -> Frame:
+        """Take what has been asked for, then advance to `now` [s] with the mouse's hand where it is."""
         self._take_keys()
         self._take_finished()
-        held = np.zeros(self.setting.scenario.channels) if push is None else push
+        self._hold(grip)
         first = self._tick
-        self._run(self.pace.due(now), held)
+        self._run(self.pace.due(now))
+        push = self._pushed.copy()
+        if grip:
+            push[grip.channel] += grip.force(self.setting.assembly.scene, self.state)
         made = self._history[-min(self._tick - first, len(self._history)) :] if self._tick > first else None
         recent = self._history[-1:] if made is None else made
         shown = self._history[-max(1, min(self._tick, len(self._history))) :]
@@ -105,7 +110,7 @@ class Session:
             mean=recent.mean(axis=0),
             low=recent.min(axis=0),
             high=recent.max(axis=0),
-            push=held + self._pushed,
+            push=push,
             history=shown.copy(),
             clipped=int((np.abs(shown) >= limit).any(axis=1).sum()),
             setting=self.setting,
@@ -143,7 +148,7 @@ class Session:
             else:
                 self._note = f"{words(event)}: {outcome}"
 
-    def _run(self, ticks: int, push: Array) -> None:
+    def _run(self, ticks: int) -> None:
         end = self._tick + ticks
         while self._tick < end:
             while self._script and self._script[0][0] <= self._tick:
@@ -154,13 +159,15 @@ class Session:
                     self._latest = setting
                     self._switch(event, setting)
             until = min(end, self._script[0][0]) if self._script else end
-            self._advance(min(STRETCH, until - self._tick), push + self._pushed)
+            self._advance(min(STRETCH, until - self._tick))
 
-    def _advance(self, count: int, push: Array) -> None:
+    def _advance(self, count: int) -> None:
         tape, scene = self._tape, self.setting.assembly.scene
         w = outside_forces(self.setting.scenario, scene, self._tick, count)
-        for column, force in zip(scene.tapped, push, strict=True):
+        for column, force in zip(scene.tapped, self._pushed, strict=True):
             w[:, column] += force
+        if self._grip:
+            w[:, scene.tapped[self._grip.channel]] += self._grip.pull
         tape.w[:count] = w[:, :, None]
         with np.errstate(over="ignore", invalid="ignore"):  # a process that runs away is noticed below
             stretch(tape, self._engine, count)
@@ -189,14 +196,26 @@ class Session:
 
     def _enter(self, setting: Setting, s: Array) -> None:
         """Go on with another process from the plant state s."""
-        process, plant = setting.assembly.process, setting.assembly.plant
-        outside = plant.B.shape[1] - process.channels
+        process = setting.assembly.process
+        outside = setting.assembly.plant.B.shape[1] - process.channels
         tape = Tape(process, STRETCH, s.size, outside)
         tape.s[0, :, 0] = s
         tape.z[0, :, 0] = rest(process.F, s[: process.channels])
-        engine = ExactEngine(plant, process.force_limit)
-        engine.start(tape)
-        self.setting, self._tape, self._engine = setting, tape, engine
+        self.setting, self._tape = setting, tape
+        self._start_engine()
+
+    def _hold(self, grip: Grip | None) -> None:
+        """Take, move or let go of a handle."""
+        before, self._grip = self._grip, grip
+        if (before and before.channel) != (grip and grip.channel):
+            self._start_engine()
+
+    def _start_engine(self) -> None:
+        """The plant, with the mouse's hand where there is one, on the present tape."""
+        assembly, held = self.setting.assembly, self._grip
+        plant = gripped(assembly.scene, held.channel, assembly.scenario.T) if held else assembly.plant
+        self._engine = ExactEngine(plant, assembly.process.force_limit)
+        self._engine.start(self._tape)
 
 
 def rest(F: Lti, x: Array) -> Array:

@@ -1,4 +1,4 @@
-"""The scene as it is shown: the loop's own bodies with shapes on them, arrows for the forces, and the mouse's force.
+"""The scene as it is shown: the loop's own bodies with shapes on them, arrows for the forces, and what the mouse holds.
 
 A dressed copy only. What is simulated stays as small as models.scene builds it; the shapes have no mass and touch
 nothing, so both models have the same matrices.
@@ -11,6 +11,7 @@ import numpy as np
 
 from controller.lti import Array
 from models.scene import Scene
+from sim.view.grip import Grip
 from sim.view.layout import (
     ALARM,
     APART,
@@ -32,7 +33,6 @@ _BOX, _SPHERE, _ARROW, _BAR = (
     getattr(mujoco.mjtGeom, f"mjGEOM_{name}") for name in ("BOX", "SPHERE", "ARROW", "CAPSULE")
 )
 _MASSLESS = {"mass": 0, "contype": 0, "conaffinity": 0}
-GRIP = (
     400.0  # [1/s^2] stiffness of the mouse's hold per kg of what it holds: as firm as the hands of the default scenario
 )
 
@@ -52,17 +52,16 @@ class Stage:
         self.data.qvel[:] = 0.0
         mujoco.mj_forward(self.model, self.data)
 
-    def pushed(self, grip: mujoco.MjvPerturb) -> Array:
-        """(m,) force [N] of the mouse on the handles. A hand holds the handle, whichever body of a device is drawn."""
-        push = np.zeros(self.scene.channels)
-        if grip.select > 0 and (grip.active or grip.active2):
-            self.data.xfrc_applied[:] = 0.0
-            mujoco.mjv_applyPerturbForce(self.model, self.data, grip)
-            joint = int(self.model.body_jntadr[grip.select])
-            if joint >= 0:
-                push[self.channel[joint]] = self.data.xfrc_applied[grip.select, 0]
-            self.data.xfrc_applied[:] = 0.0
-        return push
+    def grip(self, perturb: mujoco.MjvPerturb) -> Grip | None:
+        """What the mouse holds. A hand holds the handle, whichever body of its device was taken."""
+        joint = int(self.model.body_jntadr[perturb.select]) if perturb.select > 0 else -1
+        if joint < 0 or not (perturb.active | perturb.active2) & int(mujoco.mjtPertBit.mjPERT_TRANSLATE):
+            return None
+        channel = self.channel[joint]
+        turn = self.data.xmat[perturb.select].reshape(3, 3)
+        taken = self.data.xpos[perturb.select] + turn @ perturb.localpos
+        drawn = float(perturb.refselpos[0] - taken[0])
+        return Grip(channel, float(self.data.qpos[self.scene.handles[channel]]) + drawn)
 
     def draw(self, drawn: mujoco.MjvScene, frame: Frame) -> None:
         """Arrows: the mean force on each device, the range it has had since the last frame, and what pushes."""
@@ -75,7 +74,8 @@ class Stage:
             left, right = (np.array([-f * reach, 0, 0]) for f in (frame.high[i], frame.low[i]))
             _connect(drawn, _BAR, 0.010, at + left, at + right, band)
             _arrow(drawn, at, -frame.mean[i] * reach, (*own, 1.0))
-            _arrow(drawn, at + np.array([0, 0, 0.03]), frame.push[i] * reach, (0.1, 0.1, 0.1, 1.0))
+            pushed = float(np.clip(frame.push[i] * reach, -LONGEST, LONGEST))
+            _arrow(drawn, at + np.array([0, 0, 0.03]), pushed, (0.1, 0.1, 0.1, 1.0))
 
     def figures(self, frame: Frame, picture: mujoco.MjrRect) -> list[tuple[mujoco.MjrRect, mujoco.MjvFigure]]:
         """The forces of the last seconds, side by side at the bottom of a picture."""
@@ -99,7 +99,6 @@ def dressed(scene: Scene, size: tuple[int, int] = SIZE) -> mujoco.MjModel:
     """The scene's model with shapes, places, a camera's distance and colours, but the same dynamics."""
     spec = mujoco.MjSpec.from_string(scene.xml)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = size
-    spec.visual.map.stiffness = GRIP
     sky = {"type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mujoco.mjtBuiltin.mjBUILTIN_FLAT}
     spec.add_texture(name="sky", width=32, height=192, rgb1=[0.93, 0.93, 0.93], rgb2=[0.93, 0.93, 0.93], **sky)
     spec.visual.headlight.ambient = [0.5, 0.5, 0.5]
