@@ -33,8 +33,6 @@ _BOX, _SPHERE, _ARROW, _BAR = (
     getattr(mujoco.mjtGeom, f"mjGEOM_{name}") for name in ("BOX", "SPHERE", "ARROW", "CAPSULE")
 )
 _MASSLESS = {"mass": 0, "contype": 0, "conaffinity": 0}
-    400.0  # [1/s^2] stiffness of the mouse's hold per kg of what it holds: as firm as the hands of the default scenario
-)
 
 
 class Stage:
