@@ -22,10 +22,18 @@ COMMANDS_MAY_IMPORT = {"sim.scenario", "sim.command", "sim.files", "sim.stored",
 
 #: the only files that may import a package
 HOMES = {
-    "mujoco": {"models/scene.py", "sim/mujoco_engine.py"},
+    # the last three only show what runs without them: shapes and arrows, the window, pictures without a window
+    "mujoco": {
+        "models/scene.py",
+        "sim/mujoco_engine.py",
+        "sim/view/stage.py",
+        "sim/view/live.py",
+        "sim/view/offscreen.py",
+    },
     "cvxpy": {"design/"},
     "serial": {"hw/port.py"},
     "matplotlib": {"sim/plot.py"},
+    "PIL": {"sim/view/flat.py", "sim/view/film.py"},
 }
 
 FILES = [path for world in WORLDS for path in sorted((ROOT / world).rglob("*.py"))]

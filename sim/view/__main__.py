@@ -59,9 +59,12 @@ def main(argv: list[str]) -> int:
     label, script = _beginning(args, scenario.channels)
     menu = Menu(args.case, args.condition, args.coupling if label == GIVEN else None)
     setting = first_setting(menu, scenario, label)
-    with ThreadPoolExecutor(1) as executor:
+    executor = ThreadPoolExecutor(1)
+    try:
         session = Session(setting, executor, script, inf if args.video else LONGEST_LAG)
         outcome = _film(args, session, wish) if args.video else _window(session, wish)
+    finally:
+        executor.shutdown(cancel_futures=True)
     outcome = {"case": args.case, **happened(session), **outcome}
     print_story(outcome, console(args))
     if args.json:
