@@ -21,7 +21,7 @@ figures: .venv/ready
 	$(PY) -m sim.run --case I --out out/figure-6
 	cp out/figure-5/figure.png docs/pictures/figure-5.png
 	cp out/figure-6/figure.png docs/pictures/figure-6.png
-	$(PY) -m sim.view --case I --video docs/pictures/view.gif
+	$(PY) -m sim.view --case I --video docs/pictures/view.gif --fps 5
 
 bench: .venv/ready
 	$(PY) -m pytest tests/benchmarks --benchmark-only -s

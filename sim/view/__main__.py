@@ -78,10 +78,10 @@ def _parser() -> Parser:
     add_loop_options(parser)
     names = ", ".join(COUPLINGS)
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"to begin with: {names} or FILE.json")
-    parser.add_argument("--condition", choices=CONDITIONS, help="what 'designed' is made for (default theorem4)")
+    parser.add_argument("--condition", choices=CONDITIONS, help="of 'designed' and 'optimal' (default: each one's own)")
     parser.add_argument("--script", metavar="EVENTS", help=f"what happens when [s] (default of a video: '{SCRIPT}')")
     parser.add_argument(
-        "--duration", metavar="SECONDS", help="default: until the window is closed, or the script's end"
+        "--duration", metavar="SECONDS", help="default: a window until it is closed, a video until after its script"
     )
     parser.add_argument("--json", metavar="FILE|-", help="what happened, machine-readable; - is standard output")
     film = parser.add_argument_group("without a display")

@@ -15,12 +15,12 @@ from PIL import Image
 
 from sim.files import write
 from sim.scenario import InputError
-from sim.view.layout import SIZE
+from sim.view.layout import ALARM, PALETTE, SIZE
 
 Picture = NDArray[np.uint8]  # (height, width, 3)
 
 FORMATS = (".gif", ".mp4")
-COLOURS = 32  # of a GIF: few, so that it stays small
+COLOURS = 48  # of a GIF: few, so that it stays small
 
 
 def check_film(path: Path) -> None:
@@ -42,21 +42,25 @@ def save_film(path: Path, pictures: Iterable[Picture], fps: float) -> int:
 
 def _gif(path: Path, pictures: Iterable[Picture], fps: float) -> int:
     images: list[Image.Image] = []
+    palette: Image.Image | None = None
     for picture in pictures:
-        image = Image.fromarray(picture)
-        # one palette for all, from the first: colours do not flicker, and what stands still costs nothing
-        first = images[0] if images else None
-        images.append(
-            image.quantize(COLOURS, dither=Image.Dither.NONE)
-            if first is None
-            else image.quantize(palette=first, dither=Image.Dither.NONE)
-        )
+        # one palette for all: colours do not flicker, and what stands still costs nothing
+        palette = palette or _palette(picture)
+        images.append(Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE))
 
     def content(file: BinaryIO) -> None:
         images[0].save(file, "GIF", save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0)
 
     write(path, content)
     return len(images)
+
+
+def _palette(first: Picture) -> Image.Image:
+    """The colours of the first picture, and of what may appear later: forces, in light and in shade."""
+    shades = [np.multiply(colour, light) for colour in (*PALETTE, ALARM) for light in (1.0, 0.75, 0.5)]
+    strip = np.repeat(np.array(shades) * 255, -(-first.shape[1] // len(shades)), axis=0)[: first.shape[1]]
+    later = np.repeat(strip[None].astype(np.uint8), first.shape[0] // 4, axis=0)
+    return Image.fromarray(np.concatenate([first, later])).quantize(COLOURS, dither=Image.Dither.NONE)
 
 
 def _mp4(path: Path, pictures: Iterable[Picture], fps: float) -> int:

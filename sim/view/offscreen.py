@@ -57,7 +57,7 @@ class Offscreen:
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         self._option, self._grip, self._camera = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
-        stage.aim(self._camera, (-0.25, 0.0, 0.32), 1.7)  # they stand below and to the right of the words
+        stage.aim(self._camera, (-0.4, 0.0, 0.36), 1.7)  # they stand below and to the right of the words
 
     def picture(self, frame: Frame) -> NDArray[np.uint8]:
         """(height, width, 3): the scene with its overlay, above the forces."""

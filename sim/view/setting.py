@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from controller.coupling import Coupling
 from controller.lti import SingularLoop
 from design.assess import assess
+from design.designs import KINDS
 from design.failure import DesignFailed
 from design.margin import Requirement
 from design.promises import promise_of
@@ -23,7 +24,7 @@ class Menu:
     """What the keys choose from."""
 
     case: str
-    condition: str | None = None  # what a designed spring-damper is made for
+    condition: str | None = None  # what a coupling is designed for, by default its own
     given: str | None = None  # the file of --coupling
 
 
@@ -79,7 +80,7 @@ def _choose(menu: Menu, scenario: Scenario, label: str) -> Chosen:
             raise InputError("given: there is no coupling from a file (start with --coupling FILE.json)")
         return choose(scenario, menu.case, menu.given)
     name = COUPLINGS[label]
-    return choose(scenario, menu.case, name, menu.condition if name == "spring-damper" else None)
+    return choose(scenario, menu.case, name, menu.condition if name in KINDS else None)
 
 
 def _setting(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> Setting:
