@@ -103,7 +103,7 @@ def _parser() -> Parser:
     add_loop_options(parser)
     parser.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="what to certify (default: the coupling's own)")
-    jitter = "safe under any switching of the forces' delays in this range too [samples]; spring-damper, closed-loop"
+    jitter = "safe under any switching of the forces' delays in this range too [samples]; for closed-loop designs"
     parser.add_argument("--jitter", metavar="LO,HI", help=jitter)
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", metavar="N", help="states per channel (default 1)")
@@ -164,8 +164,9 @@ def _switching(args: argparse.Namespace, channels: int) -> dict[str, Any]:
     """The range of delays that a design must bear. Raises InputError."""
     if args.jitter is None:
         return {}
-    if args.coupling != "spring-damper" or args.condition != "closed-loop":
-        raise InputError("--jitter is for --coupling spring-damper with --condition closed-loop")
+    condition = args.condition or KINDS[args.coupling][0]
+    if args.coupling not in ("spring-damper", "optimal") or condition != "closed-loop":
+        raise InputError("--jitter is for --coupling optimal, or spring-damper with --condition closed-loop")
     lo, hi = ranges("--jitter", args.jitter, channels)
     if any(not 0 <= a <= b <= LONGEST_DELAY for a, b in zip(lo, hi, strict=True)):
         raise InputError(f"--jitter is {args.jitter!r}, expected 0 <= LO <= HI <= {LONGEST_DELAY} samples")

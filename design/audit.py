@@ -58,7 +58,7 @@ def main(argv: list[str]) -> int:
         "case": args.case,
         "scenario": None if args.rigid else scenario.name,
         "preset": args.preset and {"name": args.preset, "source": PRESETS[args.preset].source},
-        **report(subject, switching, whole),
+        **report(subject, switching, whole, None if args.rigid else scenario.holders),
         "notes": doubts(read_coupling(args.coupling), scenario.loop(args.case)) if args.coupling else [],
         "wall_s": time.perf_counter() - begin,
     }

@@ -27,6 +27,7 @@ from design.inequalities import (
     passivity,
     stable_compliance,
     static_stiffness,
+    switching,
 )
 from design.sweep import frequencies, on_circle
 from design.transparency import BAND_HZ
@@ -117,6 +118,8 @@ class Problem:
 def asked(wish: Wish, world: World, delta: Array) -> list[Inequality]:
     """What Q must satisfy in one environment, whatever is minimised."""
     inequalities = [passivity(world, delta * (1 - wish.margin)), stable_compliance(world, PASSIVE_SHARE)]
+    if wish.switching:
+        inequalities.append(switching(world, delta * (1 - wish.margin), *wish.switching))
     if wish.high_gain is not None:
         inequalities.append(high_frequency_limit(world, wish.high_gain, HIGH_HZ))
     return inequalities

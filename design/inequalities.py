@@ -11,6 +11,7 @@ import numpy as np
 from controller.lti import Array, Lti
 from design.cone_program import Block, Complex
 from design.free_parameter import GivenParameter, Response, affine, bordered, loop_force
+from design.jitter import blocks
 from design.sweep import frequencies, hermitian, on_circle, peaks
 
 
@@ -125,6 +126,29 @@ def high_frequency_limit(world: World, gain: float, above_hz: float) -> Inequali
 
     imposed = np.linspace(low, np.pi, 12)
     return Inequality(f"the limit above {above_hz:g} Hz", block, imposed, _swept(world, low=low))
+
+
+def switching(world: World, delta: Array, lo: Sequence[int], hi: Sequence[int]) -> Inequality:
+    """design.jitter's condition for forces whose ages switch within [lo, hi] [samples], scaled to Delta_D/T = I.
+
+    Its multiplier, one number per channel for all frequencies, is a shared unknown.
+    """
+    m, root = delta.size, np.sqrt(world.T / delta)
+    none = np.zeros(m)
+
+    def block(w: Array, Q: Parameter) -> Block:
+        z = on_circle(w)
+        constant, slope = loop_force(world.delayed(z), Q.at(z))
+        constant, slope = root[:, None] * constant * root, root[:, None] * slope * root
+        own = blocks(z, constant, none, lo, hi, np.ones(m), 1.0)
+        each = [blocks(z, slope[:, j], none, lo, hi, none, 1.0) for j in range(slope.shape[1])]
+        return Block(own, np.stack(each, axis=1) if each else np.zeros((z.size, 0, 2 * m, 2 * m), dtype=complex))
+
+    def multiplier(unit: Array) -> Array:
+        return blocks(np.array([-1.0 + 0j]), np.zeros((1, m, m), dtype=complex), unit, lo, hi, none, 1.0)[0].real
+
+    shared = {f"alpha {i + 1}": multiplier(unit) for i, unit in enumerate(np.eye(m))}
+    return Inequality("the condition for switching delays", block, _imposed(world, 40), _swept(world), shared)
 
 
 BOUND = "bound"  # the shared unknown that a sup objective minimises

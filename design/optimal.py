@@ -23,6 +23,7 @@ from design.cutting_planes import SLACK, cut, sketch
 from design.failure import DesignFailed, Infeasible
 from design.free_parameter import FreeParameter
 from design.inequalities import World
+from design.jitter import jitter_proof
 from design.margin import closed_loop
 from design.result import Design
 from design.set_advice import set_advice
@@ -47,6 +48,11 @@ def design(spec: Specification, wish: Wish = USUAL) -> Design:
         raise Infeasible(error.problem, error.results, advice(spec, wish)) from error
     maps = [force_map(E, coupling, spec.theta, spec.psi) for E in environments(spec)]
     requirement = max((closed_loop(F, spec.delta) for F in maps), key=lambda r: r.ratio)
+    if wish.switching:
+        free = [force_map(E, coupling, (0,) * spec.channels, spec.psi) for E in environments(spec)]
+        requirement = max(
+            (jitter_proof(G, *wish.switching, spec.delta).requirement for G in free), key=lambda r: r.ratio
+        )
     if requirement.ratio > 1 - wish.margin + 2 * SLACK:
         raise DesignFailed(None, (), f"the optimum needs {requirement.ratio:.6f} of the damping when it is swept again")
     figures = [transparency(F, E, spec.lam) for F, E in zip(maps, environments(spec), strict=True) if E.D.any()]
