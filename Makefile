@@ -35,6 +35,7 @@ figures: .venv/ready
 	cp out/figure-6/figure.png docs/pictures/figure-6.png
 	$(PY) -m design.plot --coupling published,spring-damper,spring-damper:closed-loop --out out/couplings
 	for name in required-damping perceived singular-values; do cp out/couplings/$$name.png docs/pictures/; done
+	$(PY) -m sim.view --case I --video docs/pictures/view.gif --fps 5
 
 bench: .venv/ready
 	$(PY) -m pytest tests/benchmarks --benchmark-only -s

@@ -17,9 +17,11 @@ from design.certificate import NotProved, prove
 from design.designs import FILTERS, KINDS, METHODS, OBJECTIVES, compare_methods, design_coupling
 from design.failure import DesignFailed
 from design.jitter_part import Range, switching_part, switching_requirement
-from design.promises import certificate_part, promise_of
+from design.price import cost_part, price
+from design.promises import ANY, certificate_part, promise_of
 from design.result import Design
-from design.store import Loop, Stored, data_of, save
+from design.set_check import SAMPLES, SetCheck, check_set, set_part, set_rows
+from design.store import Certificate, Loop, Stored, data_of, save
 from design.subject import LONGEST_DELAY
 from design.summary import coupling_part, transparency_part
 from design.transparency import transparency
@@ -53,6 +55,7 @@ def main(argv: list[str]) -> int:
     folder(out.parent)
     loop = scenario_from(args).loop(args.case)
     options = _options(args) | _switching(args, len(loop.theta))
+    seed, samples = seed_from(args), _samples(args)
     try:
         spec = specification(loop)
         design = design_coupling(spec, args.coupling, args.condition, **options)
@@ -62,30 +65,36 @@ def main(argv: list[str]) -> int:
         raise InputError(str(error)) from None
     F = force_map(spec.environment, design.coupling, loop.theta, loop.psi)
     requirements = assess(loop, design.coupling, design.phi)
+    whole = check_set(loop, design.coupling, seed, samples)
     outcome = {
         "case": args.case,
-        "seed": seed_from(args),
+        "seed": seed,
         "coupling": coupling_part(args.coupling, design.coupling, loop.T),
         "certificate": certificate_part(requirements[design.condition]),
         "certificates": {name: certificate_part(r) for name, r in requirements.items()},
-        "promise": promise_of(requirements, loop),
+        "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
+        "set": whole and set_part(whole),
+        "price": _price(args, loop, design, options) if whole else None,
         "transparency": transparency_part(transparency(F, spec.environment, loop.lam)),
         "objective": design.objective,
         "objective_name": design.figure,
         "sdps": design.sdps,
         "wall_s": design.wall_s,
-        "stored": _store(loop, design, out),
+        "stored": _store(loop, design, whole, out),
         "jitter_proof": _switching_figures(loop, spec.environment, design.coupling, options.get("switching")),
     }
     if args.compare:
         outcome["comparison"] = [asdict(row) for row in compare_methods(spec)]
     console(args).print(_table(outcome))
+    if outcome["price"]:
+        console(args).print(_costs(outcome["price"]))
     if args.compare:
         console(args).print(_comparison(outcome["comparison"]))
     if args.json:
         write_json(args.json, outcome)
+    holds = outcome["certificate"]["certified"] and (outcome["promise"] == ANY or not whole or whole.proved)
     proof = outcome["jitter_proof"]
-    return DONE if outcome["certificate"]["certified"] and (proof is None or proof["certified"]) else DOES_NOT_HOLD
+    return DONE if holds and (proof is None or proof["certified"]) else DOES_NOT_HOLD
 
 
 def _parser() -> Parser:
@@ -94,7 +103,7 @@ def _parser() -> Parser:
     add_loop_options(parser)
     parser.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="what to certify (default: the coupling's own)")
-    jitter = "safe under any switching of the forces' delays in this range too [samples]; spring-damper, closed-loop"
+    jitter = "safe under any switching of the forces' delays in this range too [samples]; for closed-loop designs"
     parser.add_argument("--jitter", metavar="LO,HI", help=jitter)
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", metavar="N", help="states per channel (default 1)")
@@ -106,6 +115,7 @@ def _parser() -> Parser:
     optimal.add_argument("--objective", choices=OBJECTIVES, help="which mismatch is minimised (default rms)")
     optimal.add_argument("--high-gain", metavar="G", help="limit of |F|/|E| above 100 Hz, or none (default 1.5)")
     optimal.add_argument("--margin", metavar="SHARE", help="of the damping that stays unused (default 0.005)")
+    parser.add_argument("--samples", metavar="N", help=f"environments drawn from inside a box (default {SAMPLES})")
     both = parser.add_argument_group("ccl and optimal")
     both.add_argument("--full", action="store_true", help="across channels (default: diagonal)")
     add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case>.json)")
@@ -154,8 +164,9 @@ def _switching(args: argparse.Namespace, channels: int) -> dict[str, Any]:
     """The range of delays that a design must bear. Raises InputError."""
     if args.jitter is None:
         return {}
-    if args.coupling != "spring-damper" or args.condition != "closed-loop":
-        raise InputError("--jitter is for --coupling spring-damper with --condition closed-loop")
+    condition = args.condition or KINDS[args.coupling][0]
+    if args.coupling not in ("spring-damper", "optimal") or condition != "closed-loop":
+        raise InputError("--jitter is for --coupling optimal, or spring-damper with --condition closed-loop")
     lo, hi = ranges("--jitter", args.jitter, channels)
     if any(not 0 <= a <= b <= LONGEST_DELAY for a, b in zip(lo, hi, strict=True)):
         raise InputError(f"--jitter is {args.jitter!r}, expected 0 <= LO <= HI <= {LONGEST_DELAY} samples")
@@ -171,14 +182,43 @@ def _switching_figures(loop: Loop, E: Lti, coupling: Coupling, switching: Range 
     return switching_part(found, G, *switching)
 
 
-def _store(loop: Loop, design: Design, out: Path) -> dict[str, Any]:
-    """Save the coupling with the proof of its condition, or without where there is none yet."""
+def _samples(args: argparse.Namespace) -> int:
+    (samples,) = numbers("--samples", args.samples or str(SAMPLES), int, 1)
+    if not 0 <= samples <= 10_000:
+        raise InputError(f"--samples is {samples}, allowed are 0 to 10000")
+    return samples
+
+
+def _price(args: argparse.Namespace, loop: Loop, design: Design, options: dict[str, Any]) -> list[dict[str, Any]]:
+    """The coupling over the box; an optimal one beside the one for the nominal environment alone."""
+    couplings = {args.coupling: design.coupling}
+    if args.coupling == "optimal":
+        couplings = {"whole set": design.coupling}
+        try:
+            alone = design_coupling(specification(loop.at(loop.environment)), "optimal", None, **options)
+            couplings = {"nominal only": alone.coupling, **couplings}
+        except DesignFailed:  # the set is given another basis by default
+            pass
+    return [cost_part(row) for row in price(loop, couplings)]
+
+
+def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path) -> dict[str, Any]:
+    """Save the coupling with the proof of its condition, or without where there is none yet.
+
+    What is not proved for a whole set is kept as what it is: a coupling for the nominal environment.
+    """
     data = data_of(design.coupling)
     phi = None if design.phi is None else design.phi.tolist()
-    try:
-        certificate, reason = prove(loop, data, design.condition, phi), None
-    except NotProved as error:
-        certificate, reason = None, str(error)
+    certificate: Certificate | None = None
+    reason = None
+    if whole and whole.certificate and design.condition == "closed-loop":
+        certificate = whole.certificate
+    else:
+        loop = loop if design.condition == "theorem4" else loop.at(loop.environment)
+        try:
+            certificate = prove(loop, data, design.condition, phi)
+        except NotProved as error:
+            reason = str(error)
     try:
         save(Stored(loop, data, certificate), out)
     except OSError as error:
@@ -202,6 +242,8 @@ def _table(outcome: dict[str, Any]) -> Table:
         span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))
         needs = f"needs {_list(part['required_damping'])}: {word} (proof: {part['proof']})"
         table.add_row("damping, any switching", f"{span} samples: {needs}")
+    for row in set_rows(outcome["set"]) if outcome["set"] else []:
+        table.add_row(*row)
     table.add_row("promise", outcome["promise"] or "none")
     table.add_row(outcome["objective_name"], f"{outcome['objective']:.5g}")
     rms = transparent["rms_mismatch_db"]
@@ -217,6 +259,23 @@ def _comparison(rows: list[dict[str, Any]]) -> Table:
     for row in rows:
         norm = "-" if row["norm"] is None else f"{row['norm']:.4g}"
         table.add_row(row["method"], norm, str(row["sdps"]), f"{row['wall_s']:.1f}")
+    return table
+
+
+def _costs(rows: list[dict[str, Any]]) -> Table:
+    """Each figure in the nominal environment, and the worst of the set."""
+    title = "in the nominal environment / at the worst vertex"
+    table = Table(
+        "coupling", "needs of its damping", "vertices violated", "rms mismatch", "relative mismatch", title=title
+    )
+    for row in rows:
+        pairs = [row[name] for name in ("required_over_available", "rms_mismatch_db", "relative_mismatch_db")]
+        needs, rms, sup = (
+            ["-" if v is None else f"{v:.{4 - 2 * (n > 0)}f}" for v in p.values()] for n, p in enumerate(pairs)
+        )
+        table.add_row(
+            row["coupling"], " / ".join(needs), str(row["violated"]), f"{' / '.join(rms)} dB", f"{' / '.join(sup)} dB"
+        )
     return table
 
 

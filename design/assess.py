@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from controller.box import inside, members, shrunk
 from controller.contact import frozen_states, held
 from controller.coupling import Compliance, Coupling, SpringDamper
 from controller.environment import Network, environment
@@ -15,19 +16,34 @@ from design.margin import Requirement, closed_loop, refusal, theorem4, theorem4_
 from design.specification import Specification
 from design.store import Condition, Loop, data_of
 
+TRIED, TRIAL_SEED = 64, 0xB0C5  # points of a box where a design is tried; a seed that no check is likely to draw from
+
 CONDITIONS: tuple[Condition, ...] = ("theorem4", "closed-loop")
 
 
 def specification(loop: Loop) -> Specification:
     """The loop as a request for a design, every wall touching. Raises ValueError naming the field that is wrong."""
-    return Specification(environment(held(loop.environment), loop.T), loop.theta, loop.psi, loop.lam, loop.delta)
+    E = environment(held(loop.environment), loop.T)
+    if loop.box is None:
+        return Specification(E, loop.theta, loop.psi, loop.lam, loop.delta)
+    box = loop.box
+
+    def others(factor: float = 1.0) -> dict[str, Lti]:
+        _, *vertices = members(loop.environment, box if factor == 1 else shrunk(loop.environment, box, factor))
+        return {vertex.name: environment(vertex.network, loop.T) for vertex in vertices}
+
+    drawn = {m.name: environment(m.network, loop.T) for m in inside(loop.environment, box, TRIED, TRIAL_SEED)}
+    delays = (loop.theta, loop.psi, loop.lam)
+    return Specification(E, *delays, loop.delta, others=others(), inside=drawn, shrunk=others)
 
 
 def assess(loop: Loop, coupling: Coupling, phi: Array | None = None) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
 
-    Where there are walls, closed-loop is about the frozen contact state that asks for most.
+    closed-loop is about the nominal environment alone (design.set_check asks for the rest of its box), and where there
+    are walls about the frozen contact state that asks for most.
     """
+    loop = loop.at(loop.environment)
     any_environment = theorem4_of(loop.environment, loop.T, coupling, loop.theta, loop.psi, loop.delta, phi)
     this_environment = closed_loop_of(loop.environment, loop.T, coupling, loop.theta, loop.psi, loop.delta)
     return {

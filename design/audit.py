@@ -12,6 +12,7 @@ from controller.coupling import Coupling, NoCoupling, SpringDamper
 from design.audit_report import print_report, report
 from design.jitter_part import Range
 from design.presets import PRESETS
+from design.set_check import check_set
 from design.subject import LONGEST_DELAY, Subject
 from sim.command import (
     DOES_NOT_HOLD,
@@ -43,20 +44,21 @@ STIFFNESSES, DAMPINGS = (1e-3, 1e9, "N/m"), (0.0, 1e6, "N s/m")
 
 
 def main(argv: list[str]) -> int:
-    """Audit a coupling. 0: safe in this environment, 1: not."""
+    """Audit a coupling. 0: safe in this environment and at every vertex of its box, 1: not."""
     args = _with_preset(_parser().parse_args(argv))
-    seed_from(args)
+    seed = seed_from(args)
     scenario = scenario_from(args)
     subject = _subject(args, scenario)
     switching = _range(args, subject)
     out = out_folder(args, "audit")
 
     begin = time.perf_counter()
+    whole = None if args.rigid else check_set(scenario.loop(args.case), subject.coupling, seed)
     outcome = {
         "case": args.case,
         "scenario": None if args.rigid else scenario.name,
         "preset": args.preset and {"name": args.preset, "source": PRESETS[args.preset].source},
-        **report(subject, switching),
+        **report(subject, switching, whole, None if args.rigid else scenario.holders),
         "notes": doubts(read_coupling(args.coupling), scenario.loop(args.case)) if args.coupling else [],
         "wall_s": time.perf_counter() - begin,
     }

@@ -9,25 +9,42 @@ from typing import Any, get_args
 from rich.console import Console
 from rich.table import Table
 
-from controller.coupling import Compliance, NoCoupling, SpringDamper
+from controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
+from controller.lti import SingularLoop
 from design.audit_figures import Stiffest, Tolerance, stiffest, tolerance
 from design.audit_remedies import remedies
+from design.human_structure import separate_humans_part
 from design.jitter_part import Range, switching_part
 from design.margin import Requirement
-from design.promises import CAVEATS, certificate_part, promise
+from design.promises import ANY, CAVEATS, certificate_part, promise
+from design.set_check import SetCheck, set_part, set_rows
 from design.store import Condition
 from design.subject import Subject
 
-KINDS = {NoCoupling: "none", SpringDamper: "spring-damper", Compliance: "compliance"}
+KINDS = {
+    NoCoupling: "none",
+    SpringDamper: "spring-damper",
+    Compliance: "compliance",
+    InternalModel: "internal-model",
+}
 
 
-def report(subject: Subject, switching: Range | None = None) -> dict[str, Any]:
+def report(
+    subject: Subject,
+    switching: Range | None = None,
+    whole: SetCheck | None = None,
+    holders: Sequence[int] | None = None,
+) -> dict[str, Any]:
     """Both conditions with what surrounds them; SI units, null with a "reason" where a figure does not exist.
 
-    With a range of delays also the damping that any switching within it asks.
+    With a range of delays also the damping that any switching within it asks; `whole` is the same coupling over the
+    box around the environment, if there is one, `holders` who holds each device.
     """
     requirements = {condition: subject.requirement(condition) for condition in reversed(get_args(Condition))}
     closed_loop, theorem4 = requirements["closed-loop"].certified, requirements["theorem4"].certified
+    proved = bool(whole and whole.proved)
+    rigid = subject.network is None
+    promised = promise(closed_loop and theorem4, closed_loop, rigid=rigid, walls=subject.walls, whole_set=proved)
     gains = subject.coupling if isinstance(subject.coupling, SpringDamper) else None
     return {
         "coupling": {
@@ -44,8 +61,10 @@ def report(subject: Subject, switching: Range | None = None) -> dict[str, Any]:
         },
         **{condition: _condition_part(subject, requirement) for condition, requirement in requirements.items()},
         "jitter-proof": _switching_part(subject, switching) if switching else None,
-        "certified": closed_loop,
-        "promise": promise(closed_loop and theorem4, closed_loop, rigid=subject.network is None, walls=subject.walls),
+        "separate-humans": _separate_part(subject, holders) if holders else None,
+        "set": whole and set_part(whole),
+        "certified": closed_loop and (whole is None or proved or promised == ANY),
+        "promise": promised,
         "helps": _helps(subject, requirements["theorem4" if closed_loop else "closed-loop"]),
         "not_covered": CAVEATS,
     }
@@ -56,6 +75,18 @@ def _condition_part(subject: Subject, requirement: Requirement) -> dict[str, Any
         "stiffest": _stiffest_part(stiffest(subject, requirement.condition)),
         "sensitivity": _sensitivity_part(subject, requirement, tolerance(subject, requirement)),
     }
+
+
+def _separate_part(subject: Subject, holders: Sequence[int]) -> dict[str, Any] | None:
+    """What the closed-loop condition asks if these humans are separate; None where there is no single loop."""
+    if subject.network is None or subject.network.walls:
+        return None
+    try:
+        F = subject.F
+    except SingularLoop:
+        return None
+    delays = (subject.theta, subject.psi)
+    return separate_humans_part(F, subject.delta, holders, subject.coupling, subject.network, delays)
 
 
 def _switching_part(subject: Subject, switching: Range) -> dict[str, Any]:
@@ -107,6 +138,11 @@ def print_report(report: dict[str, Any], console: Console) -> None:
     for name, cell in ROWS.items():
         table.add_row(name, *(cell(part) for part in parts))
     console.print(table)
+    if report["set"]:
+        over = Table(title="the box around the environment", title_justify="left", show_header=False)
+        for row in set_rows(report["set"]):
+            over.add_row(*row)
+        console.print(over)
     for line in _remarks(report):
         console.print(f"[dim]·[/] {line}")
 
@@ -115,6 +151,8 @@ def _verdict(report: dict[str, Any]) -> str:
     coupling = report["coupling"]
     gains = f" K {_list(coupling['K'])} N/m, B {_list(coupling['B'])} N s/m" if coupling["K"] else ""
     outcome = f"[green]certified[/] for {report['promise']}" if report["certified"] else "[red]not certified[/]"
+    if report["promise"] and not report["certified"]:
+        outcome += f" for the set, only for {report['promise']}"
     return f"{coupling['kind']}{gains}: {outcome}"
 
 
@@ -178,6 +216,10 @@ def _remarks(report: dict[str, Any]) -> list[str]:
         lines.append(f"What helps: {helping['change']} ({need}).")
     if (part := report["jitter-proof"]) is not None:
         lines += _switching_remarks(part)
+    if (part := report["separate-humans"]) is not None and len(set(part["weights"])) > 1:
+        proof = ", proved exactly" if part["proof"] == "rational" else ""
+        weights = f"weights {_list(part['weights'])}"
+        lines.append(f"As each human holds devices of his own ({weights}) it needs {_needs(part)}{proof}.")
     return [*lines, report["not_covered"]]
 
 

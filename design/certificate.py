@@ -13,6 +13,9 @@ Delta_V > 0, as V-hat carries the same factor: V-hat is stable and output strict
 passive because every parameter of the network is non-negative (the Network type refuses others), so
 Phi = 0 satisfies Lemma 4, whatever the environment.
 
+With a box around the environment the same is proved for the environment (P) and for every vertex (P1, P2, ..); nothing
+is proved of the environments in between, or of one that changes.
+
 theorem4, psi >= 1: a multiplier Phi, stored too, and two blocks (design.delayed_proof); it is of this environment.
 """
 
@@ -29,12 +32,11 @@ import scipy
 
 from controller import coupling as controller_coupling
 from controller.environment import environment
-from controller.lti import SingularLoop
-from controller.process import force_map
 from design import exact, margin
 from design.delayed import theorem4_delayed
 from design.delayed_proof import coupling_block, environment_block
 from design.exact import Exact
+from design.members import in_each, worst
 from design.positive_real import find_storage, prove_positive_real
 from design.rational import Matrix, SingularMatrix, definiteness, rational
 from design.store import Certificate, Condition, CouplingData, Loop, Stored, digest, sealed
@@ -69,16 +71,16 @@ def prove(loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequenc
     if not requirement.certified:
         needed = ", ".join(f"{d:.6g}" for d in requirement.required)
         have = ", ".join(f"{d:.6g}" for d in requirement.available)
-        raise NotProved(requirement.reason or f"needs {needed} N s/m of damping, has {have}", requirement)
+        reason = requirement.reason or f"needs {needed} N s/m of damping, has {have}"
+        place = f"P{worst(in_each(loop, coupling.build(loop.T), loop.members()))}" if loop.box else "P"
+        raise NotProved(f"{_place(loop, condition, place)}{reason}", requirement)
     proof: dict[str, Matrix] = {}
     for name, block in _blocks(loop, coupling, condition, multiplier).items():
-        if block.order > LARGEST:
-            reason = f"a proof over {block.order} states takes minutes: up to {LARGEST} are tried"
-            raise NotProved(reason, requirement)
+        _require_size(block, requirement)
         P, reason = find_storage(block)
         if P is None:
             asked = f"the sweep asks {requirement.ratio:.9f} of the available damping"
-            raise NotProved(f"{reason}; {asked}", requirement)
+            raise NotProved(f"{_place(loop, condition, name)}{reason}; {asked}", requirement)
         proof[name] = P
     if multiplier is not None:
         proof["Phi"] = Matrix.of([multiplier])
@@ -118,19 +120,16 @@ def verify(stored: Stored) -> Verdict:
 def required_damping(
     loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequence[Fraction] | None = None
 ) -> margin.Requirement:
-    """The damping that the condition asks, from a refined sweep. Raises NotProved where it is undefined.
+    """The damping that the condition asks, from a refined sweep: closed-loop, the most over all members of the set.
 
-    theorem4 with psi >= 1 needs the multiplier phi, and closed-loop an algebraic loop that has a solution.
+    Raises NotProved where it is undefined: theorem4 with psi >= 1 needs the multiplier phi.
     """
     built = coupling.build(loop.T)
     if loop.environment.walls and (condition == "closed-loop" or any(loop.psi)):
         raise NotProved("of walls only theorem4 without delay in the environment is proved; the rest is for linear E")
     if condition == "closed-loop":
-        try:
-            F = force_map(environment(loop.environment, loop.T), built, loop.theta, loop.psi)
-        except SingularLoop as error:
-            raise NotProved(str(error)) from None
-        return margin.closed_loop(F, loop.delta)
+        requirements = in_each(loop, built, loop.members())
+        return requirements[worst(requirements)]
     match built:
         case controller_coupling.SpringDamper():
             V = built.compliance(loop.T)
@@ -156,15 +155,28 @@ def no_compliance(coupling: controller_coupling.Coupling) -> str:
     return "without a coupling there is nothing that Theorem 4 could use"
 
 
-def _promise(loop: Loop, condition: Condition) -> Literal["any passive environment", "this environment"]:
-    return "any passive environment" if condition == "theorem4" and not any(loop.psi) else "this environment"
+def _promise(loop: Loop, condition: Condition) -> Literal["any passive environment", "a set", "this environment"]:
+    if condition == "theorem4":
+        return "this environment" if any(loop.psi) else "any passive environment"
+    return "a set" if loop.box else "this environment"
+
+
+def _place(loop: Loop, condition: Condition, matrix: str) -> str:
+    """Which member of a set the matrix P, P1, P2, .. is about, as the beginning of a message."""
+    if loop.box is None or condition == "theorem4":
+        return ""
+    return f"{loop.members()[int(matrix[1:] or 0)].name}: "
 
 
 def _blocks(
     loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequence[Fraction] | None
 ) -> dict[str, Exact]:
     """The blocks that must be strictly positive real, by the name of the matrix that proves it. Raises NotProved."""
-    if condition == "closed-loop" or not any(loop.psi):
+    if condition == "closed-loop":
+        names = [f"P{i or ''}" for i in range(len(loop.members()))]
+        loops = [loop.at(member.network) for member in loop.members()]
+        return {name: _block(each, coupling, condition) for name, each in zip(names, loops, strict=True)}
+    if not any(loop.psi):
         return {"P": _block(loop, coupling, condition)}
     assert phi is not None  # required_damping has refused the rest
     T, delta = rational(loop.T), [rational(d) for d in loop.delta]
@@ -187,6 +199,7 @@ def _block(loop: Loop, coupling: CouplingData, condition: Condition) -> Exact:
     try:
         if condition == "closed-loop":
             F = exact.force_map(exact.environment(loop.environment, T), built, loop.theta, loop.psi, T)
+            _require_size(F)  # splitting it takes minutes too
             F1, R = F.split_at_one()
             _require_static("F(1)", F1)
             return Exact(R.A, R.B, R.C, Matrix.diag(d / T for d in delta) - F1.scaled(Fraction(1, 2)))
@@ -196,6 +209,12 @@ def _block(loop: Loop, coupling: CouplingData, condition: Condition) -> Exact:
         raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
     _require_symmetric("H(1)", H1)
     return Exact(R.A, R.B, -R.C, H1.scaled(Fraction(1, 2)))
+
+
+def _require_size(block: Exact, requirement: margin.Requirement | None = None) -> None:
+    if block.order > LARGEST:
+        reason = f"a proof over {block.order} states takes minutes: up to {LARGEST} are tried"
+        raise NotProved(reason, requirement)
 
 
 def _require_symmetric(name: str, value: Matrix) -> None:
@@ -232,12 +251,14 @@ def _refuted_proof(loop: Loop, coupling: CouplingData, certificate: Certificate)
     """Why the matrices prove nothing, or None if they prove the condition."""
     phi = _multiplier(certificate)
     blocks = _blocks(loop, coupling, certificate.condition, phi)
-    expected = {*blocks, *(["Phi"] if len(blocks) > 1 else [])}
+    expected = {*blocks, *(["Phi"] if "P_E" in blocks else [])}
     if set(certificate.matrices) != expected:
         found = ", ".join(certificate.matrices) or "none"
         return f"matrices are {found}, expected {', '.join(sorted(expected))}"
-    reasons = (_refuted_block(name, block, certificate.matrices[name]) for name, block in blocks.items())
-    return next((reason for reason in reasons if reason), None)
+    for name, block in blocks.items():
+        if reason := _refuted_block(name, block, certificate.matrices[name]):
+            return f"{_place(loop, certificate.condition, name)}{reason}"
+    return None
 
 
 def _refuted_block(name: str, block: Exact, rows: Sequence[Sequence[str]]) -> str | None:

@@ -50,6 +50,7 @@ def _result(stored: Stored, verdict: Verdict, seconds: float) -> dict[str, Any]:
         "condition": claim and claim.condition,
         "promise": claim.promise if claim and verdict.proved else None,
         "proof": claim.proof if claim and verdict.proved else None,
+        "vertices": len(stored.loop.members()) - 1 if stored.loop.box else None,
         "required_damping": claim and claim.required,
         "available_damping": stored.loop.delta,
         "margin": claim and claim.margin,

@@ -14,16 +14,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
 
+from controller.coupling import Coupling
+from controller.environment import Network
 from controller.lti import Array, Lti
+from design import exact
+from design.exact import Exact
 from design.margin import Requirement, closed_loop
+from design.positive_real import find_storage
+from design.promises import certificate_part
+from design.rational import Matrix, SingularMatrix, definiteness, rational
 from design.sweep import on_circle
 
 RECIPROCAL = 1e-6  # relative difference of |F_ij| and |F_ji| that is taken for rounding
 LARGEST_RATIO = 1e4  # between two weights
+LARGEST = 60  # states of a model that a proof is tried for, as in design.certificate
 
 
 def weighted(F: Lti, d: Array) -> Lti:
@@ -48,6 +58,36 @@ def reciprocal(F: Lti) -> bool:
     size = np.abs(F.at(on_circle(np.geomspace(1e-3, np.pi, 60))))
     difference = np.abs(size - np.swapaxes(size, 1, 2)).max(axis=(1, 2))
     return bool((difference <= RECIPROCAL * size.max(axis=(1, 2))).all())
+
+
+def proved(F: Exact, delta: Sequence[float], d: Sequence[float], T: float) -> bool:
+    """Whether the weighted condition is proved in exact arithmetic; F is the exact force map."""
+    try:
+        static, R = (Exact.constant(Matrix.diag(d)) @ F).split_at_one()
+    except SingularMatrix:
+        return False
+    if not static.equals(static.T) or not definiteness(static).semidefinite:
+        return False
+    damping = Matrix.diag(rational(w) * rational(b) / rational(T) for w, b in zip(d, delta, strict=True))
+    return find_storage(Exact(R.A, R.B, R.C, damping - static.scaled(Fraction(1, 2))))[0] is not None
+
+
+def separate_humans_part(
+    F: Lti,
+    delta: Sequence[float],
+    holders: Sequence[int],
+    coupling: Coupling,
+    network: Network,
+    delays: tuple[Sequence[int], Sequence[int]],
+) -> dict[str, Any]:
+    """The requirement for these holders as plain data, proved exactly where that is possible; delays (theta, psi)."""
+    requirement, d = closed_loop_of_separate_humans(F, delta, holders)
+    if requirement.certified and F.order <= LARGEST:
+        period = rational(F.T)
+        whole = exact.force_map(exact.environment(network, period), coupling, *delays, period)
+        if proved(whole, delta, d, F.T):
+            requirement = replace(requirement, proof="rational")
+    return certificate_part(requirement) | {"holders": list(holders), "weights": list(d)}
 
 
 def closed_loop_of_separate_humans(

@@ -8,10 +8,10 @@ from typing import Protocol
 
 import numpy as np
 
-from controller.delay import delay
 from controller.lti import Array, Lti
 from design.cone_program import Block, Complex
 from design.free_parameter import GivenParameter, Response, affine, bordered, loop_force
+from design.jitter import blocks
 from design.sweep import frequencies, hermitian, on_circle, peaks
 
 
@@ -68,22 +68,27 @@ class World:
 
     def delayed(self, z: Complex) -> Complex:
         """Psi E."""
-        return delay(self.psi, self.T).at(z) @ self.environment.at(z)
+        return late(self.psi, z) * self.environment.at(z)
 
     def force(self, z: Complex, Q: Parameter) -> Response:
         """F = Theta (Psi E - Psi E Q Psi E)."""
         constant, slope = loop_force(self.delayed(z), Q.at(z))
-        theta = delay(self.theta, self.T).at(z)
-        return theta @ constant, theta[:, None] @ slope
+        theta = late(self.theta, z)
+        return theta * constant, theta[:, None] * slope
 
     def mismatch(self, z: Complex, Q: Parameter) -> Response:
         """M = F - Lambda E (8)."""
         constant, slope = self.force(z, Q)
-        return constant - delay(self.lam, self.T).at(z) @ self.environment.at(z), slope
+        return constant - late(self.lam, z) * self.environment.at(z), slope
 
     def size(self, z: Complex) -> Array:
         """sigma_max(E), (k,)."""
         return np.linalg.norm(self.environment.at(z), 2, axis=(1, 2))
+
+
+def late(steps: Sequence[int], z: Complex) -> Complex:
+    """z^-n of each channel, as factors of the rows of a matrix, shape (k, m, 1)."""
+    return z[:, None, None] ** -np.array(steps)[:, None]
 
 
 def passivity(world: World, delta: Array) -> Inequality:
@@ -121,6 +126,29 @@ def high_frequency_limit(world: World, gain: float, above_hz: float) -> Inequali
 
     imposed = np.linspace(low, np.pi, 12)
     return Inequality(f"the limit above {above_hz:g} Hz", block, imposed, _swept(world, low=low))
+
+
+def switching(world: World, delta: Array, lo: Sequence[int], hi: Sequence[int]) -> Inequality:
+    """design.jitter's condition for forces whose ages switch within [lo, hi] [samples], scaled to Delta_D/T = I.
+
+    Its multiplier, one number per channel for all frequencies, is a shared unknown.
+    """
+    m, root = delta.size, np.sqrt(world.T / delta)
+    none = np.zeros(m)
+
+    def block(w: Array, Q: Parameter) -> Block:
+        z = on_circle(w)
+        constant, slope = loop_force(world.delayed(z), Q.at(z))
+        constant, slope = root[:, None] * constant * root, root[:, None] * slope * root
+        own = blocks(z, constant, none, lo, hi, np.ones(m), 1.0)
+        each = [blocks(z, slope[:, j], none, lo, hi, none, 1.0) for j in range(slope.shape[1])]
+        return Block(own, np.stack(each, axis=1) if each else np.zeros((z.size, 0, 2 * m, 2 * m), dtype=complex))
+
+    def multiplier(unit: Array) -> Array:
+        return blocks(np.array([-1.0 + 0j]), np.zeros((1, m, m), dtype=complex), unit, lo, hi, none, 1.0)[0].real
+
+    shared = {f"alpha {i + 1}": multiplier(unit) for i, unit in enumerate(np.eye(m))}
+    return Inequality("the condition for switching delays", block, _imposed(world, 40), _swept(world), shared)
 
 
 BOUND = "bound"  # the shared unknown that a sup objective minimises

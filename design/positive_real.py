@@ -150,7 +150,7 @@ def _least_eigenvalue(G: Lti) -> tuple[float, float]:
 def _riccati(G: Lti, margin: float, share: float) -> Array:
     n, m = G.B.shape
     gain = np.linalg.norm(_states(G), 2, axis=(1, 2)).max() ** 2
-    drive = (1 - share) * margin / max(gain, 1e-300)
+    drive = (1 - share) * margin / max(gain, 1.0)  # the gain is at least one unless no input reaches any state
     return -solve_discrete_are(G.A, G.B, -drive * np.eye(n), G.D + G.D.T - 2 * share * margin * np.eye(m), s=G.C.T)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from design.margin import Requirement
 from design.store import Loop
 
-ANY, HERE, WALL = "any passive environment", "this environment", "a rigid wall only"
+ANY, SET, HERE, WALL = "any passive environment", "a set", "this environment", "a rigid wall only"
 FROZEN = "each frozen contact state of this environment (contact that makes and breaks is not covered)"
 
 #: What no certificate covers.
@@ -38,18 +38,23 @@ def certificate_part(requirement: Requirement) -> dict[str, Any]:
     return part | ({"reason": requirement.reason} if requirement.reason else {})
 
 
-def promise(theorem4: bool, closed_loop: bool, rigid: bool = False, walls: bool = False) -> str | None:
+def promise(
+    theorem4: bool, closed_loop: bool, *, rigid: bool = False, walls: bool = False, whole_set: bool = False
+) -> str | None:
     """For which environments a coupling is certified, given which conditions hold.
 
-    `rigid` if E is a rigid wall that is never left, `walls` if contact is made and broken.
+    `rigid` if E is a rigid wall that is never left, `walls` if contact is made and broken, `whole_set` if closed-loop
+    is proved at every vertex of a box around E.
     """
     if theorem4:
         return ANY
+    if whole_set:
+        return SET
     return (WALL if rigid else FROZEN if walls else HERE) if closed_loop else None
 
 
-def promise_of(requirements: dict[str, Requirement], loop: Loop) -> str | None:
+def promise_of(requirements: dict[str, Requirement], loop: Loop, whole_set: bool = False) -> str | None:
     """The promise of a coupling by its requirements; the multiplier that psi >= 1 takes is of one environment."""
     held = {name: requirement.certified for name, requirement in requirements.items()}
     walls = bool(loop.environment.walls)
-    return promise(held["theorem4"] and not any(loop.psi), any(held.values()), walls=walls)
+    return promise(held["theorem4"] and not any(loop.psi), any(held.values()), walls=walls, whole_set=whole_set)

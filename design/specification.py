@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -27,6 +27,9 @@ class Specification:
     delta: tuple[float, ...]  # (N,) device dampings [N s/m]
     W1: Lti | None = None  # weight on the left of (22); the identity if None
     W2: Lti | None = None  # diagonal weight on its right; low_pass if None
+    others: Mapping[str, Lti] = field(default_factory=dict)  # by name: what else the environment may be, for `optimal`
+    inside: Mapping[str, Lti] = field(default_factory=dict)  # points of a box, where the design is tried
+    shrunk: Callable[[float], Mapping[str, Lti]] | None = None  # the others of a box with ranges so many times as wide
 
     def __post_init__(self) -> None:
         E = self.environment

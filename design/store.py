@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 
 from controller import coupling
+from controller.box import Box, Member, members
 from controller.environment import Network, environment
 from controller.lti import Array, Lti
 
@@ -33,7 +34,7 @@ class Strict(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Immutable, and refuses fields that it does not know."""
 
 
-class Loop(Strict, frozen=True):
+class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without a box has the digest that it always had
     """All that enters a condition beside the coupling."""
 
     T: Positive  # [s]
@@ -42,6 +43,7 @@ class Loop(Strict, frozen=True):
     lam: Steps  # (m,) delays of the reference [samples]; they matter to transparency only
     delta: tuple[Positive, ...]  # (m,) damping that the devices guarantee [N s/m]
     environment: Network
+    box: Box | None = None  # what else the environment may be
 
     def __post_init__(self) -> None:
         m = len(self.environment.contacts)
@@ -50,7 +52,19 @@ class Loop(Strict, frozen=True):
                 raise ValueError(f"{name} has {len(getattr(self, name))} entries, the environment has {m} contacts")
         if any(n > t + p for n, t, p in zip(self.lam, self.theta, self.psi, strict=True)):
             raise ValueError(f"lam is {list(self.lam)}, expected at most theta + psi on every channel")
-        environment(self.environment, self.T)  # raises ValueError if nothing holds an internal node
+        for member in self.members():
+            try:
+                environment(member.network, self.T)  # raises ValueError if nothing holds an internal node
+            except ValueError as error:
+                raise ValueError(f"{member.name}: {error}" if self.box else str(error)) from None
+
+    def members(self) -> tuple[Member, ...]:
+        """The environment, and the vertices of its box where it has one."""
+        return members(self.environment, self.box)
+
+    def at(self, network: Network) -> Loop:
+        """The loop around this environment, known exactly."""
+        return msgspec.structs.replace(self, environment=network, box=None)
 
 
 class NoCoupling(Strict, frozen=True, tag_field="kind", tag="none"):
@@ -122,7 +136,7 @@ class Certificate(Strict, frozen=True):
     required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep
     available: tuple[float, ...]  # (m,) [N s/m], the damping for which it is proved
     margin: float  # available / required
-    promise: Literal["any passive environment", "this environment"]
+    promise: Literal["any passive environment", "a set", "this environment"]
     proof: Literal["sampled", "kyp", "rational"]
     matrices: dict[str, tuple[tuple[Rational, ...], ...]]  # rationals "p/q"
     scenario: str  # digest of the loop and the coupling

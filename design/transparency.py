@@ -48,12 +48,13 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
     peak, _ = supremum(lambda w: np.linalg.norm(mismatch(w), 2, axis=(1, 2)), full)
     least, _ = supremum(lambda w: -sigma(environment, w, -1), full)
     static = np.linalg.svd(environment.dc(), compute_uv=False)
+    rounding = 1e-9 * float(np.abs(environment.D).max())  # a stiffness of zero comes out of larger numbers
     least = 0.0 if static[-1] < 1e-9 * static[0] else min(-least, float(static[-1]))
     return Transparency(
         tau=_ratio(peak, least),
         relative_mismatch=supremum(relative, grid)[0],
         rms_mismatch=_rms(mismatch, environment, grid),
-        dc_ratio=_ratio(float(np.linalg.norm(F.dc(), 2)), float(static[0])),
+        dc_ratio=_ratio(float(np.linalg.norm(F.dc(), 2)), float(static[0])) if static[0] > rounding else np.nan,
         high_frequency_gain=_high_frequency_gain(F, environment, 100.0 * per_hz),
         band_hz=band_hz,
     )

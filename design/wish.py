@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,7 @@ class Wish:
     objective: str = "rms"  # "rms" or "sup" of the mismatch over the band, relative to the environment
     high_gain: float | None = HIGH_GAIN
     margin: float = MARGIN
+    switching: tuple[Sequence[int], Sequence[int]] | None = None  # (lo, hi) [samples]: ages of forces that may switch
 
     def __post_init__(self) -> None:
         if not 1 <= self.functions <= 200:
@@ -42,11 +44,12 @@ class Wish:
         """Poles of the basis, (functions - 1,).
 
         fir: all at zero. slow: from 0.5 to 0.992, even in the logarithm of the time constant. mixed: a third at
-        zero, the rest slow. auto: mixed where theta >= 3 or psi >= 1, which no short FIR filter can wait for, else fir.
+        zero, the rest slow. auto: mixed where theta >= 3 or psi >= 1, which no short FIR filter can wait for, and for a
+        set of environments or delays that switch, which ask for more room; else fir.
         """
         n = self.functions - 1
-        waits = max(spec.theta) >= 3 or any(spec.psi)
-        kind = ("mixed" if waits else "fir") if self.filter == "auto" else self.filter
+        hard = max(spec.theta) >= 3 or any(spec.psi) or bool(spec.others) or bool(self.switching)
+        kind = ("mixed" if hard else "fir") if self.filter == "auto" else self.filter
         zero = {"fir": n, "slow": 0, "mixed": n // 3}[kind]
         slow = np.round(1 - np.geomspace(1 - FASTEST, 1 - SLOWEST, n - zero), 6)
         return np.concatenate([np.zeros(zero), slow])

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.box import Member
 from controller.coupling import Coupling
 from controller.lti import Array
 from models.crowd import Crowd, Variants, variants
@@ -40,14 +41,26 @@ class Question:
     engine: str  # exact | mujoco | both
     duration: float  # [s] of the traces; 0 for none
     threads: int = 0  # of MuJoCo; 0 for all
+    environments: tuple[Member, ...] = ()  # that the humans are spread over; empty: all meet the scenario's own
 
     @property
     def ticks(self) -> int:
         return round(self.duration / self.scenario.T)
 
     def batches(self) -> list[range]:
-        """All indices, in ranges of BATCH."""
-        return [range(i, min(i + BATCH, self.humans)) for i in range(0, self.humans, BATCH)]
+        """All indices, BATCH of them at a time, all in one environment."""
+        spread = max(1, len(self.environments))
+        each = [range(i, self.humans, spread) for i in range(min(spread, self.humans))]
+        return [indices[i : i + BATCH] for indices in each for i in range(0, len(indices), BATCH)]
+
+    def environment(self, index: int) -> Member | None:
+        """What the humans of this index meet, None for the scenario's own environment: each in turn."""
+        return self.environments[index % len(self.environments)] if self.environments else None
+
+    def scenario_of(self, index: int) -> Scenario:
+        """The scenario with the environment that the humans of this index meet."""
+        member = self.environment(index)
+        return self.scenario.replace(environment=member.network, box=None) if member else self.scenario
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +92,11 @@ class Findings:
 
 
 def examine(question: Question, indices: Sequence[int], ticked: Callable[[int], None] = lambda ticks: None) -> Findings:
-    """Decide and simulate the humans of `indices`; `ticked` hears of every tick simulated for all of them."""
-    scenario = question.scenario
+    """Decide and simulate the humans of `indices`, who all meet the same environment.
+
+    `ticked` hears of every tick simulated for all of them.
+    """
+    scenario = question.scenario_of(indices[0])
     assembly = assemble(scenario, question.coupling)
     parts = [
         _group(question, assembly, index, crowd, ticked)

@@ -25,8 +25,13 @@ STYLES: tuple[dict[str, Any], ...] = (
 )
 
 
-def plot_run(result: Result, path: Path, title: str, frequency_hz: float) -> Path:
-    """Displacements and forces over the whole run, and six periods of `frequency_hz` where it is strongest."""
+def plot_run(
+    result: Result, path: Path, title: str, frequency_hz: float, ideal: tuple[Array, float | None] | None = None
+) -> Path:
+    """Displacements and forces over the whole run, and six periods of `frequency_hz` where it is strongest.
+
+    `ideal`: forces (N, m) [N] of the ideal environment, drawn behind the others, and how far they are from it [%].
+    """
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(2, 2, figsize=(11, 6), layout="constrained", width_ratios=(2, 1), sharex="col")
@@ -41,7 +46,9 @@ def plot_run(result: Result, path: Path, title: str, frequency_hz: float) -> Pat
                 )
             axes[row, column].grid(alpha=0.3)
         axes[row, 0].set_ylabel(label)
-    handles, labels = axes[0, 0].get_legend_handles_labels()
+    if ideal:
+        _draw_ideal(axes[1], result, ideal, (slice(None), near))
+    handles, labels = axes[1, 0].get_legend_handles_labels()
     order = np.argsort(labels)
     figure.legend([handles[i] for i in order], [labels[i] for i in order], loc="outside lower center", ncols=6)
     axes[0, 1].set_title("zoom: where the forces change fastest", fontsize=10)
@@ -57,6 +64,18 @@ def plot_run(result: Result, path: Path, title: str, frequency_hz: float) -> Pat
         return write(path, content)
     finally:
         plt.close(figure)
+
+
+def _draw_ideal(axes: Array, result: Result, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
+    """The ideal forces, broad and pale behind the rendered ones; cut where they are more than three times as large."""
+    forces, percent = ideal
+    label = "ideal environment" + ("" if percent is None else f" (force error {percent:.2g} %)")
+    for axis, part in zip(axes, parts, strict=True):
+        most = 3 * max(map(abs, axis.get_ylim()))
+        lines = axis.plot(result.t[part], forces[part], color="#BBBBBB", linewidth=2.5, zorder=1)
+        lines[0].set_label(label)
+        low, high = axis.get_ylim()
+        axis.set_ylim(max(low, -most), min(high, most))
 
 
 def plot_accuracy(rows: list[dict[str, Any]], path: Path) -> Path:

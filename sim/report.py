@@ -10,6 +10,7 @@ from rich.table import Table
 
 from controller.lti import Array
 from design.promises import ANY, CAVEATS, finite
+from design.set_check import set_rows
 from sim.loop import Record
 from sim.one_period import frozen_modes, worst_mode
 from sim.simulate import Assembly
@@ -176,10 +177,12 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(
             (f"damping, {part['condition']}", f"needs {need} of {_list(part['available_damping'])} N s/m: {word}")
         )
+    rows += set_rows(report["set"]) if report["set"] else []
     rows.append(("promise", f"holds for {report['promise']}" if report["promise"] else "none"))
     rows.append(
         ("relative mismatch", f"{_db(transparent['relative_mismatch_db'])} (rms {_db(transparent['rms_mismatch_db'])})")
     )
+    rows.append(("force error", _force_error(report["ideal_force"])))
     rows.append(("static stiffness felt", f"{100 * transparent['dc_ratio']:.1f} %" if transparent["dc_ratio"] else "-"))
     rows.append(("growth, eigenvalues", _growth(stability)))
     growth = stability["growth_rate_per_s"]
@@ -193,6 +196,8 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         contact = stability["contact"]
         rows.append(("contact", f"made {contact['made']} times, lasting {contact['ticks']} of {run['samples']} ticks"))
         rows += [(f"growth, {_walls(state['touching'])}", _growth(state)) for state in contact["frozen"]]
+    if report["set"]:
+        rows.append(("simulated in", run["environment"]))
     rows.append(("clipped ticks", f"{stability['clipped_ticks']} of {run['samples']}"))
     engine = run["engine"] + (f" {run['integrator']} x {run['substeps']}" if run["integrator"] else "")
     rows.append(
@@ -244,6 +249,12 @@ def varying(jitter: dict[str, Any]) -> list[tuple[str, str]]:
         needs = f"needs {_list(proof['required_damping'])} of {_list(proof['available_damping'])} N s/m: {word}"
         rows.append(("damping, any switching", needs))
     return [*rows, ("these delays covered", "[green]yes[/]" if jitter["covered"] else "[yellow]no[/]")]
+
+
+def _force_error(part: dict[str, Any]) -> str:
+    if part["error_percent"] is None:
+        return f"- ({part['reason']})"
+    return f"{part['error_percent']:.3g} % rms, against Lambda E for the same motion"
 
 
 def _verdict(word: str | None) -> str:

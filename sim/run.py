@@ -12,6 +12,7 @@ from typing import Any
 
 from design.assess import CONDITIONS, assess
 from design.promises import certificate_part, promise_of
+from design.set_check import SetCheck, check_set, set_part
 from design.summary import coupling_part, transparency_part
 from design.transparency import transparency
 from sim import jitter_report, report, reproducibility
@@ -33,11 +34,12 @@ from sim.couplings import NAMES, Chosen, choose
 from sim.drawn import switching
 from sim.files import write, write_json
 from sim.human_file import load_humans
+from sim.ideal import Likeness, likeness
 from sim.jitter_options import add_jitter_options, with_jitter
 from sim.loop import Record
 from sim.mujoco_engine import INTEGRATORS, LEAPFROG
 from sim.result import Result
-from sim.scenario import InputError
+from sim.scenario import InputError, Scenario
 from sim.simulate import ENGINES, Assembly, assemble, simulate
 from sim.substeps import LEAST, MOST, check_substeps, default_substeps
 from sim.worst_switching import Period
@@ -54,11 +56,13 @@ def main(argv: list[str]) -> int:
         scenario = scenario.replace(human=people.human, person=people.person)
     asked, seed, out = _substeps(args), seed_from(args), out_folder(args, "run")
     chosen = choose(scenario, args.case, args.coupling, args.condition)
-    assembly, period = assemble(scenario, chosen.coupling), None
+    where, simulated = _environment(args, scenario)
+    assembly, period = assemble(simulated, chosen.coupling), None
     if args.engine == "exact" and assembly.friction:
         raise InputError("--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco")
     if scenario.switches:
         assembly, period = switching(assembly, chosen.coupling, seed, scenario.samples)
+    whole = check_set(scenario.loop(args.case), chosen.coupling, seed)
     substeps, warnings = _settled(args, assembly, asked)
 
     with (bar := progress_bar("simulating"))[0]:
@@ -67,10 +71,12 @@ def main(argv: list[str]) -> int:
         wall = time.perf_counter() - begin
     exact = record if args.engine == "exact" else _exact(assembly, record)
 
-    outcome = _outcome(args, chosen, assembly, period, record, exact, wall)
-    outcome["run"] |= {"substeps": substeps, "seed": seed}
+    alike = likeness(assembly, record, scenario.loop(args.case).lam)
+    outcome = _outcome(args, chosen, assembly, period, record, exact, wall, whole)
+    outcome["ideal_force"] = alike.part()
+    outcome["run"] |= {"substeps": substeps, "seed": seed, "environment": where}
     outcome["remarks"] = [*warnings, *outcome["remarks"]]
-    outcome["files"] = [str(p) for p in _save(args, out, assembly, record, outcome)]
+    outcome["files"] = [str(p) for p in _save(args, out, assembly, record, alike, outcome)]
     report.print_report(outcome, console(args))
     if args.json:
         write_json(args.json, outcome)
@@ -96,6 +102,9 @@ def _parser() -> Parser:
     parser.add_argument("--substeps", metavar="N", help="MuJoCo steps per period (default 4, more where needed)")
     parser.add_argument("--duration", metavar="SECONDS", help="default: the scenario's")
     parser.add_argument("--human", metavar="FILE.toml", help="other humans: [[human]] per channel, [[person]]")
+    parser.add_argument(
+        "--vertex", metavar="N", help="simulate at this vertex of the scenario's box (default 0: nominal)"
+    )
     parser.add_argument("--no-plot", action="store_true", help="write no picture")
     add_output_options(parser)
     return parser
@@ -109,6 +118,16 @@ def _substeps(args: argparse.Namespace) -> int | None:
     if not 1 <= substeps <= MOST:
         raise InputError(f"--substeps is {substeps}, allowed are 1 to {MOST}")
     return substeps
+
+
+def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Scenario]:
+    """Which environment is simulated, and the scenario with that one, known exactly. Raises InputError."""
+    members = scenario.loop(args.case).members()
+    (vertex,) = numbers("--vertex", args.vertex or "0", int, 1)
+    if not 0 <= vertex < len(members):
+        why = f"allowed are 0 to {len(members) - 1}" if scenario.box else "but the scenario has no box"
+        raise InputError(f"--vertex is {vertex}, {why}")
+    return members[vertex].name, scenario.replace(environment=members[vertex].network, box=None)
 
 
 def _settled(args: argparse.Namespace, assembly: Assembly, asked: int | None) -> tuple[int | None, list[str]]:
@@ -133,6 +152,7 @@ def _outcome(
     record: Record,
     exact: Record | None,
     wall: float,
+    whole: SetCheck | None,
 ) -> dict[str, Any]:
     scenario, samples = assembly.scenario, record.s.shape[0]
     loop = scenario.loop(args.case)
@@ -151,7 +171,8 @@ def _outcome(
         "coupling": coupling_part(chosen.kind, chosen.coupling, scenario.T),
         "certificate": certificates[chosen.condition],
         "certificates": certificates,
-        "promise": promise_of(requirements, loop),
+        "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
+        "set": whole and set_part(whole),
         "transparency": transparency_part(transparency(assembly.felt, assembly.E, loop.lam)),
         "stability": stability or report.stability_part(assembly, record),
         "jitter": jitter,
@@ -176,7 +197,12 @@ def _outcome(
 
 
 def _save(
-    args: argparse.Namespace, out: Path, assembly: Assembly, record: Record, outcome: dict[str, Any]
+    args: argparse.Namespace,
+    out: Path,
+    assembly: Assembly,
+    record: Record,
+    alike: Likeness,
+    outcome: dict[str, Any],
 ) -> list[Path]:
     result = Result.from_record(assembly, record, outcome)
     files = [
@@ -193,7 +219,9 @@ def _save(
         if assembly.scenario.jitter and assembly.scenario.switches:
             growth = f"{outcome['jitter']['pattern']} delays, {stability['verdict']}"
         title = f"{outcome['scenario']}, case {args.case}, {with_what}: {growth}"
-        files.append(plot_run(result, out / "figure.png", title, stability["exact_frequency_hz"]))
+        apart = outcome["ideal_force"]["error_percent"]
+        ideal = None if apart is None else (alike.ideal, apart)
+        files.append(plot_run(result, out / "figure.png", title, stability["exact_frequency_hz"], ideal))
     files.append(out / "report.json")
     write_json(files[-1], outcome | {"files": [str(p) for p in files]})
     return files

@@ -12,6 +12,7 @@ from typing import Any, Self, get_args
 
 import msgspec
 
+from controller.box import Box, UncertainSpring
 from controller.environment import Network, Spring, Wall, environment
 from controller.jitter import Jitter
 from design.store import Loop
@@ -55,6 +56,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     device: tuple[Device, ...]
     human: tuple[Human, ...]
     environment: Network
+    box: Box | None = None  # what else the environment may be
     lam: Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
     person: tuple[Person, ...] = ()  # those who hold several devices
     tap: Tap | None = None
@@ -79,6 +81,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         check_holds(self.person, self.channels)
         if self.jitter:
             self._check_jitter(self.jitter)
+        if self.box and self.environment.walls:
+            raise ValueError("box and environment.walls: a set is of linear environments; give one of them")
+        self.loop("I")  # raises ValueError where the box does not fit the environment
         if self.tap and not 1 <= self.tap.channel <= self.channels:
             raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
 
@@ -96,6 +101,12 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def channels(self) -> int:
         return len(self.environment.contacts)
+
+    @property
+    def holders(self) -> tuple[int, ...]:
+        """Who holds each device, (m,): a number per human, one for all devices of the same person."""
+        owner = {channel: p for p, person in enumerate(self.person) for channel in person.holds}
+        return tuple(owner.get(i, len(self.person) + i) for i in range(1, self.channels + 1))
 
     @property
     def switches(self) -> bool:
@@ -126,7 +137,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def loop(self, case: str) -> Loop:
         """All that a design may know: no device but its damping, no human."""
-        return Loop(self.T, self.theta, self.psi, self.reference_delays(case), self.delta, self.environment)
+        return Loop(self.T, self.theta, self.psi, self.reference_delays(case), self.delta, self.environment, self.box)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping."""
@@ -206,5 +217,6 @@ def _hint(what: str) -> str:
 
 
 _STRUCTS = (
-    Scenario, Tap, Jitter, Human, Link, Voluntary, Person, Cross, Population, Network, Spring, Wall, *get_args(Device)
+    Scenario, Tap, Jitter, Human, Link, Voluntary, Person, Cross, Population, Network, Spring, Wall, Box,
+    UncertainSpring, *get_args(Device)
 )  # fmt: skip

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from controller.box import Member
 from design.assess import CONDITIONS, assess
 from design.margin import Requirement
-from design.promises import certificate_part
+from design.promises import ANY, certificate_part, promise_of
+from design.set_check import SetCheck, check_set, set_part
 from design.summary import coupling_part
 from sim import jitter_report, verdict_report
 from sim.adversary import Worst, search
@@ -42,6 +44,7 @@ from sim.scenario import InputError, Scenario
 from sim.shards import validate
 from sim.simulate import assemble
 
+ENVIRONMENTS = ("nominal", "box")
 LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
 
@@ -55,9 +58,14 @@ def main(argv: list[str]) -> int:
     links = LINKS[args.links] if args.links else scenario.population.links
     out = out_folder(args, "validate")
     chosen = choose(scenario, args.case, args.coupling, args.condition)
-    question = Question(scenario, chosen.coupling, seed, humans, links, args.engine, duration)
+    whole = check_set(scenario.loop(args.case), chosen.coupling, seed)
+    environments = _environments(args, whole)
+    question = Question(
+        scenario, chosen.coupling, seed, humans, links, args.engine, duration, environments=environments
+    )
     requirements = assess(scenario.loop(args.case), chosen.coupling, chosen.phi)
-    certified = any(requirement.certified for requirement in requirements.values())
+    promised = promise_of(requirements, scenario.loop(args.case), bool(whole and whole.proved))
+    certified = promised is not None and (not environments or promised == ANY or bool(whole and whole.proved))
 
     with (bar := progress_bar("validating"))[0]:
         begin = time.perf_counter()
@@ -67,14 +75,18 @@ def main(argv: list[str]) -> int:
             findings = validate(question, shards, bar[1])
         wall = time.perf_counter() - begin
     outcome = _outcome(args, scenario, chosen, requirements, question, findings, certified, wall)
+    outcome |= {"promise": promised, "set": whole and set_part(whole)}
     if scenario.jitter:
         outcome["switching"] = _switching(scenario, chosen, findings, certified)
         outcome["holds"] = outcome["holds"] and outcome["switching"]["holds"]
+    attacked, ratio = scenario, requirements["closed-loop"].ratio
+    if environments and whole:
+        member, requirement = whole.worst
+        attacked, ratio = scenario.replace(environment=member.network, box=None), requirement.ratio
     worst = (
-        _attack(scenario, chosen, seed, generations, outcome) if args.adversary and not findings.interrupted else None
+        _attack(attacked, chosen, seed, generations, outcome) if args.adversary and not findings.interrupted else None
     )
     if worst:
-        ratio = requirements["closed-loop"].ratio
         outcome["adversary"] = verdict_report.adversary_part(worst, ratio, certified)
         outcome["holds"] = outcome["holds"] and outcome["adversary"]["holds"]
     outcome["files"] = [str(path) for path in _save(args, out, question, findings, worst, outcome)]
@@ -107,6 +119,10 @@ def _parser() -> Parser:
     parser.add_argument("--dask", metavar="HOST:PORT", help="work on an existing Dask cluster; the result is the same")
     parser.add_argument("--adversary", action="store_true", help="also search for the worst passive human")
     parser.add_argument("--generations", default="150", metavar="N", help="of the adversary's search (default 150)")
+    spread = (
+        "what the humans meet: the nominal environment, or in turn all vertices of the box and as many points inside"
+    )
+    parser.add_argument("--environments", choices=ENVIRONMENTS, default="nominal", help=f"{spread} (default nominal)")
     parser.add_argument("--no-plot", action="store_true", help="write no picture")
     add_output_options(parser)
     return parser
@@ -124,6 +140,15 @@ def _shards(args: argparse.Namespace) -> int:
     if args.dask is not None and shards > 1:
         raise InputError(f"--shards {shards} with --dask: the cluster decides who does what, give one of them")
     return shards
+
+
+def _environments(args: argparse.Namespace, whole: SetCheck | None) -> tuple[Member, ...]:
+    """Members of the set and as many from inside it, or none where all meet the nominal one. Raises InputError."""
+    if args.environments == "nominal":
+        return ()
+    if whole is None:
+        raise InputError("--environments box: the scenario has no box (docs/scenario.md says how to give one)")
+    return (*whole.members, *whole.samples[: len(whole.members)])
 
 
 def _duration(args: argparse.Namespace, scenario: Scenario) -> float:

@@ -6,6 +6,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -40,6 +41,7 @@ def outcome(question: Question, findings: Findings, certified: bool, wall: float
         "worst": _worst(question, findings),
         "largest_difference_per_s": _largest(np.abs(findings.mujoco - findings.exact)),
         "traces": _traces(question, findings),
+        "environments": _environments(question, findings, bad),
         "certified": certified,
         "holds": disagreements == 0 and not (certified and wrong),
         "interrupted": findings.interrupted,
@@ -97,7 +99,22 @@ def person_part(persons: tuple[Person, ...]) -> list[dict[str, Any]]:
 def _identified(question: Question, index: int) -> dict[str, Any]:
     crowd = crowd_of(question.scenario, question.seed, index, question.links)
     who = {"human": human_part(crowd.humans(0)), "person": person_part(crowd.persons(0))}
-    return {"seed": question.seed, "index": index} | who
+    member = question.environment(index)
+    where = {"environment": member.name, "network": msgspec.to_builtins(member.network)} if member else {}
+    return {"seed": question.seed, "index": index} | who | where
+
+
+def _environments(question: Question, findings: Findings, bad: NDArray[np.bool_]) -> dict[str, Any]:
+    """Which environments the loops had, and in which of them a loop was unstable."""
+    if not question.environments:
+        return {"of": "the nominal environment", "count": 1}
+    unstable_in = sorted({int(i) % len(question.environments) for i in findings.index[bad]})
+    return {
+        "of": "the box",
+        "count": len(question.environments),
+        "names": [member.name for member in question.environments],
+        "unstable_in": [question.environments[i].name for i in unstable_in],
+    }
 
 
 def _worst(question: Question, findings: Findings) -> dict[str, Any] | None:
@@ -161,6 +178,7 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     engines = f"{bad['exact']} exact" + (f", {bad['mujoco']} MuJoCo" if bad["mujoco"] is not None else "")
     rows = [
         ("humans", f"{report['humans']} (links {report['links']}, seed {report['seed']})"),
+        ("environments", _met(report["environments"])),
         ("unstable", engines),
         ("disagreements", str(report["disagreements"])),
     ]
@@ -168,7 +186,8 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(
             (
                 "worst human",
-                f"{worst['growth_rate_per_s']:+.4g} 1/s at {worst['frequency_hz']:.2f} Hz (index {worst['index']})",
+                f"{worst['growth_rate_per_s']:+.4g} 1/s at {worst['frequency_hz']:.2f} Hz (index {worst['index']})"
+                + (f", at {worst['environment']}" if "environment" in worst else ""),
             )
         )
     if report["largest_difference_per_s"] is not None:
@@ -211,3 +230,10 @@ def _switching_rows(switching: dict[str, Any]) -> list[tuple[str, str]]:
         grow = f"{switching['unstable']['exact']} of {switching['humans']} exact{also}{worst}"
         rows.append(("grow while delays vary", grow))
     return rows
+
+
+def _met(environments: dict[str, Any]) -> str:
+    if "names" not in environments:
+        return environments["of"]
+    found = "; ".join(environments["unstable_in"]) or "none"
+    return f"{environments['count']} of {environments['of']}, in turn; unstable in: {found}"

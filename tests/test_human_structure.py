@@ -1,5 +1,7 @@
 """Who holds which device: what the weights of Remark 1 buy, and where they buy nothing."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -7,9 +9,16 @@ from controller.coupling import Compliance, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
+from design import audit
 from design.human_structure import closed_loop_of_separate_humans, reciprocal, shared_weights, weighted
 from design.margin import closed_loop
+from design.store import Stored, data_of, save
 from design.sweep import on_circle
+from models.device import RigidDevice
+from models.human import Cross, Human, Link, Person
+from sim.one_period import exact_growth
+from sim.scenario import Scenario, load
+from sim.simulate import assemble
 
 T, DELTA = 1.2e-3, (1.37, 1.37)
 WALLS = Network(("a", "b"), (Spring(("a", GROUND), 800.0, 1.0), Spring(("b", GROUND), 700.0, 1.0)))
@@ -68,3 +77,79 @@ def test_static_stiffness_and_a_common_human_join_weights():
     assert shared_weights(coupled, (1, 2, 3)) == [[0, 1], [2]]
     assert shared_weights(np.eye(3), (1, 2, 1)) == [[0, 2], [1]]
     assert shared_weights(coupled, (1, 2, 1)) == [[0, 1, 2]]
+
+
+def two_walls(*persons: Person) -> Scenario:
+    """The default devices and hands, each in front of a wall of its own: statically uncoupled."""
+    return load().replace(name="two-walls", environment=WALLS, person=persons)
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_an_audit_asks_who_holds_what(tmp_path, together):
+    both = Person(holds=(1, 2), mass=30.0, damping=80.0, stiffness=900.0, cross=Cross(0.0, 40.0))
+    scenario = two_walls(both) if together else two_walls()
+    assert len(set(scenario.holders)) == (1 if together else 2)
+    file = tmp_path / "one-way.json"
+    save(Stored(scenario.loop("I"), data_of(one_way(1e-4))), file)
+    toml = tmp_path / "two-walls.toml"
+    toml.write_text(TWO_WALLS + (PERSON if together else ""))
+    result = tmp_path / "audit.json"
+    options = ["--scenario", str(toml), "--coupling", str(file), "--json", str(result), "--out", str(tmp_path / "a")]
+    assert audit.main(options) == 1  # the plain condition decides: whoever holds what
+    part = json.loads(result.read_text())["separate-humans"]
+    assert part["certified"] is not together
+    assert part["proof"] == ("sampled" if together else "rational")
+    assert (len(set(part["weights"])) > 1) is not together
+
+
+TWO_WALLS = """
+name = "two-walls"
+T = 1.2e-3
+theta = [1, 2]
+psi = [0, 0]
+
+[[device]]
+kind = "rigid"
+mass = 0.25
+damping = 1.37
+[[device]]
+kind = "rigid"
+mass = 0.25
+damping = 1.37
+
+[[human]]
+links = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]
+[[human]]
+links = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]
+
+[environment]
+contacts = ["a", "b"]
+springs = [
+    { between = ["a", "ground"], stiffness = 800.0, damping = 1.0 },
+    { between = ["b", "ground"], stiffness = 700.0, damping = 1.0 },
+]
+"""
+PERSON = """
+[[person]]
+holds = [1, 2]
+mass = 30.0
+damping = 80.0
+stiffness = 900.0
+cross = { damping = 0.0, stiffness = 40.0 }
+"""
+
+
+def test_the_weights_do_matter():
+    """A one-way coupling certified for separate humans only: one person in both devices makes it oscillate."""
+    rng = np.random.default_rng(0)
+    light = {"mass": 0.05, "damping": 1.37}
+    scenario = two_walls().replace(device=(RigidDevice(**light), RigidDevice(**light)))
+    V = one_way(3e-3)  # needs 32 times the damping if one person may hold both, 0.88 times for two
+    alone, both = [], []
+    for k in np.exp(rng.uniform(np.log(10.0), np.log(1e4), 60)):
+        hands = (Human((Link(0.05, 0.01, 100.0),)),) * 2
+        person = Person(holds=(1, 2), mass=1.0, damping=0.01, stiffness=100.0, cross=Cross(0.0, float(k)))
+        alone.append(exact_growth(assemble(scenario.replace(human=hands), V)))
+        both.append(exact_growth(assemble(scenario.replace(human=hands, person=(person,)), V)))
+    assert max(alone) < 0
+    assert max(both) > 0
