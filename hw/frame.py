@@ -5,8 +5,8 @@ All integers are little-endian; there is no float, so no NaN can travel. The lon
 before stuffing, so COBS costs exactly one byte and the size of a frame does not depend on its content.
 """
 
+import operator
 from itertools import chain
-from operator import index
 from struct import Struct, error
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -136,7 +136,7 @@ def check(message: Message) -> None:
 def check_integer(name: str, value: Any, limits: tuple[int, int]) -> None:
     """Raises ValueError naming the field unless the value is an integer from limits[0] to limits[1]."""
     try:
-        number = index(value)
+        number = operator.index(value)
     except TypeError:
         raise ValueError(f"{name}: {value!r}; integers only") from None
     if not limits[0] <= number <= limits[1]:
