@@ -140,11 +140,6 @@ def attempts(
     return rows
 
 
-def success_rate(rows: list[Attempt]) -> float:
-    """The share of attempts that found a destabilising human."""
-    return sum(row.worst.destabilises for row in rows) / len(rows)
-
-
 def _ladders(x: Array, channels: int, kind: Pass) -> Crowd:
     """Logs of masses and stiffnesses, (2 channels links, nsim), as lossless humans.
 

@@ -13,7 +13,7 @@ from models.device import RigidDevice
 from models.scene import build, plant
 from sim import adversary
 from sim import run as run_command
-from sim.adversary import DESTABILISED, attempts, search, success_rate
+from sim.adversary import DESTABILISED, attempts, search
 from sim.exact_engine import hold
 from sim.scenario import InputError, load
 from sim.simulate import assemble
@@ -29,12 +29,12 @@ LOOPS = {"none": (SCENARIO, NoCoupling()), "published": (SCENARIO, CASE_I), "des
 def test_it_finds_what_random_humans_do_not():
     """The published gains pass random humans; with 5 % less damping than they need, a lossless hand is found."""
     rows = attempts(LOOPS, np.array([0.05, 0.1, 0.2]), generations=60)
-    assert success_rate(rows) == 1.0
+    assert all(row.worst.destabilises for row in rows)
 
 
 def test_nobody_destabilises_a_loop_with_the_damping_it_requires():
     rows = attempts(LOOPS, np.array([-1e-3]), generations=12)
-    assert success_rate(rows) == 0.0
+    assert not any(row.worst.destabilises for row in rows)
     # lossless hands come to the edge: 0 from below, to the rounding of the eigenvalues
     assert all(abs(row.worst.growth) < DESTABILISED for row in rows)
 

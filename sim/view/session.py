@@ -85,11 +85,6 @@ class Session:
         """Positions, then velocities."""
         return self._tape.s[0, :, 0].copy()
 
-    @property
-    def working(self) -> bool:
-        """Whether something that was asked for is still being made."""
-        return bool(self._wanted)
-
     def frame(self, now: float, grip: Grip | None = None) -> Frame:
         """Take what has been asked for, then advance to `now` [s] with the mouse's hand where it is."""
         self._take_keys()
