@@ -102,14 +102,17 @@ def inside(network: Network, box: Box, count: int, seed: int) -> tuple[Member, .
 def shrunk(network: Network, box: Box, factor: float) -> Box:
     """The box with every range drawn in towards the environment's own value; what may be absent still may."""
 
-    def closer(limits: Range | None, own: float) -> Range | None:
-        return limits and (own + factor * (limits[0] - own), own + factor * (limits[1] - own))
+    def closer(limits: Range, own: float) -> Range:
+        return own + factor * (limits[0] - own), own + factor * (limits[1] - own)
 
     springs = []
     for one in box.springs:
         own = next((s for s in network.springs if set(s.between) == set(one.between)), None)
-        ranges = (closer(one.stiffness, own.stiffness), closer(one.damping, own.damping)) if own else ()
-        springs.append(UncertainSpring(one.between, *(ranges or (one.stiffness, one.damping)), one.absent))
+        stiffness, damping = one.stiffness, one.damping
+        if own:
+            stiffness = stiffness and closer(stiffness, own.stiffness)
+            damping = damping and closer(damping, own.damping)
+        springs.append(UncertainSpring(one.between, stiffness, damping, one.absent))
     return Box(tuple(springs), {n: closer(r, network.masses.get(n, 0.0)) for n, r in box.masses.items()})
 
 

@@ -57,7 +57,7 @@ def nominal(lo: Sequence[int], hi: Sequence[int], T: float) -> Lti:
 
 
 def blocks(
-    z: Complex, G: Complex, alpha: Array, lo: Sequence[int], hi: Sequence[int], delta: Sequence[float], T: float
+    z: Complex, G: Complex, alpha: Array, lo: Sequence[int], hi: Sequence[int], delta: Sequence[float] | Array, T: float
 ) -> Complex:
     """The condition's matrix at each z (not 1), to be positive: (k, 2m, 2m) from z (k,), G(z) (k, m, m), alpha (m,).
 
