@@ -9,7 +9,7 @@ from design import designs
 from design.assess import assess, specification
 from design.margin import Requirement
 from design.result import Design
-from design.store import Loop
+from design.store import Loop, Stored, data_of
 
 
 def design_coupling(loop: Loop, kind: str = "spring-damper", condition: str | None = None, **options: Any) -> Design:
@@ -38,6 +38,7 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement]:
     Raises ValueError where coupling and loop do not fit each other, SingularLoop where their algebraic loop has no
     solution.
     """
-    if isinstance(coupling, Design):
-        return assess(loop, coupling.coupling, coupling.phi)
-    return assess(loop, coupling)
+    phi = coupling.phi if isinstance(coupling, Design) else None
+    bare = coupling.coupling if isinstance(coupling, Design) else coupling
+    Stored(loop, data_of(bare))  # refuses a coupling of another number of channels
+    return assess(loop, bare, phi)
