@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-SHOWN = re.compile(r"(<!-- output(?:: (.+))? -->\n```console\n\$ (python -m .+)\n)((?:.*\n)*?)(?=```)")
+SHOWN = re.compile(r"(<!-- output(?:: (.+))? -->\n```console\n\$ (python (?:-m|examples/).+)\n)((?:.*\n)*?)(?=```)")
 BLOCK = re.compile(r"^```(sh|console|toml|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 PICTURE = re.compile(r"<!-- picture: (\S+) (\S+) -->")
 
@@ -44,12 +44,12 @@ def steps(text: str) -> Iterator[Step]:
             yield Step("python", body)
         elif kind in ("sh", "console"):
             lines = (line.removeprefix("$ ") for line in body.splitlines())
-            yield from (Step("command", line) for line in lines if line.startswith("python -m"))
+            yield from (Step("command", line) for line in lines if line.startswith(("python -m", "python examples/")))
 
 
 def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """A documented command, in a terminal of 100 columns."""
-    words = shlex.split(command, comments=True)
+    words = [str(ROOT / w) if w.startswith("examples/") else w for w in shlex.split(command, comments=True)]
     environment = {"PYTHONPATH": str(ROOT), "PATH": os.environ["PATH"], "COLUMNS": "100"}
     return subprocess.run(
         [sys.executable, *words[1:]], cwd=folder, env=environment, capture_output=True, text=True, check=False
