@@ -50,7 +50,8 @@ def steps(text: str) -> Iterator[Step]:
 def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """A documented command, in a terminal of 100 columns."""
     words = [str(ROOT / w) if w.startswith("examples/") else w for w in shlex.split(command, comments=True)]
-    environment = {"PYTHONPATH": str(ROOT), "PATH": os.environ["PATH"], "COLUMNS": "100"}
+    shared = {"PATH": os.environ["PATH"], "OPENBLAS_NUM_THREADS": "1"}  # small matrices: threads only wait
+    environment = shared | {"PYTHONPATH": str(ROOT), "COLUMNS": "100"}
     return subprocess.run(
         [sys.executable, *words[1:]], cwd=folder, env=environment, capture_output=True, text=True, check=False
     )
