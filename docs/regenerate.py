@@ -63,6 +63,11 @@ def kept(output: str, pattern: str | None) -> str:
     return "".join(f"{line}\n" for line in lines if re.search(pattern or "", line))
 
 
+def renewed(text: str, printed: dict[str, str]) -> str:
+    """The page with what its commands have printed."""
+    return SHOWN.sub(lambda block: block[1] + kept(printed[block[3]], block[2]), text)
+
+
 def main() -> int:
     printed: dict[str, str] = {}
     with TemporaryDirectory() as place:
@@ -81,7 +86,7 @@ def main() -> int:
                     printed[step.text] = done.stdout
             for source, target in PICTURE.findall(text):
                 shutil.copyfile(folder / source, page.parent / target)
-            fresh = SHOWN.sub(lambda block: block[1] + kept(printed[block[3]], block[2]), text)
+            fresh = renewed(text, printed)
             if fresh != text:
                 page.write_text(fresh, encoding="utf-8")
                 print(f"changed: {page.relative_to(ROOT)}")
