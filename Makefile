@@ -3,7 +3,7 @@
 # make lint   ruff and pyright, without a finding: to be run, with make test, before anything is committed
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
 # make validate  every check that a verdict rests on: a report in out/validate/report.md, under five minutes
-# make figures  the pictures that README and docs show
+# make figures  the pictures that README and docs show, and the output in their blocks
 PYTHON ?= python3
 PY := .venv/bin/python
 # a file of tests stays on one core: its tests share fixtures, and those of the documentation files
@@ -36,6 +36,11 @@ figures: .venv/ready
 	$(PY) -m design.plot --coupling published,spring-damper,spring-damper:closed-loop --out out/couplings
 	for name in required-damping perceived singular-values; do cp out/couplings/$$name.png docs/pictures/; done
 	$(PY) -m sim.view --case I --video docs/pictures/view.gif --fps 5
+	$(PY) -m design.limits --out out/limits
+	cp out/limits/limits.png docs/pictures/limits.png
+	$(PY) -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0 --out out/zwidth || test $$? -eq 1 # 1: not certified
+	cp out/zwidth/zwidth.png docs/pictures/zwidth.png
+	$(PY) docs/regenerate.py
 
 bench: .venv/ready
 	$(PY) -m pytest tests/benchmarks --benchmark-only -s

@@ -1,1 +1,41 @@
-"""Where the two worlds meet: scenarios, engines, the loop, and what a run is worth."""
+"""Where the two worlds meet: scenarios, engines, the loop, and what a run is worth.
+
+    from sim import Scenario, load, simulate, validate
+
+Names are loaded when they are first used: a command must not wait for what it does not need.
+"""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sim.api import simulate, validate
+    from sim.examine import Findings
+    from sim.result import Result
+    from sim.scenario import InputError, Scenario, load, parse
+
+__all__ = ["Findings", "InputError", "Result", "Scenario", "load", "parse", "simulate", "validate"]
+
+_HOMES = {"simulate": "sim.api", "validate": "sim.api", "Findings": "sim.examine", "Result": "sim.result"}
+
+
+class _Package(ModuleType):
+    """`sim.simulate` and `sim.validate` are files too, and importing a file would put it in the function's place."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in __all__ and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in __all__:
+            raise AttributeError(f"module 'sim' has no attribute {name!r}")
+        value = getattr(import_module(_HOMES.get(name, "sim.scenario")), name)
+        setattr(self, name, value)
+        return value
+
+
+sys.modules[__name__].__class__ = _Package

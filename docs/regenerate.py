@@ -1,0 +1,97 @@
+"""python docs/regenerate.py: run what README and docs command, and write the real output where a block asks for it.
+
+    <!-- output: certified|binds -->      lines with one of these words (a regular expression); all without ": .."
+    ```console
+    $ python -m design.audit ..
+    ```
+
+A toml block whose first line is `# NAME.toml` is a file for the commands after it; `<!-- picture: FROM TO -->` keeps a
+picture that a command has drawn. tests/test_docs.py runs the same steps and compares.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+SHOWN = re.compile(r"(<!-- output(?:: (.+))? -->\n```console\n\$ (python (?:-m|examples/).+)\n)((?:.*\n)*?)(?=```)")
+BLOCK = re.compile(r"^```(sh|console|toml|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+PICTURE = re.compile(r"<!-- picture: (\S+) (\S+) -->")
+
+
+class Step(NamedTuple):
+    kind: str  # file | command | python
+    text: str
+    name: str = ""  # of the file
+
+
+def steps(text: str) -> Iterator[Step]:
+    """What a reader of the page does, in order."""
+    for kind, body in BLOCK.findall(text):
+        if kind == "toml" and (name := re.match(r"# (\S+\.toml)\n", body)):
+            yield Step("file", body, name[1])
+        elif kind == "python":
+            yield Step("python", body)
+        elif kind in ("sh", "console"):
+            lines = (line.removeprefix("$ ") for line in body.splitlines())
+            yield from (Step("command", line) for line in lines if line.startswith(("python -m", "python examples/")))
+
+
+def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    """A documented command, in a terminal of 100 columns."""
+    words = [str(ROOT / w) if w.startswith("examples/") else w for w in shlex.split(command, comments=True)]
+    shared = {"PATH": os.environ["PATH"], "OPENBLAS_NUM_THREADS": "1"}  # small matrices: threads only wait
+    environment = shared | {"PYTHONPATH": str(ROOT), "COLUMNS": "100"}
+    return subprocess.run(
+        [sys.executable, *words[1:]], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+
+
+def kept(output: str, pattern: str | None) -> str:
+    """The lines of a command's output that a page shows."""
+    lines = (line.rstrip() for line in output.splitlines())
+    return "".join(f"{line}\n" for line in lines if re.search(pattern or "", line))
+
+
+def renewed(text: str, printed: dict[str, str]) -> str:
+    """The page with what its commands have printed."""
+    return SHOWN.sub(lambda block: block[1] + kept(printed[block[3]], block[2]), text)
+
+
+def main() -> int:
+    printed: dict[str, str] = {}
+    with TemporaryDirectory() as place:
+        folder = Path(place)
+        for page in PAGES:
+            text = page.read_text(encoding="utf-8")
+            if not (SHOWN.search(text) or PICTURE.search(text)):
+                continue
+            for step in steps(text):
+                if step.kind == "file":
+                    (folder / step.name).write_text(step.text, encoding="utf-8")
+                elif step.kind == "command" and step.text not in printed:
+                    done = run(step.text, folder)
+                    if done.returncode not in (0, 1):
+                        sys.exit(f"{page.name}: {step.text}\n{done.stderr}")
+                    printed[step.text] = done.stdout
+            for source, target in PICTURE.findall(text):
+                shutil.copyfile(folder / source, page.parent / target)
+            fresh = renewed(text, printed)
+            if fresh != text:
+                page.write_text(fresh, encoding="utf-8")
+                print(f"changed: {page.relative_to(ROOT)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,39 @@
+"""Is a hand-picked coupling safe for every passive human, and how much must it give?
+
+The loop is the paper's: two devices of 1.37 N s/m, T = 1.2 ms, delays of 1 and 2 samples.
+"""
+
+from controller.coupling import SpringDamper
+from design import certify
+from sim import load
+
+LOOP = load("omega-pair").loop("I")
+K, B = (2870.0, 2320.0), (5.47, 5.55)  # the paper's gains (27) [N/m], [N s/m]
+
+
+def safe(share: float) -> bool:
+    """Whether the gains times `share` are certified in this environment."""
+    gains = SpringDamper([share * k for k in K], [share * b for b in B])
+    return certify(LOOP, gains)["closed-loop"].certified
+
+
+def largest_safe_share(steps: int = 20) -> float:
+    """By bisection, to a millionth."""
+    low, high = 0.0, 1.0
+    for _ in range(steps):
+        middle = (low + high) / 2
+        low, high = (middle, high) if safe(middle) else (low, middle)
+    return low
+
+
+def main() -> None:
+    for name, found in certify(LOOP, SpringDamper(K, B)).items():
+        needed = ", ".join(f"{b:.4f}" for b in found.required)
+        verdict = f"certified ({found.proof})" if found.certified else "not certified"
+        print(f"{name:>11}: needs {needed} of 1.37 N s/m: {verdict}, binds at {found.frequency_hz:.1f} Hz")
+    share = largest_safe_share()
+    print(f"closed-loop certifies the gains times {share:.4f}: K = {share * K[0]:.0f}, {share * K[1]:.0f} N/m")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""The five examples run as a newcomer would run them, and say what they should."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+
+#: what each must print; figures are those that docs and other tests have
+SAYS = {
+    "audit": ["closed-loop: needs 1.3987, 1.3987 of 1.37 N s/m: not certified", "the gains times 0.8995"],
+    "compare_couplings": ["any passive environment", "closed-loop +1.36.. ", r"-16.6. .*-29.5. .*this environment"],
+    "simulate_and_plot": [r"no coupling: growth \+1.48. 1/s at 84.0 Hz", "designed coupling: growth -1.726 1/s"],
+    "monte_carlo": [r"no coupling: 4\d\d of 500 unstable", "designed coupling: 0 of 500 unstable; .* 0.6 %"],
+    "your_own_device": ["certified = True", "ended finished", r"zero force 10\d.. ms after the stop"],
+}
+
+
+def test_every_example_is_tested_and_short():
+    assert {path.stem for path in EXAMPLES} == set(SAYS)
+    assert all(len(path.read_text().splitlines()) < 60 for path in EXAMPLES)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_runs(path, tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, str(path)], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    missing = [words for words in SAYS[path.stem] if not re.search(words, done.stdout)]
+    assert not missing, done.stdout
