@@ -55,6 +55,10 @@ def main(argv: list[str]) -> int:
     folder(out.parent)
     loop = scenario_from(args).loop(args.case)
     options = _options(args) | _switching(args, len(loop.theta))
+    if options.get("switching") and loop.box:
+        raise InputError("--jitter and [box]: switching delays are judged in one environment; give one of them")
+    if args.coupling == "optimal" and loop.environment.walls:
+        raise InputError("environment.walls: an optimal coupling holds a linear model, so it cannot face walls")
     seed, samples = seed_from(args), _samples(args)
     try:
         spec = specification(loop)

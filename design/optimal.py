@@ -33,6 +33,7 @@ from design.wish import Wish
 
 USUAL = Wish()
 ADDED, MOST_ADDITIONS = 4, 5  # points inside a box that become environments at a time, and how often at most
+NO_LIMIT = "no limit above 100 Hz"
 EASIER = (1.5, 2, 3, 5, 10, 20, 50)  # times the damping, tried to say how far a request is from having a solution
 
 
@@ -116,6 +117,10 @@ def advice(spec: Specification, wish: Wish) -> str:
     kind = "diagonal" if wish.diagonal else "full"
     delays = f"theta = {list(spec.theta)}, psi = {list(spec.psi)}"
     request = f"no {kind} Q of {wish.functions} functions is certified with {delays}, delta = {list(spec.delta)}"
+    if NO_LIMIT in helpful:
+        request += ": the limit above 100 Hz binds"
+    elif helpful:
+        request += ": the closed-loop condition (with a stable V) binds in this basis"
     if helpful:
         return f"{request}; there seem to be some with {', or '.join(helpful)}"
     damped = ((f, replace(spec, delta=tuple(f * d for d in spec.delta))) for f in EASIER)
@@ -132,7 +137,7 @@ def changes(wish: Wish) -> dict[str, Wish]:
         "a mixed basis": replace(wish, filter="mixed"),
         "a full Q": replace(wish, diagonal=False),
         f"a full Q of {more} functions in a mixed basis": replace(wish, functions=more, diagonal=False, filter="mixed"),
-        "no limit above 100 Hz": replace(wish, high_gain=None),
+        NO_LIMIT: replace(wish, high_gain=None),
     }
     return {words: changed for words, changed in other.items() if changed != wish}
 

@@ -90,6 +90,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def _check_jitter(self, jitter: Jitter) -> None:
         if jitter.channels != self.channels:
             raise ValueError(f"jitter has {jitter.channels} ranges for {self.channels} channels")
+        if self.box:
+            raise ValueError("jitter and box: switching delays are judged in one environment; give one of them")
         if self.environment.walls:
             raise ValueError("jitter and environment.walls: what switching delays do is judged for linear loops only")
         for i, (n, lo, hi) in enumerate(zip(self.theta, jitter.lo, jitter.hi, strict=True)):

@@ -75,7 +75,7 @@ def main(argv: list[str]) -> int:
             findings = validate(question, shards, bar[1])
         wall = time.perf_counter() - begin
     outcome = _outcome(args, scenario, chosen, requirements, question, findings, certified, wall)
-    outcome |= {"promise": promised, "set": whole and set_part(whole)}
+    outcome |= {"promise": promised, "set": whole and set_part(whole), "remarks": list(chosen.notes)}
     if scenario.jitter:
         outcome["switching"] = _switching(scenario, chosen, findings, certified)
         outcome["holds"] = outcome["holds"] and outcome["switching"]["holds"]

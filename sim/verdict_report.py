@@ -51,6 +51,8 @@ def outcome(question: Question, findings: Findings, certified: bool, wall: float
     if certified and question.ticks:
         part["energy_audit"] = _energy(findings)
         part["holds"] = part["holds"] and part["energy_audit"]["holds"]
+    if not findings.index.size:
+        part |= {"holds": None, "reason": "interrupted before the first batch of humans was done"}
     return part
 
 
@@ -171,6 +173,8 @@ def print_verdicts(report: dict[str, Any], console: Console) -> None:
     console.print(table)
     if switching := report.get("switching"):
         console.print(f"[dim]·[/] Delays that vary: {switching['covers']}.")
+    for remark in report["remarks"]:
+        console.print(f"[dim]·[/] {remark}")
 
 
 def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
@@ -215,7 +219,9 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         close = "no damping is enough" if ratio is None else f"the loop needs {ratio:.4g} of the damping it has"
         rows.append(("adversary", f"{found} among {adversary['evaluated']}; {close}"))
     rows.append(("certified", "yes" if report["certified"] else "no"))
-    rows.append(("holds", "[green]yes[/]" if report["holds"] else "[red]no[/]"))
+    rows.append(("holds", {True: "[green]yes[/]", False: "[red]no[/]"}.get(report["holds"], report.get("reason", "-"))))
+    if report["interrupted"]:
+        rows.append(("interrupted", "what was finished is kept; an adversary's search is not"))
     rows.append(("time", f"{report['wall_s']:.1f} s, {report['simulated_s_per_s']:.0f} simulated seconds per second"))
     return rows
 

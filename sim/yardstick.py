@@ -68,6 +68,8 @@ def measure(truth: Reference, engine: str, integrator: str | None, substeps: int
 def _timed(assembly: Assembly, engine: str, integrator: str, substeps: int) -> tuple[Record, float]:
     begin = time.perf_counter()
     record = simulate(assembly, engine, integrator, substeps)
+    if record.interrupted:  # a part of a run is no measurement
+        raise KeyboardInterrupt
     return record, time.perf_counter() - begin
 
 
