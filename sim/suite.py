@@ -67,6 +67,12 @@ CHECKS = (
         suite_report.verdicts,
     ),
     Check(
+        "optimal",
+        "The best linear coupling for this environment",
+        f"sim.validate --case I --coupling optimal {_MEET}",
+        suite_report.verdicts,
+    ),
+    Check(
         "published",
         "The gains that the paper prints",
         f"sim.validate --case I --coupling published {_MEET}",
@@ -89,6 +95,12 @@ CHECKS = (
         "How tight is it with long delays?",
         "sim.tightness --case none --theta 4,9 --short 0,0.2,0.5,1,2 --seed {seed}",
         suite_report.tightness,
+    ),
+    Check(
+        "map",
+        "Which springs and dampers may a device render against a wall?",
+        "sim.zwidth --rigid --T 1e-3 --theta 0 --grid 30 --points 8 --seed {seed}",
+        suite_report.gain_map,
     ),
     Check("accuracy", "Is MuJoCo right, and at what cost?", "sim.accuracy --duration 6", suite_report.accuracy),
     Check("hard", "Numerically hard loops", "sim.hard", suite_report.hard),

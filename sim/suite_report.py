@@ -102,6 +102,27 @@ def accuracy(report: dict[str, Any]) -> list[Part]:
     return [Part("", columns, tuple(rows), gist)]
 
 
+def gain_map(report: dict[str, Any]) -> list[Part]:
+    """Of sim.zwidth."""
+    cells = len(report["grid"]["K"]) * len(report["grid"]["B"])
+    population, simulation = report["population"], report["simulation"]
+    rows = [
+        (
+            f"certified by {name}",
+            f"{report[name]['certified_cells']} of {cells} cells, {report[name]['contradicted_cells']} contradicted",
+        )
+        for name in ("theorem4", "closed-loop")
+    ]
+    stable = f"{population['stable_cells']} of {population['decided_cells']} cells"
+    rows.append((f"stable with all of {population['humans']} random hands", stable))
+    odd = f"{simulation['oscillate']} oscillate, {simulation['differ_from_linear']} unlike the linear loop"
+    rows.append((f"{len(simulation['points'])} points simulated in MuJoCo", odd))
+    edge = max(report["error"][name]["edge_relative_in_K"] for name in ("theorem4", "closed-loop"))
+    rows.append(("edge of the map, error in K", f"{edge:.0e}"))
+    contradicted = sum(report[name]["contradicted_cells"] for name in ("theorem4", "closed-loop"))
+    return [Part("", ("figure", "value"), tuple(rows), f"{contradicted} certified cells that any hand upsets")]
+
+
 def hard(report: dict[str, Any]) -> list[Part]:
     """Of sim.hard."""
     rows = tuple(
