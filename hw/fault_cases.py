@@ -113,6 +113,10 @@ CASES = (
     Case("a link too slow", G.REFUSED, "at most theta = 15", ("delay=0.012",), designed=True),
     Case("a coupling not certified", G.REFUSED, "published is not certified", coupling="published", designed=True),
     Case("no coupling", G.REFUSED, "without coupling is not certified", coupling="none", designed=True),
+    # while the gain rises
+    Case("answers late in ramp-in", G.DISARMED, "theta = 2", ("down:jitter=0.0007@0.02",), AT_ONCE, designed=True),
+    Case("no FORCE in ramp-in", G.STOPPED, "cause watchdog", ("down:drop=1@0.1",), AT_ONCE),
+    Case("40 % of FORCEs lost in ramp-in", G.STOPPED, "no answer in time|watchdog", ("down:drop=0.4@0.02",), AT_ONCE),
     # the device
     Case("device freezes for 20 ms", G.LOST, "no new STATE", at("stall=0.02"), 20.0 + WATCHDOG),
     Case("device resets", G.LOST, "no new STATE", at("reset"), AT_ONCE),

@@ -257,11 +257,12 @@ class Session:
         ready = state.phase != Phase.DISARMED
         direction = (-1 if self.stage == Stage.DISARMING else 1) if ready else 0
         steps = self.drive.step(state, ticks, direction)
+        if self.stage != Stage.DISARMING:
+            self._judge()
         if self.stage == Stage.ARMING and self.gain == 1.0:
             self._enter(Stage.ARMED, "full gain")
         if self.stage == Stage.DISARMING and self.gain == 0.0:
             return self._ramped_out()
-        self._judge()
         return self._answer(state, Command.RUN if ready else Command.ARM, steps)
 
     def _check_device(self, state: State) -> None:
@@ -300,8 +301,6 @@ class Session:
 
     def _judge(self) -> None:
         """Whether the link still is what the coupling was certified for."""
-        if self.stage != Stage.ARMED or not self.watch.full:
-            return
         assert self.rung is not None
         late, missed = self.watch.late_part, self.watch.missed_part
         if missed > self.settings.missed + late:
