@@ -99,7 +99,7 @@ class Clockwork:
                 self._lost += now - due
             self._send(self.emulator.tick(round(due)), due)
             self.emulator.advance()
-            due = max(due + self._period, self.emulator.stalled_until)
+            due = max(due + self._period * self.emulator.stretch, self.emulator.stalled_until)
             if self.emulator.unplugged and unplugged_at is None:
                 unplugged_at = due
                 self.terminal.unplug()

@@ -97,7 +97,7 @@ class Rehearsal:
         data = emulator.tick(clock)
         emulator.advance()
         self.moments.append(Moment(clock, emulator.device.phase, emulator.applied))
-        self._at(now + self._period, "tick", None)
+        self._at(now + self._period * emulator.stretch, "tick", None)
         if emulator.unplugged and not self._gone:
             self._gone = True
             self._at(now + self.latency_us, "gone", None)

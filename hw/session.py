@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from hw.conduct import check_state
 from hw.drive import Drive, Row
 from hw.frame import Ack, Config, Decoder, Force, Hello, Info, Message, State, Stop, config_crc, encode
 from hw.handshake import Units, configuration, objections, probe_delay
@@ -244,7 +245,8 @@ class Session:
         self.watch.note(state)
         if state.phase == Phase.ESTOP:
             return self.estop(f"pressed, {state.cause.name.lower()}", self.now)
-        self._check_device(state)
+        assert self.config is not None
+        check_state(state, self.config, self.stage, self.gain)
         if self.stage in DRIVING:
             return self._on_driving(state, ticks)
         if self.stage == Stage.MEASURING:
@@ -256,7 +258,7 @@ class Session:
         self.missed_while_driving += self.watch.missed[-1]
         ready = state.phase != Phase.DISARMED
         direction = (-1 if self.stage == Stage.DISARMING else 1) if ready else 0
-        steps = self.drive.step(state, ticks, direction)
+        steps = self.drive.step(state, ticks, direction, self.now)
         if self.stage != Stage.DISARMING:
             self._judge()
         if self.stage == Stage.ARMING and self.gain == 1.0:
@@ -264,19 +266,6 @@ class Session:
         if self.stage == Stage.DISARMING and self.gain == 0.0:
             return self._ramped_out()
         return self._answer(state, Command.RUN if ready else Command.ARM, steps)
-
-    def _check_device(self, state: State) -> None:
-        assert self.config is not None
-        strongest = max(abs(a) - c for a, c in zip(state.applied, self.config.cap, strict=True))
-        if strongest > 0:
-            raise Fault(f"the device applies {state.applied} steps, the cap is {self.config.cap}")
-        if state.phase in (Phase.STOPPED, Phase.RAMP, Phase.SILENT):
-            raise Fault(f"the device is in {state.phase.name.lower()}, cause {state.cause.name.lower()}")
-        armed = state.phase in (Phase.ARMED, Phase.HOLDING)
-        if armed and self.stage not in DRIVING:
-            raise Fault("the device is armed, and nobody asked it to")
-        if not armed and (self.stage in (Stage.ARMED, Stage.DISARMING) or self.gain > 0):
-            raise Fault("the device has disarmed itself")
 
     def _measure(self, state: State) -> bytes:
         margin, T_us = self.watch.margins[-1], 1e6 * self.scenario.T
