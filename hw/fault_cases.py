@@ -118,6 +118,9 @@ CASES = (
     Case("no FORCE in ramp-in", G.STOPPED, "cause watchdog", ("down:drop=1@0.1",), AT_ONCE),
     Case("40 % of FORCEs lost in ramp-in", G.STOPPED, "no answer in time|watchdog", ("down:drop=0.4@0.02",), AT_ONCE),
     Case("tick number leaps in ramp-in", G.STOPPED, "leapt by 301, the watchdog allows 5", ("leap=300@0.03",), AT_ONCE),
+    # the measurement
+    Case("a third of FORCEs lost from the start", G.REFUSED, "% of the answers never reached", ("down:drop=0.33",)),
+    Case("3 % lost from the start", G.REFUSED, "no delay keeps 99 %", ("down:drop=0.03",), designed=True),
     # the device
     Case("tick number leaps by 300", G.STOPPED, "leapt by 301", at("leap=300"), STOP),
     Case("tick number leaps by 3", G.STOPPED, "by its own clock", at("leap=3"), STOP),

@@ -36,6 +36,7 @@ from sim.command import (
     execute,
     numbers,
     out_folder,
+    require_constant_delay,
     require_linear,
     scenario_from,
     seed_from,
@@ -56,6 +57,7 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     scenario, seed, settings = scenario_from(args), seed_from(args), check_link(args)
     require_linear(scenario, "hw.identify")
+    require_constant_delay(scenario, "hw.identify")
     force, seconds = number(args, "force", 0.05, 6.0), number(args, "seconds", 0.5, 30.0)
     low, high = numbers("--band", args.band, float, 2)
     if not 0.5 <= low < high <= 0.4 / scenario.T:

@@ -106,7 +106,7 @@ class Live:
         """Design while the device rests at zero force; what it says meanwhile is of no use."""
         session = self.session
         try:
-            rungs = self._plan(Ages(tuple(session.ages)))
+            rungs = self._plan(session.measurement.result)
         except Fault as fault:
             self._write(session.refuse(str(fault), self.now()))
             return

@@ -112,7 +112,7 @@ class Rehearsal:
         self._send(session.receive(data, round(now)), now)
         if session.stage == Stage.MEASURED:
             try:
-                rungs = self.plan(Ages(tuple(session.ages)))
+                rungs = self.plan(session.measurement.result)
             except Fault as fault:
                 return self._send(session.refuse(str(fault), round(now)), now)
             return self._send(session.load(rungs, round(now)), now)

@@ -17,8 +17,9 @@ from hw.conduct import check_state
 from hw.drive import Drive, Row
 from hw.frame import Ack, Config, Decoder, Force, Hello, Info, Message, State, Stop, config_crc, encode
 from hw.handshake import Units, configuration, objections, probe_delay
+from hw.measurement import Measurement
 from hw.message import Command, Phase, Reason, Refused
-from hw.plan import Ages, Program
+from hw.plan import Program
 from hw.safety import DRIVING, ENDED, Fault, Limits, Stage
 from hw.watch import FRESH, Counters, LinkWatch
 from sim.scenario import Scenario
@@ -26,7 +27,6 @@ from sim.scenario import Scenario
 RESEND_US, PATIENCE_US = 100_000, 2_000_000  # a question is asked again, and then given up
 QUIET_US = 1_000_000  # longest silence of a device that has no force to take away
 ARMING_US = 500_000  # in which a device must follow ARM
-PERIOD_TOLERANCE = 0.01  # of the device's clock against T, over the measurement
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Session:
         self.watch = LinkWatch(settings.window, self.counters)
         self.stage, self.cause = Stage.CONNECTING, ""
         self.log: list[Event] = []
-        self.ages: list[int] = []
+        self.measurement = Measurement(settings.measure, self.probe, scenario.T, settings.missed)
         self.rungs: tuple[Program, ...] = ()
         self.rung: Program | None = None
         self.info: Info | None = None
@@ -268,19 +268,14 @@ class Session:
         return self._answer(state, Command.RUN if ready else Command.ARM, steps)
 
     def _measure(self, state: State) -> bytes:
-        margin, T_us = self.watch.margins[-1], 1e6 * self.scenario.T
-        if not self.ages:
-            self._clock = (state.t_us, state.tick)
-        if margin is not None:
-            self.ages.append(round(self.probe * T_us) - margin)
-        if len(self.ages) < self.settings.measure:
+        try:
+            done = self.measurement.note(state, self.watch.margins[-1], self.watch.missed[-1])
+        except Fault as fault:
+            return self._end(Stage.REFUSED, str(fault))
+        if not done:
             return self._answer(state, Command.IDLE)
-        elapsed = (state.t_us - self._clock[0]) & 0xFFFFFFFF
-        ticks = (state.tick - self._clock[1]) & 0xFFFF
-        if ticks and abs(elapsed / (ticks * T_us) - 1) > PERIOD_TOLERANCE:
-            clock = f"a tick of the device lasts {elapsed / ticks:.1f} us by its own clock, T is {T_us:g} us"
-            return self._end(Stage.REFUSED, clock)
-        self._enter(Stage.MEASURED, f"{len(self.ages)} answers, median age {Ages(tuple(self.ages)).quantile(0.5)} us")
+        ages = self.measurement.result
+        self._enter(Stage.MEASURED, f"{len(ages.values)} answers, median age {ages.median} us")
         return b""
 
     def _answer(self, state: State, command: Command, steps: tuple[int, ...] | None = None) -> bytes:

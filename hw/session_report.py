@@ -48,9 +48,11 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
 
 
 def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
+    measured = session.measurement
     counters = asdict(session.counters) | {"host_errors": session.decoder.rejected, "host_dropped_bytes": dropped}
     part: dict[str, Any] = {
-        "measured_age_us": _percentiles(np.array(session.ages)),
+        "measured_age_us": _percentiles(np.array(measured.ages)),
+        "measured_missing": measured.missing,
         "age_us": None,
         "rate_hz": None,
         "missed_percent": None,
@@ -72,9 +74,10 @@ def _percentiles(values: np.ndarray) -> dict[str, float] | None:
 
 def print_certificate(ages: Ages, link: int, rungs: Sequence[Rung], console: Console) -> None:
     """What was measured, and what is certified for it: printed before anything is armed."""
+    at = {p: int(np.percentile(ages.values, p)) for p in (50, 99)}
     console.print(
-        f"answers are {ages.quantile(0.5)} us old, {ages.quantile(0.99)} us at the 99th percentile: "
-        f"a link of {link} tick{'s' if link > 1 else ''}"
+        f"answers are {at[50]} us old, {at[99]} us at the 99th percentile, {ages.missing} of "
+        f"{len(ages.values) + ages.missing} never arrived: a link of {link} tick{'s' if link > 1 else ''}"
     )
     table = Table(title="certified for the delay measured, and softer in reserve")
     for column in ("theta", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "promise"):

@@ -11,8 +11,8 @@ from hw.device import Device
 from hw.emulator_core import Emulator, info_of
 from hw.faults import lively
 from hw.frame import Ack, Config, Force, State, config_crc, encode
-from hw.message import Command, Phase
-from hw.plan import ladder
+from hw.message import NO_MARGIN, Command, Phase
+from hw.plan import Ages, ladder
 from hw.rehearsal import Rehearsal
 from hw.safety import Fault, Limits, Stage
 from hw.session import Session, Settings
@@ -186,3 +186,25 @@ def test_gaps_within_the_watchdog_are_allowed():
         clock.check(state(n, t_us=n * T_US), 5 if n in (5, 11) else 1, n * T_US)
     with pytest.raises(Fault, match="leapt by 6"):
         clock.check(state(18, t_us=18 * T_US), 6, 18 * T_US)
+
+
+@pytest.mark.parametrize("misses", [0, 1])
+def test_a_measurement_without_answers_ends(scenario, misses):
+    """Whether or not the device counts what it does not hear."""
+    session, most = Session(scenario, Limits((12.0, 12.0)), Settings(measure=50)), 2 * (50 + 15)
+    session.start(0)
+    session.receive(encode(info_of(scenario)), 0)
+    session.receive(encode(Ack(config_crc(session.config), 0)), 0)
+    for k in range(1, most + 1):
+        silent = State(Phase.DISARMED, k, 0, NO_MARGIN, 0, k * misses & 0xFF, k * T_US, (0, 0), (0, 0))
+        session.receive(encode(silent), k * T_US)
+    assert session.stage == Stage.REFUSED
+    assert "100 % of the answers never reached the device" in session.cause
+
+
+def test_answers_that_never_arrive_count_in_the_quantile():
+    ages = Ages(tuple(range(100, 190)), missing=10)
+    assert ages.quantile(0.5) == 150
+    assert ages.quantile(0.89) == 189
+    with pytest.raises(Fault, match=r"10 % of the answers never arrived: no delay keeps 95 %"):
+        ages.quantile(0.95)
