@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from array import array
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,6 +16,7 @@ from controller.lti import Array
 from hw.drive import Row
 from hw.handshake import Units
 from hw.message import NO_MARGIN
+from hw.trace_check import complaint
 from sim.files import write
 from sim.result import Result
 from sim.scenario import InputError
@@ -86,11 +88,14 @@ def save_npz(path: Path, result: Result, recorder: Recorder) -> Path:
 
 def load(path: Path) -> tuple[Result, dict[str, Array]]:
     """A trace with its link arrays. Raises InputError where the file holds no session of a bridge."""
-    result = Result.load_npz(path)
+    try:
+        result = Result.load_npz(path)
+    except (TypeError, AttributeError, zlib.error) as error:
+        raise InputError(f"{path}: not a trace of this program ({error})") from None
     try:
         with np.load(path, allow_pickle=False) as archive:
             link = {name: archive[f"link_{name}"] for name in LINK}
-    except (OSError, KeyError, ValueError, EOFError, BadZipFile):
+    except (OSError, KeyError, ValueError, EOFError, BadZipFile, zlib.error):
         raise InputError(f"{path}: a trace, but not of a bridge's session; hw.bridge writes one") from None
     n, m = result.x.shape
     for name, axes in LINK.items():
@@ -98,4 +103,6 @@ def load(path: Path) -> tuple[Result, dict[str, Array]]:
             raise InputError(
                 f"{path}: link_{name} has the shape {link[name].shape}, the trace {n} ticks of {m} channels"
             )
+    if wrong := complaint(result, link):
+        raise InputError(f"{path}: no session of hw.bridge: {wrong}")
     return result, link

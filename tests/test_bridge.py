@@ -1,6 +1,7 @@
 """Whole sessions in virtual time: every fault, the exact engine's run, the delay into the design, traces, replays."""
 
 import json
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -343,6 +344,76 @@ def test_a_trace_whose_recipe_is_broken_is_bad_input(trace, tmp_path):
     path = save_npz(tmp_path / "trace.npz", broken, trace[1])
     with pytest.raises(InputError, match="cannot be replayed"):
         replay.replay(*load(path))
+
+
+def _spoil(path, to, **changes):
+    with np.load(path) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    np.savez_compressed(to, **(arrays | {name: change(arrays) for name, change in changes.items()}))
+    return to
+
+
+def _nan(name):
+    def change(arrays):
+        values = arrays[name].copy()
+        values[7] = np.nan
+        return values
+
+    return change
+
+
+def _meta(**changes):
+    def change(arrays):
+        meta = json.loads(str(arrays["meta"]))
+        limits = meta["replay"]["limits"] | changes.pop("limits_more", {})
+        return np.array(json.dumps(meta | {"replay": meta["replay"] | {"limits": limits} | changes}))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"x": _nan("x")}, "x is not finite at tick 7"),
+        ({"link_gain": _nan("link_gain")}, "link_gain is not finite at tick 7"),
+        ({"link_asked": _nan("link_asked")}, "link_asked is not finite at tick 7"),
+        ({"link_gain": lambda a: a["link_gain"] * 5}, "link_gain is outside of 0 to 1"),
+        ({"link_gain": lambda a: a["link_gain"].astype(str)}, "link_gain is of type <U32"),
+        ({"link_asked": lambda a: a["link_asked"].astype(np.float32)}, "link_asked is of type float32"),
+        ({"link_received": lambda a: a["link_received"] * np.nan}, "link_received is of type float64"),
+        ({"link_sent": lambda a: a["link_sent"] * 1.0}, "link_sent is of type float64"),
+        ({"meta": lambda a: np.array("[1]")}, "metadata is a list"),
+        ({"meta": _meta(force_step=[0.0, 0.0])}, r"force_step\[0\] is 0"),
+        ({"meta": _meta(force_step=[4e-4])}, "force_step has 1 entries"),
+        ({"meta": _meta(cap=[30000])}, "cap has 1 entries"),
+        ({"meta": _meta(limits={})}, "missing required field `cap`"),
+        ({"meta": _meta(limits="none")}, "Expected `object`, got `str`"),
+        ({"meta": _meta(limits_more={"cap": [100.0, 100.0]})}, r"cap\[0\] is 100"),
+        ({"meta": _meta(limits_more={"slew": "fast"})}, "Expected `float`, got `str`"),
+        ({"meta": _meta(link_delay=9)}, "link_delay is 9, allowed are 1 to 1"),
+        ({"meta": _meta(link_delay=-(10**7))}, "link_delay is -10000000"),
+    ],
+)
+def test_a_spoiled_trace_is_one_line(trace, tmp_path, changes, words):
+    path = _spoil(trace[0][0], tmp_path / "trace.npz", **changes)
+    with pytest.raises(InputError, match=words) as error:
+        replay.main([str(path)])
+    assert "\n" not in str(error.value)
+
+
+def test_an_empty_or_a_damaged_trace_is_one_line(trace, tmp_path):
+    with np.load(trace[0][0]) as archive:
+        empty = {name: archive[name] if name == "meta" else archive[name][:0] for name in archive.files}
+    np.savez_compressed(tmp_path / "empty.npz", **empty)
+    with pytest.raises(InputError, match="has no ticks"):
+        replay.main([str(tmp_path / "empty.npz")])
+    whole = bytearray(trace[0][0].read_bytes())
+    for place in range(200, len(whole), len(whole) // 40):
+        damaged = whole.copy()
+        damaged[place] ^= 0x55
+        (tmp_path / "damaged.npz").write_bytes(damaged)
+        with suppress(InputError):  # a byte of the archive's own padding or of a name may not matter
+            replay.main([str(tmp_path / "damaged.npz")])
 
 
 def test_the_report_is_json_and_names_its_end(trace):
