@@ -24,6 +24,7 @@ class Row(NamedTuple):
     gain: float
     sent: tuple[int, ...]  # [steps]
     state: State | None
+    arming: int = 0  # which arming of the session this belongs to
 
 
 class Drive:
@@ -37,13 +38,14 @@ class Drive:
         limits: Limits,
         counters: Counters,
         record: Callable[[Row], None],
+        arming: int = 0,
     ) -> None:
         self.law, self.units, self.config, self.limits = law, units, config, limits
         self.T = law.T
         self.gain = Gain(limits, law.T)
         self.force = (0.0,) * config.axes  # [N] the last one sent
         self.x: tuple[float, ...] | None = None  # [m] of the last STATE
-        self._counters, self._record = counters, record
+        self._counters, self._record, self._arming = counters, record, arming
         self._told, self._clock = Told(config), Clock(limits, law.T)
 
     def step(self, state: State, ticks: int, direction: int, now: int) -> tuple[int, ...]:
@@ -73,10 +75,11 @@ class Drive:
         self._counters.slowed += shaped.slowed
         steps = self.units.steps(shaped.force, self.config.cap)
         self._told.tell(state.tick, steps)
-        self._record(Row(state.tick, x, asked, self.gain.value, steps, state))
+        self._record(Row(state.tick, x, asked, self.gain.value, steps, state, self._arming))
         return steps
 
     def _miss(self, state: State, positions: list[tuple[float, ...]]) -> None:
         """The law moves on through ticks of which no STATE came."""
         for back, x in zip(range(len(positions), 0, -1), positions, strict=True):
-            self._record(Row((state.tick - back) & 0xFFFF, x, self.law.step(x), self.gain.value, (), None))
+            tick, asked = (state.tick - back) & 0xFFFF, self.law.step(x)
+            self._record(Row(tick, x, asked, self.gain.value, (), None, self._arming))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -69,32 +70,46 @@ class Comparison:
         return not (self.asked.any() or self.sent.any())
 
 
-def recipe_of(result: Result) -> Recipe:
-    """The recipe in a trace. Raises InputError where there is none."""
+def recipes_of(result: Result) -> list[Recipe]:
+    """The recipes in a trace, one for each arming. Raises InputError where there is none."""
     try:
-        return msgspec.convert(result.meta.get("replay"), Recipe)
+        return msgspec.convert(result.meta.get("replay"), Annotated[list[Recipe], msgspec.Meta(min_length=1)])
     except (msgspec.ValidationError, ValueError) as error:
         raise InputError(f"the trace cannot be replayed: {error}") from None
 
 
 def replay(result: Result, link: dict[str, Array]) -> Comparison:
-    """Feed the recorded displacements through law, gain, limits and rounding."""
-    recipe = recipe_of(result)
-    law, limits = _built(recipe), recipe.limits
-    units = Units((1.0,) * len(recipe.cap), recipe.force_step, (1.0,) * len(recipe.cap))
+    """Feed the recorded displacements through law, gain, limits and rounding, every arming from rest."""
+    recipes, arming = recipes_of(result), link["arming"]
+    channels = result.x.shape[1]
+    if int(arming[-1]) + 1 != len(recipes) or any(recipe.scenario.channels != channels for recipe in recipes):
+        told = f"{len(recipes)} recipes for {int(arming[-1]) + 1} armings of {channels} channels"
+        raise InputError(f"the trace cannot be replayed: it has {told}")
     asked, sent = np.zeros_like(link["asked"]), np.zeros_like(link["sent"])
-    force: Sequence[float] = (0.0,) * len(recipe.cap)
-    for k, x in enumerate(result.x):
-        asked[k] = law.step(x)
-        if link["received"][k]:
-            try:
-                force = shape(asked[k].tolist(), force, float(link["gain"][k]), limits, recipe.scenario.T).force
-            except Fault as fault:
-                raise InputError(f"the trace cannot be replayed: tick {k}: {fault}") from None
-            sent[k] = units.steps(force, recipe.cap)
+    for i, recipe in enumerate(recipes):
+        _again(recipe, np.flatnonzero(arming == i), result, link, (asked, sent))
     different = asked.view(np.int64) != link["asked"].view(np.int64)
     largest = float(np.abs(asked - link["asked"]).max(initial=0.0))
     return Comparison(different.any(axis=1), (sent != link["sent"]).any(axis=1), largest)
+
+
+def _again(
+    recipe: Recipe, ticks: NDArray[np.intp], result: Result, link: dict[str, Array], into: tuple[Array, Array]
+) -> None:
+    """The `ticks` of one arming: forces asked for and steps sent, written to `into`."""
+    law, units = _built(recipe), Units((1.0,) * len(recipe.cap), recipe.force_step, (1.0,) * len(recipe.cap))
+    force: Sequence[float] = (0.0,) * len(recipe.cap)
+    asked, sent = into
+    for k in ticks:
+        asked[k] = law.step(result.x[k])
+        if not link["received"][k]:
+            continue
+        try:
+            gain = float(link["gain"][k])
+            force = shape(asked[k].tolist(), force, gain, recipe.limits, recipe.scenario.T).force
+        except Fault as fault:
+            raise InputError(f"the trace cannot be replayed: tick {k}: {fault}") from None
+        sent[k] = units.steps(force, recipe.cap)
 
 
 def _built(recipe: Recipe) -> Law:

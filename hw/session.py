@@ -64,6 +64,7 @@ class Session:
         self.measurement = Measurement(settings.measure, self.probe, scenario.T, settings.missed)
         self.rungs: tuple[Program, ...] = ()
         self.rung: Program | None = None
+        self.armings: list[tuple[Program, Config]] = []  # what forces came from, arming by arming
         self.info: Info | None = None
         self.config: Config | None = None
         self.record: Callable[[Row], None] = lambda row: None
@@ -108,7 +109,9 @@ class Session:
             assert self.rung
             assert self.config
             law = self.rung.controller()
-            self.drive = Drive(law, self.units, self.config, self.limits, self.counters, self.record)
+            record, arming = self.record, len(self.armings)
+            self.drive = Drive(law, self.units, self.config, self.limits, self.counters, record, arming)
+            self.armings.append((self.rung, self.config))
             self._enter(Stage.ARMING, "asked to")
         return b""
 

@@ -15,8 +15,9 @@ from rich.table import Table
 
 from design.promises import CAVEATS
 from design.store import data_of
+from hw.frame import Config
 from hw.message import NO_MARGIN
-from hw.plan import Ages, Rung
+from hw.plan import Ages, Program, Rung
 from hw.safety import Stage
 from hw.session import Session
 from hw.trace import Recorder, result_of, save_npz
@@ -120,15 +121,7 @@ def save(out: Path, session: Session, recorder: Recorder, report: dict[str, Any]
     """The trace (where forces acted), its picture, and the report."""
     files = []
     if len(recorder):
-        assert isinstance(session.rung, Rung)
-        replay = {
-            "scenario": json.loads(msgspec.json.encode(session.rung.scenario)),
-            "coupling": json.loads(msgspec.json.encode(data_of(session.rung.chosen.coupling))),
-            "link_delay": session.rung.link,
-            "limits": asdict(session.limits),
-            "force_step": list(session.units.force_step),
-            "cap": list(session.config.cap) if session.config else [],
-        }
+        replay = [_recipe(session, program, config) for program, config in session.armings]
         result = result_of(recorder, session.units, session.scenario.T, report | {"replay": replay})
         files += [save_npz(out / "trace.npz", result, recorder), result.save_csv(out / "trace.csv")]
         if plot:
@@ -139,6 +132,19 @@ def save(out: Path, session: Session, recorder: Recorder, report: dict[str, Any]
     files.append(out / "report.json")
     write_json(files[-1], report | {"files": [str(p) for p in files]})
     return files
+
+
+def _recipe(session: Session, program: Program, config: Config) -> dict[str, Any]:
+    """All that hw.replay needs of one arming."""
+    assert isinstance(program, Rung)
+    return {
+        "scenario": json.loads(msgspec.json.encode(program.scenario)),
+        "coupling": json.loads(msgspec.json.encode(data_of(program.chosen.coupling))),
+        "link_delay": program.link,
+        "limits": asdict(session.limits),
+        "force_step": list(session.units.force_step),
+        "cap": list(config.cap),
+    }
 
 
 def _list(values: Sequence[float | None] | None) -> str:

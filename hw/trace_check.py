@@ -9,7 +9,7 @@ import numpy as np
 from controller.lti import Array
 from sim.result import Result
 
-FLOATS, WHOLE = ("asked", "gain"), ("tick", "sent", "margin_us", "status")
+FLOATS, WHOLE = ("asked", "gain"), ("tick", "arming", "sent", "margin_us", "status")
 #: link array -> least and most that a session writes
 RANGES = {"gain": (0.0, 1.0), "tick": (0, 0xFFFF), "sent": (-0x7FFF, 0x7FFF), "margin_us": (-0x8000, 0x7FFF)}
 
@@ -36,6 +36,9 @@ def complaint(result: Result, link: dict[str, Array]) -> str | None:
         outside = (values < low) | (values > high) if name in RANGES else np.zeros(1, bool)
         if outside.any():
             return f"link_{name} is outside of {low:g} to {high:g} at tick {_first(outside)}"
+    arming = link["arming"]
+    if arming[0] != 0 or not np.isin(np.diff(arming), (0, 1)).all():
+        return "link_arming does not count armings from 0 up"
     return None
 
 

@@ -307,6 +307,23 @@ def test_a_replay_is_identical_bit_by_bit(trace):
     assert np.abs(link["sent"]).max() > 1000
 
 
+def test_a_session_armed_twice_is_replayed_with_both_couplings(scenario, rungs, tmp_path):
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(lively(scenario), rungs, "down:jitter=0.0007@0.45", recorder=recorder)
+    session = rehearsal.run_until_armed(1.2)
+    assert session.stage == Stage.DISARMED
+    session.arm(session.now)
+    rehearsal.run(1e-6 * session.now + 0.8)
+    session.stop("enough", session.now)
+    rehearsal.run(1e-6 * session.now + 0.2)
+    files = session_report.save(tmp_path, session, recorder, session_report.outcome("I", session, recorder, 0), False)
+    result, link = load(files[0])
+    assert [recipe.link_delay for recipe in replay.recipes_of(result)] == [1, 2]
+    assert np.bincount(link["arming"]).min() > 300
+    assert replay.replay(result, link).identical
+    assert np.abs(link["sent"][link["arming"] == 1]).max() > 100
+
+
 def test_a_replay_finds_one_changed_bit(trace):
     result, link = load(trace[0][0])
     changed = link["asked"].copy()
@@ -365,8 +382,10 @@ def _nan(name):
 def _meta(**changes):
     def change(arrays):
         meta = json.loads(str(arrays["meta"]))
-        limits = meta["replay"]["limits"] | changes.pop("limits_more", {})
-        return np.array(json.dumps(meta | {"replay": meta["replay"] | {"limits": limits} | changes}))
+        (recipe,) = meta["replay"]
+        limits = recipe["limits"] | changes.get("limits_more", {})
+        rest = {name: value for name, value in changes.items() if name != "limits_more"}
+        return np.array(json.dumps(meta | {"replay": [recipe | {"limits": limits} | rest]}))
 
     return change
 
@@ -383,6 +402,8 @@ def _meta(**changes):
         ({"link_received": lambda a: a["link_received"] * np.nan}, "link_received is of type float64"),
         ({"link_sent": lambda a: a["link_sent"] * 1.0}, "link_sent is of type float64"),
         ({"meta": lambda a: np.array("[1]")}, "metadata is a list"),
+        ({"link_arming": lambda a: a["link_arming"] + 1}, "link_arming does not count"),
+        ({"link_arming": lambda a: (a["link_tick"] == a["link_tick"][-1]).astype(int)}, "1 recipes for 2 armings"),
         ({"meta": _meta(force_step=[0.0, 0.0])}, r"force_step\[0\] is 0"),
         ({"meta": _meta(force_step=[4e-4])}, "force_step has 1 entries"),
         ({"meta": _meta(cap=[30000])}, "cap has 1 entries"),
