@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -73,9 +73,20 @@ class Comparison:
 def recipes_of(result: Result) -> list[Recipe]:
     """The recipes in a trace, one for each arming. Raises InputError where there is none."""
     try:
+        _require_limits(result.meta.get("replay"))
         return msgspec.convert(result.meta.get("replay"), Annotated[list[Recipe], msgspec.Meta(min_length=1)])
     except (msgspec.ValidationError, ValueError) as error:
         raise InputError(f"the trace cannot be replayed: {error}") from None
+
+
+def _require_limits(raw: object) -> None:
+    """Raise ValueError where a recipe has other limits than Limits: msgspec passes over those of a dataclass."""
+    names = {field.name for field in fields(Limits)}
+    for recipe in raw if isinstance(raw, list) else []:
+        limits = recipe.get("limits") if isinstance(recipe, dict) else None
+        if isinstance(limits, dict) and set(limits) != names:
+            wrong = ", ".join(sorted(set(limits) ^ names))
+            raise ValueError(f"limits are {', '.join(sorted(names))}; missing or unknown: {wrong}")
 
 
 def replay(result: Result, link: dict[str, Array]) -> Comparison:

@@ -95,6 +95,8 @@ def print_certificate(ages: Ages, link: int, rungs: Sequence[Rung], console: Con
             part["promise"],
         )
     console.print(table)
+    if len(rungs) == 1:
+        console.print("no reserve: nothing softer is certified, so late answers end the session")
 
 
 def print_session(report: dict[str, Any], console: Console) -> None:
