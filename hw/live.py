@@ -130,8 +130,8 @@ class Live:
 
 @contextmanager
 def _signals(received: list[int]) -> Iterator[None]:
-    """SIGINT and SIGTERM are noted, and dealt with between two ticks."""
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    """SIGINT, SIGTERM, SIGHUP and SIGQUIT are noted, and dealt with between two ticks."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
     before = {number: signal.signal(number, lambda got, frame: received.append(got)) for number in numbers}
     try:
         yield

@@ -99,7 +99,7 @@ def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
         assert replay.main(["out/bridge-I/trace.npz"]) == 0
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGQUIT"])
 def test_a_signal_ends_a_session_at_zero_force(emulator, scenario, rungs, name):
     def glance(session):
         if session.stage == Stage.MEASURING and not sent:
