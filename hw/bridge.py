@@ -24,6 +24,7 @@ from sim.command import (
     console,
     execute,
     out_folder,
+    require_constant_delay,
     require_linear,
     scenario_from,
     seed_from,
@@ -40,6 +41,7 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     scenario, seed, settings = scenario_from(args), seed_from(args), check_link(args)
     require_linear(scenario, "hw.bridge")
+    require_constant_delay(scenario, "hw.bridge")
     seconds = number(args, "duration", 0.1, LONGEST, scenario.duration)
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")

@@ -13,6 +13,7 @@ from typing import Any
 from hw.dashboard import Dashboard
 from hw.emulate import spawned
 from hw.emulator import pace_from
+from hw.handshake import require_period
 from hw.live import Live
 from hw.plan import Ages, Program, link_delay
 from hw.port import Port
@@ -72,7 +73,9 @@ def number(args: argparse.Namespace, name: str, low: float, high: float, default
 def session_for(scenario: Scenario, settings: Settings, cap: float = STRONGEST) -> Session:
     """A session that never asks for more than `cap` [N]. Raises InputError where T is none for a serial link."""
     try:
-        return Session(scenario, Limits(tuple(min(cap, d.force_limit) for d in scenario.device)), settings)
+        limits = Limits(tuple(min(cap, d.force_limit) for d in scenario.device))
+        require_period(scenario.T, limits)
+        return Session(scenario, limits, settings)
     except ValueError as error:
         raise InputError(str(error)) from None
 

@@ -66,15 +66,8 @@ class Device:
         else:
             self.phase, self.held = Phase.ARMED, 0
             self.run = min(self.run + 1, self.config.ramp_in)
-            self.applied = tuple(map(self.limited, frame.force, self.applied, self.config.cap, self.config.slew))
-
-    def limited(self, force: int, last: int, cap: int, slew: int) -> int:
-        """A force within the cap, which grows after arming, and within the slew rate of the last one."""
-        assert self.config is not None
-        if self.config.ramp_in:
-            cap = cap * self.run // self.config.ramp_in
-        force = max(-cap, min(cap, force))
-        return last + max(-slew, min(slew, force - last))
+            caps = [cap_after(self.config, cap, self.run) for cap in self.config.cap]
+            self.applied = tuple(map(limited, frame.force, self.applied, caps, self.config.slew))
 
     def ramp_down(self) -> None:
         assert self.config is not None
@@ -170,6 +163,17 @@ class Device:
             (0 in config.slew, Refused.SLEW),
         )
         return next((reason for wrong, reason in reasons if wrong), Refused.ACCEPTED)
+
+
+def cap_after(config: Config, cap: int, run: int) -> int:
+    """The cap after `run` forces since arming: it grows from zero."""
+    return cap * min(run, config.ramp_in) // config.ramp_in if config.ramp_in else cap
+
+
+def limited(force: int, last: int, cap: int, slew: int) -> int:
+    """A force within the cap and within the slew rate of the last one."""
+    force = max(-cap, min(cap, force))
+    return last + max(-slew, min(slew, force - last))
 
 
 def scaled(value: int, by: int, over: int) -> int:

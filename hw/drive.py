@@ -6,14 +6,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from controller.lti import Array
+from hw.clock import Clock
+from hw.conduct import Told
 from hw.frame import Config, State
 from hw.handshake import Units
 from hw.law import Controller, fill
-from hw.message import Phase
 from hw.safety import Gain, Limits, check_jump, check_range, shape
 from hw.watch import Counters
-
-REMEMBERED = 64  # forces on their way, of which at most theta matter
 
 
 class Row(NamedTuple):
@@ -25,6 +24,7 @@ class Row(NamedTuple):
     gain: float
     sent: tuple[int, ...]  # [steps]
     state: State | None
+    arming: int = 0  # which arming of the session this belongs to
 
 
 class Drive:
@@ -38,21 +38,25 @@ class Drive:
         limits: Limits,
         counters: Counters,
         record: Callable[[Row], None],
+        arming: int = 0,
     ) -> None:
         self.law, self.units, self.config, self.limits = law, units, config, limits
         self.T = law.T
         self.gain = Gain(limits, law.T)
         self.force = (0.0,) * config.axes  # [N] the last one sent
         self.x: tuple[float, ...] | None = None  # [m] of the last STATE
-        self._counters, self._record = counters, record
-        self._sent: dict[int, tuple[int, ...]] = {}
+        self._counters, self._record, self._arming = counters, record, arming
+        self._told, self._clock = Told(config), Clock(limits, law.T)
 
-    def step(self, state: State, ticks: int, direction: int) -> tuple[int, ...]:
-        """The force [steps] that answers `state`, which came `ticks` after the one before.
+    def step(self, state: State, ticks: int, direction: int, now: int) -> tuple[int, ...]:
+        """The force [steps] that answers `state`, which came at `now` [us], `ticks` after the one before.
 
-        The gain rises (direction 1), falls (-1) or stays (0). Raises Fault where an encoder or the controller is out of
-        bounds.
+        The gain rises (direction 1), falls (-1) or stays (0). Raises Fault where the device, an encoder or the
+        controller is out of bounds.
         """
+        if self.x is None:
+            ticks = 1  # what went before does not count
+        self._clock.check(state, ticks, now)
         x = self.units.positions(state.counts)
         check_range(x, self.units.reach)
         if self.x is None:
@@ -60,7 +64,7 @@ class Drive:
         else:
             check_jump(x, self.x, ticks, self.limits)
             positions = fill(self.x, x, ticks)
-        self._compare(state)
+        self._counters.unlike += self._told.unlike(state, ticks)
         self._miss(state, positions[:-1])
         asked = self.law.step(x)
         if direction:
@@ -70,19 +74,12 @@ class Drive:
         self._counters.clipped += shaped.clipped
         self._counters.slowed += shaped.slowed
         steps = self.units.steps(shaped.force, self.config.cap)
-        self._sent[(state.tick + self.config.theta) & 0xFFFF] = steps
-        self._record(Row(state.tick, x, asked, self.gain.value, steps, state))
+        self._told.tell(state.tick, steps)
+        self._record(Row(state.tick, x, asked, self.gain.value, steps, state, self._arming))
         return steps
 
     def _miss(self, state: State, positions: list[tuple[float, ...]]) -> None:
         """The law moves on through ticks of which no STATE came."""
         for back, x in zip(range(len(positions), 0, -1), positions, strict=True):
-            self._record(Row((state.tick - back) & 0xFFFF, x, self.law.step(x), self.gain.value, (), None))
-
-    def _compare(self, state: State) -> None:
-        """Whether the device does what it was told in time."""
-        told = self._sent.pop(state.tick, None)
-        if len(self._sent) > REMEMBERED:
-            self._sent.pop(next(iter(self._sent)))
-        if told is not None and state.phase == Phase.ARMED and self.gain.value == 1.0:
-            self._counters.unlike += told != state.applied
+            tick, asked = (state.tick - back) & 0xFFFF, self.law.step(x)
+            self._record(Row(tick, x, asked, self.gain.value, (), None, self._arming))

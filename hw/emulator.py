@@ -32,6 +32,7 @@ from sim.command import (
     add_loop_options,
     execute,
     numbers,
+    require_constant_delay,
     require_linear,
     scenario_from,
     seed_from,
@@ -99,7 +100,7 @@ class Clockwork:
                 self._lost += now - due
             self._send(self.emulator.tick(round(due)), due)
             self.emulator.advance()
-            due = max(due + self._period, self.emulator.stalled_until)
+            due = max(due + self._period * self.emulator.stretch, self.emulator.stalled_until)
             if self.emulator.unplugged and unplugged_at is None:
                 unplugged_at = due
                 self.terminal.unplug()
@@ -146,6 +147,7 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     scenario, seed = scenario_from(args), seed_from(args)
     require_linear(scenario, "hw.emulator")
+    require_constant_delay(scenario, "hw.emulator")
     upsets = tuple(Upset.parse(text) for text in args.fault)
     seconds = numbers("--duration", args.duration, float, 1)[0]
     if not 0 < seconds <= 1e6:

@@ -7,8 +7,8 @@ import numpy as np
 from controller.lti import Array
 from hw.device import RUNNING, Device
 from hw.emulated_plant import EmulatedPlant
-from hw.frame import Info
-from hw.message import PROTOCOL
+from hw.frame import Force, Info
+from hw.message import PROTOCOL, Phase
 from hw.upset import Upset
 from sim.scenario import Scenario
 
@@ -49,6 +49,7 @@ class Emulator:
         self.begun_at: int | None = None  # tick at which the person began to move
         self.unplugged = False
         self.stalled_until = 0  # [us]
+        self.stretch = 1.0  # length of a tick in T
         self.applied: Array = np.zeros(scenario.channels)  # [N] by the motors
         self._offset = [0] * scenario.channels  # [counts] of an encoder that jumped
         self._waiting = list(upsets)
@@ -99,7 +100,26 @@ class Emulator:
                     self.device = Device(self.info)
                 case "jump":
                     self._offset[0] += round(1e-3 * upset.value / (1e-12 * self.info.encoder_step[0]))
+                case "leap":
+                    self.device.k = (self.device.k + round(upset.value)) & 0xFFFF
+                case "own":
+                    self.device = wilful(self.device, round(upset.value / self.force_step[0]))
+                case "period":
+                    self.stretch = upset.value
                 case "estop":
                     self.device.estop()
                 case "trip":
                     self.device.fault()
+
+
+def wilful(device: Device, force: int) -> Device:
+    """The same device with motors that have `force` [steps] while it is armed, whatever it is told."""
+    obeys = device.latch
+
+    def latch(frame: Force | None) -> None:
+        obeys(frame)
+        if device.phase in (Phase.ARMED, Phase.HOLDING):
+            device.applied = (force,) * device.info.axes
+
+    device.latch = latch
+    return device

@@ -113,7 +113,22 @@ CASES = (
     Case("a link too slow", G.REFUSED, "at most theta = 15", ("delay=0.012",), designed=True),
     Case("a coupling not certified", G.REFUSED, "published is not certified", coupling="published", designed=True),
     Case("no coupling", G.REFUSED, "without coupling is not certified", coupling="none", designed=True),
+    # while the gain rises
+    Case("answers late in ramp-in", G.DISARMED, "theta = 2", ("down:jitter=0.0007@0.02",), AT_ONCE, designed=True),
+    Case("no FORCE in ramp-in", G.STOPPED, "cause watchdog", ("down:drop=1@0.1",), AT_ONCE),
+    Case("40 % of FORCEs lost in ramp-in", G.STOPPED, "no answer in time|watchdog", ("down:drop=0.4@0.02",), AT_ONCE),
+    Case("tick number leaps in ramp-in", G.STOPPED, "leapt by 301, the watchdog allows 5", ("leap=300@0.03",), AT_ONCE),
+    # the measurement
+    Case("a third of FORCEs lost from the start", G.REFUSED, "% of the answers never reached", ("down:drop=0.33",)),
+    Case("3 % lost from the start", G.REFUSED, "no delay keeps 99 %", ("down:drop=0.03",), designed=True),
     # the device
+    Case("tick number leaps by 300", G.STOPPED, "leapt by 301", at("leap=300"), STOP),
+    Case("tick number leaps by 3", G.STOPPED, "by its own clock", at("leap=3"), STOP),
+    Case("a force of its own", G.STOPPED, "it was told .*, and so for 5 ticks", at("own=2"), STOP + 6 * T_MS),
+    Case("a force of its own in ramp-in", G.STOPPED, "it was told", ("own=2@0.05",), AT_ONCE),
+    Case("a tick lasts twice as long", G.STOPPED, "by its own clock", at("period=2"), 2 * STOP + 6 * T_MS),
+    Case("clock drifts by 2 %", G.STOPPED, "lasts 12.. us by its own clock", at("period=1.02"), 250.0),
+    Case("clock drifts by 0.5 %", A, upsets=at("period=1.005")),
     Case("device freezes for 20 ms", G.LOST, "no new STATE", at("stall=0.02"), 20.0 + WATCHDOG),
     Case("device resets", G.LOST, "no new STATE", at("reset"), AT_ONCE),
     Case("encoder jumps by 2 mm", A, upsets=at("jump=2")),

@@ -80,11 +80,21 @@ def objections(info: Info, scenario: Scenario, limits: Limits, baud: int | None)
 
 
 def probe_delay(T: float) -> int:
-    """The theta to measure with: the longest whose margin can be told. Raises ValueError where T is too long."""
+    """The theta to measure with: the longest whose margin can be told. Raises ValueError where there is none."""
     theta = min(MAX_THETA, int(LARGEST_MARGIN_US / (1e6 * T)))
     if theta < 1:
         raise ValueError(f"T is {T:g} s, a serial link is for at most {1e-6 * LARGEST_MARGIN_US:g} s")
     return theta
+
+
+def require_period(T: float, limits: Limits) -> None:
+    """Raise ValueError where the host's watchdog does not span two ticks: one lost STATE would end every session."""
+    if limits.watchdog_us * (1 + 1e-9) < 2e6 * T:
+        most = 0.5e-6 * limits.watchdog_us
+        raise ValueError(
+            f"T is {T:g} s, a serial link is for at most {most:g} s: the host's watchdog of "
+            f"{limits.watchdog_us / 1000:g} ms has to outlast one lost STATE"
+        )
 
 
 def configuration(info: Info, limits: Limits, theta: int) -> Config:

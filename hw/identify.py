@@ -36,6 +36,7 @@ from sim.command import (
     execute,
     numbers,
     out_folder,
+    require_constant_delay,
     require_linear,
     scenario_from,
     seed_from,
@@ -43,11 +44,13 @@ from sim.command import (
 from sim.files import write, write_json
 from sim.scenario import InputError, Scenario
 
+SUSPICIOUS = 0.1  # part by which an estimate may exceed the declared damping
 LIMITS = (
     "The bound is a statement about this record: 95 % confidence that the viscous friction of the model (motor, "
     "transmission, handle) is at least this, where residuals are correlated over at most 60 ticks. It does not see "
-    "friction that changes with position, temperature or wear, gravity, or motions faster than the chirp. Coulomb "
-    "friction is left out of delta: it dissipates too, but ever less compared to a viscous damper as speed grows."
+    "friction that changes with position, temperature or wear, gravity, or motions faster than the chirp. Nor can it "
+    "tell a hand from the device: whoever holds or touches the handle adds damping, and the bound is then too high. "
+    "Coulomb friction is left out of delta: it dissipates too, but ever less than a viscous damper as speed grows."
 )
 
 
@@ -56,6 +59,7 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     scenario, seed, settings = scenario_from(args), seed_from(args), check_link(args)
     require_linear(scenario, "hw.identify")
+    require_constant_delay(scenario, "hw.identify")
     force, seconds = number(args, "force", 0.05, 6.0), number(args, "seconds", 0.5, 30.0)
     low, high = numbers("--band", args.band, float, 2)
     if not 0.5 <= low < high <= 0.4 / scenario.T:
@@ -110,10 +114,28 @@ def _outcome(
             outcome["reason"] = str(error)
     else:
         outcome["reason"] = f"the session ended in {session.stage}: {session.cause}"
+    outcome["warnings"] = warnings = held(estimates, scenario, session)
     outcome["axes"] = [asdict(e) for e in estimates]
-    outcome["bounded"] = bool(estimates) and all(e.delta > 0 for e in estimates)
+    outcome["bounded"] = bool(estimates) and all(e.delta > 0 for e in estimates) and not warnings
     outcome["limits"] = LIMITS
     return outcome, estimates
+
+
+def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[str]:
+    """Axes with more damping than they are said to have, by INFO's guarantee and the scenario's own damping.
+
+    A hand cannot be told from a device by its motion; a bound above the declared damping is not offered.
+    """
+    found = []
+    for i, (e, device) in enumerate(zip(estimates, scenario.device, strict=False)):
+        guaranteed = 1e-6 * session.info.osp_damping[i] if session.info else 0.0
+        declared = max(device.damping, guaranteed)
+        if e.viscous > (1 + SUSPICIOUS) * declared or e.delta > declared:
+            found.append(
+                f"axis {i + 1}: {e.viscous:.4g} N s/m estimated, {declared:.4g} declared (scenario, INFO): is somebody "
+                "holding it? No bound is offered; where the device really has more, declare it and take another record"
+            )
+    return found
 
 
 def estimate(recorder: Recorder, session: Session, scenario: Scenario) -> list[Estimate]:
@@ -173,6 +195,8 @@ def _print(outcome: dict[str, Any], console: Console) -> None:
     console.print(table)
     if "reason" in outcome:
         console.print(f"nothing was identified: {outcome['reason']}")
+    for warning in outcome["warnings"]:
+        console.print(f"[yellow]{warning}[/]")
     console.print(f"[dim]·[/] {LIMITS}")
     console.print("files: " + ", ".join(outcome["files"]), soft_wrap=True)
 

@@ -19,10 +19,10 @@ from hw.plan import Ages, Program
 from hw.port import PortLost
 from hw.safety import ENDED, Fault, Stage
 from hw.session import Session
+from hw.steering import Steering
 
 LONGEST_WAIT = 1e-3  # [s] between two looks at the time-outs
 GRACE_US = 50_000  # after the end, in which a STOP that was lost is repeated
-KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
 
 
 class Wire(Protocol):
@@ -49,11 +49,10 @@ class Live:
         pace: float = 1.0,  # seconds of the session per second; 1 with any real device
     ) -> None:
         self.session, self.port, self._plan = session, port, plan
-        self._auto_arm, self._seconds = auto_arm, seconds
+        self._steering = Steering(auto_arm, seconds)
         self._keyboard, self._glance, self._pace = keyboard, glance, pace
         self.signals: list[int] = []
         self.dropped = 0  # bytes that the port would not take at once
-        self._armed_at: int | None = None
         self._glanced = 0
 
     def now(self) -> int:
@@ -91,19 +90,11 @@ class Live:
             self._pressed(os.read(self._keyboard, 64).decode(errors="replace"))
 
     def _steer(self) -> None:
-        """What is not an answer: couplings for the measured delay, arming, the planned end, signals."""
+        """What is not an answer: couplings for the measured delay, arming and the planned end, signals."""
         session, now = self.session, self.now()
         if session.stage == Stage.MEASURED:
             self._load()
-        elif session.stage == Stage.DISARMED and self._auto_arm:
-            if self._armed_at is None:
-                self._write(session.arm(now))
-            else:  # a softer coupling is ready, and nobody is there to arm it
-                self._write(session.refuse(f"nobody to arm the softer coupling ({session.cause})", now))
-        if session.stage == Stage.ARMED and self._armed_at is None:
-            self._armed_at = now
-        if self._armed_at is not None and now - self._armed_at > 1e6 * self._seconds:
-            self._write(session.stop("the time is over", now))
+        self._write(self._steering.look(session, now))
         if self.signals:
             name = signal.Signals(self.signals[0]).name
             self._write(session.stop(name, now) if len(self.signals) == 1 else session.fail(f"{name} again", now))
@@ -115,7 +106,7 @@ class Live:
         """Design while the device rests at zero force; what it says meanwhile is of no use."""
         session = self.session
         try:
-            rungs = self._plan(Ages(tuple(session.ages)))
+            rungs = self._plan(session.measurement.result)
         except Fault as fault:
             self._write(session.refuse(str(fault), self.now()))
             return
@@ -126,14 +117,7 @@ class Live:
 
     def _pressed(self, keys: str) -> None:
         for key in keys:
-            match KEYS.get(key):
-                case "arm":
-                    self._armed_at = None
-                    self._write(self.session.arm(self.now()))
-                case "stop":
-                    self._write(self.session.stop(f"key {key}", self.now()))
-                case "estop":
-                    self._write(self.session.estop("space bar", self.now()))
+            self._write(self._steering.press(key, self.session, self.now()))
 
     def _write(self, data: bytes) -> None:
         if data:
@@ -146,8 +130,8 @@ class Live:
 
 @contextmanager
 def _signals(received: list[int]) -> Iterator[None]:
-    """SIGINT and SIGTERM are noted, and dealt with between two ticks."""
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    """SIGINT, SIGTERM, SIGHUP and SIGQUIT are noted, and dealt with between two ticks."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
     before = {number: signal.signal(number, lambda got, frame: received.append(got)) for number in numbers}
     try:
         yield

@@ -27,14 +27,24 @@ from sim.scenario import InputError, Scenario
 
 @dataclass(frozen=True)
 class Ages:
-    """How old a force is when it reaches the device, counted from its sample [us]."""
+    """How old a force is when it reaches the device, counted from its sample [us], and how many never do."""
 
     values: tuple[int, ...]
+    missing: int = 0
 
     def quantile(self, q: float) -> int:
-        """The least age that a fraction q of the forces does not exceed."""
-        ordered = sorted(self.values)
-        return ordered[min(len(ordered) - 1, int(q * len(ordered)))]
+        """The least age that a fraction q of all forces does not exceed. Raises Fault where so many never arrive."""
+        ordered, everything = sorted(self.values), len(self.values) + self.missing
+        place = min(everything - 1, int(q * everything))
+        if place >= len(ordered):
+            part = 100 * self.missing / everything
+            raise Fault(f"{part:.2g} % of the answers never arrived: no delay keeps {100 * q:g} % (--quantile)")
+        return ordered[place]
+
+    @property
+    def median(self) -> int:
+        """Of those that arrived [us]."""
+        return sorted(self.values)[len(self.values) // 2]
 
 
 def link_delay(ages: Ages, T_us: float, quantile: float, guard_us: float) -> int:

@@ -19,6 +19,7 @@ from hw.message import Phase
 from hw.plan import Ages, Program
 from hw.safety import ENDED, Fault, Stage
 from hw.session import Session
+from hw.steering import Steering
 from hw.upset import Line, Upset
 
 POLL_US = 1000
@@ -47,7 +48,8 @@ class Rehearsal:
     seed: int = 0
     actions: Sequence[tuple[float, Callable[[Session, int], bytes]]] = ()
     host_stalls: Sequence[tuple[float, float]] = ()  # (seconds after arming, seconds) in which the host is frozen
-    arm: bool = True
+    arm: bool = True  # once; a softer coupling waits for a person
+    steering: Steering | None = None  # in place of `arm`: the rule of a live session
     latency_us: float = LATENCY_US
     clock: float = 1.0  # how long a tick of the device lasts, in T
     moments: list[Moment] = field(default_factory=list)
@@ -95,7 +97,7 @@ class Rehearsal:
         data = emulator.tick(clock)
         emulator.advance()
         self.moments.append(Moment(clock, emulator.device.phase, emulator.applied))
-        self._at(now + self._period, "tick", None)
+        self._at(now + self._period * emulator.stretch, "tick", None)
         if emulator.unplugged and not self._gone:
             self._gone = True
             self._at(now + self.latency_us, "gone", None)
@@ -110,10 +112,12 @@ class Rehearsal:
         self._send(session.receive(data, round(now)), now)
         if session.stage == Stage.MEASURED:
             try:
-                rungs = self.plan(Ages(tuple(session.ages)))
+                rungs = self.plan(session.measurement.result)
             except Fault as fault:
                 return self._send(session.refuse(str(fault), round(now)), now)
             return self._send(session.load(rungs, round(now)), now)
+        if self.steering:
+            return self._send(self.steering.look(session, round(now)), now)
         if session.stage == Stage.DISARMED and self.arm and session.rung is session.rungs[0]:
             self._send(session.arm(round(now)), now)  # once: a softer coupling waits for a person
         return None

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -18,8 +18,9 @@ from controller.process import force_map
 from design.store import CouplingData
 from hw.handshake import Units
 from hw.law import Law
-from hw.safety import Limits, shape
+from hw.safety import Fault, Limits, shape
 from hw.trace import load
+from models.quantity import require
 from sim.command import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute
 from sim.files import write_json
 from sim.result import Result
@@ -32,9 +33,21 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scenario: Scenario
     coupling: CouplingData
     link_delay: int
-    limits: dict[str, Any]
+    limits: Limits
     force_step: tuple[float, ...]
     cap: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        """Raises ValueError naming what no session can have written."""
+        m, least = self.scenario.channels, min(self.scenario.theta)
+        for name, given in (("limits.cap", self.limits.cap), ("force_step", self.force_step), ("cap", self.cap)):
+            if len(given) != m:
+                raise ValueError(f"{name} has {len(given)} entries, the scenario {m} channels")
+        for i in range(m):
+            require(f"force_step[{i}]", self.force_step[i], 1e-9, 1.0, "N")
+            require(f"cap[{i}]", self.cap[i], 1, 0x7FFF, "steps")
+        if not 1 <= self.link_delay <= least:
+            raise ValueError(f"link_delay is {self.link_delay}, allowed are 1 to {least}, the scenario's least theta")
 
     def law(self) -> Lti:
         """F as the host ran it."""
@@ -57,29 +70,64 @@ class Comparison:
         return not (self.asked.any() or self.sent.any())
 
 
-def recipe_of(result: Result) -> Recipe:
-    """The recipe in a trace. Raises InputError where there is none."""
+def recipes_of(result: Result) -> list[Recipe]:
+    """The recipes in a trace, one for each arming. Raises InputError where there is none."""
     try:
-        return msgspec.convert(result.meta.get("replay"), Recipe)
+        _require_limits(result.meta.get("replay"))
+        return msgspec.convert(result.meta.get("replay"), Annotated[list[Recipe], msgspec.Meta(min_length=1)])
     except (msgspec.ValidationError, ValueError) as error:
         raise InputError(f"the trace cannot be replayed: {error}") from None
 
 
+def _require_limits(raw: object) -> None:
+    """Raise ValueError where a recipe has other limits than Limits: msgspec passes over those of a dataclass."""
+    names = {field.name for field in fields(Limits)}
+    for recipe in raw if isinstance(raw, list) else []:
+        limits = recipe.get("limits") if isinstance(recipe, dict) else None
+        if isinstance(limits, dict) and set(limits) != names:
+            wrong = ", ".join(sorted(set(limits) ^ names))
+            raise ValueError(f"limits are {', '.join(sorted(names))}; missing or unknown: {wrong}")
+
+
 def replay(result: Result, link: dict[str, Array]) -> Comparison:
-    """Feed the recorded displacements through law, gain, limits and rounding."""
-    recipe = recipe_of(result)
-    law, limits = Law(recipe.law()), Limits(**{**recipe.limits, "cap": tuple(recipe.limits["cap"])})
-    units = Units((1.0,) * len(recipe.cap), recipe.force_step, (1.0,) * len(recipe.cap))
+    """Feed the recorded displacements through law, gain, limits and rounding, every arming from rest."""
+    recipes, arming = recipes_of(result), link["arming"]
+    channels = result.x.shape[1]
+    if int(arming[-1]) + 1 != len(recipes) or any(recipe.scenario.channels != channels for recipe in recipes):
+        told = f"{len(recipes)} recipes for {int(arming[-1]) + 1} armings of {channels} channels"
+        raise InputError(f"the trace cannot be replayed: it has {told}")
     asked, sent = np.zeros_like(link["asked"]), np.zeros_like(link["sent"])
-    force: Sequence[float] = (0.0,) * len(recipe.cap)
-    for k, x in enumerate(result.x):
-        asked[k] = law.step(x)
-        if link["received"][k]:
-            force = shape(asked[k].tolist(), force, float(link["gain"][k]), limits, recipe.scenario.T).force
-            sent[k] = units.steps(force, recipe.cap)
+    for i, recipe in enumerate(recipes):
+        _again(recipe, np.flatnonzero(arming == i), result, link, (asked, sent))
     different = asked.view(np.int64) != link["asked"].view(np.int64)
     largest = float(np.abs(asked - link["asked"]).max(initial=0.0))
     return Comparison(different.any(axis=1), (sent != link["sent"]).any(axis=1), largest)
+
+
+def _again(
+    recipe: Recipe, ticks: NDArray[np.intp], result: Result, link: dict[str, Array], into: tuple[Array, Array]
+) -> None:
+    """The `ticks` of one arming: forces asked for and steps sent, written to `into`."""
+    law, units = _built(recipe), Units((1.0,) * len(recipe.cap), recipe.force_step, (1.0,) * len(recipe.cap))
+    force: Sequence[float] = (0.0,) * len(recipe.cap)
+    asked, sent = into
+    for k in ticks:
+        asked[k] = law.step(result.x[k])
+        if not link["received"][k]:
+            continue
+        try:
+            gain = float(link["gain"][k])
+            force = shape(asked[k].tolist(), force, gain, recipe.limits, recipe.scenario.T).force
+        except Fault as fault:
+            raise InputError(f"the trace cannot be replayed: tick {k}: {fault}") from None
+        sent[k] = units.steps(force, recipe.cap)
+
+
+def _built(recipe: Recipe) -> Law:
+    try:
+        return Law(recipe.law())
+    except ValueError as error:
+        raise InputError(f"the trace cannot be replayed: {error}") from None
 
 
 def main(argv: list[str]) -> int:

@@ -13,11 +13,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from hw.conduct import check_state
 from hw.drive import Drive, Row
 from hw.frame import Ack, Config, Decoder, Force, Hello, Info, Message, State, Stop, config_crc, encode
 from hw.handshake import Units, configuration, objections, probe_delay
+from hw.measurement import Measurement
 from hw.message import Command, Phase, Reason, Refused
-from hw.plan import Ages, Program
+from hw.plan import Program
 from hw.safety import DRIVING, ENDED, Fault, Limits, Stage
 from hw.watch import FRESH, Counters, LinkWatch
 from sim.scenario import Scenario
@@ -25,7 +27,6 @@ from sim.scenario import Scenario
 RESEND_US, PATIENCE_US = 100_000, 2_000_000  # a question is asked again, and then given up
 QUIET_US = 1_000_000  # longest silence of a device that has no force to take away
 ARMING_US = 500_000  # in which a device must follow ARM
-PERIOD_TOLERANCE = 0.01  # of the device's clock against T, over the measurement
 
 
 @dataclass(frozen=True)
@@ -60,9 +61,10 @@ class Session:
         self.watch = LinkWatch(settings.window, self.counters)
         self.stage, self.cause = Stage.CONNECTING, ""
         self.log: list[Event] = []
-        self.ages: list[int] = []
+        self.measurement = Measurement(settings.measure, self.probe, scenario.T, settings.missed)
         self.rungs: tuple[Program, ...] = ()
         self.rung: Program | None = None
+        self.armings: list[tuple[Program, Config]] = []  # what forces came from, arming by arming
         self.info: Info | None = None
         self.config: Config | None = None
         self.record: Callable[[Row], None] = lambda row: None
@@ -107,7 +109,9 @@ class Session:
             assert self.rung
             assert self.config
             law = self.rung.controller()
-            self.drive = Drive(law, self.units, self.config, self.limits, self.counters, self.record)
+            record, arming = self.record, len(self.armings)
+            self.drive = Drive(law, self.units, self.config, self.limits, self.counters, record, arming)
+            self.armings.append((self.rung, self.config))
             self._enter(Stage.ARMING, "asked to")
         return b""
 
@@ -244,7 +248,8 @@ class Session:
         self.watch.note(state)
         if state.phase == Phase.ESTOP:
             return self.estop(f"pressed, {state.cause.name.lower()}", self.now)
-        self._check_device(state)
+        assert self.config is not None
+        check_state(state, self.config, self.stage, self.gain)
         if self.stage in DRIVING:
             return self._on_driving(state, ticks)
         if self.stage == Stage.MEASURING:
@@ -256,41 +261,24 @@ class Session:
         self.missed_while_driving += self.watch.missed[-1]
         ready = state.phase != Phase.DISARMED
         direction = (-1 if self.stage == Stage.DISARMING else 1) if ready else 0
-        steps = self.drive.step(state, ticks, direction)
+        steps = self.drive.step(state, ticks, direction, self.now)
+        if self.stage != Stage.DISARMING:
+            self._judge()
         if self.stage == Stage.ARMING and self.gain == 1.0:
             self._enter(Stage.ARMED, "full gain")
         if self.stage == Stage.DISARMING and self.gain == 0.0:
             return self._ramped_out()
-        self._judge()
         return self._answer(state, Command.RUN if ready else Command.ARM, steps)
 
-    def _check_device(self, state: State) -> None:
-        assert self.config is not None
-        strongest = max(abs(a) - c for a, c in zip(state.applied, self.config.cap, strict=True))
-        if strongest > 0:
-            raise Fault(f"the device applies {state.applied} steps, the cap is {self.config.cap}")
-        if state.phase in (Phase.STOPPED, Phase.RAMP, Phase.SILENT):
-            raise Fault(f"the device is in {state.phase.name.lower()}, cause {state.cause.name.lower()}")
-        armed = state.phase in (Phase.ARMED, Phase.HOLDING)
-        if armed and self.stage not in DRIVING:
-            raise Fault("the device is armed, and nobody asked it to")
-        if not armed and (self.stage in (Stage.ARMED, Stage.DISARMING) or self.gain > 0):
-            raise Fault("the device has disarmed itself")
-
     def _measure(self, state: State) -> bytes:
-        margin, T_us = self.watch.margins[-1], 1e6 * self.scenario.T
-        if not self.ages:
-            self._clock = (state.t_us, state.tick)
-        if margin is not None:
-            self.ages.append(round(self.probe * T_us) - margin)
-        if len(self.ages) < self.settings.measure:
+        try:
+            done = self.measurement.note(state, self.watch.margins[-1], self.watch.missed[-1])
+        except Fault as fault:
+            return self._end(Stage.REFUSED, str(fault))
+        if not done:
             return self._answer(state, Command.IDLE)
-        elapsed = (state.t_us - self._clock[0]) & 0xFFFFFFFF
-        ticks = (state.tick - self._clock[1]) & 0xFFFF
-        if ticks and abs(elapsed / (ticks * T_us) - 1) > PERIOD_TOLERANCE:
-            clock = f"a tick of the device lasts {elapsed / ticks:.1f} us by its own clock, T is {T_us:g} us"
-            return self._end(Stage.REFUSED, clock)
-        self._enter(Stage.MEASURED, f"{len(self.ages)} answers, median age {Ages(tuple(self.ages)).quantile(0.5)} us")
+        ages = self.measurement.result
+        self._enter(Stage.MEASURED, f"{len(ages.values)} answers, median age {ages.median} us")
         return b""
 
     def _answer(self, state: State, command: Command, steps: tuple[int, ...] | None = None) -> bytes:
@@ -300,8 +288,6 @@ class Session:
 
     def _judge(self) -> None:
         """Whether the link still is what the coupling was certified for."""
-        if self.stage != Stage.ARMED or not self.watch.full:
-            return
         assert self.rung is not None
         late, missed = self.watch.late_part, self.watch.missed_part
         if missed > self.settings.missed + late:

@@ -15,8 +15,9 @@ from rich.table import Table
 
 from design.promises import CAVEATS
 from design.store import data_of
+from hw.frame import Config
 from hw.message import NO_MARGIN
-from hw.plan import Ages, Rung
+from hw.plan import Ages, Program, Rung
 from hw.safety import Stage
 from hw.session import Session
 from hw.trace import Recorder, result_of, save_npz
@@ -48,9 +49,11 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
 
 
 def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
+    measured = session.measurement
     counters = asdict(session.counters) | {"host_errors": session.decoder.rejected, "host_dropped_bytes": dropped}
     part: dict[str, Any] = {
-        "measured_age_us": _percentiles(np.array(session.ages)),
+        "measured_age_us": _percentiles(np.array(measured.ages)),
+        "measured_missing": measured.missing,
         "age_us": None,
         "rate_hz": None,
         "missed_percent": None,
@@ -72,9 +75,10 @@ def _percentiles(values: np.ndarray) -> dict[str, float] | None:
 
 def print_certificate(ages: Ages, link: int, rungs: Sequence[Rung], console: Console) -> None:
     """What was measured, and what is certified for it: printed before anything is armed."""
+    at = {p: int(np.percentile(ages.values, p)) for p in (50, 99)}
     console.print(
-        f"answers are {ages.quantile(0.5)} us old, {ages.quantile(0.99)} us at the 99th percentile: "
-        f"a link of {link} tick{'s' if link > 1 else ''}"
+        f"answers are {at[50]} us old, {at[99]} us at the 99th percentile, {ages.missing} of "
+        f"{len(ages.values) + ages.missing} never arrived: a link of {link} tick{'s' if link > 1 else ''}"
     )
     table = Table(title="certified for the delay measured, and softer in reserve")
     for column in ("theta", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "promise"):
@@ -91,6 +95,8 @@ def print_certificate(ages: Ages, link: int, rungs: Sequence[Rung], console: Con
             part["promise"],
         )
     console.print(table)
+    if len(rungs) == 1:
+        console.print("no reserve: nothing softer is certified, so late answers end the session")
 
 
 def print_session(report: dict[str, Any], console: Console) -> None:
@@ -117,15 +123,7 @@ def save(out: Path, session: Session, recorder: Recorder, report: dict[str, Any]
     """The trace (where forces acted), its picture, and the report."""
     files = []
     if len(recorder):
-        assert isinstance(session.rung, Rung)
-        replay = {
-            "scenario": json.loads(msgspec.json.encode(session.rung.scenario)),
-            "coupling": json.loads(msgspec.json.encode(data_of(session.rung.chosen.coupling))),
-            "link_delay": session.rung.link,
-            "limits": asdict(session.limits),
-            "force_step": list(session.units.force_step),
-            "cap": list(session.config.cap) if session.config else [],
-        }
+        replay = [_recipe(session, program, config) for program, config in session.armings]
         result = result_of(recorder, session.units, session.scenario.T, report | {"replay": replay})
         files += [save_npz(out / "trace.npz", result, recorder), result.save_csv(out / "trace.csv")]
         if plot:
@@ -136,6 +134,19 @@ def save(out: Path, session: Session, recorder: Recorder, report: dict[str, Any]
     files.append(out / "report.json")
     write_json(files[-1], report | {"files": [str(p) for p in files]})
     return files
+
+
+def _recipe(session: Session, program: Program, config: Config) -> dict[str, Any]:
+    """All that hw.replay needs of one arming."""
+    assert isinstance(program, Rung)
+    return {
+        "scenario": json.loads(msgspec.json.encode(program.scenario)),
+        "coupling": json.loads(msgspec.json.encode(data_of(program.chosen.coupling))),
+        "link_delay": program.link,
+        "limits": asdict(session.limits),
+        "force_step": list(session.units.force_step),
+        "cap": list(config.cap),
+    }
 
 
 def _list(values: Sequence[float | None] | None) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from array import array
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -15,12 +16,13 @@ from controller.lti import Array
 from hw.drive import Row
 from hw.handshake import Units
 from hw.message import NO_MARGIN
+from hw.trace_check import complaint
 from sim.files import write
 from sim.result import Result
 from sim.scenario import InputError
 
 #: what the link adds, one entry per tick: name -> axes of the array
-LINK = {"tick": 1, "received": 1, "asked": 2, "gain": 1, "sent": 2, "margin_us": 1, "status": 1}
+LINK = {"tick": 1, "arming": 1, "received": 1, "asked": 2, "gain": 1, "sent": 2, "margin_us": 1, "status": 1}
 
 
 class Recorder:
@@ -29,16 +31,16 @@ class Recorder:
     def __init__(self, channels: int) -> None:
         self.channels = channels
         self._floats = array("d")  # x, asked, gain
-        self._whole = array("i")  # tick, received, sent, applied, margin, status
+        self._whole = array("i")  # tick, arming, received, sent, applied, margin, status
 
     def __call__(self, row: Row) -> None:
         """Take in one tick."""
         m, state = self.channels, row.state
         self._floats.extend((*row.x, *row.asked, row.gain))
         if state is None:
-            self._whole.extend((row.tick, 0, *(0,) * (2 * m), NO_MARGIN, 0))
+            self._whole.extend((row.tick, row.arming, 0, *(0,) * (2 * m), NO_MARGIN, 0))
         else:
-            self._whole.extend((row.tick, 1, *row.sent, *state.applied, state.margin_us, state.status))
+            self._whole.extend((row.tick, row.arming, 1, *row.sent, *state.applied, state.margin_us, state.status))
 
     def __len__(self) -> int:
         return len(self._floats) // (2 * self.channels + 1)
@@ -47,13 +49,14 @@ class Recorder:
         """Arrays by the names of LINK, with `x` (N, m) [m] and `applied` (N, m) [steps] beside them."""
         m, n = self.channels, len(self)
         floats = np.array(self._floats).reshape(n, 2 * m + 1)
-        whole = np.array(self._whole).reshape(n, 2 * m + 4)
-        tick, received, sent, applied, rest = np.split(whole, [1, 2, 2 + m, 2 + 2 * m], axis=1)
+        whole = np.array(self._whole).reshape(n, 2 * m + 5)
+        tick, arming, received, sent, applied, rest = np.split(whole, [1, 2, 3, 3 + m, 3 + 2 * m], axis=1)
         return {
             "x": floats[:, :m],
             "asked": floats[:, m : 2 * m],
             "gain": floats[:, -1],
             "tick": tick[:, 0],
+            "arming": arming[:, 0],
             "received": received[:, 0].astype(bool),
             "sent": sent,
             "applied": applied,
@@ -86,11 +89,14 @@ def save_npz(path: Path, result: Result, recorder: Recorder) -> Path:
 
 def load(path: Path) -> tuple[Result, dict[str, Array]]:
     """A trace with its link arrays. Raises InputError where the file holds no session of a bridge."""
-    result = Result.load_npz(path)
+    try:
+        result = Result.load_npz(path)
+    except (TypeError, AttributeError, zlib.error) as error:
+        raise InputError(f"{path}: not a trace of this program ({error})") from None
     try:
         with np.load(path, allow_pickle=False) as archive:
             link = {name: archive[f"link_{name}"] for name in LINK}
-    except (OSError, KeyError, ValueError, EOFError, BadZipFile):
+    except (OSError, KeyError, ValueError, EOFError, BadZipFile, zlib.error):
         raise InputError(f"{path}: a trace, but not of a bridge's session; hw.bridge writes one") from None
     n, m = result.x.shape
     for name, axes in LINK.items():
@@ -98,4 +104,6 @@ def load(path: Path) -> tuple[Result, dict[str, Array]]:
             raise InputError(
                 f"{path}: link_{name} has the shape {link[name].shape}, the trace {n} ticks of {m} channels"
             )
+    if wrong := complaint(result, link):
+        raise InputError(f"{path}: no session of hw.bridge: {wrong}")
     return result, link

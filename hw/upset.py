@@ -40,6 +40,9 @@ DEVICE = {
     "unplug": ("no value", 0.0, 0.0, 0.0),
     "reset": ("no value", 0.0, 0.0, 0.0),
     "jump": ("millimetres by which encoder 1 jumps", -1000.0, 1000.0, 5.0),
+    "leap": ("ticks by which its tick number leaps", 1.0, 32000.0, 300.0),
+    "own": ("newtons that its motors have while armed, whatever they are told", -12.0, 12.0, 2.0),
+    "period": ("length of a tick in T", 0.5, 4.0, 2.0),
     "estop": ("no value: the emergency stop at the device", 0.0, 0.0, 0.0),
     "trip": ("no value: a fault that the firmware found", 0.0, 0.0, 0.0),
 }

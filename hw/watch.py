@@ -82,18 +82,14 @@ class LinkWatch:
         self._late = self._missed = 0
 
     @property
-    def full(self) -> bool:
-        return len(self.margins) >= self.window
-
-    @property
     def late_part(self) -> float:
-        """The part of the window's answers that came too late."""
-        return self._late / max(1, len(self.margins))
+        """The late answers as a part of a whole window: they are that many, however few ticks there were yet."""
+        return self._late / self.window
 
     @property
     def missed_part(self) -> float:
-        """The part of the window's ticks without an answer in time, late or lost."""
-        return min(1.0, self._missed / max(1, len(self.missed)))
+        """The part of a whole window without an answer in time, late or lost."""
+        return min(1.0, self._missed / self.window)
 
 
 def _is_late(margin: int | None) -> bool:

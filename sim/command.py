@@ -96,6 +96,13 @@ def require_linear(scenario: Scenario, what: str) -> None:
         raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
 
 
+def require_constant_delay(scenario: Scenario, what: str) -> None:
+    """Raises InputError where a scenario's delays vary, for a command that would not make them vary."""
+    if scenario.jitter is not None:
+        instead = "sim.run simulates it"
+        raise InputError(f"jitter: {what} takes the delays that its link has; take the table out, {instead}")
+
+
 def numbers(option: str, text: str, kind: Callable[[str], Number], count: int) -> tuple[Number, ...]:
     """'1,2' as `count` numbers; a single one serves all channels. Raises InputError."""
     try:

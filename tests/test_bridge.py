@@ -1,6 +1,7 @@
 """Whole sessions in virtual time: every fault, the exact engine's run, the delay into the design, traces, replays."""
 
 import json
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -306,6 +307,23 @@ def test_a_replay_is_identical_bit_by_bit(trace):
     assert np.abs(link["sent"]).max() > 1000
 
 
+def test_a_session_armed_twice_is_replayed_with_both_couplings(scenario, rungs, tmp_path):
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(lively(scenario), rungs, "down:jitter=0.0007@0.45", recorder=recorder)
+    session = rehearsal.run_until_armed(1.2)
+    assert session.stage == Stage.DISARMED
+    session.arm(session.now)
+    rehearsal.run(1e-6 * session.now + 0.8)
+    session.stop("enough", session.now)
+    rehearsal.run(1e-6 * session.now + 0.2)
+    files = session_report.save(tmp_path, session, recorder, session_report.outcome("I", session, recorder, 0), False)
+    result, link = load(files[0])
+    assert [recipe.link_delay for recipe in replay.recipes_of(result)] == [1, 2]
+    assert np.bincount(link["arming"]).min() > 300
+    assert replay.replay(result, link).identical
+    assert np.abs(link["sent"][link["arming"] == 1]).max() > 100
+
+
 def test_a_replay_finds_one_changed_bit(trace):
     result, link = load(trace[0][0])
     changed = link["asked"].copy()
@@ -343,6 +361,81 @@ def test_a_trace_whose_recipe_is_broken_is_bad_input(trace, tmp_path):
     path = save_npz(tmp_path / "trace.npz", broken, trace[1])
     with pytest.raises(InputError, match="cannot be replayed"):
         replay.replay(*load(path))
+
+
+def _spoil(path, to, **changes):
+    with np.load(path) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    np.savez_compressed(to, **(arrays | {name: change(arrays) for name, change in changes.items()}))
+    return to
+
+
+def _nan(name):
+    def change(arrays):
+        values = arrays[name].copy()
+        values[7] = np.nan
+        return values
+
+    return change
+
+
+def _meta(**changes):
+    def change(arrays):
+        meta = json.loads(str(arrays["meta"]))
+        (recipe,) = meta["replay"]
+        limits = recipe["limits"] | changes.get("limits_more", {})
+        rest = {name: value for name, value in changes.items() if name != "limits_more"}
+        return np.array(json.dumps(meta | {"replay": [recipe | {"limits": limits} | rest]}))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"x": _nan("x")}, "x is not finite at tick 7"),
+        ({"link_gain": _nan("link_gain")}, "link_gain is not finite at tick 7"),
+        ({"link_asked": _nan("link_asked")}, "link_asked is not finite at tick 7"),
+        ({"link_gain": lambda a: a["link_gain"] * 5}, "link_gain is outside of 0 to 1"),
+        ({"link_gain": lambda a: a["link_gain"].astype(str)}, "link_gain is of type <U32"),
+        ({"link_asked": lambda a: a["link_asked"].astype(np.float32)}, "link_asked is of type float32"),
+        ({"link_received": lambda a: a["link_received"] * np.nan}, "link_received is of type float64"),
+        ({"link_sent": lambda a: a["link_sent"] * 1.0}, "link_sent is of type float64"),
+        ({"meta": lambda a: np.array("[1]")}, "metadata is a list"),
+        ({"link_arming": lambda a: a["link_arming"] + 1}, "link_arming does not count"),
+        ({"link_arming": lambda a: (a["link_tick"] == a["link_tick"][-1]).astype(int)}, "1 recipes for 2 armings"),
+        ({"meta": _meta(force_step=[0.0, 0.0])}, r"force_step\[0\] is 0"),
+        ({"meta": _meta(force_step=[4e-4])}, "force_step has 1 entries"),
+        ({"meta": _meta(cap=[30000])}, "cap has 1 entries"),
+        ({"meta": _meta(limits={})}, "missing or unknown: cap"),
+        ({"meta": _meta(limits_more={"sleew": 1.0})}, "missing or unknown: sleew"),
+        ({"meta": _meta(limits="none")}, "Expected `object`, got `str`"),
+        ({"meta": _meta(limits_more={"cap": [100.0, 100.0]})}, r"cap\[0\] is 100"),
+        ({"meta": _meta(limits_more={"slew": "fast"})}, "Expected `float`, got `str`"),
+        ({"meta": _meta(link_delay=9)}, "link_delay is 9, allowed are 1 to 1"),
+        ({"meta": _meta(link_delay=-(10**7))}, "link_delay is -10000000"),
+    ],
+)
+def test_a_spoiled_trace_is_one_line(trace, tmp_path, changes, words):
+    path = _spoil(trace[0][0], tmp_path / "trace.npz", **changes)
+    with pytest.raises(InputError, match=words) as error:
+        replay.main([str(path)])
+    assert "\n" not in str(error.value)
+
+
+def test_an_empty_or_a_damaged_trace_is_one_line(trace, tmp_path):
+    with np.load(trace[0][0]) as archive:
+        empty = {name: archive[name] if name == "meta" else archive[name][:0] for name in archive.files}
+    np.savez_compressed(tmp_path / "empty.npz", **empty)
+    with pytest.raises(InputError, match="has no ticks"):
+        replay.main([str(tmp_path / "empty.npz")])
+    whole = bytearray(trace[0][0].read_bytes())
+    for place in range(200, len(whole), len(whole) // 40):
+        damaged = whole.copy()
+        damaged[place] ^= 0x55
+        (tmp_path / "damaged.npz").write_bytes(damaged)
+        with suppress(InputError):  # a byte of the archive's own padding or of a name may not matter
+            replay.main([str(tmp_path / "damaged.npz")])
 
 
 def test_the_report_is_json_and_names_its_end(trace):

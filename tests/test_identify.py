@@ -1,5 +1,7 @@
 """Identification on the emulated device, in virtual time: known parameters come back, and a bound is a lower bound."""
 
+from types import SimpleNamespace
+
 import msgspec
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from hw.emulated_plant import nobody
 from hw.emulator_core import Emulator
 from hw.excitation import chirp
 from hw.fit import identify
-from hw.identify import estimate
+from hw.identify import estimate, held
 from hw.identify import main as identify_command
 from hw.rehearsal import Rehearsal
 from hw.safety import Limits, Stage
@@ -130,3 +132,18 @@ def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
     with pytest.raises(InputError) as error:
         identify_command(["--emulate", *options])
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("viscous", "delta", "suspicious"),
+    [(1.37, 1.36, False), (1.49, 1.35, False), (1.52, 1.36, True), (1.4, 1.38, True)],
+)
+def test_more_damping_than_declared_asks_who_holds_it(viscous, delta, suspicious):
+    """A hand that damps looks like the device: only the declared 1.37 N s/m can say so."""
+    scenario = load()
+    session = Session(scenario, Limits((1.0, 1.0)), Settings())
+    estimate = SimpleNamespace(viscous=viscous, delta=delta)
+    warnings = held([estimate], scenario, session)
+    assert len(warnings) == suspicious
+    if suspicious:
+        assert "is somebody holding it?" in warnings[0]

@@ -15,7 +15,9 @@ from pathlib import Path
 
 import pytest
 
-from hw import bridge, replay
+from controller.jitter import Jitter
+from hw import bridge, identify, replay
+from hw import emulator as emulator_command
 from hw.live import Live
 from hw.plan import ladder, rung
 from hw.port import Port
@@ -97,7 +99,7 @@ def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
         assert replay.main(["out/bridge-I/trace.npz"]) == 0
 
 
-@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGQUIT"])
 def test_a_signal_ends_a_session_at_zero_force(emulator, scenario, rungs, name):
     def glance(session):
         if session.stage == Stage.MEASURING and not sent:
@@ -151,6 +153,7 @@ def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
         (["--emulate", "--pace", "2"], "--pace is 2, allowed are 0.01 to 1"),
         (["--port", "x", "--pace", "0.5"], "--pace is for --emulate"),
         (["--emulate", "--T", "0.05"], "T is 0.05 s"),
+        (["--emulate", "--T", "0.006"], "at most 0.003 s: the host's watchdog of 6 ms has to outlast one lost STATE"),
         (["--emulate", "--fault", "nonsense"], "the emulator did not start: --fault is 'nonsense'"),
     ],
 )
@@ -160,3 +163,11 @@ def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
     with pytest.raises(InputError) as error:
         bridge.main(options)
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize("module", [bridge, emulator_command, identify])
+def test_delays_that_vary_in_the_scenario_are_refused_by_name(module, scenario, tmp_path, monkeypatch):
+    """The link has the delays that it has; a table that nothing reads would promise something else."""
+    monkeypatch.setattr(module, "scenario_from", lambda args: scenario.replace(jitter=Jitter((1, 1), (2, 2))))
+    with pytest.raises(InputError, match=r"jitter: hw\.\w+ takes the delays that its link has"):
+        module.main([] if module is emulator_command else ["--emulate", "--out", str(tmp_path)])
