@@ -112,7 +112,7 @@ def _again(
     force: Sequence[float] = (0.0,) * len(recipe.cap)
     asked, sent = into
     for k in ticks:
-        asked[k] = law.step(result.x[k])
+        asked[k] = law.step(result.x[k].tolist())
         if not link["received"][k]:
             continue
         try:

@@ -219,7 +219,8 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
         close = "no damping is enough" if ratio is None else f"the loop needs {ratio:.4g} of the damping it has"
         rows.append(("adversary", f"{found} among {adversary['evaluated']}; {close}"))
     rows.append(("certified", "yes" if report["certified"] else "no"))
-    rows.append(("holds", {True: "[green]yes[/]", False: "[red]no[/]"}.get(report["holds"], report.get("reason", "-"))))
+    verdict = {True: "[green]yes[/]", False: "[red]no[/]"}.get(report["holds"])
+    rows.append(("holds", verdict or str(report["reason"])))
     if report["interrupted"]:
         rows.append(("interrupted", "what was finished is kept; an adversary's search is not"))
     rows.append(("time", f"{report['wall_s']:.1f} s, {report['simulated_s_per_s']:.0f} simulated seconds per second"))
