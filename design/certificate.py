@@ -204,7 +204,9 @@ def _block(loop: Loop, coupling: CouplingData, condition: Condition) -> Exact:
             _require_static("F(1)", F1)
             return Exact(R.A, R.B, R.C, Matrix.diag(d / T for d in delta) - F1.scaled(Fraction(1, 2)))
         V = exact.compliance(built, len(delta), T)
-        H1, R = exact.shifted_compliance(V, loop.theta, delta, T).split_at_one()
+        H = exact.shifted_compliance(V, loop.theta, delta, T)
+        _require_size(H)
+        H1, R = H.split_at_one()
     except SingularMatrix as error:
         raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
     _require_symmetric("H(1)", H1)
