@@ -20,8 +20,9 @@ from hw.message import NO_MARGIN
 from hw.plan import Ages, Program, Rung
 from hw.safety import Stage
 from hw.session import Session
-from hw.trace import Recorder, result_of, save_npz
+from hw.trace import Recorder, result_of, save_npz, steady_ticks
 from sim.files import write_json
+from sim.growth import growths, told
 
 PERCENTILES = (50, 90, 99, 100)
 
@@ -32,7 +33,9 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     log = [{"t_s": 1e-6 * (e.t_us - begin), "stage": str(e.stage), "cause": e.cause} for e in session.log]
     parts = session.rung.part() if isinstance(session.rung, Rung) else {}
     empty = {"coupling": None, "certificate": None, "certificates": None, "promise": None, "theta": None}
-    return {
+    loop = isinstance(session.rung, Rung) and len(recorder) > 0
+    caps = [config.cap for _, config in session.armings] if loop else []
+    report = {
         "case": case,
         "scenario": session.scenario.name,
         **(empty | parts),
@@ -44,8 +47,12 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
             "T_s": session.scenario.T,
             "scenario_digest": session.scenario.digest,
             "pace": pace,  # below 1: slow motion, in which a link looks faster than it is
+            "encoder_step_m": list(session.units.encoder_step) if loop else None,
+            "steady_ticks": steady_ticks(recorder, caps),
         },
     }
+    trace = result_of(recorder, session.units, session.scenario.T, report) if loop else None
+    return report | {"growth": [one.part() for one in growths(trace)] if trace else []}
 
 
 def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
@@ -113,6 +120,8 @@ def print_session(report: dict[str, Any], console: Console) -> None:
         console.print(
             f"link: {link['rate_hz']:.0f} answers a second, {link['missed_percent']:.2f} % missed; age {ages}"
         )
+    for i, part in enumerate(report["growth"], start=1):
+        console.print(f"growth at full gain, arming {i}, {told(part, report['run']['T_s'])}")
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link["counters"].items() if n)
     console.print(f"counted: {counted or 'nothing'}")
     console.print(f"[dim]·[/] {CAVEATS}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zlib
 from array import array
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 from zipfile import BadZipFile
@@ -65,6 +66,22 @@ class Recorder:
         }
 
 
+def steady_ticks(recorder: Recorder, caps: Sequence[tuple[int, ...]]) -> list[list[int]]:
+    """[first, stop) of each arming in which the loop was one linear loop: at full gain, before a force met its cap.
+
+    `caps` (armings, m) [steps]. Missed ticks are not left out.
+    """
+    link = recorder.link()
+    stretches = []
+    for arming, cap in enumerate(caps):
+        full = np.flatnonzero((link["arming"] == arming) & (link["gain"] == 1.0))
+        if full.size:
+            capped = np.any(np.abs(link["applied"][full]) >= cap, axis=1)
+            count = int(np.argmax(capped)) if capped.any() else full.size
+            stretches.append([int(full[0]), int(full[0]) + count])
+    return stretches
+
+
 def result_of(recorder: Recorder, units: Units, T: float, meta: dict[str, Any]) -> Result:
     """The trace in the terms of sim.run. Handles and outside forces are not measured: nan, and no column."""
     link = recorder.link()
@@ -89,10 +106,7 @@ def save_npz(path: Path, result: Result, recorder: Recorder) -> Path:
 
 def load(path: Path) -> tuple[Result, dict[str, Array]]:
     """A trace with its link arrays. Raises InputError where the file holds no session of a bridge."""
-    try:
-        result = Result.load_npz(path)
-    except (TypeError, AttributeError, zlib.error) as error:
-        raise InputError(f"{path}: not a trace of this program ({error})") from None
+    result = Result.load_npz(path)
     try:
         with np.load(path, allow_pickle=False) as archive:
             link = {name: archive[f"link_{name}"] for name in LINK}

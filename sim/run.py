@@ -41,6 +41,7 @@ from sim.mujoco_engine import INTEGRATORS, LEAPFROG
 from sim.result import Result
 from sim.scenario import InputError, Scenario
 from sim.simulate import ENGINES, Assembly, assemble, simulate
+from sim.stability import before_clipping
 from sim.substeps import LEAST, MOST, check_substeps, default_substeps
 from sim.worst_switching import Period
 
@@ -189,6 +190,8 @@ def _outcome(
             "T_s": scenario.T,
             "interrupted": record.interrupted,
             "scenario_digest": scenario.digest,
+            "encoder_step_m": assembly.process.encoder_step.tolist(),
+            "steady_ticks": [[0, before_clipping(record, assembly.process.force_limit)]],
         },
         "error": report.error_part(record, exact, assembly, unstable),
     }

@@ -1,11 +1,14 @@
 """Whole sessions in virtual time: every fault, the exact engine's run, the delay into the design, traces, replays."""
 
 import json
+import re
 from contextlib import suppress
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from design.assess import assess
 from hw import replay, session_report
 from hw.emulator_core import Emulator
 from hw.fault_cases import CASES
@@ -14,19 +17,22 @@ from hw.frame import Decoder, Force, State, Stop, encode
 from hw.handshake import Units
 from hw.law import Law, fill
 from hw.message import Command, Phase
-from hw.plan import Ages, ladder, link_delay, rung
+from hw.plan import Ages, Rung, ladder, link_delay, rung
 from hw.rehearsal import Rehearsal
 from hw.safety import Fault, Limits, Stage
 from hw.session import Session, Settings
-from hw.trace import Recorder, load, result_of, save_npz
+from hw.trace import Recorder, load, result_of, save_npz, steady_ticks
 from hw.upset import Upset
 from models.scene import plant
+from sim import trace as trace_command
+from sim.couplings import choose
 from sim.engine import outside_forces
 from sim.exact_engine import hold
 from sim.result import Result
 from sim.scenario import InputError
 from sim.scenario import load as scenario_of
 from sim.simulate import assemble, simulate
+from sim.stability import close, dominant_mode
 
 FAST = Settings(measure=100)
 
@@ -436,6 +442,59 @@ def test_an_empty_or_a_damaged_trace_is_one_line(trace, tmp_path):
         (tmp_path / "damaged.npz").write_bytes(damaged)
         with suppress(InputError):  # a byte of the archive's own padding or of a name may not matter
             replay.main([str(tmp_path / "damaged.npz")])
+
+
+def test_steady_ticks_end_where_a_force_meets_its_cap(trace):
+    _, recorder = trace
+    link = recorder.link()
+    ((first, stop),) = steady_ticks(recorder, [(30000, 30000)])
+    assert np.flatnonzero(link["gain"] == 1.0)[[0, -1]].tolist() == [first, stop - 1]
+    cap = int(np.abs(link["applied"][first:stop]).max()) // 2
+    ((_, met),) = steady_ticks(recorder, [(30000, cap), (1, 1)])
+    strong = np.abs(link["applied"][first:stop, 1]) >= cap
+    assert met == first + int(np.argmax(strong)) < stop
+
+
+class Dared(Rung):
+    """A coupling that passes for certified: what a certificate keeps out has to be seen once."""
+
+    certified = True
+
+
+@pytest.mark.parametrize(("name", "settles"), [("none", False), (None, True)])
+def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, settles):
+    """From the file alone: the exact engine's eigenvalue without coupling, to 2e-3 1/s (a rounded force is no linear
+    one), and with the certified one nothing that oscillates. On the ticks of full gain, before the cap is met.
+    """
+    made = rung(scenario, "I", None, None, 1) if settles else None
+    if made is None:
+        chosen = choose(scenario, "I", name, None)
+        made = Dared(1, scenario, "I", chosen, assess(scenario.loop("I"), chosen.coupling))
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(scenario, [made], recorder=recorder)
+    session = rehearsal.run_until_armed(2.0 if settles else 7.0)
+    session.stop("enough", session.now)
+    rehearsal.run(1e-6 * session.now + 0.2)
+    report = session_report.outcome("I", session, recorder, 0)
+    ((first, stop),) = report["run"]["steady_ticks"]
+    gain, applied = recorder.link()["gain"], recorder.link()["applied"]
+    assert (gain[first:stop] == 1.0).all()
+    assert gain[first - 1] < 1.0
+    assert np.abs(applied[first:stop]).max() < 30000
+    path = session_report.save(tmp_path, session, recorder, report, False)[0]
+    assert trace_command.main([str(path), "--json", "-"]) == 0
+    (part,) = json.loads(capsys.readouterr().out)["growth"]
+    assert [part] == report["growth"]
+    if settles:
+        assert part["reason"].startswith("nothing oscillates")
+        return
+    assembly = assemble(scenario, made.chosen.coupling)
+    exact = dominant_mode(close(assembly.plant, assembly.F))
+    assert part["growth_rate_per_s"] == pytest.approx(exact.growth, abs=2e-3)
+    assert part["frequency_hz"] == pytest.approx(exact.frequency_hz, abs=1.0)
+    assert part["trend"] == "grows"
+    session_report.print_session(report | {"files": []}, Console(width=200))
+    assert re.search(r"growth at full gain, arming 1, ticks \d+ to \d+ .*: \+1.48", capsys.readouterr().out)
 
 
 def test_the_report_is_json_and_names_its_end(trace):
