@@ -34,7 +34,6 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     parts = session.rung.part() if isinstance(session.rung, Rung) else {}
     empty = {"coupling": None, "certificate": None, "certificates": None, "promise": None, "theta": None}
     loop = isinstance(session.rung, Rung) and len(recorder) > 0
-    caps = [config.cap for _, config in session.armings] if loop else []
     report = {
         "case": case,
         "scenario": session.scenario.name,
@@ -48,7 +47,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
             "scenario_digest": session.scenario.digest,
             "pace": pace,  # below 1: slow motion, in which a link looks faster than it is
             "encoder_step_m": list(session.units.encoder_step) if loop else None,
-            "steady_ticks": steady_ticks(recorder, caps),
+            "steady_ticks": steady_ticks(recorder, session.units.force_step) if loop else [],
         },
     }
     trace = result_of(recorder, session.units, session.scenario.T, report) if loop else None

@@ -66,18 +66,19 @@ class Recorder:
         }
 
 
-def steady_ticks(recorder: Recorder, caps: Sequence[tuple[int, ...]]) -> list[list[int]]:
-    """[first, stop) of each arming in which the loop was one linear loop: at full gain, before a force met its cap.
+def steady_ticks(recorder: Recorder, force_step: Sequence[float]) -> list[list[int]]:
+    """[first, stop) of each arming in which the loop was one linear loop: full gain, until a cap or the slew rate cuts.
 
-    `caps` (armings, m) [steps]. Missed ticks are not left out.
+    Missed ticks are not left out. `force_step` (m,) [N].
     """
     link = recorder.link()
+    asked = -np.round(link["asked"] / np.array(force_step))
+    cut = link["received"] & np.any(link["sent"] != asked, axis=1)
     stretches = []
-    for arming, cap in enumerate(caps):
+    for arming in np.unique(link["arming"]):
         full = np.flatnonzero((link["arming"] == arming) & (link["gain"] == 1.0))
         if full.size:
-            capped = np.any(np.abs(link["applied"][full]) >= cap, axis=1)
-            count = int(np.argmax(capped)) if capped.any() else full.size
+            count = int(np.argmax(cut[full])) if cut[full].any() else full.size
             stretches.append([int(full[0]), int(full[0]) + count])
     return stretches
 

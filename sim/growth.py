@@ -1,9 +1,9 @@
-"""Does an oscillation grow? From displacements alone, where nobody knows the states: a bridge's trace, or any stored one.
+"""Does an oscillation grow? From displacements alone, where nobody knows the states: a bridge's trace, any stored one.
 
-sim.stability projects a run on a mode of the loop whose humans are known. Of a real device there are only displacements,
-and the person moves as they like. So the second half of a stretch of ticks is cut into overlapping windows, the slow
-part of each is taken out, and the rest is split into octaves (sim.oscillation). An oscillation that grows like exp(g t)
-multiplies a window's amplitude by exp(g hop) from one to the next: g is the slope of a line through the logarithms.
+sim.stability projects a run on a mode of the loop whose humans are known. Of a real device there are displacements
+only, and the person moves as they like. So the second half of a stretch of ticks is cut into overlapping windows, the
+slow part of each is taken out, and the rest is split into octaves (sim.oscillation). An oscillation that grows like
+exp(g t) is exp(g hop) times larger in each window than in the one before: g is the slope of a line through logarithms.
 
 It is a figure about motion, not a verdict about a loop: a person who shakes the handle harder and harder grows too.
 """
@@ -52,9 +52,9 @@ class Growth:
 def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
     """Of displacements x (N, m) [m] sampled every T [s] by encoders of steps (m,) [m]; tick 0 of x is called `first`.
 
-    Looks at the second half of x; where nothing is seen there for long enough, as of a mode that grows fast, at the last
-    quarter, and so on. Where octaves grow, the strongest of these is reported, else the strongest of all: a mode that
-    decays does not hide one that grows.
+    Looks at the second half of x; where nothing is seen there for long enough, as of a mode that grows fast, at the
+    last quarter, and so on. Where octaves grow, the strongest of these is reported, else the strongest of all: a mode
+    that decays does not hide one that grows.
     """
     n, stop = len(x), first + len(x)
     if n < SHORTEST:

@@ -1,4 +1,4 @@
-"""python -m sim.trace: what a stored trace shows, of sim.run or of a bridge's session: its picture, and what grows in it."""
+"""python -m sim.trace: what a stored trace of sim.run or hw.bridge shows: its picture, and what grows in it."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ T, STEP = 1.2e-3, np.full(2, 1e-6)
 
 
 def motion(seconds, *modes):
-    """A person's 15 mm at 0.6 Hz, and modes (amplitude at the end [m], frequency [Hz], growth [1/s]), in whole steps."""
+    """A person's 15 mm at 0.6 Hz, with modes (amplitude at the end [m], frequency [Hz], growth [1/s]), rounded."""
     t = T * np.arange(round(seconds / T))
     x = 15e-3 * np.sin(2 * np.pi * 0.6 * t + 0.3)
     for size, frequency, rate in modes:
