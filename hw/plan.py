@@ -24,6 +24,8 @@ from hw.safety import Fault
 from sim.couplings import Chosen, choose
 from sim.scenario import InputError, Scenario
 
+FALLBACK = ("spring-damper", "theorem4")  # what softer couplings are where the one asked for cannot be had
+
 
 @dataclass(frozen=True)
 class Ages:
@@ -140,14 +142,18 @@ def ladder(
 ) -> tuple[Rung, ...]:
     """The coupling for the measured delay and up to `spare` softer ones, each for one tick more.
 
-    Raises Fault where the first of them is not certified; where a softer one is not, the ladder ends.
+    A softer one is of the same kind or from the same file; where that is not certified for the longer delay, it is
+    the spring-damper by Theorem 4, which promises the most. Raises Fault where the first coupling is not certified;
+    where no softer one is, the ladder ends.
     """
-    rungs = [rung(scenario, case, name, condition, link)]
-    for _ in range(spare):
+    rungs, wanted = [rung(scenario, case, name, condition, link)], [(name, condition), FALLBACK]
+    while len(rungs) <= spare:
         try:
-            rungs.append(rung(scenario, case, name, condition, rungs[-1].link + 1))
+            rungs.append(rung(scenario, case, *wanted[0], rungs[-1].link + 1))
         except (Fault, InputError):
-            break
+            wanted.pop(0)
+            if not wanted:
+                break
     return tuple(rungs)
 
 

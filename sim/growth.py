@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller.lti import Array
 from sim.oscillation import PERIODS, octaves
@@ -102,10 +103,10 @@ def _lines(x: Array, T: float, encoder_step: Array) -> _Lines:
     return _Lines(found, bool((seen > floor).any()), float(floor.max()), PERIODS / (2 * hop * T))
 
 
-def _longest(on: Array) -> Array:
+def _longest(on: NDArray[np.bool_]) -> NDArray[np.intp]:
     """The places of the longest run of True; the last of several."""
     runs = np.split(np.arange(len(on)), np.flatnonzero(np.diff(on)) + 1)
-    return max((run for run in reversed(runs) if on[run[0]]), key=len, default=np.zeros(0, int))
+    return max((run for run in reversed(runs) if on[run[0]]), key=len, default=np.zeros(0, np.intp))
 
 
 def _slope(values: Array, spacing: float) -> tuple[float, float]:
@@ -144,7 +145,7 @@ def growths(result: Result) -> list[Growth]:
 def told(part: dict[str, Any], T: float) -> str:
     """One stretch in words, from its plain data."""
     where = f"ticks {part['first']} to {part['stop']} ({(part['stop'] - part['first']) * T:.2f} s)"
-    above = "" if part["slowest_hz"] is None else f" (from {part['slowest_hz']:.2g} Hz up)"
+    above = "" if part["slowest_hz"] is None else f" (from {part['slowest_hz']:.3g} Hz up)"
     if part["reason"]:
         return f"{where}: {part['reason']}{above}"
     rate = f"{part['growth_rate_per_s']:+.4g} ± {part['error_per_s']:.2g} 1/s at {part['frequency_hz']:.4g} Hz"

@@ -9,6 +9,8 @@ import pytest
 from rich.console import Console
 
 from design.assess import assess
+from design.store import Stored, data_of
+from design.store import save as save_coupling
 from hw import replay, session_report
 from hw.emulator_core import Emulator
 from hw.fault_cases import CASES
@@ -273,6 +275,55 @@ def test_a_softer_coupling_takes_over_once_a_person_arms_it(scenario, rungs):
     assert session.config
     assert session.config.theta == 2
     assert any(np.any(m.applied) for m in rehearsal.moments[-100:])
+
+
+@pytest.fixture(scope="module")
+def optimal_rungs(scenario):
+    return ladder(scenario, "I", "optimal", None, 1, spare=1)
+
+
+def test_an_optimal_coupling_has_a_spring_damper_in_reserve(optimal_rungs, capsys):
+    """With one tick more no optimal coupling of the default basis is certified; by Theorem 4 a spring-damper is."""
+    fast, soft = optimal_rungs
+    assert (fast.chosen.kind, soft.chosen.kind) == ("optimal", "spring-damper")
+    assert (fast.link, soft.link) == (1, 2)
+    assert fast.requirements["closed-loop"].certified
+    assert soft.requirements["theorem4"].certified
+    assert soft.scenario.theta == (2, 2)
+    session_report.print_certificate(Ages((130,) * 100), 1, optimal_rungs, Console(width=160))
+    table = capsys.readouterr().out
+    assert re.search(r"│ optimal +│ 1, 2 .*\(closed-loop, rational\).*this environment", table)
+    assert re.search(r"│ spring-damper +│ 2, 2 .*\(theorem4, rational\).*any passive environment", table)
+    assert "no reserve" not in table
+
+
+def test_a_coupling_from_a_file_has_one_too(scenario, optimal_rungs, tmp_path):
+    path = tmp_path / "stiff.json"
+    save_coupling(Stored(scenario.loop("I"), data_of(optimal_rungs[0].chosen.coupling)), path)
+    rungs = ladder(scenario, "I", str(path), None, 1)
+    assert [r.chosen.kind for r in rungs] == ["stiff.json", "spring-damper", "spring-damper"]
+    assert [r.link for r in rungs] == [1, 2, 3]
+    assert all(r.certified for r in rungs)
+    with pytest.raises(Fault, match=r"the coupling stiff\.json is not certified for theta = \[2, 2\]"):
+        ladder(scenario, "I", str(path), None, 2)  # the one asked for is the one that is armed first, or none
+
+
+def test_the_spring_damper_follows_the_optimal_coupling(scenario, optimal_rungs, tmp_path):
+    """Late answers, a ramp to zero, the reserve armed by a person; and the trace of both replays bit by bit."""
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(lively(scenario), optimal_rungs, "down:jitter=0.0007@0.45", recorder=recorder)
+    session = rehearsal.run_until_armed(1.2)
+    assert (session.stage, session.rung) == (Stage.DISARMED, optimal_rungs[1])
+    session.arm(session.now)
+    rehearsal.run(1e-6 * session.now + 0.8)
+    assert session.stage == Stage.ARMED
+    session.stop("enough", session.now)
+    rehearsal.run(1e-6 * session.now + 0.2)
+    files = session_report.save(tmp_path, session, recorder, session_report.outcome("I", session, recorder, 0), False)
+    result, link = load(files[0])
+    assert [recipe.link_delay for recipe in replay.recipes_of(result)] == [1, 2]
+    assert replay.replay(result, link).identical
+    assert np.abs(link["sent"][link["arming"] == 1]).max() > 100
 
 
 # traces

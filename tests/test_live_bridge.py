@@ -18,11 +18,13 @@ import pytest
 from controller.jitter import Jitter
 from hw import bridge, identify, replay
 from hw import emulator as emulator_command
+from hw.desk import add_link_options, check_link
 from hw.live import Live
 from hw.plan import ladder, rung
 from hw.port import Port
 from hw.safety import ENDED, Limits, Stage
 from hw.session import Session, Settings
+from sim.command import Parser
 from sim.scenario import InputError
 from sim.scenario import load as scenario_of
 
@@ -146,6 +148,7 @@ def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
         (["--port", "/nowhere", "--arm"], "--port /nowhere"),
         (["--emulate", "--case", "none"], "no coupling"),
         (["--emulate", "--baud", "5"], "--baud is 5, allowed are"),
+        (["--emulate", "--baud", "no"], "--baud is 'no', expected a whole number"),
         (["--emulate", "--quantile", "2"], "--quantile is 2"),
         (["--emulate", "--guard", "nan"], "--guard is nan"),
         (["--emulate", "--measure", "1"], "--measure is 1"),
@@ -163,6 +166,39 @@ def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
     with pytest.raises(InputError) as error:
         bridge.main(options)
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "baud"),
+    [
+        (["--emulate"], None),
+        (["--emulate", "--baud", "115200"], 115_200),
+        (["--port", "/dev/ttyACM0", "--arm"], 921_600),  # may be an Uno, with a UART behind its USB chip
+        (["--port", "/dev/ttyACM0", "--arm", "--baud", "none"], None),
+        (["--port", "/dev/ttyUSB0", "--arm", "--baud", "2000000"], 2_000_000),
+    ],
+)
+def test_only_a_uart_has_a_baud_rate(options, baud):
+    parser = Parser("x", "", "")
+    add_link_options(parser)
+    assert check_link(parser.parse_args(options)).baud == baud
+
+
+def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
+    """By its own name, or by a link as socat makes them; the port opens all the same."""
+    master, slave = os.openpty()
+    link = tmp_path / "haptic"
+    link.symlink_to(os.ttyname(slave))
+    parser = Parser("x", "", "")
+    add_link_options(parser)
+    for path in (os.ttyname(slave), str(link)):
+        settings = check_link(parser.parse_args(["--port", path, "--arm"]))
+        assert settings.baud is None
+        with Port(path, settings.baud) as port:
+            assert port.write(b"\x01") == 1
+            assert os.read(master, 1) == b"\x01"
+    os.close(master)
+    os.close(slave)
 
 
 @pytest.mark.parametrize("module", [bridge, emulator_command, identify])
