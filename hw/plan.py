@@ -147,13 +147,12 @@ def ladder(
     where no softer one is, the ladder ends.
     """
     rungs, wanted = [rung(scenario, case, name, condition, link)], [(name, condition), FALLBACK]
-    while len(rungs) <= spare:
+    while len(rungs) <= spare and wanted:
+        kind, by = wanted[0]
         try:
-            rungs.append(rung(scenario, case, *wanted[0], rungs[-1].link + 1))
+            rungs.append(rung(scenario, case, kind, by, rungs[-1].link + 1))
         except (Fault, InputError):
             wanted.pop(0)
-            if not wanted:
-                break
     return tuple(rungs)
 
 

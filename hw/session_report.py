@@ -71,7 +71,7 @@ def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
         part["age_us"] = _percentiles(session.config.theta * 1e6 * session.scenario.T - margins)
         part["rate_hz"] = float(arrays["received"].mean() / session.scenario.T)
         answered = arrays["received"].sum()
-        part["missed_percent"] = 100 * session.missed_while_driving / answered if answered else None
+        part["missed_percent"] = 100 * session.stream.missed_while_driving / answered if answered else None
     return part
 
 

@@ -97,7 +97,7 @@ def test_a_device_that_repeats_itself_is_lost_while_its_bytes_keep_coming(scenar
         now += 100
         session.receive(again, now)
     assert session.stage == Stage.LOST
-    assert session.log[-1].t_us - session.heard <= session.limits.watchdog_us + 100
+    assert session.log[-1].t_us - session.stream.heard <= session.limits.watchdog_us + 100
 
 
 @pytest.mark.parametrize(
