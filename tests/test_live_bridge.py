@@ -4,12 +4,15 @@ Nothing here judges timing: on a busy machine a session may end because the link
 any other. What must hold on every machine: a named end with its cause, no armed device left behind, a true trace.
 """
 
+import fcntl
 import json
 import os
 import select
 import signal
 import subprocess
 import sys
+import termios
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -112,6 +115,65 @@ def test_a_signal_ends_a_session_at_zero_force(emulator, scenario, rungs, name):
     session, live = run(emulator, scenario, lambda ages: rungs, glance=glance)
     assert (session.stage, session.cause) == (Stage.FINISHED, name)
     assert live.signals == [getattr(signal, name)]
+
+
+class BridgeOnTerminal:
+    """hw.bridge with a terminal of its own, measuring for as long as the machine likes: nothing is armed."""
+
+    def __init__(self, out):
+        self.master, self.slave = os.openpty()
+        self.before = termios.tcgetattr(self.slave)
+        options = ["--emulate", "--case=I", "--pace=0.05", "--measure=100000", "--no-plot", f"--out={out}"]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "hw.bridge", *options],
+            env=os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm"},
+            stdin=self.slave,
+            stdout=self.slave,
+            stderr=self.slave,
+            start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+        )
+
+    @property
+    def settings(self):
+        return termios.tcgetattr(self.slave)
+
+    def read_until(self, word, patience=120.0):
+        """What it shows, until it shows `word` or is gone."""
+        shown, end = b"", time.monotonic() + patience
+        while word not in shown and time.monotonic() < end:
+            if select.select([self.master], [], [], 0.05)[0]:
+                shown += os.read(self.master, 65536)
+            elif self.process.poll() is not None:
+                break
+        return shown
+
+    def close(self):
+        self.process.kill()
+        self.process.wait()
+        os.close(self.master)
+        os.close(self.slave)
+
+
+def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
+    """With the dashboard drawing and single keys read; SIGQUIT by its key. All three at once, since they mostly wait."""
+    bridges = {name: BridgeOnTerminal(tmp_path / name) for name in ("SIGQUIT", "SIGTERM", "SIGHUP")}
+    try:
+        for bridge_on in bridges.values():
+            assert b"measuring" in bridge_on.read_until(b"measuring")
+            assert not bridge_on.settings[3] & (termios.ICANON | termios.ECHO)
+        os.write(bridges["SIGQUIT"].master, b"\x1c")
+        for name in ("SIGTERM", "SIGHUP"):
+            os.kill(bridges[name].process.pid, getattr(signal, name))
+        for name, bridge_on in bridges.items():
+            shown = bridge_on.read_until(b"files: ")
+            assert bridge_on.process.wait(60) == 130
+            assert name.encode() in shown
+            assert bridge_on.settings == bridge_on.before
+            assert shown.rfind(b"\x1b[?25h") > shown.rfind(b"\x1b[?25l")  # the cursor is shown again
+    finally:
+        for bridge_on in bridges.values():
+            bridge_on.close()
 
 
 def test_an_exception_stops_the_device_first(emulator, scenario):
