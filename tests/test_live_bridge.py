@@ -156,7 +156,7 @@ class BridgeOnTerminal:
 
 
 def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
-    """With the dashboard drawing and single keys read; SIGQUIT by its key. All three at once, since they mostly wait."""
+    """With the dashboard drawing and single keys read; SIGQUIT by its key. All at once, since they mostly wait."""
     bridges = {name: BridgeOnTerminal(tmp_path / name) for name in ("SIGQUIT", "SIGTERM", "SIGHUP")}
     try:
         for bridge_on in bridges.values():
