@@ -87,15 +87,15 @@ def print_certificate(ages: Ages, link: int, rungs: Sequence[Rung], console: Con
         f"{len(ages.values) + ages.missing} never arrived: a link of {link} tick{'s' if link > 1 else ''}"
     )
     table = Table(title="certified for the delay measured, and softer in reserve")
-    for column in ("coupling", "theta", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "promise"):
+    table.add_column("coupling", min_width=13)
+    for column in ("K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "promise"):
         table.add_column(column)
     for rung in rungs:
         part = rung.part()
         certificate = next(c for c in (part["certificate"], *part["certificates"].values()) if c["certified"])
         coupling = part["coupling"]
         table.add_row(
-            coupling["kind"],
-            ", ".join(map(str, part["theta"])),
+            f"{coupling['kind']}, theta = {', '.join(map(str, part['theta']))}",
             *(_list(coupling[name]) for name in "KB"),
             f"{_list(certificate['required_damping'])} ({certificate['condition']}, {certificate['proof']})",
             _list(certificate["available_damping"]),

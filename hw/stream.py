@@ -16,6 +16,8 @@ from hw.watch import FRESH, Counters, LinkWatch
 
 QUIET_US = 1_000_000  # longest silence of a device that has no force to take away
 
+UNTOLD = 0.5  # part of STATEs without a margin above which the link cannot be judged
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -85,6 +87,10 @@ class Stream:
         late, missed = self.watch.late_part, self.watch.missed_part
         if missed > self._settings.missed + late:
             raise Fault(f"{100 * missed:.0f} % of the last {self._settings.window} ticks had no answer in time")
+        if self.watch.untold_part > UNTOLD:
+            raise Fault(
+                f"most of the last {self._settings.window} STATEs told no margin: nobody can say how late answers are"
+            )
         if late > self._settings.late:
             return f"{100 * late:.0f} % of the last {self._settings.window} answers were late"
         return None

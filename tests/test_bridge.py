@@ -292,8 +292,8 @@ def test_an_optimal_coupling_has_a_spring_damper_in_reserve(optimal_rungs, capsy
     assert soft.scenario.theta == (2, 2)
     session_report.print_certificate(Ages((130,) * 100), 1, optimal_rungs, Console(width=160))
     table = capsys.readouterr().out
-    assert re.search(r"│ optimal +│ 1, 2 .*\(closed-loop, rational\).*this environment", table)
-    assert re.search(r"│ spring-damper +│ 2, 2 .*\(theorem4, rational\).*any passive environment", table)
+    assert re.search(r"│ optimal, theta = 1, 2 .*\(closed-loop, rational\).*this environment", table)
+    assert re.search(r"│ spring-damper, theta = 2, 2 .*\(theorem4, rational\).*any passive environment", table)
     assert "no reserve" not in table
 
 

@@ -111,11 +111,11 @@ def hand_driven(scenario, rungs):
     session.receive(encode(info_of(scenario)), t)
     session.receive(encode(Ack(config_crc(session.config), 0)), t)
 
-    def send(phase, ticks=1, lasts=T_US, lie=None, counts=(0, 0)):
+    def send(phase, ticks=1, lasts=T_US, lie=None, counts=(0, 0), margin=17_900):
         nonlocal t, k
         t, k = t + lasts, k + ticks
         clock = t if lie is None else lie
-        session.receive(encode(State(phase, k & 0xFFFF, 0, 17_900, 0, 0, clock & 0xFFFFFFFF, counts, (0, 0))), t)
+        session.receive(encode(State(phase, k & 0xFFFF, 0, margin, 0, 0, clock & 0xFFFFFFFF, counts, (0, 0))), t)
 
     while session.stage == Stage.MEASURING:
         send(Phase.DISARMED)
@@ -141,6 +141,21 @@ def test_a_leap_of_the_tick_number_skips_neither_ramp_nor_jump(scenario, rungs):
     assert session.stage == Stage.ARMING  # a leap before the first force is none of its business
     send(Phase.ARMED, ticks=300)
     assert session.stage == Stage.STOPPED
+
+
+def test_a_device_that_stops_telling_margins_is_stopped(scenario, rungs):
+    """It applies what it is told and counts no miss, but whether answers come in time nobody knows any more."""
+    session, send = hand_driven(scenario, rungs)
+    for _ in range(250):
+        send(Phase.ARMED)
+    assert session.stage == Stage.ARMED
+    silent = 0
+    while session.stage == Stage.ARMED and silent < 200:
+        send(Phase.ARMED, margin=NO_MARGIN)
+        silent += 1
+    assert silent == 101
+    assert session.stage == Stage.STOPPED
+    assert session.cause == "most of the last 200 STATEs told no margin: nobody can say how late answers are"
 
 
 def test_a_clock_that_is_made_of_ticks_is_found_by_the_host(scenario, rungs):

@@ -184,6 +184,26 @@ def test_an_exception_stops_the_device_first(emulator, scenario):
         run(emulator, scenario, plan)
 
 
+def test_an_emulator_ends_with_the_bridge_that_started_it():
+    """However that ended: here by SIGKILL, which nobody can catch. An orphan would keep its terminal for minutes."""
+    code = (
+        "import argparse, os, time; from hw.emulate import spawned\n"
+        "args = argparse.Namespace(case='I', scenario=None, theta=None, psi=None, lam=None, delta=None, T=None)\n"
+        "args.fault, args.pace = [], '0.2'\n"
+        "with spawned(args, 0, 60.0) as path: print(path, flush=True); time.sleep(600)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    bridge_like = subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+    path = bridge_like.stdout.readline().strip()
+    assert Path(path).exists()
+    bridge_like.kill()
+    bridge_like.communicate()
+    end = time.monotonic() + 60
+    while Path(path).exists() and time.monotonic() < end:
+        time.sleep(0.02)
+    assert not Path(path).exists()
+
+
 def test_a_coupling_that_is_not_certified_is_not_armed(emulator, scenario):
     def plan(ages):
         return [rung(scenario, "I", "published", None, 1)]
