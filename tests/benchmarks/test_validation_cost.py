@@ -49,8 +49,8 @@ def test_verdicts(benchmark, held_by, coupling, request):
     median = benchmark.stats.stats.median if benchmark.stats else float("nan")
     wrong = int(disagree(exact, mujoco).sum())
     print(
-        f"\n{HUMANS} verdicts, {name}: exact {median:.3f} s, {int(unstable(exact).sum())} unstable; MuJoCo {wall:.2f} s, "
-        f"{wrong} disagree, growth within {np.abs(mujoco - exact).max():.1e} 1/s"
+        f"\n{HUMANS} verdicts, {name}: exact {median:.3f} s, {int(unstable(exact).sum())} unstable; "
+        f"MuJoCo {wall:.2f} s, {wrong} disagree, growth within {np.abs(mujoco - exact).max():.1e} 1/s"
     )
     assert wrong == 0
 
