@@ -46,7 +46,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
             "T_s": session.scenario.T,
             "scenario_digest": session.scenario.digest,
             "pace": pace,  # below 1: slow motion, in which a link looks faster than it is
-            "encoder_step_m": list(session.units.encoder_step) if loop else None,
+            "encoder_step_m": list(session.units.encoder_step) if len(recorder) else None,
             "steady_ticks": steady_ticks(recorder, session.units.force_step) if loop else [],
         },
     }

@@ -45,7 +45,7 @@ def main(argv: list[str]) -> int:
     for part in outcome["growth"]:
         out.print(f"growth, {told(part, T)}", soft_wrap=True)
     if not found:
-        out.print("the loop was never at full gain: there is no growth to tell of")
+        out.print("no loop was closed at full gain: there is no growth to tell of")
     if args.json:
         write_json(args.json, outcome)
     return DONE

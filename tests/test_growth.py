@@ -121,6 +121,9 @@ def test_an_empty_trace_or_none_is_one_line(tmp_path):
     made(motion(0.0), {}).save_npz(tmp_path / "empty.npz")
     with pytest.raises(InputError, match="has no ticks"):
         trace.main([str(tmp_path / "empty.npz")])
+    made(motion(1.0), {}).save_npz(tmp_path / "whole.npz")
+    with pytest.raises(InputError, match=r"cannot write .*: Is a directory"):
+        trace.main([str(tmp_path / "whole.npz"), "--plot", str(tmp_path)])
     (tmp_path / "text.npz").write_text("no trace")
     with pytest.raises(InputError, match="not a trace of this program"):
         trace.main([str(tmp_path / "text.npz")])
