@@ -10,9 +10,9 @@ import time
 
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from design.audit_report import print_report, report
-from design.jitter_part import Range
 from design.presets import PRESETS
 from design.set_check import check_set
+from design.store import DelayRange
 from design.subject import LONGEST_DELAY, Subject
 from sim.command import (
     DOES_NOT_HOLD,
@@ -110,8 +110,8 @@ def _subject(args: argparse.Namespace, scenario: Scenario) -> Subject:
         raise InputError(str(error)) from None
 
 
-def _range(args: argparse.Namespace, subject: Subject) -> Range | None:
-    """(lo, hi) of --jitter, around the constant theta that the other conditions are about. Raises InputError."""
+def _range(args: argparse.Namespace, subject: Subject) -> DelayRange | None:
+    """The range of --jitter, around the constant theta that the other conditions are about. Raises InputError."""
     if args.jitter is None:
         return None
     lo, hi = ranges("--jitter", args.jitter, subject.channels)
@@ -119,7 +119,7 @@ def _range(args: argparse.Namespace, subject: Subject) -> Range | None:
         if not 0 <= least <= n <= largest <= LONGEST_DELAY:
             allowed = f"0 <= LO <= theta = {n} <= HI <= {LONGEST_DELAY} samples (--theta gives another)"
             raise InputError(f"--jitter on channel {i + 1} is {least} to {largest}, expected {allowed}")
-    return lo, hi
+    return DelayRange(lo, hi)
 
 
 def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Coupling:

@@ -16,6 +16,8 @@ Phi = 0 satisfies Lemma 4, whatever the environment.
 With a box around the environment the same is proved for the environment (P) and for every vertex (P1, P2, ..); nothing
 is proved of the environments in between, or of one that changes.
 
+A loop whose delays may switch within a range carries a second proof, of any switching (design.jitter_proof).
+
 theorem4, psi >= 1: a multiplier Phi, stored too, and two blocks (design.delayed_proof); it is of this environment.
 """
 
@@ -27,6 +29,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal
 
+import msgspec
 import numpy as np
 import scipy
 
@@ -36,8 +39,10 @@ from design import exact, margin
 from design.delayed import theorem4_delayed
 from design.delayed_proof import coupling_block, environment_block
 from design.exact import Exact
+from design.jitter_proof import prove_switching, refuted
 from design.members import in_each, worst
 from design.positive_real import find_storage, prove_positive_real
+from design.promises import switching_promise
 from design.rational import Matrix, SingularMatrix, definiteness, rational
 from design.store import Certificate, Condition, CouplingData, Loop, Stored, digest, sealed
 
@@ -84,6 +89,9 @@ def prove(loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequenc
         proof[name] = P
     if multiplier is not None:
         proof["Phi"] = Matrix.of([multiplier])
+    switching = prove_switching(loop, coupling.build(loop.T), LARGEST) if loop.jitter else msgspec.UNSET
+    if loop.jitter and isinstance(switching, str):
+        raise NotProved(f"{switching_promise(loop.jitter)}: {switching}", requirement)
     return sealed(
         Certificate(
             condition=condition,
@@ -95,6 +103,7 @@ def prove(loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequenc
             matrices={name: tuple(tuple(str(v) for v in row) for row in M.fractions()) for name, M in proof.items()},
             scenario=digest(loop, coupling),
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
+            switching=switching,
         )
     )
 
@@ -260,7 +269,7 @@ def _refuted_proof(loop: Loop, coupling: CouplingData, certificate: Certificate)
     for name, block in blocks.items():
         if reason := _refuted_block(name, block, certificate.matrices[name]):
             return f"{_place(loop, certificate.condition, name)}{reason}"
-    return None
+    return refuted(loop, coupling.build(loop.T), certificate.switching, LARGEST)
 
 
 def _refuted_block(name: str, block: Exact, rows: Sequence[Sequence[str]]) -> str | None:

@@ -23,7 +23,7 @@ from design.cutting_planes import SLACK, cut, sketch
 from design.failure import DesignFailed, Infeasible
 from design.free_parameter import FreeParameter
 from design.inequalities import World
-from design.jitter import jitter_proof
+from design.jitter_multiplier import jitter_proof
 from design.margin import closed_loop
 from design.result import Design
 from design.set_advice import set_advice

@@ -12,7 +12,8 @@ from controller.lti import Lti
 from controller.process import force_map
 from design import jitter_exact
 from design.audit import main
-from design.jitter import blocks, half_widths, jitter_proof
+from design.jitter import blocks, half_widths
+from design.jitter_multiplier import jitter_proof
 from design.jitter_lmi import block
 from design.jitter_part import switching_part, switching_requirement
 from design.margin import closed_loop
