@@ -44,7 +44,7 @@ from design.members import in_each, worst
 from design.positive_real import find_storage, prove_positive_real
 from design.promises import switching_promise
 from design.rational import Matrix, SingularMatrix, definiteness, rational
-from design.store import Certificate, Condition, CouplingData, Loop, Stored, digest, sealed
+from design.store import Certificate, Condition, CouplingData, Loop, Stored, SwitchingProof, digest, sealed
 
 LARGEST = 60  # states of a model that a proof is tried for: seconds; it grows with the fourth power
 CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
@@ -89,9 +89,6 @@ def prove(loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequenc
         proof[name] = P
     if multiplier is not None:
         proof["Phi"] = Matrix.of([multiplier])
-    switching = prove_switching(loop, coupling.build(loop.T), LARGEST) if loop.jitter else msgspec.UNSET
-    if loop.jitter and isinstance(switching, str):
-        raise NotProved(f"{switching_promise(loop.jitter)}: {switching}", requirement)
     return sealed(
         Certificate(
             condition=condition,
@@ -103,9 +100,21 @@ def prove(loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequenc
             matrices={name: tuple(tuple(str(v) for v in row) for row in M.fractions()) for name, M in proof.items()},
             scenario=digest(loop, coupling),
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
-            switching=switching,
+            switching=_switching(loop, coupling, requirement),
         )
     )
+
+
+def _switching(
+    loop: Loop, coupling: CouplingData, requirement: margin.Requirement
+) -> SwitchingProof | msgspec.UnsetType:
+    """The proof that the delays may switch, of a loop with a range of them. Raises NotProved."""
+    if loop.jitter is None:
+        return msgspec.UNSET
+    proof = prove_switching(loop, coupling.build(loop.T), LARGEST)
+    if isinstance(proof, str):
+        raise NotProved(f"{switching_promise(loop.jitter)}: {proof}", requirement)
+    return proof
 
 
 def verify(stored: Stored) -> Verdict:

@@ -1,4 +1,4 @@
-"""The damping that delays switching within [lo, hi] ask of the devices: the condition of design.jitter at its best alpha.
+"""The damping that delays switching within [lo, hi] ask: the condition of design.jitter with the best alpha.
 
 With a = alpha T/delta the least factor s on delta is the supremum over frequency of an eigenvalue that is convex in a:
 at every frequency and direction u it is at least u*(..)u, a sum n + p.a + q.(1/a), and that bounds s from below for
@@ -37,7 +37,7 @@ class JitterProof:
 def jitter_proof(
     G: Lti, lo: Sequence[int], hi: Sequence[int], delta: Sequence[float], alpha: Sequence[float] | None = None
 ) -> JitterProof:
-    """The least common factor on `delta` [N s/m] with which some multiplier satisfies the condition, and that multiplier.
+    """The least common factor on `delta` [N s/m] with which some multiplier satisfies the condition, and which does.
 
     G is the force map without Theta. The factor is that of the refined sweep of design.sweep at the multiplier found,
     or at `alpha` (m,) [N/m] where it is given, positive where lo < hi; `bound` is then that factor.

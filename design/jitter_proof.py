@@ -36,7 +36,7 @@ def sent(loop: Loop, coupling: Coupling) -> Lti:
 
 
 def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) -> JitterProof:
-    """What switching within the loop's range asks of the devices, by a sweep; with this multiplier where one is given."""
+    """What switching within the loop's range asks, by a sweep; with the multiplier `alpha` [N/m] where it is given."""
     span = range_of(loop)
     try:
         G = sent(loop, coupling)
@@ -69,9 +69,7 @@ def storage(loop: Loop, coupling: Coupling, alpha: Sequence[float], largest: int
     return reason or "nothing was found that proves it" if P is None else P
 
 
-def refuted(
-    loop: Loop, coupling: Coupling, proof: SwitchingProof | msgspec.UnsetType, largest: int
-) -> str | None:
+def refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof | msgspec.UnsetType, largest: int) -> str | None:
     """Why what is on file does not prove that the delays may switch within the loop's range, or None if it does."""
     if loop.jitter is None:
         return None if proof is msgspec.UNSET else "a proof for switching delays, but the loop's delays are constant"

@@ -144,8 +144,10 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def loop(self, case: str) -> Loop:
         """All that a design may know: no device but its damping, no human."""
+        span = self.delay_range
+        jitter = span if self.switches and span.lo != span.hi else None
         delays = (self.theta, self.psi, self.reference_delays(case))
-        return Loop(self.T, *delays, self.delta, self.environment, self.box, self.delay_range if self.switches else None)
+        return Loop(self.T, *delays, self.delta, self.environment, self.box, jitter)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping."""

@@ -171,7 +171,7 @@ def _attack(scenario: Scenario, chosen: Chosen, seed: int, generations: int, out
 def _switching(scenario: Scenario, chosen: Chosen, findings: Findings, certified: bool) -> dict[str, Any]:
     """What delays that vary did to these humans, and whether that contradicts what is certified of them."""
     assert scenario.jitter is not None
-    covered = jitter_report.certified_part(assemble(scenario, chosen.coupling), chosen.coupling, certified)
+    covered = jitter_report.certified_part(scenario, chosen, certified)
     return verdict_report.switching_part(findings, jitter_report.range_part(scenario.jitter) | covered)
 
 
