@@ -41,12 +41,11 @@ from design.delayed_proof import coupling_block, environment_block
 from design.exact import Exact
 from design.jitter_proof import prove_switching, refuted
 from design.members import in_each, worst
-from design.positive_real import find_storage, prove_positive_real
+from design.positive_real import find_storage, prove_positive_real, too_large
 from design.promises import switching_promise
 from design.rational import Matrix, SingularMatrix, definiteness, rational
 from design.store import Certificate, Condition, CouplingData, Loop, Stored, SwitchingProof, digest, sealed
 
-LARGEST = 60  # states of a model that a proof is tried for: seconds; it grows with the fourth power
 CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
 
 
@@ -111,7 +110,7 @@ def _switching(
     """The proof that the delays may switch, of a loop with a range of them. Raises NotProved."""
     if loop.jitter is None:
         return msgspec.UNSET
-    proof = prove_switching(loop, coupling.build(loop.T), LARGEST)
+    proof = prove_switching(loop, coupling.build(loop.T))
     if isinstance(proof, str):
         raise NotProved(f"{switching_promise(loop.jitter)}: {proof}", requirement)
     return proof
@@ -217,7 +216,7 @@ def _block(loop: Loop, coupling: CouplingData, condition: Condition) -> Exact:
     try:
         if condition == "closed-loop":
             F = exact.force_map(exact.environment(loop.environment, T), built, loop.theta, loop.psi, T)
-            _require_size(F)  # splitting it takes minutes too
+            _require_size(F)
             F1, R = F.split_at_one()
             _require_static("F(1)", F1)
             return Exact(R.A, R.B, R.C, Matrix.diag(d / T for d in delta) - F1.scaled(Fraction(1, 2)))
@@ -232,8 +231,7 @@ def _block(loop: Loop, coupling: CouplingData, condition: Condition) -> Exact:
 
 
 def _require_size(block: Exact, requirement: margin.Requirement | None = None) -> None:
-    if block.order > LARGEST:
-        reason = f"a proof over {block.order} states takes minutes: up to {LARGEST} are tried"
+    if reason := too_large(block):
         raise NotProved(reason, requirement)
 
 
@@ -278,7 +276,7 @@ def _refuted_proof(loop: Loop, coupling: CouplingData, certificate: Certificate)
     for name, block in blocks.items():
         if reason := _refuted_block(name, block, certificate.matrices[name]):
             return f"{_place(loop, certificate.condition, name)}{reason}"
-    return refuted(loop, coupling.build(loop.T), certificate.switching, LARGEST)
+    return refuted(loop, coupling.build(loop.T), certificate.switching)
 
 
 def _refuted_block(name: str, block: Exact, rows: Sequence[Sequence[str]]) -> str | None:

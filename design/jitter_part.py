@@ -8,7 +8,6 @@ from typing import Any
 from controller.coupling import Coupling
 from controller.delay import delay
 from controller.lti import Lti
-from design.certificate import LARGEST
 from design.jitter_multiplier import JitterProof
 from design.jitter_proof import storage, swept
 from design.margin import closed_loop
@@ -25,7 +24,7 @@ NOT_COVERED = (
 def switching_requirement(loop: Loop, coupling: Coupling) -> JitterProof:
     """The damping that switching within loop.jitter asks; `proof` is "rational" where exact arithmetic confirms it."""
     found = swept(loop, coupling)
-    if not found.requirement.certified or not isinstance(storage(loop, coupling, found.alpha, LARGEST), Matrix):
+    if not found.requirement.certified or not isinstance(storage(loop, coupling, found.alpha), Matrix):
         return found
     return replace(found, requirement=replace(found.requirement, proof="rational"))
 

@@ -22,7 +22,7 @@ from controller.process import force_map
 from design import exact
 from design.exact import Exact
 from design.jitter_multiplier import JitterProof, jitter_proof, jitter_refusal
-from design.positive_real import find_storage, prove_positive_real
+from design.positive_real import find_storage, prove_positive_real, too_large
 from design.promises import switching_promise
 from design.rational import Matrix, SingularMatrix, block, definiteness, rational
 from design.store import DelayRange, Loop, SwitchingProof
@@ -45,41 +45,41 @@ def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) 
     return jitter_proof(G, span.lo, span.hi, loop.delta, alpha)
 
 
-def prove_switching(loop: Loop, coupling: Coupling, largest: int) -> SwitchingProof | str:
-    """An exact proof over at most so many states, or why there is none."""
+def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
+    """An exact proof of any switching within the loop's range, or why there is none."""
     found = swept(loop, coupling)
     requirement = found.requirement
     if not requirement.certified:
         needed, have = (", ".join(f"{d:.6g}" for d in side) for side in (requirement.required, requirement.available))
         return requirement.reason or f"needs {needed} N s/m of damping, has {have}"
-    P = storage(loop, coupling, found.alpha, largest)
+    P = storage(loop, coupling, found.alpha)
     if isinstance(P, str):
         return P
     rows = tuple(tuple(str(value) for value in row) for row in P.fractions())
     return SwitchingProof(requirement.required, _margin(found), found.alpha, rows)
 
 
-def storage(loop: Loop, coupling: Coupling, alpha: Sequence[float], largest: int) -> Matrix | str:
+def storage(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Matrix | str:
     """The matrix that proves the condition for these alpha [N/m] at the loop's damping, or why there is none."""
     try:
-        condition = condition_block(loop, coupling, alpha, largest)
+        condition = condition_block(loop, coupling, alpha)
     except (SingularMatrix, ValueError) as error:
         return str(error)
     P, reason = find_storage(condition)
     return reason or "nothing was found that proves it" if P is None else P
 
 
-def refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof | msgspec.UnsetType, largest: int) -> str | None:
+def refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof | msgspec.UnsetType) -> str | None:
     """Why what is on file does not prove that the delays may switch within the loop's range, or None if it does."""
     if loop.jitter is None:
         return None if proof is msgspec.UNSET else "a proof for switching delays, but the loop's delays are constant"
-    reason = "no proof is on file" if proof is msgspec.UNSET else _refuted(loop, coupling, proof, largest)
+    reason = "no proof is on file" if proof is msgspec.UNSET else _refuted(loop, coupling, proof)
     return reason and f"{switching_promise(loop.jitter)}: {reason}"
 
 
-def _refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof, largest: int) -> str | None:
+def _refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof) -> str | None:
     try:
-        condition = condition_block(loop, coupling, proof.alpha, largest)
+        condition = condition_block(loop, coupling, proof.alpha)
     except (SingularMatrix, ValueError) as error:
         return str(error)
     found = swept(loop, coupling, proof.alpha)
@@ -98,11 +98,10 @@ def _refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof, largest: int
     return prove_positive_real(condition, P)
 
 
-def condition_block(loop: Loop, coupling: Coupling, alpha: Sequence[float], largest: int) -> Exact:
+def condition_block(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Exact:
     """The block that must be strictly positive real.
 
-    Raises ValueError where alpha [N/m] is no multiplier of this range, the model has more than `largest` states, or
-    F(1) is not exactly as it must be.
+    Raises ValueError where alpha [N/m] is no multiplier of this range, the model has too many states, or F(1) is not exactly as it must be.
     """
     m, T, span = len(loop.delta), rational(loop.T), range_of(loop)
     widths = [hi - lo for lo, hi in zip(span.lo, span.hi, strict=True)]  # 2 h
@@ -112,8 +111,8 @@ def condition_block(loop: Loop, coupling: Coupling, alpha: Sequence[float], larg
     multiplier = [rational(float(a)) for a in alpha]
     G = exact.force_map(exact.environment(loop.environment, T), coupling, (0,) * m, loop.psi, T)
     F = nominal(span) @ G
-    if F.order > largest:
-        raise ValueError(f"a proof over {F.order} states takes minutes: up to {largest} are tried")
+    if reason := too_large(F):  # splitting it takes long too
+        raise ValueError(reason)
     F1, R = F.split_at_one()
     if not F1.equals(F1.T) or not definiteness(F1).semidefinite:
         raise ValueError("G(1) is not exactly symmetric and positive semidefinite")
