@@ -22,10 +22,11 @@ from controller.process import force_map
 from design import exact
 from design.exact import Exact
 from design.jitter_multiplier import JitterProof, jitter_proof, jitter_refusal
-from design.positive_real import find_storage, prove_positive_real, too_large
+from design.positive_real import find_storage, too_large
 from design.promises import switching_promise
 from design.rational import Matrix, SingularMatrix, block, definiteness, rational
 from design.store import DelayRange, Loop, SwitchingProof
+from design.stored_matrix import refuted_rows, rows_of
 
 CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
 
@@ -55,8 +56,7 @@ def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
     P = storage(loop, coupling, found.alpha)
     if isinstance(P, str):
         return P
-    rows = tuple(tuple(str(value) for value in row) for row in P.fractions())
-    return SwitchingProof(requirement.required, _margin(found), found.alpha, rows)
+    return SwitchingProof(requirement.required, _margin(found), found.alpha, rows_of(P))
 
 
 def storage(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Matrix | str:
@@ -66,7 +66,7 @@ def storage(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Matrix | 
     except (SingularMatrix, ValueError) as error:
         return str(error)
     P, reason = find_storage(condition)
-    return reason or "nothing was found that proves it" if P is None else P
+    return str(reason) if P is None else P
 
 
 def refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof | msgspec.UnsetType) -> str | None:
@@ -88,20 +88,14 @@ def _refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof) -> str | Non
         return f"required is {list(proof.required)}, the sweep finds {list(required)}"
     if not np.isclose(proof.margin, _margin(found), rtol=CLAIM_TOLERANCE):
         return f"margin is {proof.margin:.9g}, the sweep finds {_margin(found):.9g}"
-    n = condition.order
-    if len(proof.P) != n or any(len(row) != n for row in proof.P):
-        return f"P has {len(proof.P)} rows, the model has {n} states"
-    try:
-        P = Matrix.of(proof.P, (n, n))
-    except (ValueError, ZeroDivisionError) as error:
-        return f"P has an entry that is not a rational number: {error}"
-    return prove_positive_real(condition, P)
+    return refuted_rows("P", condition, proof.P)
 
 
 def condition_block(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Exact:
     """The block that must be strictly positive real.
 
-    Raises ValueError where alpha [N/m] is no multiplier of this range, the model has too many states, or F(1) is not exactly as it must be.
+    Raises ValueError where alpha [N/m] is no multiplier of this range, the model has too many states, or F(1) is not
+    exactly as it must be; SingularMatrix where the loop has a pole at z = 1.
     """
     m, T, span = len(loop.delta), rational(loop.T), range_of(loop)
     widths = [hi - lo for lo, hi in zip(span.lo, span.hi, strict=True)]  # 2 h
