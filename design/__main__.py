@@ -18,7 +18,7 @@ from design.failure import DesignFailed
 from design.jitter_part import switching_part, switching_requirement
 from design.jitter_proof import sent
 from design.price import cost_part, price
-from design.promises import ANY, certificate_part, promise_of, switching_promise
+from design.promises import ANY, HERE, certificate_part, promise_of, switching_promise
 from design.result import Design
 from design.set_check import SAMPLES, SetCheck, check_set, set_part, set_rows
 from design.store import Certificate, DelayRange, Loop, Stored, data_of, save
@@ -232,7 +232,7 @@ def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path) -> dic
     switching = None
     if loop.jitter:
         proof = certificate.proof if certificate else None
-        switching = {"promise": switching_promise(loop.jitter), "proof": proof, "reason": reason}
+        switching = {"promise": f"{switching_promise(loop.jitter)}, in {HERE}", "proof": proof, "reason": reason}
         if certificate is None:
             loop = loop.switching(None)
             certificate, reason = _proved(loop, design)
@@ -275,7 +275,7 @@ def _table(outcome: dict[str, Any]) -> Table:
     promised = [outcome["promise"] or "none"]
     if stored["switching"] and stored["switching"]["proof"]:
         promised.append(stored["switching"]["promise"])
-    table.add_row("promise", ", ".join(promised))
+    table.add_row("promise", "; ".join(promised))
     table.add_row(outcome["objective_name"], f"{outcome['objective']:.5g}")
     rms = transparent["rms_mismatch_db"]
     table.add_row("mismatch", f"{transparent['relative_mismatch_db']:.2f} dB (rms {rms:.2f} dB)")

@@ -8,7 +8,7 @@ from typing import Any
 from rich.table import Table
 
 from design.certificate import Verdict, verify
-from design.promises import switching_promise
+from design.promises import HERE, switching_promise
 from design.store import Stored, SwitchingProof
 from sim.command import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute
 from sim.files import write_json
@@ -68,7 +68,7 @@ def _switching(stored: Stored, verdict: Verdict) -> dict[str, Any] | None:
     return {
         "lo": span.lo,
         "hi": span.hi,
-        "promise": switching_promise(span) if verdict.proved else None,
+        "promise": f"{switching_promise(span)}, in {HERE}" if verdict.proved else None,
         "proof": "rational" if verdict.proved else None,
         "required_damping": claim.required,
         "margin": claim.margin,

@@ -54,7 +54,7 @@ def promise(
 
 
 def switching_promise(span: DelayRange) -> str:
-    """Which delays of the forces a coupling is certified for that bears switching."""
+    """Which delays of the forces a coupling is certified for that bears switching, in the environment of its loop."""
     return f"delays switching within {span}"
 
 

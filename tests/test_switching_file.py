@@ -208,7 +208,7 @@ def told(capsys, main, *options) -> tuple[int, dict]:
 def test_check_names_the_promise_and_the_proof(stored, file, tmp_path, capsys):
     code, report = told(capsys, check_main, file)
     assert (code, report["proved"]) == (0, True)
-    assert report["switching"]["promise"] == "delays switching within [1, 2] samples"
+    assert report["switching"]["promise"] == "delays switching within [1, 2] samples, in this environment"
     assert report["switching"]["proof"] == "rational"
     broken = change(stored.certificate.switching, required=(1.0, 1.0))
     save(change(stored, certificate=sealed(change(stored.certificate, switching=broken))), tmp_path / "broken.json")
