@@ -265,7 +265,7 @@ def test_what_the_file_does_not_cover_is_judged_anew(run, file, constant_file):
     assert line in plain["remarks"]
     assert not plain["jitter"]["covered"]
     # the buffer's constant (2, 2) needs 1.70 of 1.37 N s/m: it is no way out for these gains
-    assert "the constant 2, 2, for which these gains are not certified either" in plain["jitter"]["covers"]
+    assert "the constant [2, 2], for which it is not certified either" in plain["jitter"]["covers"]
     lossy = run(file, "--jitter", "1,2", "--loss", "0.1")["jitter"]
     assert not lossy["covered"]
 
