@@ -272,10 +272,9 @@ def _table(outcome: dict[str, Any]) -> Table:
     for row in set_rows(outcome["set"]) if outcome["set"] else []:
         table.add_row(*row)
     stored = outcome["stored"]
-    promised = [outcome["promise"] or "none"]
+    table.add_row("promise", outcome["promise"] or "none")
     if stored["switching"] and stored["switching"]["proof"]:
-        promised.append(stored["switching"]["promise"])
-    table.add_row("promise", "; ".join(promised))
+        table.add_row("promise, delays", stored["switching"]["promise"])
     table.add_row(outcome["objective_name"], f"{outcome['objective']:.5g}")
     rms = transparent["rms_mismatch_db"]
     table.add_row("mismatch", f"{transparent['relative_mismatch_db']:.2f} dB (rms {rms:.2f} dB)")
