@@ -23,7 +23,7 @@ from design.cutting_planes import SLACK, cut, sketch
 from design.failure import DesignFailed, Infeasible
 from design.free_parameter import FreeParameter
 from design.inequalities import World
-from design.jitter import jitter_proof
+from design.jitter_multiplier import jitter_proof
 from design.margin import closed_loop
 from design.result import Design
 from design.set_advice import set_advice
@@ -115,18 +115,22 @@ def advice(spec: Specification, wish: Wish) -> str:
     spec = alone
     helpful = [words for words, other in changes(wish).items() if feasible(spec, other)]
     kind = "diagonal" if wish.diagonal else "full"
-    delays = f"theta = {list(spec.theta)}, psi = {list(spec.psi)}"
+    delays, condition = f"theta = {list(spec.theta)}, psi = {list(spec.psi)}", "the closed-loop condition"
+    if wish.switching:
+        lo, hi = wish.switching
+        delays += f", delays switching from {list(lo)} to {list(hi)}"
+        condition = "the condition for switching delays"
     request = f"no {kind} Q of {wish.functions} functions is certified with {delays}, delta = {list(spec.delta)}"
     if NO_LIMIT in helpful:
         request += ": the limit above 100 Hz binds"
     elif helpful:
-        request += ": the closed-loop condition (with a stable V) binds in this basis"
+        request += f": {condition} (with a stable V) binds in this basis"
     if helpful:
         return f"{request}; there seem to be some with {', or '.join(helpful)}"
     damped = ((f, replace(spec, delta=tuple(f * d for d in spec.delta))) for f in EASIER)
     factor = next((f for f, easier in damped if feasible(easier, wish)), None)
     remedy = f"{factor:g} times the damping, or less delay, would do" if factor else "only less delay can help"
-    return f"{request}: the closed-loop condition binds; {remedy}"
+    return f"{request}: {condition} binds; {remedy}"
 
 
 def changes(wish: Wish) -> dict[str, Wish]:
