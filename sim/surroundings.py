@@ -16,16 +16,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import msgspec
 import numpy as np
 
 from controller.coupling import Compliance, Coupling, InternalModel
 from controller.delay import delay
-from controller.environment import Network, Spring, environment
+from controller.environment import Network, environment
 from controller.gains import Gains, Stack
 from controller.lti import Array, Lti, SingularLoop
 from controller.process import Process, force_map
 from design.assess import theorem4_requirement
+from design.environment_map import Environments, closed_loop_in_each, contact_springs, response
 from design.margin import Requirement, closed_loop, refusal
 from models.device import Device, passivity_level
 from models.human import Population
@@ -94,17 +94,10 @@ class Surroundings:
         """Environments with these springs at every contact, (n,) each."""
         return Gains(K, B, self.T)
 
-    def environment(self, K: float, B: float) -> Lti:
-        """E with K [N/m] and B [N s/m] at every contact."""
-        springs = tuple(
-            msgspec.structs.replace(s, stiffness=K, damping=B) if _at_contact(s, self.network) else s
-            for s in self.network.springs
-        )
-        return environment(msgspec.structs.replace(self.network, springs=springs), self.T)
-
     def force_maps(self, gains: Gains) -> tuple[Stack, ...]:
         """F in every environment, the coupling's model following it."""
-        maps = [self._force_map(self.coupling, K, B) for K, B in zip(gains.K, gains.B, strict=True)]
+        around = self._environments(gains)
+        maps = [self._force_map(self.coupling, around[i]) for i in range(len(around))]
         order = max(F.order for F in maps)  # without damping or stiffness an environment may have fewer states
         A, B, C, D = zip(*(_padded(F, order) for F in maps), strict=True)
         return (Stack(np.stack(A), np.stack(B), np.stack(C), np.stack(D), self.T),)
@@ -116,8 +109,13 @@ class Surroundings:
 
     def ratios(self, condition: str, gains: Gains) -> Array:
         """Required over available damping, (n,); inf where no damping is enough."""
-        pairs = zip(gains.K, gains.B, strict=True)
-        return np.array([self.requirement(condition, K, B).ratio for K, B in pairs])
+        if condition == "theorem4":
+            return np.full(len(gains), self._any_environment.ratio)
+        around, coupling = self._environments(gains), self._kept if condition == MODEL_KEPT else self.coupling
+        each = [self._force_map(coupling, around[i]).poles() for i in range(len(around))]
+        most = max(poles.size for poles in each)
+        poles = np.stack([np.pad(p, (0, most - p.size)) for p in each])
+        return closed_loop_in_each(around, response(coupling, self.T), poles, self.theta, self.psi, self.delta)
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """The damping that the condition asks of the devices in one environment, by design.margin."""
@@ -125,7 +123,8 @@ class Surroundings:
             return self._any_environment
         coupling = self._kept if condition == MODEL_KEPT else self.coupling
         try:
-            return closed_loop(self._force_map(coupling, K, B), self.delta)
+            E = self._environments(self.gains(np.array([K]), np.array([B])))[0]
+            return closed_loop(self._force_map(coupling, E), self.delta)
         except SingularLoop as error:
             return refusal("closed-loop", self.delta, str(error))
 
@@ -144,17 +143,11 @@ class Surroundings:
         model = delay(self.psi, self.T) @ environment(self.network, self.T)
         return Compliance(self.coupling.parameter(self.T).feedback(-model))
 
-    def _force_map(self, coupling: Coupling, K: float, B: float) -> Lti:
-        return force_map(self.environment(float(K), float(B)), coupling, self.theta, self.psi)
+    def _environments(self, gains: Gains) -> Environments:
+        return Environments(self.network, gains.K, gains.B, self.T)
 
-
-def contact_springs(network: Network) -> tuple[Spring, ...]:
-    """Those that end at a contact: the ones whose K and B the map varies."""
-    return tuple(s for s in network.springs if _at_contact(s, network))
-
-
-def _at_contact(spring: Spring, network: Network) -> bool:
-    return bool(set(spring.between) & set(network.contacts))
+    def _force_map(self, coupling: Coupling, E: Lti) -> Lti:
+        return force_map(E, coupling, self.theta, self.psi)
 
 
 def _padded(F: Lti, order: int) -> tuple[Array, Array, Array, Array]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from design.assess import CONDITIONS, assess
+from design.environment_map import contact_springs
 from design.promises import certificate_part, promise_of
 from design.set_check import check_set, set_part
 from design.summary import coupling_part
@@ -42,7 +43,7 @@ from sim.gain_marks import look, truth
 from sim.gain_population import holders
 from sim.gain_simulation import Effects, Plan
 from sim.scenario import InputError, Scenario
-from sim.surroundings import Surroundings, contact_springs
+from sim.surroundings import Surroundings
 from sim.zwidth_text import print_map
 
 EXAMPLE = """python -m sim.zwidth --theta 1 --grid 30
