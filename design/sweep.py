@@ -15,8 +15,9 @@ Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)
 def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: int = 600) -> Array:
     """Sorted frequencies [rad/sample] in [low, high]: even in w and in log w, dense around each pole.
 
-    A pole r exp(j phi) bends the response over a width of about 1 - r around phi, however sharp it is. Those that repeat
-    count once: of points that rounding holds apart, the wrong one may be the higher, and the peak beside the other.
+    A pole r exp(j phi) bends the response over a width of about 1 - r around phi, however sharp it is. One that
+    repeats counts once: of points that rounding alone holds apart the wrong one may be the higher, and hide the peak
+    beside the other.
     """
     even = np.linspace(low, high, points)
     logarithmic = np.geomspace(low, high, points)
