@@ -62,9 +62,15 @@ def cut(Q: FreeParameter, wish: Wish, worlds: Sequence[World], delta: Array) -> 
     raise DesignFailed(None, (), f"after {MOST_ROUNDS} rounds of cutting planes {names} still fails in between")
 
 
-def sketch(Q: FreeParameter, wish: Wish, worlds: Sequence[World], delta: Array) -> InternalModel:
-    """The optimum of the first round, which bounds the final one from below. Raises as `cut`."""
+def sketch(
+    Q: FreeParameter, wish: Wish, worlds: Sequence[World], delta: Array, without: str | None = None
+) -> InternalModel:
+    """The optimum of the first round, which bounds the final one from below. Raises as `cut`.
+
+    `without` names an inequality that is left out in all worlds, to learn whether it is the one in the way.
+    """
     problem = Problem.of(Q, wish, worlds, delta)
+    problem = replace(problem, inequalities=[one for one in problem.inequalities if one.name != without])
     return Q.coupling(problem.optimum([one.imposed for one in problem.inequalities])[0])
 
 
