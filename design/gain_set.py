@@ -76,7 +76,8 @@ def solve_within(
         if not any(w.size for w in missed.values()):
             return problem
         cones = {i: np.union1d(w, missed[i]) for i, w in cones.items()}
-    raise DesignFailed(problem, (), f"{what}: Theorem 4 still fails between {MOST_ROUNDS} rounds of frequencies")
+    line = f"{what}: after {MOST_ROUNDS} rounds Theorem 4 still fails between the frequencies"
+    raise DesignFailed(None, (), line)
 
 
 def _constraints(

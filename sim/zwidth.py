@@ -154,11 +154,9 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
 
 def _surroundings(scenario: Scenario, chosen: Chosen) -> Surroundings:
     """The loop with that coupling. Raises InputError."""
-    delays = {"theta": scenario.theta, "psi": scenario.psi}
+    who = scenario.device, scenario.population
     try:
-        return Surroundings(
-            scenario.device, scenario.population, scenario.environment, scenario.T, coupling=chosen.coupling, **delays
-        )
+        return Surroundings(*who, scenario.environment, scenario.T, scenario.theta, scenario.psi, chosen.coupling)
     except ValueError as error:
         raise InputError(str(error)) from None
 
