@@ -12,6 +12,7 @@ environment alone would gain it 0.2 dB and cost the worst vertex 0.3 to 0.5), th
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,8 +23,8 @@ from controller.process import force_map
 from design.cutting_planes import SLACK, asked, cut, sketch
 from design.failure import DesignFailed, Infeasible
 from design.free_parameter import FreeParameter
-from design.inequalities import World
-from design.jitter import jitter_proof
+from design.inequalities import CLOSED_LOOP, SWITCHING, World
+from design.jitter_multiplier import jitter_proof
 from design.margin import closed_loop
 from design.result import Design
 from design.set_advice import Progress, set_advice
@@ -126,6 +127,9 @@ def advice(spec: Specification, wish: Wish, progress: Progress = lambda what, do
         helpful += [words] if feasible(spec, other) else []
     kind = "diagonal" if wish.diagonal else "full"
     delays = f"theta = {list(spec.theta)}, psi = {list(spec.psi)}"
+    if wish.switching:
+        lo, hi = wish.switching
+        delays += f", delays switching from {list(lo)} to {list(hi)}"
     request = f"no {kind} Q of {wish.functions} functions is certified with {delays}, delta = {list(spec.delta)}"
     request += f": {binding(spec, wish)}"
     if helpful:
@@ -137,9 +141,15 @@ def advice(spec: Specification, wish: Wish, progress: Progress = lambda what, do
 
 
 def binding(spec: Specification, wish: Wish) -> str:
-    """Which inequality is in the way: one without which the others have a solution."""
-    names = dict.fromkeys(one.name for one in asked(wish, world(spec), np.asarray(spec.delta)))
-    free = [name for name in names if feasible(spec, wish, name)]
+    """Which inequality is in the way: one without which the others have a solution.
+
+    The condition for switching delays contains the closed-loop one, so it is left out with it.
+    """
+    names = list(dict.fromkeys(one.name for one in asked(wish, world(spec), np.asarray(spec.delta))))
+    sets = {name: (name,) for name in names}
+    if wish.switching:
+        sets = {name: (name,) if name != SWITCHING else (name, CLOSED_LOOP) for name in names if name != CLOSED_LOOP}
+    free = [name for name, left_out in sets.items() if feasible(spec, wish, left_out)]
     if not free:
         return "more than one condition binds: none of them alone is in the way"
     return f"{free[0]} binds" if len(free) == 1 else f"{' and '.join(free)} contradict each other"
@@ -168,10 +178,10 @@ def solvable(spec: Specification, wish: Wish) -> bool:
     return True
 
 
-def feasible(spec: Specification, wish: Wish, without: str | None = None) -> bool:
+def feasible(spec: Specification, wish: Wish, without: Sequence[str] = ()) -> bool:
     """Whether some Q meets what is asked at the frequencies where it is imposed first: a necessary condition.
 
-    `without` names an inequality that is not asked.
+    `without` names inequalities that are not asked.
     """
     try:
         sketch(parameter(spec, wish), wish, worlds(spec), np.asarray(spec.delta), without)

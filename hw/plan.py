@@ -94,6 +94,12 @@ class Rung:
     def name(self) -> str:
         return f"{self.chosen.kind} for theta = {list(self.scenario.theta)}"
 
+    @property
+    def held(self) -> int:
+        """Missed answers in a row through which the device may hold a force: so much the coupling's file proves."""
+        span = self.chosen.switching
+        return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
+
     def controller(self) -> Controller:
         return Law(self.law())
 
@@ -112,8 +118,15 @@ class Rung:
             "certificate": certificate_part(self.requirements[self.chosen.condition]),
             "certificates": {name: certificate_part(r) for name, r in self.requirements.items()},
             "promise": promise_of(self.requirements, self.scenario.loop(self.case)),
-            "remarks": list(self.chosen.notes),
+            "remarks": self.remarks(),
         }
+
+    def remarks(self) -> list[str]:
+        """What a reader should know of the coupling's file."""
+        if self.held < 1:
+            return list(self.chosen.notes)
+        answers = "1 missed answer" if self.held == 1 else f"{self.held} missed answers in a row"
+        return [*self.chosen.notes, f"a force that is held through {answers} is covered by the file's proof"]
 
 
 def rung(scenario: Scenario, case: str, name: str | None, condition: str | None, link: int) -> Rung:

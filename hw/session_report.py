@@ -95,6 +95,9 @@ def print_certificate(ages: Ages, link: int, rungs: Sequence[Rung], console: Con
             part["promise"],
         )
     console.print(table)
+    for rung in rungs:
+        for remark in rung.remarks():
+            console.print(f"[dim]·[/] theta = {list(rung.scenario.theta)}: {remark}", highlight=False)
     if len(rungs) == 1:
         console.print("no reserve: nothing softer is certified, so late answers end the session")
 

@@ -160,7 +160,7 @@ def _outcome(
     certificates = {name: certificate_part(requirement) for name, requirement in requirements.items()}
     simulated = samples * scenario.T
     certified = any(requirement.certified for requirement in requirements.values())
-    jitter, stability, unstable = jitter_report.part(assembly, chosen.coupling, period, samples, certified), None, None
+    jitter, stability, unstable = jitter_report.part(assembly, chosen, period, samples, certified), None, None
     if jitter and scenario.switches:
         stability = jitter_report.stability_part(assembly, record, jitter)
         unstable = stability["verdict"] == "unstable"

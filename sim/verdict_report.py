@@ -60,8 +60,8 @@ def outcome(question: Question, findings: Findings, certified: bool, wall: float
 def switching_part(findings: Findings, covered: dict[str, Any]) -> dict[str, Any]:
     """How many humans grow under delays that vary; it holds unless certificates cover these delays and one grows."""
     exact, mujoco = findings.switching, findings.switching_mujoco
-    seen = np.isfinite(exact) | np.isinf(exact)
-    unstable, also = int((exact[seen] > 0).sum()), mujoco[~np.isnan(mujoco)]
+    seen = ~np.isnan(exact)
+    unstable, also = int((exact > 0).sum()), mujoco[~np.isnan(mujoco)]
     worst = int(np.nanargmax(exact)) if seen.any() else None
     return covered | {
         "unstable": {"exact": unstable, "mujoco": int((also > 0).sum()) if also.size else None},

@@ -380,7 +380,7 @@ def test_what_is_in_the_way_is_what_the_others_can_do_without():
     spec = Specification(environment(wall, 1e-3), (0,), (0,), (0,), (0.02,))
     wish = Wish(functions=4, filter="fir", high_gain=None)
     assert binding(spec, wish) == "the closed-loop condition and a stable V contradict each other"
-    Q = sketch(parameter(spec, wish), wish, worlds(spec), np.array(spec.delta), "a stable V").parameter(1e-3)
+    Q = sketch(parameter(spec, wish), wish, worlds(spec), np.array(spec.delta), ["a stable V"]).parameter(1e-3)
     z = np.exp(1j * np.linspace(1e-3, np.pi, 2000))
     assert (1 - spec.environment.at(z) @ Q.at(z)).real.min() < 0.02  # and V is what it gives up
     late = replace(SPEC["I"], theta=(4, 4), lam=(4, 4))
