@@ -31,10 +31,12 @@ from sim.command import (
     Parser,
     add_loop_options,
     add_output_options,
+    as_option,
     check_json,
     console,
     execute,
     numbers,
+    progress_bar,
     ranges,
     scenario_from,
     seed_from,
@@ -60,11 +62,14 @@ def main(argv: list[str]) -> int:
     seed, samples = seed_from(args), _samples(args)
     try:
         spec = specification(loop)
-        design = design_coupling(spec, args.coupling, args.condition, **options)
+        with (bar := progress_bar("designing"))[0]:
+            design = design_coupling(
+                spec, args.coupling, args.condition, lambda what, done, total: bar[1](done, total, what), **options
+            )
     except DesignFailed:
         raise
     except ValueError as error:
-        raise InputError(str(error)) from None
+        raise InputError(as_option(error, args)) from None
     F = force_map(spec.environment, design.coupling, loop.theta, loop.psi)
     requirements = assess(loop, design.coupling, design.phi)
     whole = check_set(loop, design.coupling, seed, samples)
