@@ -19,6 +19,7 @@ from design.gain_map import closed_loop_ratios, theorem4_ratios
 from design.margin import Requirement, closed_loop, refusal
 from design.multiplier import shortage
 from design.specification import Specification
+from design.store import Condition
 from design.subject import Subject
 from models.device import Device, passivity_level
 from models.human import Population
@@ -118,7 +119,8 @@ class Ground:
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """The same for one coupling by design.margin, which a map is checked against."""
         if self.cutoff is None and (condition == "closed-loop" or not any(self.psi)):
-            return self._subject.with_gains([K] * self.channels, [B] * self.channels).requirement(condition)
+            asked: Condition = "closed-loop" if condition == "closed-loop" else "theorem4"
+            return self._subject.with_gains([K] * self.channels, [B] * self.channels).requirement(asked)
         gains = self.gains(np.array([K]), np.array([B]))
         if condition == "closed-loop":
             states = [closed_loop(stack[0], self.delta) for stack in self.force_maps(gains)]
