@@ -30,8 +30,8 @@ def test_places_keep_poles_together():
 @pytest.mark.parametrize(
     ("case", "wish"),
     [
-        ("I", Wish(high_gain=None)),
-        ("I", Wish(high_gain=1.5)),
+        ("II", Wish(high_gain=None)),
+        ("II", Wish(high_gain=1.5)),
         ("II", Wish(objective="sup", diagonal=False, high_gain=None)),
     ],
     ids=["rms", "rms, limited", "sup"],
@@ -39,7 +39,8 @@ def test_places_keep_poles_together():
 def test_the_gradient_is_that_of_the_optimum(case, wish):
     """Against central differences of solved problems, the frequencies held.
 
-    A step of 1e-3 and a solver good to 1e-8 leave 1e-5, and the curvature about 1e-3 of the largest slope.
+    The solver is good to 1e-8 of a mismatch of 0.3, whose square the rms objective is (in case I it is 1e-3, and the
+    differences are coarser); with steps of 1e-3 that is 1e-4, and the curvature less than 1 % of the largest slope.
     """
     poles = [0.1, 0.1, 0.1, 0.6, 0.95]
     here = problem(case, wish, poles)
@@ -72,19 +73,20 @@ def test_an_adapted_basis_is_better_than_its_start():
 
 
 def test_a_basis_without_poles_stays():
-    Q, solved = descend(FreeParameter(np.zeros(0), 2, True), Wish(functions=1), [world(SPEC["I"])], np.full(2, 1.37))
+    """With more damping than the loop without coupling needs there is a solution, and nothing to move."""
+    Q, solved = descend(FreeParameter(np.zeros(0), 2, True), Wish(functions=1), [world(SPEC["I"])], np.full(2, 3.0))
     assert Q.poles.size == 0
     assert solved >= 1
 
 
 def test_a_start_without_solution_is_infeasible():
-    """The descent needs a solution to start from."""
     with pytest.raises(Infeasible):
         descend(FreeParameter(np.zeros(0), 2, True), Wish(functions=1), [world(SPEC["I"])], np.full(2, 0.01))
 
 
-def test_a_long_basis_for_the_sup_of_case_II():
-    """The usual basis of 17 functions, and the FIR filter of as many, full, without limit: -6.9 against -5.9 dB."""
-    made = design(SPEC["II"], Wish(functions=17, objective="sup", diagonal=False, high_gain=None))
-    assert 20 * np.log10(made.objective) < -6.7
+def test_repeated_poles_are_the_better_long_basis():
+    """Case II, sup, a full Q of 11 functions: -5.70 dB, where as many taps reach -5.50 (37: -7.91 and -6.76)."""
+    made = design(SPEC["II"], Wish(functions=11, objective="sup", diagonal=False, high_gain=None))
+    assert (made.coupling.poles > 0).all()
+    assert 20 * np.log10(made.objective) < -5.65
     assert made.requirement.certified
