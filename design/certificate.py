@@ -37,11 +37,10 @@ from design.delayed import theorem4_delayed
 from design.delayed_proof import coupling_block, environment_block
 from design.exact import Exact
 from design.members import in_each, worst
-from design.positive_real import find_storage, prove_positive_real
+from design.positive_real import find_storage, prove_positive_real, too_large
 from design.rational import Matrix, SingularMatrix, definiteness, rational
 from design.store import Certificate, Condition, CouplingData, Loop, Stored, digest, sealed
 
-LARGEST = 60  # states of a model that a proof is tried for: seconds; it grows with the fourth power
 CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
 
 
@@ -199,7 +198,7 @@ def _block(loop: Loop, coupling: CouplingData, condition: Condition) -> Exact:
     try:
         if condition == "closed-loop":
             F = exact.force_map(exact.environment(loop.environment, T), built, loop.theta, loop.psi, T)
-            _require_size(F)  # splitting it takes minutes too
+            _require_size(F)
             F1, R = F.split_at_one()
             _require_static("F(1)", F1)
             return Exact(R.A, R.B, R.C, Matrix.diag(d / T for d in delta) - F1.scaled(Fraction(1, 2)))
@@ -214,8 +213,7 @@ def _block(loop: Loop, coupling: CouplingData, condition: Condition) -> Exact:
 
 
 def _require_size(block: Exact, requirement: margin.Requirement | None = None) -> None:
-    if block.order > LARGEST:
-        reason = f"a proof over {block.order} states takes minutes: up to {LARGEST} are tried"
+    if reason := too_large(block):
         raise NotProved(reason, requirement)
 
 

@@ -62,7 +62,7 @@ class Exact:
 
         Raises SingularMatrix if A has the eigenvalue one.
         """
-        C = -(self.C @ (Matrix.eye(self.order) - self.A).inverse())
+        C = -(Matrix.eye(self.order) - self.A).T.solve(self.C.T).T
         p, m = self.D.shape
         return self.D - C @ self.B, Exact(self.A, self.B, C, Matrix.zeros(p, m))
 

@@ -26,14 +26,13 @@ from controller.lti import Array, Lti
 from design import exact
 from design.exact import Exact
 from design.margin import Requirement, closed_loop
-from design.positive_real import find_storage
+from design.positive_real import find_storage, too_large
 from design.promises import certificate_part
 from design.rational import Matrix, SingularMatrix, definiteness, rational
 from design.sweep import on_circle
 
 RECIPROCAL = 1e-6  # relative difference of |F_ij| and |F_ji| that is taken for rounding
 LARGEST_RATIO = 1e4  # between two weights
-LARGEST = 60  # states of a model that a proof is tried for, as in design.certificate
 
 
 def weighted(F: Lti, d: Array) -> Lti:
@@ -62,6 +61,8 @@ def reciprocal(F: Lti) -> bool:
 
 def proved(F: Exact, delta: Sequence[float], d: Sequence[float], T: float) -> bool:
     """Whether the weighted condition is proved in exact arithmetic; F is the exact force map."""
+    if too_large(F):
+        return False
     try:
         static, R = (Exact.constant(Matrix.diag(d)) @ F).split_at_one()
     except SingularMatrix:
@@ -82,7 +83,7 @@ def separate_humans_part(
 ) -> dict[str, Any]:
     """The requirement for these holders as plain data, proved exactly where that is possible; delays (theta, psi)."""
     requirement, d = closed_loop_of_separate_humans(F, delta, holders)
-    if requirement.certified and F.order <= LARGEST:
+    if requirement.certified:
         period = rational(F.T)
         whole = exact.force_map(exact.environment(network, period), coupling, *delays, period)
         if proved(whole, delta, d, F.T):

@@ -17,10 +17,8 @@ from controller.coupling import Coupling
 from controller.environment import Network
 from design import exact
 from design.exact import Exact
-from design.positive_real import find_storage
+from design.positive_real import find_storage, too_large
 from design.rational import Matrix, SingularMatrix, block, definiteness, rational
-
-LARGEST = 40  # states for which a proof is tried: about a second
 
 
 def prove(
@@ -38,9 +36,7 @@ def prove(
         condition = condition_block(coupling, network, T, psi, lo, hi, delta, alpha)
     except (SingularMatrix, ValueError) as error:
         return str(error)
-    if condition.order > LARGEST:
-        return f"a proof over {condition.order} states takes long: up to {LARGEST} are tried"
-    return find_storage(condition)[1]
+    return too_large(condition) or find_storage(condition)[1]
 
 
 def condition_block(

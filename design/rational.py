@@ -102,24 +102,55 @@ class Matrix:
         return self.shape == other.shape and bool((self.num * other.den == other.num * self.den).all())
 
     def inverse(self) -> Matrix:
-        """The exact inverse, by fraction-free Gauss-Jordan elimination. Raises SingularMatrix."""
+        """The exact inverse. Raises SingularMatrix."""
+        return self.solve(Matrix.eye(self.shape[0]))
+
+    def solve(self, right: Matrix) -> Matrix:
+        """X with `self @ X` = right, by elimination over the fractions. Raises SingularMatrix.
+
+        The models here are series of small blocks, triangular when read in the right order: the next pivot is in the
+        row with the fewest entries, and there in the column with the fewest (Markowitz), so next to nothing fills in.
+        """
         n = self.shape[0]
-        work = np.hstack([self.num, np.eye(n, dtype=object) * self.den])
-        previous = 1
-        for k in range(n):
-            pivots = np.flatnonzero(work[k:, k] != 0)
-            if not pivots.size:
-                raise SingularMatrix(f"a {n} x {n} matrix has rank {k} in its first {k + 1} columns")
-            work[[k, k + pivots[0]]] = work[[k + pivots[0], k]]
-            others = np.arange(n) != k
-            pivot, row = work[k, k], work[k].copy()
-            work[others] = (pivot * work[others] - np.outer(work[others, k], row)) // previous
-            previous = pivot
-        return _over(work[:, n:], previous if n else 1)
+        rows = [{j: Fraction(int(v), self.den) for j, v in enumerate(row) if v} for row in self.num]
+        values = [list(row) for row in right.fractions()]
+        columns = [{i for i in range(n) if j in rows[i]} for j in range(n)]
+        active, order = set(range(n)), []
+        while active:
+            i = min(active, key=lambda r: len(rows[r]))
+            if not rows[i]:
+                raise SingularMatrix(f"a {n} x {n} matrix is singular")
+            j = min(rows[i], key=lambda c: len(columns[c]))
+            active.remove(i)
+            order.append((i, j))
+            for c in rows[i]:
+                columns[c].discard(i)
+            for r in list(columns[j]):
+                factor = rows[r].pop(j) / rows[i][j]
+                for c, v in rows[i].items():
+                    if c != j:
+                        _subtract(rows[r], columns[c], r, c, factor * v)
+                values[r] = [x - factor * y for x, y in zip(values[r], values[i], strict=True)]
+            columns[j].clear()
+        solution: list[list[Fraction]] = [[] for _ in range(n)]
+        for i, j in reversed(order):
+            total = values[i]
+            for c, v in rows[i].items():
+                if c != j:
+                    total = [x - v * y for x, y in zip(total, solution[c], strict=True)]
+            solution[j] = [x / rows[i][j] for x in total]
+        return Matrix.of(solution, right.shape)
 
 
-def _over(num: Integers, den: int) -> Matrix:
-    return Matrix(num if den > 0 else -num, abs(den)).reduced()
+def _subtract(row: dict[int, Fraction], column: set[int], r: int, c: int, value: Fraction) -> None:
+    """Take `value` off the entry (r, c) of a sparse matrix that is kept by rows, with the rows of each column."""
+    entry = row.get(c, Fraction(0)) - value
+    if entry:
+        row[c] = entry
+        column.add(r)
+    else:
+        row.pop(c, None)
+        column.discard(r)
 
 
 def block(rows: Sequence[Sequence[Matrix]]) -> Matrix:
@@ -136,7 +167,7 @@ def block_diag(*parts: Matrix) -> Matrix:
 
 @dataclass(frozen=True)
 class Definiteness:
-    """What the exact LDL' elimination of a symmetric matrix found."""
+    """What the exact elimination of a symmetric matrix found."""
 
     definite: bool
     semidefinite: bool

@@ -5,8 +5,12 @@
     $ python -m design.audit ..
     ```
 
+    <!-- measured: RK4 x 4 -->            the same for a command that is slow or prints times
+    ```text
+    $ python -m sim.accuracy
+
 A toml block whose first line is `# NAME.toml` is a file for the commands after it; `<!-- picture: FROM TO -->` keeps a
-picture that a command has drawn. tests/test_docs.py runs the same steps and compares.
+picture that a command has drawn. tests/test_docs.py runs the same steps and compares, but for what is measured.
 """
 
 from __future__ import annotations
@@ -24,7 +28,9 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-SHOWN = re.compile(r"(<!-- output(?:: (.+))? -->\n```console\n\$ (python (?:-m|examples/).+)\n)((?:.*\n)*?)(?=```)")
+_BLOCK = r"(<!-- {}(?:: (.+))? -->\n```{}\n\$ (python (?:-m|examples/).+)\n)((?:.*\n)*?)(?=```)"
+SHOWN = re.compile(_BLOCK.format("output", "console"))
+MEASURED = re.compile(_BLOCK.format("measured", "text"))
 BLOCK = re.compile(r"^```(sh|console|toml|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 PICTURE = re.compile(r"<!-- picture: (\S+) (\S+) -->")
 
@@ -49,7 +55,8 @@ def steps(text: str) -> Iterator[Step]:
 
 def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
     """A documented command, in a terminal of 100 columns."""
-    words = [str(ROOT / w) if w.startswith("examples/") else w for w in shlex.split(command, comments=True)]
+    here = ("examples/", "tests/")
+    words = [str(ROOT / w) if w.startswith(here) else w for w in shlex.split(command, comments=True)]
     shared = {"PATH": os.environ["PATH"], "OPENBLAS_NUM_THREADS": "1"}  # small matrices: threads only wait
     environment = shared | {"PYTHONPATH": str(ROOT), "COLUMNS": "100"}
     return subprocess.run(
@@ -65,21 +72,26 @@ def kept(output: str, pattern: str | None) -> str:
 
 def renewed(text: str, printed: dict[str, str]) -> str:
     """The page with what its commands have printed."""
-    return SHOWN.sub(lambda block: block[1] + kept(printed[block[3]], block[2]), text)
+    for blocks in (SHOWN, MEASURED):
+        text = blocks.sub(lambda block: block[1] + kept(printed[block[3]], block[2]), text)
+    return text
 
 
 def main() -> int:
+    """Run every page that shows output, and rewrite those whose output is another."""
     printed: dict[str, str] = {}
     with TemporaryDirectory() as place:
         folder = Path(place)
         for page in PAGES:
             text = page.read_text(encoding="utf-8")
-            if not (SHOWN.search(text) or PICTURE.search(text)):
+            if not any(kind.search(text) for kind in (SHOWN, MEASURED, PICTURE)):
                 continue
-            for step in steps(text):
+            measured = [Step("command", block[3]) for block in MEASURED.finditer(text)]
+            for step in [*steps(text), *measured]:
                 if step.kind == "file":
                     (folder / step.name).write_text(step.text, encoding="utf-8")
                 elif step.kind == "command" and step.text not in printed:
+                    print(f"{page.name}: {step.text}", flush=True)
                     done = run(step.text, folder)
                     if done.returncode not in (0, 1):
                         sys.exit(f"{page.name}: {step.text}\n{done.stderr}")

@@ -62,9 +62,16 @@ def test_delay_inside_the_environment_is_proved_with_its_multiplier(psi):
 
 
 def test_a_model_too_large_to_prove_in_seconds_is_said_so():
-    loop = change(DEFAULT, theta=(40, 40))
-    with pytest.raises(NotProved, match="states takes minutes: up to 60 are tried"):
+    loop = change(DEFAULT, theta=(100, 100), delta=(400.0, 400.0))
+    with pytest.raises(NotProved, match="over 206 states takes long: up to 200 are tried"):
         prove(loop, SpringDamper((4.0, 4.0), (0.5, 0.5)), "closed-loop")
+
+
+def test_a_model_of_a_hundred_states_is_proved():
+    loop = change(DEFAULT, theta=(45, 46), delta=(400.0, 400.0))
+    stored = certified(loop, SpringDamper((300.0, 200.0), (0.1, 0.1)), "closed-loop")
+    assert len(stored.certificate.matrices["P"]) == 97
+    assert verify(stored) == Verdict(True)
 
 
 def certified(loop: Loop, coupling, condition: str) -> Stored:

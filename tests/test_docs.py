@@ -21,6 +21,7 @@ COMMANDS = {s.text: page.name for page in reversed(PAGES) for s in regenerate.st
 IN_ORDER = list(dict.fromkeys(s.text for page in PAGES for s in regenerate.steps(TEXTS[page]) if s.kind == "command"))
 SNIPPETS = {p: [s.text for s in regenerate.steps(TEXTS[p]) if s.kind == "python"] for p in PAGES}
 SHOWN = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.SHOWN.finditer(TEXTS[page])]
+MEASURED = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.MEASURED.finditer(TEXTS[page])]
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]\d+)?(?![\w])")
 
 
@@ -71,6 +72,15 @@ def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown,
     assert shown.splitlines()
     assert len(fresh) == len(shown.splitlines()), f"{page.name}: {output}"
     assert [a for a, b in zip(shown.splitlines(), fresh, strict=True) if not same_line(a, b)] == []
+
+
+@pytest.mark.parametrize(("page", "command", "pattern", "shown"), MEASURED, ids=[block[1] for block in MEASURED])
+def test_measured_output_is_of_a_command_that_exists(page, command, pattern, shown):
+    """Minutes, and times: not run here, `python docs/regenerate.py` does."""
+    module = command.split()[2]
+    assert importlib.util.find_spec(module) is not None
+    assert shown
+    assert shown == regenerate.kept(shown, pattern)
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if SNIPPETS[page]], ids=lambda page: page.name)

@@ -11,7 +11,8 @@ from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
 from design import exact
-from design.positive_real import prove_positive_real, strictly_positive
+from design.positive_definite import strictly_positive
+from design.positive_real import prove_positive_real
 from design.rational import Matrix, SingularMatrix, block_diag, definiteness, rational
 
 T = 1.2e-3
@@ -58,7 +59,7 @@ def test_definiteness_agrees_with_the_eigenvalues_of_random_integer_matrices():
         outcome = definiteness(Matrix.of(S.tolist()))
         if abs(least) > 1e-9:  # a zero eigenvalue has a rounded sign
             assert outcome.definite == (least > 0)
-            assert strictly_positive(Matrix.of(S.tolist())).definite == (least > 0)
+            assert strictly_positive(Matrix.of(S.tolist())) == (least > 0)
         assert outcome.semidefinite == (least > -1e-9)
         seen.add(outcome.definite)
         if not outcome.definite:
@@ -75,7 +76,7 @@ def test_singular_matrices_are_semidefinite_only_without_a_negative_direction():
         outcome = definiteness(gram)
         assert outcome.semidefinite
         assert not outcome.definite
-        assert not strictly_positive(gram).definite
+        assert not strictly_positive(gram)
     assert not definiteness(Matrix.of([[0, 1], [1, 5]])).semidefinite
     with pytest.raises(ValueError, match="not exactly symmetric"):
         definiteness(Matrix.of([[1, 2], [3, 9]]))
@@ -85,7 +86,23 @@ def test_a_matrix_definite_by_less_than_the_rounding_is_not_proved():
     tiny = Fraction(1, 2**400)
     S = Matrix.of([[Fraction(1), 1 - tiny], [1 - tiny, Fraction(1)]])
     assert definiteness(S).definite
-    assert not strictly_positive(S).definite
+    assert not strictly_positive(S)
+
+
+def hilbert(n: int, shift: Fraction = Fraction(0)) -> Matrix:
+    return Matrix.of([[Fraction(1, i + j + 1) - (shift if i == j else 0) for j in range(n)] for i in range(n)])
+
+
+def test_definiteness_is_proved_beyond_the_reach_of_double_precision():
+    """Hilbert's matrices, condition 5e5 to 2e28: against elimination, on both sides of the least eigenvalue."""
+    for n in (5, 12, 20):
+        low, high = Fraction(0), Fraction(1, n)
+        while high - low > high / 1000:
+            middle = (low + high) / 2
+            low, high = (middle, high) if definiteness(hilbert(n, middle)).definite else (low, middle)
+        assert strictly_positive(hilbert(n))
+        assert strictly_positive(hilbert(n, low))
+        assert not strictly_positive(hilbert(n, high))
 
 
 def test_the_exact_inverse_is_an_inverse():
@@ -140,6 +157,6 @@ def test_a_wrong_storage_matrix_proves_nothing():
     # unstable: P < 0 may satisfy the second inequality alone, and only P > 0 refuses it
     unstable = exact.Exact(*(Matrix.of([[v]]) for v in (2, 1, 0, 5)))
     assert prove_positive_real(unstable, Matrix.of([[-1]])) == (
-        "P is not positive definite: the leading minor of order 1 is negative"
+        "P is not positive definite, or by so little that it is not proved"
     )
     assert prove_positive_real(G, Matrix.eye(2)) == "P has shape (2, 2), the model has 1 states"

@@ -524,6 +524,14 @@ def test_mp4_is_what_ffmpeg_makes_of_the_pictures(tmp_path, monkeypatch):
         film.save_film(tmp_path / "b.mp4", iter(pictures), 10)
 
 
+def test_case_none_begins_without_a_coupling_and_takes_one_later(tmp_path):
+    """Nothing designed for "none" exists: what is asked for later is designed for case I."""
+    where, told = str(tmp_path / "a.gif"), tmp_path / "a.json"
+    words = ("--case", "none", "--script", "0.1:designed", "--duration", "0.3", "--draw", "flat", "--fps", "5")
+    run(*words, "--video", where, "--json", str(told))
+    assert [e["coupling"] for e in json.loads(told.read_text())["events"]] == ["none", "designed"]
+
+
 # bad input
 
 BAD = [

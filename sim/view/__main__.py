@@ -57,7 +57,8 @@ def main(argv: list[str]) -> int:
     if args.video:
         check_film(Path(args.video))
     label, script = _beginning(args, scenario.channels)
-    menu = Menu(args.case, args.condition, args.coupling if label == GIVEN else None)
+    # --case none begins without a coupling; those that keys bring are for case I
+    menu = Menu("I" if args.case == "none" else args.case, args.condition, args.coupling if label == GIVEN else None)
     setting = first_setting(menu, scenario, label)
     executor = ThreadPoolExecutor(1)
     try:

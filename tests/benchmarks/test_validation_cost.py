@@ -34,8 +34,9 @@ def held_by():
     return variants(scenario.device, crowd)
 
 
-@pytest.mark.parametrize("coupling", [NoCoupling(), CASE_I], ids=["none", "published"])
-def test_verdicts(benchmark, held_by, coupling):
+@pytest.mark.parametrize("coupling", [NoCoupling(), CASE_I], ids=["no coupling", "published"])
+def test_verdicts(benchmark, held_by, coupling, request):
+    name = request.node.callspec.id
     assembly = assemble(load(), coupling)
 
     def once():
@@ -48,8 +49,8 @@ def test_verdicts(benchmark, held_by, coupling):
     median = benchmark.stats.stats.median if benchmark.stats else float("nan")
     wrong = int(disagree(exact, mujoco).sum())
     print(
-        f"\n{HUMANS} verdicts: exact {median:.3f} s, {int(unstable(exact).sum())} unstable; MuJoCo {wall:.2f} s, "
-        f"{wrong} disagree, growth within {np.abs(mujoco - exact).max():.1e} 1/s"
+        f"\n{HUMANS} verdicts, {name}: exact {median:.3f} s, {int(unstable(exact).sum())} unstable; "
+        f"MuJoCo {wall:.2f} s, {wrong} disagree, growth within {np.abs(mujoco - exact).max():.1e} 1/s"
     )
     assert wrong == 0
 
