@@ -384,7 +384,7 @@ def test_the_basis_follows_the_delays():
 
 
 def test_slow_poles_hide_no_violation_at_low_frequency():
-    """Q = q (b - 1) with b of a pole at 1 - 3e-6 asks for 3.1 times the damping below w = 1e-6, and for 0.65 of it at 1e-5.
+    """Q = q (b - 1) with b of a pole at 1 - 3e-6 asks for 3.1 times the damping at w = 1e-6, for 0.65 of it at 1e-5.
 
     Without delay He[F/(z-1)] is -E/2 - E^2 q He[(b - 1)/(z-1)], and b - 1 = -(z-1)/(z-a).
     """
