@@ -40,6 +40,8 @@ figures: .venv/ready
 	cp out/limits/limits.png docs/pictures/limits.png
 	$(PY) -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0 --out out/zwidth || test $$? -eq 1 # 1: not certified
 	cp out/zwidth/zwidth.png docs/pictures/zwidth.png
+	$(PY) -m sim.zwidth --coupling optimal --out out/zwidth-optimal
+	cp out/zwidth-optimal/zwidth.png docs/pictures/zwidth-optimal.png
 	$(PY) docs/regenerate.py
 
 bench: .venv/ready

@@ -10,18 +10,18 @@ from typing import Any
 from rich.table import Table
 
 from controller.coupling import Coupling
-from controller.lti import Lti
 from controller.process import force_map
 from design.assess import CONDITIONS, assess, specification
 from design.certificate import NotProved, prove
 from design.designs import FILTERS, KINDS, METHODS, OBJECTIVES, compare_methods, design_coupling
 from design.failure import DesignFailed
-from design.jitter_part import Range, switching_part, switching_requirement
+from design.jitter_part import switching_part, switching_requirement
+from design.jitter_proof import sent
 from design.price import cost_part, price
-from design.promises import ANY, certificate_part, promise_of
+from design.promises import ANY, HERE, certificate_part, promise_of, switching_promise
 from design.result import Design
 from design.set_check import SAMPLES, SetCheck, check_set, set_part, set_rows
-from design.store import Certificate, Loop, Stored, data_of, save
+from design.store import Certificate, DelayRange, Loop, Stored, data_of, save
 from design.subject import LONGEST_DELAY
 from design.summary import coupling_part, transparency_part
 from design.transparency import transparency
@@ -31,16 +31,18 @@ from sim.command import (
     Parser,
     add_loop_options,
     add_output_options,
+    as_option,
     check_json,
     console,
     execute,
     numbers,
+    progress_bar,
     ranges,
     scenario_from,
     seed_from,
 )
 from sim.files import folder, write_json
-from sim.scenario import InputError
+from sim.scenario import InputError, Scenario
 
 
 def main(argv: list[str]) -> int:
@@ -53,20 +55,21 @@ def main(argv: list[str]) -> int:
         raise InputError(f"--out {out}: is a folder, expected the file of the coupling")
     check_json(args)
     folder(out.parent)
-    loop = scenario_from(args).loop(args.case)
-    options = _options(args) | _switching(args, len(loop.theta))
-    if options.get("switching") and loop.box:
-        raise InputError("--jitter and [box]: switching delays are judged in one environment; give one of them")
+    loop = _loop(args, scenario_from(args))
+    options = _options(args) | _switching(args, loop)
     if args.coupling == "optimal" and loop.environment.walls:
         raise InputError("environment.walls: an optimal coupling holds a linear model, so it cannot face walls")
     seed, samples = seed_from(args), _samples(args)
     try:
         spec = specification(loop)
-        design = design_coupling(spec, args.coupling, args.condition, **options)
+        with (bar := progress_bar("designing"))[0]:
+            design = design_coupling(
+                spec, args.coupling, args.condition, lambda what, done, total: bar[1](done, total, what), **options
+            )
     except DesignFailed:
         raise
     except ValueError as error:
-        raise InputError(str(error)) from None
+        raise InputError(as_option(error, args)) from None
     F = force_map(spec.environment, design.coupling, loop.theta, loop.psi)
     requirements = assess(loop, design.coupling, design.phi)
     whole = check_set(loop, design.coupling, seed, samples)
@@ -85,7 +88,7 @@ def main(argv: list[str]) -> int:
         "sdps": design.sdps,
         "wall_s": design.wall_s,
         "stored": _store(loop, design, whole, out),
-        "jitter_proof": _switching_figures(loop, spec.environment, design.coupling, options.get("switching")),
+        "jitter_proof": _switching_figures(loop, design.coupling),
     }
     if args.compare:
         outcome["comparison"] = [asdict(row) for row in compare_methods(spec)]
@@ -164,26 +167,40 @@ def _options(args: argparse.Namespace) -> dict[str, Any]:
     return given
 
 
-def _switching(args: argparse.Namespace, channels: int) -> dict[str, Any]:
-    """The range of delays that a design must bear. Raises InputError."""
+def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
+    """The scenario's loop with the range of delays that --jitter gives. Raises InputError."""
+    loop = scenario.loop(args.case)
     if args.jitter is None:
-        return {}
-    condition = args.condition or KINDS[args.coupling][0]
-    if args.coupling not in ("spring-damper", "optimal") or condition != "closed-loop":
+        return loop
+    if not _for_switching(args):
         raise InputError("--jitter is for --coupling optimal, or spring-damper with --condition closed-loop")
-    lo, hi = ranges("--jitter", args.jitter, channels)
+    if loop.box:
+        raise InputError("--jitter and [box]: switching delays are judged in one environment; give one of them")
+    lo, hi = ranges("--jitter", args.jitter, len(loop.theta))
     if any(not 0 <= a <= b <= LONGEST_DELAY for a, b in zip(lo, hi, strict=True)):
         raise InputError(f"--jitter is {args.jitter!r}, expected 0 <= LO <= HI <= {LONGEST_DELAY} samples")
-    return {"switching": (lo, hi)}
+    try:
+        return loop.switching(DelayRange(lo, hi))
+    except ValueError as error:
+        raise InputError(f"--jitter is {args.jitter!r}: {error}") from None
 
 
-def _switching_figures(loop: Loop, E: Lti, coupling: Coupling, switching: Range | None) -> dict[str, Any] | None:
+def _for_switching(args: argparse.Namespace) -> bool:
+    """Whether this design can be made for delays that vary; any other is only judged under them."""
+    condition = args.condition or KINDS[args.coupling][0]
+    return args.coupling in ("spring-damper", "optimal") and condition == "closed-loop"
+
+
+def _switching(args: argparse.Namespace, loop: Loop) -> dict[str, Any]:
+    """The range of delays that a design must bear, as an option of the design's own function."""
+    return {"switching": (loop.jitter.lo, loop.jitter.hi)} if loop.jitter and _for_switching(args) else {}
+
+
+def _switching_figures(loop: Loop, coupling: Coupling) -> dict[str, Any] | None:
     """What any switching asks of the designed coupling, from the coupling alone."""
-    if switching is None:
+    if loop.jitter is None:
         return None
-    G = force_map(E, coupling, (0,) * len(loop.theta), loop.psi)
-    found = switching_requirement(coupling, loop.environment, G, loop.psi, *switching, loop.delta)
-    return switching_part(found, G, *switching)
+    return switching_part(switching_requirement(loop, coupling), sent(loop, coupling), loop.jitter)
 
 
 def _samples(args: argparse.Namespace) -> int:
@@ -209,25 +226,36 @@ def _price(args: argparse.Namespace, loop: Loop, design: Design, options: dict[s
 def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path) -> dict[str, Any]:
     """Save the coupling with the proof of its condition, or without where there is none yet.
 
-    What is not proved for a whole set is kept as what it is: a coupling for the nominal environment.
+    What is not proved for a whole set, or for switching delays, is kept as what it is: a coupling for the nominal
+    environment, or for constant delays.
     """
-    data = data_of(design.coupling)
-    phi = None if design.phi is None else design.phi.tolist()
-    certificate: Certificate | None = None
-    reason = None
     if whole and whole.certificate and design.condition == "closed-loop":
-        certificate = whole.certificate
+        certificate, reason = whole.certificate, None
     else:
         loop = loop if design.condition == "theorem4" else loop.at(loop.environment)
-        try:
-            certificate = prove(loop, data, design.condition, phi)
-        except NotProved as error:
-            reason = str(error)
+        certificate, reason = _proved(loop, design)
+    switching = None
+    if loop.jitter:
+        proof = certificate.proof if certificate else None
+        switching = {"promise": f"{switching_promise(loop.jitter)}, in {HERE}", "proof": proof, "reason": reason}
+        if certificate is None:
+            loop = loop.switching(None)
+            certificate, reason = _proved(loop, design)
     try:
-        save(Stored(loop, data, certificate), out)
+        save(Stored(loop, data_of(design.coupling), certificate), out)
     except OSError as error:
         raise InputError(f"--out {out}: {error.strerror}") from None
-    return {"file": str(out), "proof": certificate.proof if certificate else None, "reason": reason}
+    proof = certificate.proof if certificate else None
+    return {"file": str(out), "proof": proof, "reason": reason, "switching": switching}
+
+
+def _proved(loop: Loop, design: Design) -> tuple[Certificate | None, str | None]:
+    """The certificate of all that the loop claims, or why there is none."""
+    try:
+        phi = None if design.phi is None else design.phi.tolist()
+        return prove(loop, data_of(design.coupling), design.condition, phi), None
+    except NotProved as error:
+        return None, str(error)
 
 
 def _table(outcome: dict[str, Any]) -> Table:
@@ -248,13 +276,17 @@ def _table(outcome: dict[str, Any]) -> Table:
         table.add_row("damping, any switching", f"{span} samples: {needs}")
     for row in set_rows(outcome["set"]) if outcome["set"] else []:
         table.add_row(*row)
+    stored = outcome["stored"]
     table.add_row("promise", outcome["promise"] or "none")
+    if stored["switching"] and stored["switching"]["proof"]:
+        table.add_row("promise, delays", stored["switching"]["promise"])
     table.add_row(outcome["objective_name"], f"{outcome['objective']:.5g}")
     rms = transparent["rms_mismatch_db"]
     table.add_row("mismatch", f"{transparent['relative_mismatch_db']:.2f} dB (rms {rms:.2f} dB)")
     table.add_row("convex problems", f"{outcome['sdps']} in {outcome['wall_s']:.2f} s")
-    stored = outcome["stored"]
     table.add_row("stored", f"{stored['file']} (proof: {stored['proof'] or stored['reason']})")
+    if stored["switching"] and not stored["switching"]["proof"]:
+        table.add_row("", f"for constant delays only: {stored['switching']['reason']}")
     return table
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from controller.coupling import Coupling
 from design import designs
 from design.assess import assess, specification
+from design.jitter_part import switching_requirement
 from design.margin import Requirement
 from design.result import Design
+from design.set_check import check_set
 from design.store import Loop, Stored, data_of
 
 
@@ -17,7 +20,8 @@ def design_coupling(loop: Loop, kind: str = "spring-damper", condition: str | No
 
     `kind` is "spring-damper", "ccl" or "optimal"; `condition` is "theorem4" (any passive environment) or "closed-loop"
     (this environment), None for the kind's own. `options` are those of the kind: order, method, diagonal for ccl, the
-    fields of design.wish.Wish for optimal.
+    fields of design.wish.Wish for optimal, and switching = (lo, hi) for delays that vary (it is not taken from
+    loop.jitter).
 
     Returns a Design: `coupling` (for a spring-damper with K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the damping
     that it needs, from a sweep of the coupling alone), `figure` and `objective` (what was minimised, and its value).
@@ -31,6 +35,10 @@ def design_coupling(loop: Loop, kind: str = "spring-damper", condition: str | No
 def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement]:
     """What both conditions, "theorem4" and "closed-loop", ask of a coupling in its loop.
 
+    With a box around the loop's environment closed-loop is about the environment and every vertex: the figure is that
+    of the one that asks the most, proved only if all are (inside the box nothing is proved). With a range of delays,
+    loop.jitter, there is a third, "jitter-proof": what any switching within the range asks.
+
     Each Requirement has `required` and `available` (m,) [N s/m], `certified` (required < available), the frequency [Hz]
     where it binds, and `proof`: "rational" where exact arithmetic confirms it, "sampled" where a refined sweep says so.
     A condition that no damping satisfies has infinite `required` and a `reason`.
@@ -41,4 +49,10 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement]:
     phi = coupling.phi if isinstance(coupling, Design) else None
     bare = coupling.coupling if isinstance(coupling, Design) else coupling
     Stored(loop, data_of(bare))  # refuses a coupling of another number of channels
-    return assess(loop, bare, phi)
+    requirements: dict[str, Requirement] = dict(assess(loop, bare, phi))
+    if whole := check_set(loop, bare, samples=0):
+        _, worst = whole.worst
+        requirements["closed-loop"] = replace(worst, proof="rational" if whole.certificate else "sampled")
+    if loop.jitter:
+        requirements["jitter-proof"] = switching_requirement(loop, bare).requirement
+    return requirements

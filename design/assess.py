@@ -40,10 +40,11 @@ def specification(loop: Loop) -> Specification:
 def assess(loop: Loop, coupling: Coupling, phi: Array | None = None) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
 
-    closed-loop is about the nominal environment alone (design.set_check asks for the rest of its box), and where there
-    are walls about the frozen contact state that asks for most.
+    closed-loop is about the nominal environment alone (design.set_check asks for the rest of its box) and the constant
+    theta (design.jitter_part asks for the rest of its range); where there are walls it is about the frozen contact
+    state that asks for most.
     """
-    loop = loop.at(loop.environment)
+    loop = loop.at(loop.environment).switching(None)
     any_environment = theorem4_of(loop.environment, loop.T, coupling, loop.theta, loop.psi, loop.delta, phi)
     this_environment = closed_loop_of(loop.environment, loop.T, coupling, loop.theta, loop.psi, loop.delta)
     return {

@@ -10,9 +10,9 @@ import time
 
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from design.audit_report import print_report, report
-from design.jitter_part import Range
 from design.presets import PRESETS
 from design.set_check import check_set
+from design.store import DelayRange
 from design.subject import LONGEST_DELAY, Subject
 from sim.command import (
     DOES_NOT_HOLD,
@@ -32,7 +32,7 @@ from sim.command import (
 )
 from sim.files import write_json
 from sim.scenario import InputError, Scenario
-from sim.stored import doubts, fitted, read_coupling
+from sim.stored import fitted, read_coupling, standing
 
 EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
   python -m design.audit --rigid --K 5000 --B 0 --T 1e-3 --theta 0 --delta 1.37
@@ -49,7 +49,7 @@ def main(argv: list[str]) -> int:
     seed = seed_from(args)
     scenario = scenario_from(args)
     subject = _subject(args, scenario)
-    switching = _range(args, subject)
+    switching = _range(args, scenario, subject)
     out = out_folder(args, "audit")
 
     begin = time.perf_counter()
@@ -59,7 +59,7 @@ def main(argv: list[str]) -> int:
         "scenario": None if args.rigid else scenario.name,
         "preset": args.preset and {"name": args.preset, "source": PRESETS[args.preset].source},
         **report(subject, switching, whole, None if args.rigid else scenario.holders),
-        "notes": doubts(read_coupling(args.coupling), scenario.loop(args.case)) if args.coupling else [],
+        "notes": _notes(args, scenario, switching),
         "wall_s": time.perf_counter() - begin,
     }
     write_json(out / "report.json", outcome)
@@ -110,16 +110,27 @@ def _subject(args: argparse.Namespace, scenario: Scenario) -> Subject:
         raise InputError(str(error)) from None
 
 
-def _range(args: argparse.Namespace, subject: Subject) -> Range | None:
-    """(lo, hi) of --jitter, around the constant theta that the other conditions are about. Raises InputError."""
+def _notes(args: argparse.Namespace, scenario: Scenario, switching: DelayRange | None) -> list[str]:
+    """What the coupling's file is worth in the loop that is audited."""
+    if args.coupling is None:
+        return []
+    loop = scenario.loop(args.case)
+    return list(standing(read_coupling(args.coupling), loop.switching(switching)).notes)
+
+
+def _range(args: argparse.Namespace, scenario: Scenario, subject: Subject) -> DelayRange | None:
+    """The range of --jitter, or of the scenario, around the constant theta that the other conditions are about.
+
+    Raises InputError.
+    """
     if args.jitter is None:
-        return None
+        return None if args.rigid else scenario.loop(args.case).jitter
     lo, hi = ranges("--jitter", args.jitter, subject.channels)
     for i, (least, n, largest) in enumerate(zip(lo, subject.theta, hi, strict=True)):
         if not 0 <= least <= n <= largest <= LONGEST_DELAY:
             allowed = f"0 <= LO <= theta = {n} <= HI <= {LONGEST_DELAY} samples (--theta gives another)"
             raise InputError(f"--jitter on channel {i + 1} is {least} to {largest}, expected {allowed}")
-    return lo, hi
+    return DelayRange(lo, hi)
 
 
 def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Coupling:

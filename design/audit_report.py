@@ -14,11 +14,11 @@ from controller.lti import SingularLoop
 from design.audit_figures import Stiffest, Tolerance, stiffest, tolerance
 from design.audit_remedies import remedies
 from design.human_structure import separate_humans_part
-from design.jitter_part import Range, switching_part
+from design.jitter_part import switching_part
 from design.margin import Requirement
 from design.promises import ANY, CAVEATS, certificate_part, promise
 from design.set_check import SetCheck, set_part, set_rows
-from design.store import Condition
+from design.store import Condition, DelayRange
 from design.subject import Subject
 
 KINDS = {
@@ -31,7 +31,7 @@ KINDS = {
 
 def report(
     subject: Subject,
-    switching: Range | None = None,
+    switching: DelayRange | None = None,
     whole: SetCheck | None = None,
     holders: Sequence[int] | None = None,
 ) -> dict[str, Any]:
@@ -89,11 +89,11 @@ def _separate_part(subject: Subject, holders: Sequence[int]) -> dict[str, Any] |
     return separate_humans_part(F, subject.delta, holders, subject.coupling, subject.network, delays)
 
 
-def _switching_part(subject: Subject, switching: Range) -> dict[str, Any]:
-    found = subject.switching(*switching)
+def _switching_part(subject: Subject, span: DelayRange) -> dict[str, Any]:
+    found = subject.switching(span)
     if found.requirement.reason:
-        return certificate_part(found.requirement) | {"lo": list(switching[0]), "hi": list(switching[1])}
-    return switching_part(found, subject.G, *switching)
+        return certificate_part(found.requirement) | {"lo": list(span.lo), "hi": list(span.hi)}
+    return switching_part(found, subject.G, span)
 
 
 def _stiffest_part(found: Stiffest) -> dict[str, Any]:

@@ -16,6 +16,8 @@ Phi = 0 satisfies Lemma 4, whatever the environment.
 With a box around the environment the same is proved for the environment (P) and for every vertex (P1, P2, ..); nothing
 is proved of the environments in between, or of one that changes.
 
+A loop whose delays may switch within a range carries a second proof, of any switching (design.jitter_proof).
+
 theorem4, psi >= 1: a multiplier Phi, stored too, and two blocks (design.delayed_proof); it is of this environment.
 """
 
@@ -27,6 +29,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal
 
+import msgspec
 import numpy as np
 import scipy
 
@@ -36,10 +39,13 @@ from design import exact, margin
 from design.delayed import theorem4_delayed
 from design.delayed_proof import coupling_block, environment_block
 from design.exact import Exact
+from design.jitter_proof import prove_switching, refuted
 from design.members import in_each, worst
-from design.positive_real import find_storage, prove_positive_real, too_large
+from design.positive_real import find_storage, too_large
+from design.promises import switching_promise
 from design.rational import Matrix, SingularMatrix, definiteness, rational
-from design.store import Certificate, Condition, CouplingData, Loop, Stored, digest, sealed
+from design.store import Certificate, Condition, CouplingData, Loop, Stored, SwitchingProof, digest, sealed
+from design.stored_matrix import refuted_rows, rows_of
 
 CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
 
@@ -91,11 +97,24 @@ def prove(loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequenc
             margin=1 / max(requirement.ratio, 1e-12),
             promise=_promise(loop, condition),
             proof="rational",
-            matrices={name: tuple(tuple(str(v) for v in row) for row in M.fractions()) for name, M in proof.items()},
+            matrices={name: rows_of(M) for name, M in proof.items()},
             scenario=digest(loop, coupling),
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
+            switching=_switching(loop, coupling, requirement),
         )
     )
+
+
+def _switching(
+    loop: Loop, coupling: CouplingData, requirement: margin.Requirement
+) -> SwitchingProof | msgspec.UnsetType:
+    """The proof that the delays may switch, of a loop with a range of them. Raises NotProved."""
+    if loop.jitter is None:
+        return msgspec.UNSET
+    proof = prove_switching(loop, coupling.build(loop.T))
+    if isinstance(proof, str):
+        raise NotProved(f"{switching_promise(loop.jitter)}: {proof}", requirement)
+    return proof
 
 
 def verify(stored: Stored) -> Verdict:
@@ -256,20 +275,9 @@ def _refuted_proof(loop: Loop, coupling: CouplingData, certificate: Certificate)
         found = ", ".join(certificate.matrices) or "none"
         return f"matrices are {found}, expected {', '.join(sorted(expected))}"
     for name, block in blocks.items():
-        if reason := _refuted_block(name, block, certificate.matrices[name]):
+        if reason := refuted_rows(name, block, certificate.matrices[name]):
             return f"{_place(loop, certificate.condition, name)}{reason}"
-    return None
-
-
-def _refuted_block(name: str, block: Exact, rows: Sequence[Sequence[str]]) -> str | None:
-    """Why one matrix does not prove its block, or None."""
-    if len(rows) != block.order or any(len(row) != block.order for row in rows):
-        return f"{name} has {len(rows)} rows, the model has {block.order} states"
-    try:
-        P = Matrix.of(rows, (block.order, block.order))
-    except (ValueError, ZeroDivisionError) as error:
-        return f"{name} has an entry that is not a rational number: {error}"
-    return prove_positive_real(block, P)
+    return refuted(loop, coupling.build(loop.T), certificate.switching)
 
 
 def _multiplier(certificate: Certificate) -> list[Fraction] | None:

@@ -8,7 +8,8 @@ from typing import Any
 from rich.table import Table
 
 from design.certificate import Verdict, verify
-from design.store import Stored
+from design.promises import HERE, switching_promise
+from design.store import Stored, SwitchingProof
 from sim.command import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute
 from sim.files import write_json
 from sim.scenario import InputError
@@ -54,15 +55,34 @@ def _result(stored: Stored, verdict: Verdict, seconds: float) -> dict[str, Any]:
         "required_damping": claim and claim.required,
         "available_damping": stored.loop.delta,
         "margin": claim and claim.margin,
+        "switching": _switching(stored, verdict),
         "wall_s": seconds,
+    }
+
+
+def _switching(stored: Stored, verdict: Verdict) -> dict[str, Any] | None:
+    """The claim for delays that vary, None where the file makes none; promise and proof are null where it fails."""
+    span, claim = stored.loop.jitter, stored.certificate and stored.certificate.switching
+    if span is None or not isinstance(claim, SwitchingProof):
+        return None
+    return {
+        "lo": span.lo,
+        "hi": span.hi,
+        "promise": f"{switching_promise(span)}, in {HERE}" if verdict.proved else None,
+        "proof": "rational" if verdict.proved else None,
+        "required_damping": claim.required,
+        "margin": claim.margin,
     }
 
 
 def _table(result: dict[str, Any]) -> Table:
     title = "proved, in exact arithmetic" if result["proved"] else "not proved"
     table = Table(title=title, show_header=False, title_justify="left")
-    for key, value in result.items():
-        if value is not None and key != "proved":
+    switching = result["switching"] or {}
+    rows = {key: value for key, value in result.items() if key not in ("proved", "switching")}
+    rows |= {f"switching, {key}": value for key, value in switching.items() if key not in ("lo", "hi")}
+    for key, value in rows.items():
+        if value is not None:
             shown = ", ".join(f"{v:.6g}" for v in value) if isinstance(value, tuple) else value
             table.add_row(key.replace("_", " "), f"{shown:.6g}" if isinstance(shown, float) else str(shown))
     return table

@@ -11,10 +11,10 @@ import cvxpy as cp
 import numpy as np
 
 from controller.lti import Array
-from design.gain_set import gain_sets
+from design.gain_set import solve_within
 from design.sampled import Complex, affine_lmis, gain_lmi
 from design.shaping import Shaping
-from design.solve import solve, solved
+from design.solve import solved
 from design.specification import Specification
 
 
@@ -24,7 +24,7 @@ def step(spec: Specification, sigma: Array, shaping: Shaping, at: Array, norm: f
     gains, t = cp.Variable(2 * N), cp.Variable()
     constant, slopes = _tangent(spec, shaping, at, norm, w)
     cuts = affine_lmis(constant, slopes, cp.hstack([gains, t]))
-    solve(cp.Problem(cp.Minimize(t), [*gain_sets(gains, spec.theta, sigma), *cuts]), "a step of the convex sequence")
+    solve_within(cp.Minimize(t), gains, spec.theta, sigma, "a step of the convex sequence", cuts)
     return solved(gains), norm * float(np.sqrt(solved(t)))
 
 

@@ -68,9 +68,15 @@ def cut_problem(problem: Problem, imposed: Sequence[Array] | None = None) -> tup
     raise DesignFailed(None, (), f"after {MOST_ROUNDS} rounds of cutting planes {names} still fails in between")
 
 
-def sketch(Q: FreeParameter, wish: Wish, worlds: Sequence[World], delta: Array) -> InternalModel:
-    """The optimum of the first round, which bounds the final one from below. Raises as `cut`."""
+def sketch(
+    Q: FreeParameter, wish: Wish, worlds: Sequence[World], delta: Array, without: Sequence[str] = ()
+) -> InternalModel:
+    """The optimum of the first round, which bounds the final one from below. Raises as `cut`.
+
+    `without` names inequalities that are left out in all worlds, to learn whether they are in the way.
+    """
     problem = Problem.of(Q, wish, worlds, delta)
+    problem = replace(problem, inequalities=[one for one in problem.inequalities if one.name not in without])
     return Q.coupling(problem.optimum([one.imposed for one in problem.inequalities]).x)
 
 

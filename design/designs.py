@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from design.result import Design, Row
@@ -19,10 +20,14 @@ OBJECTIVES = ("rms", "sup")
 
 
 def design_coupling(
-    spec: Specification, kind: str = "spring-damper", condition: str | None = None, **options: Any
+    spec: Specification,
+    kind: str = "spring-damper",
+    condition: str | None = None,
+    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+    **options: Any,
 ) -> Design:
     """Design and verify a coupling; `options` are those of the design's own function: order, method, diagonal for ccl,
-    the fields of design.wish.Wish for optimal.
+    the fields of design.wish.Wish for optimal. `progress` hears what takes long: (what, steps done, of how many).
 
     Raises ValueError for a kind or condition that does not exist, Infeasible or DesignFailed (design.failure) where
     there is nothing to return.
@@ -38,7 +43,7 @@ def design_coupling(
     if kind == "ccl":
         return ccl.design(spec, **options)
     if kind == "optimal":
-        return optimal.design(spec, Wish(**options))
+        return optimal.design(spec, Wish(**options), progress)
     return spring_damper.design(spec, condition, **options)
 
 

@@ -17,6 +17,7 @@ from design.certificate import Verdict, verify
 from design.export_c import c_source
 from design.export_control import control_source
 from design.exported import Block, NothingToExport, Trial, coupling_block, data, process_block, trial
+from design.promises import HERE, switching_promise
 from design.store import SpringDamper, Stored
 from sim.command import DOES_NOT_HOLD, DONE, Parser, add_output_options, check_json, console, execute, seed_from
 from sim.files import folder, write, write_json
@@ -104,7 +105,9 @@ def _promise(stored: Stored, verdict: Verdict) -> str:
     if claim is None or not verdict.proved:
         return f"NOT CERTIFIED: {verdict.reason}"
     needs = f"needs {_list(claim.required)} of {_list(claim.available)} N s/m of device damping"
-    return f"Certified for {claim.promise} ({claim.condition}, proof: {claim.proof}): {needs}; linear forces only."
+    delays = f"; {switching_promise(stored.loop.jitter)}, in {HERE}" if stored.loop.jitter else ""
+    how = f"{claim.condition}, proof: {claim.proof}"
+    return f"Certified for {claim.promise}{delays} ({how}): {needs}; linear forces only."
 
 
 def _destination(args: argparse.Namespace, block: Block) -> Path:

@@ -43,7 +43,7 @@ def closed_loop_ratios(
     def needed(w: Array) -> Array:
         return _needed(gains, X, on_circle(w), theta, delta)
 
-    ratios = np.maximum(suprema(needed, _around(poles, _common(theta, psi))), 0.0)
+    ratios = np.maximum(suprema(needed, around(poles, common_frequencies(theta, psi))), 0.0)
     return np.where(np.abs(poles).max(axis=1, initial=0.0) < 1, ratios, np.inf)
 
 
@@ -68,7 +68,7 @@ def _theorem4_dampings(gains: Gains, theta: int, phi: float) -> Array:
         spare = gains.K[:, None] * gains.T / 2 + damper.real - phi
         return phi + np.abs(y / 2 - phi) ** 2 / np.where(spare > 0, spare, np.nan)
 
-    grid = _common((theta,), (0,))
+    grid = common_frequencies((theta,), (0,))
     return suprema(needed, np.broadcast_to(grid, (len(gains), grid.size)))
 
 
@@ -78,7 +78,7 @@ def _needed(gains: Gains, X: Lti | None, z: Complex, theta: Sequence[int], delta
     G = stiffness[..., None, None] if X is None else _closed(X.at(z), 1 / stiffness)
     F = z[..., None, None] ** -np.asarray(theta)[:, None] * G / (z - 1)[..., None, None]
     weight = np.sqrt(gains.T / np.asarray(delta))
-    return _largest_eigenvalue(-(weight[:, None] * weight) * (F + np.conj(np.swapaxes(F, -1, -2))) / 2)
+    return largest_eigenvalue(-(weight[:, None] * weight) * (F + np.conj(np.swapaxes(F, -1, -2))) / 2)
 
 
 def _closed(X: Complex, v: Complex) -> Complex:
@@ -93,7 +93,7 @@ def _closed(X: Complex, v: Complex) -> Complex:
     return np.linalg.solve(np.eye(m) + v[..., None, None] * X, X).astype(np.complex128, copy=False)
 
 
-def _largest_eigenvalue(H: Complex) -> Array:
+def largest_eigenvalue(H: Complex) -> Array:
     """Of Hermitian matrices over the last two axes."""
     m = H.shape[-1]
     if m == 1:
@@ -104,14 +104,14 @@ def _largest_eigenvalue(H: Complex) -> Array:
     return np.linalg.eigvalsh(H)[..., -1]
 
 
-def _common(theta: Sequence[int], psi: Sequence[int]) -> Array:
+def common_frequencies(theta: Sequence[int], psi: Sequence[int]) -> Array:
     """Sorted frequencies for every coupling."""
     lobes = max(t + p for t, p in zip(theta, psi, strict=True)) + 1
     even = np.linspace(LOWEST, np.pi, max(POINTS, PER_LOBE * lobes))
     return np.unique(np.concatenate([even, np.geomspace(LOWEST, np.pi, POINTS)]))
 
 
-def _around(poles: Complex, common: Array) -> Array:
+def around(poles: Complex, common: Array) -> Array:
     """The common frequencies and, per coupling, those around its poles as in sweep.frequencies: (n, k), sorted."""
     width = np.maximum(1 - np.abs(poles), 1e-9)
     near = (np.abs(np.angle(poles))[..., None] + width[..., None] * OFFSETS).reshape(poles.shape[0], -1)

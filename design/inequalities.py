@@ -14,6 +14,8 @@ from design.free_parameter import GivenParameter, Response, affine, bordered, lo
 from design.jitter import blocks
 from design.sweep import frequencies, hermitian, on_circle, peaks
 
+CLOSED_LOOP, SWITCHING = "the closed-loop condition", "the condition for switching delays"
+
 
 class Parameter(Protocol):
     """Q with or without unknowns."""
@@ -105,7 +107,7 @@ def passivity(world: World, delta: Array) -> Inequality:
         over = root / (z - 1)[:, None, None]
         return affine(world.force(z, Q), np.eye(delta.size), lambda F: root[:, None] * F * over)
 
-    return Inequality("the closed-loop condition", block, _imposed(world, 40), _swept(world))
+    return Inequality(CLOSED_LOOP, block, _imposed(world, 40), _swept(world))
 
 
 def stable_compliance(world: World, least: float) -> Inequality:
@@ -153,7 +155,7 @@ def switching(world: World, delta: Array, lo: Sequence[int], hi: Sequence[int]) 
         return blocks(np.array([-1.0 + 0j]), np.zeros((1, m, m), dtype=complex), unit, lo, hi, none, 1.0)[0].real
 
     shared = {f"alpha {i + 1}": multiplier(unit) for i, unit in enumerate(np.eye(m))}
-    return Inequality("the condition for switching delays", block, _imposed(world, 40), _swept(world), shared)
+    return Inequality(SWITCHING, block, _imposed(world, 40), _swept(world), shared)
 
 
 BOUND = "bound"  # the shared unknown that a sup objective minimises

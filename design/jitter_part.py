@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.environment import Network
 from controller.lti import Lti
-from design import jitter_exact
-from design.jitter import JitterProof, jitter_proof
+from design.jitter_multiplier import JitterProof
+from design.jitter_proof import storage, swept
 from design.margin import closed_loop
 from design.promises import certificate_part, finite
-
-Range = tuple[tuple[int, ...], tuple[int, ...]]  # (lo, hi), each (m,) [samples]
+from design.rational import Matrix
+from design.store import DelayRange, Loop
 
 NOT_COVERED = (
     "Covered: any ages of the forces within the range, at every tick and on every channel. Not covered: jitter on the "
@@ -23,33 +21,26 @@ NOT_COVERED = (
 )
 
 
-def switching_requirement(
-    coupling: Coupling,
-    network: Network,
-    G: Lti,
-    psi: Sequence[int],
-    lo: Sequence[int],
-    hi: Sequence[int],
-    delta: Sequence[float],
-) -> JitterProof:
-    """The jitter-proof requirement of a coupling with force map G (without Theta), proved exactly where possible."""
-    found = jitter_proof(G, lo, hi, delta)
-    if not found.requirement.certified:
-        return found
-    if jitter_exact.prove(coupling, network, G.T, psi, lo, hi, delta, found.alpha) is not None:
+def switching_requirement(loop: Loop, coupling: Coupling) -> JitterProof:
+    """The damping that switching within loop.jitter asks; `proof` is "rational" where exact arithmetic confirms it."""
+    found = swept(loop, coupling)
+    if not found.requirement.certified or not isinstance(storage(loop, coupling, found.alpha), Matrix):
         return found
     return replace(found, requirement=replace(found.requirement, proof="rational"))
 
 
-def switching_part(found: JitterProof, G: Lti, lo: Sequence[int], hi: Sequence[int]) -> dict[str, Any]:
-    """The requirement with its multiplier, and what a playout buffer to the constant delay hi would need."""
-    buffered = closed_loop(delay(hi, G.T) @ G, found.requirement.available)
+def switching_part(found: JitterProof, G: Lti, span: DelayRange) -> dict[str, Any]:
+    """The requirement with its multiplier, and what a playout buffer to the constant delay hi would need.
+
+    G is the force map without Theta.
+    """
+    buffered = closed_loop(delay(span.hi, G.T) @ G, found.requirement.available)
     return certificate_part(found.requirement) | {
-        "lo": list(lo),
-        "hi": list(hi),
+        "lo": list(span.lo),
+        "hi": list(span.hi),
         "alpha": [finite(a) for a in found.alpha],
         "playout": {
-            "theta": list(hi),
+            "theta": list(span.hi),
             "required_damping": [finite(d) for d in buffered.required],
             "certified": buffered.certified,
         },

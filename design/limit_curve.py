@@ -18,10 +18,12 @@ from controller.coupling import NoCoupling
 from controller.lti import Array
 from controller.process import force_map
 from design.assess import specification
+from design.certificate import NotProved, prove
 from design.designs import design_coupling
 from design.margin import Requirement, closed_loop
 from design.promises import finite
-from design.store import Condition, Loop, digest
+from design.result import Design
+from design.store import Condition, Loop, data_of, digest
 from design.transparency import decibels, transparency
 from design.wish import Wish
 
@@ -106,6 +108,8 @@ class Limit:
     bare_damping: tuple[float | None, ...]  # what the loop without any coupling requires, closed-loop [N s/m]
     wall_s: float
     reason: str | None = None  # why there is no design
+    proof: str | None = None  # of the condition it was designed for: "rational" (exact) or "sampled"; None: no design
+    proof_reason: str | None = None  # why there is no exact proof
 
 
 Designer = Callable[[Setting], Limit]
@@ -131,22 +135,34 @@ def measured(setting: Setting, kind: str, condition: Condition | None, options: 
     try:
         spec = specification(loop)
         bare = _damping(closed_loop(force_map(spec.environment, NoCoupling(), loop.theta, loop.psi), loop.delta))
-        coupling = design_coupling(spec, kind, condition, **options).coupling
+        design = design_coupling(spec, kind, condition, **options)
     except ValueError as error:  # no such design, or a loop that cannot be
         figures["reason"] = str(error)
     else:
-        F = force_map(spec.environment, coupling, loop.theta, loop.psi)
+        F = force_map(spec.environment, design.coupling, loop.theta, loop.psi)
         transparent = transparency(F, spec.environment, loop.lam)
         figures = {
             "rms_mismatch_db": finite(decibels(transparent.rms_mismatch)),
             "relative_mismatch_db": finite(decibels(transparent.relative_mismatch)),
             "required_damping": _damping(closed_loop(F, loop.delta)),
             "dc_ratio": finite(transparent.dc_ratio),
-        }
+        } | _proof(loop, design)
     functions = setting.wish.functions if kind == "optimal" else None
     wall = time.perf_counter() - begin
     place = (setting.value, loop.delta, loop.theta, loop.T, functions)
     return Limit(*place, **figures, bare_damping=bare, wall_s=wall)
+
+
+def _proof(loop: Loop, design: Design) -> dict[str, str | None]:
+    """Whether the design's own condition was proved in exact arithmetic, and why not."""
+    phi = None if design.phi is None else design.phi.tolist()
+    # what is asked is the environment alone, as the figures are
+    alone = loop.at(loop.environment)
+    try:
+        certificate = prove(alone, data_of(design.coupling), design.condition, phi)
+    except NotProved as error:
+        return {"proof": "sampled", "proof_reason": str(error)}
+    return {"proof": certificate.proof, "proof_reason": None}
 
 
 def _damping(requirement: Requirement) -> tuple[float | None, ...]:

@@ -23,6 +23,7 @@ from sim.command import (
     Parser,
     add_loop_options,
     add_output_options,
+    as_option,
     console,
     execute,
     numbers,
@@ -122,7 +123,7 @@ def _wish(args: argparse.Namespace) -> Wish:
     try:
         return Wish(functions, args.filter, args.diagonal, args.objective, high_gain, margin)
     except ValueError as error:
-        raise InputError(str(error)) from None
+        raise InputError(as_option(error, args)) from None
 
 
 def _only_the_ladder(args: argparse.Namespace, parser: Parser) -> None:

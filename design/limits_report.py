@@ -62,12 +62,14 @@ def print_curves(outcome: dict[str, Any], beside: Sequence[str], screen: Console
         )
         table.add_column(sweep["unit"], justify="right")
         table.add_column("theta")
-        for column in ("optimal", *beside, "seconds"):
+        for column in ("optimal", *beside, "proof", "seconds"):
             table.add_column(column, justify="right", no_wrap=True)
         for i, row in enumerate(sweep["optimal"]):
             others = [sweep[kind][i] if i < len(sweep[kind]) else None for kind in beside]
             shown = [_shown(limit, outcome["objective"]) for limit in (row, *others)]
-            table.add_row(f"{row['value']:.4g}", ",".join(map(str, row["theta"])), *shown, f"{row['wall_s']:.1f}")
+            proof = _proofs(dict(zip(("optimal", *beside), (row, *others), strict=True)))
+            place = f"{row['value']:.4g}", ",".join(map(str, row["theta"]))
+            table.add_row(*place, *shown, proof, f"{row['wall_s']:.1f}")
             reasons += [f"{name} {row['value']:.4g}: {row['reason']}"] if row["reason"] else []
         screen.print(table)
     if beside:
@@ -75,6 +77,15 @@ def print_curves(outcome: dict[str, Any], beside: Sequence[str], screen: Console
     for line in (*reasons, *outcome["gains"]):
         screen.print(f"[dim]·[/] {line}")
     screen.print(f"{outcome['wall_s']:.1f} s; files: {', '.join(outcome['files'])}", soft_wrap=True)
+
+
+def _proofs(limits: dict[str, dict[str, Any] | None]) -> str:
+    """Rational where every design of a row is proved exactly, else which are only sampled."""
+    found = {name: limit["proof"] for name, limit in limits.items() if limit and limit["proof"]}
+    sampled = [name for name, proof in found.items() if proof != "rational"]
+    if not found:
+        return "-"
+    return f"sampled: {', '.join(sampled)}" if sampled else "rational"
 
 
 def _shown(limit: dict[str, Any] | None, objective: str) -> str:

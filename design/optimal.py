@@ -12,6 +12,7 @@ environment alone would gain it 0.2 dB and cost the worst vertex 0.3 to 0.5), th
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,18 +20,18 @@ import numpy as np
 from controller.coupling import InternalModel
 from controller.lti import Lti
 from controller.process import force_map
-from design.cutting_planes import SLACK, cut, sketch
+from design.cutting_planes import SLACK, asked, cut, sketch
 from design.failure import DesignFailed, Infeasible
 from design.free_parameter import FreeParameter
-from design.inequalities import World
-from design.jitter import jitter_proof
+from design.inequalities import CLOSED_LOOP, SWITCHING, World
+from design.jitter_multiplier import jitter_proof
 from design.margin import closed_loop
 from design.pole_descent import descend
 from design.result import Design
-from design.set_advice import set_advice
+from design.set_advice import Progress, set_advice
 from design.specification import Specification
 from design.transparency import transparency
-from design.wish import Wish
+from design.wish import MARGIN, Wish
 
 USUAL = Wish()
 ADDED, MOST_ADDITIONS = 4, 5  # points inside a box that become environments at a time, and how often at most
@@ -38,16 +39,17 @@ NO_LIMIT = "no limit above 100 Hz"
 EASIER = (1.5, 2, 3, 5, 10, 20, 50)  # times the damping, tried to say how far a request is from having a solution
 
 
-def design(spec: Specification, wish: Wish = USUAL) -> Design:
+def design(spec: Specification, wish: Wish = USUAL, progress: Progress = lambda what, done, total: None) -> Design:
     """The coupling of the least mismatch, verified by the refined sweep of the condition.
 
+    `progress` hears of the search for a reason where there is none, which takes longer than most designs.
     Raises Infeasible where no Q of this kind meets the condition, DesignFailed where none could be verified.
     """
     started = time.perf_counter()
     try:
         coupling, spec, rounds = searched(spec, wish)
     except Infeasible as error:
-        raise Infeasible(error.problem, error.results, advice(spec, wish)) from error
+        raise Infeasible(error.problem, error.results, advice(spec, wish, progress)) from error
     maps = [force_map(E, coupling, spec.theta, spec.psi) for E in environments(spec)]
     requirement = max((closed_loop(F, spec.delta) for F in maps), key=lambda r: r.ratio)
     if wish.switching:
@@ -56,12 +58,18 @@ def design(spec: Specification, wish: Wish = USUAL) -> Design:
             (jitter_proof(G, *wish.switching, spec.delta).requirement for G in free), key=lambda r: r.ratio
         )
     if requirement.ratio > 1 - wish.margin + 2 * SLACK:
-        raise DesignFailed(None, (), f"the optimum needs {requirement.ratio:.6f} of the damping when it is swept again")
+        raise DesignFailed(None, (), _missed(requirement.ratio, wish))
     figures = [transparency(F, E, spec.lam) for F, E in zip(maps, environments(spec), strict=True) if E.D.any()]
     squares = [f.rms_mismatch**2 for f in figures]
     value = np.sqrt(np.mean(squares)) if wish.objective == "rms" else max(f.relative_mismatch for f in figures)
     wall = time.perf_counter() - started
     return Design(coupling, "closed-loop", wish.objective, float(value), requirement, rounds, wall)
+
+
+def _missed(ratio: float, wish: Wish) -> str:
+    more = wish.margin + 2 * (ratio - (1 - wish.margin))
+    advice = f"leave more of it unused: --margin {more:.2g}" if more < 1 else "ask for fewer functions"
+    return f"the optimum needs {ratio:.6f} of the damping when it is swept again; {advice}"
 
 
 def searched(spec: Specification, wish: Wish) -> tuple[InternalModel, Specification, int]:
@@ -110,26 +118,44 @@ def world(spec: Specification, E: Lti | None = None) -> World:
     return World(E or spec.environment, spec.theta, spec.psi, spec.lam)
 
 
-def advice(spec: Specification, wish: Wish) -> str:
+def advice(spec: Specification, wish: Wish, progress: Progress = lambda what, done, total: None) -> str:
     """Why nothing was found, and which change of the request, one at a time, leaves a solution."""
     alone = replace(spec, others={}, shrunk=None)
     if spec.others and feasible(alone, wish):
-        return set_advice(spec, wish, changes(wish), feasible, solvable)
+        return set_advice(spec, wish, changes(wish), feasible, solvable, binding, progress)
     spec = alone
-    helpful = [words for words, other in changes(wish).items() if feasible(spec, other)]
+    helpful = []
+    for k, (words, other) in enumerate(changes(wish).items()):
+        progress("no coupling: looking for the reason", k, len(changes(wish)))
+        helpful += [words] if feasible(spec, other) else []
     kind = "diagonal" if wish.diagonal else "full"
     delays = f"theta = {list(spec.theta)}, psi = {list(spec.psi)}"
+    if wish.switching:
+        lo, hi = wish.switching
+        delays += f", delays switching from {list(lo)} to {list(hi)}"
     request = f"no {kind} Q of {wish.functions} functions is certified with {delays}, delta = {list(spec.delta)}"
-    if NO_LIMIT in helpful:
-        request += ": the limit above 100 Hz binds"
-    elif helpful:
-        request += ": the closed-loop condition (with a stable V) binds in this basis"
+    request += f": {binding(spec, wish)}"
     if helpful:
-        return f"{request}; there seem to be some with {', or '.join(helpful)}"
+        return f"{request} in this basis; there seem to be some with {', or '.join(helpful)}"
     damped = ((f, replace(spec, delta=tuple(f * d for d in spec.delta))) for f in EASIER)
     factor = next((f for f, easier in damped if feasible(easier, wish)), None)
     remedy = f"{factor:g} times the damping, or less delay, would do" if factor else "only less delay can help"
-    return f"{request}: the closed-loop condition binds; {remedy}"
+    return f"{request}; {remedy}"
+
+
+def binding(spec: Specification, wish: Wish) -> str:
+    """Which inequality is in the way: one without which the others have a solution.
+
+    The condition for switching delays contains the closed-loop one, so it is left out with it.
+    """
+    names = list(dict.fromkeys(one.name for one in asked(wish, world(spec), np.asarray(spec.delta))))
+    sets = {name: (name,) for name in names}
+    if wish.switching:
+        sets = {name: (name,) if name != SWITCHING else (name, CLOSED_LOOP) for name in names if name != CLOSED_LOOP}
+    free = [name for name, left_out in sets.items() if feasible(spec, wish, left_out)]
+    if not free:
+        return "more than one condition binds: none of them alone is in the way"
+    return f"{free[0]} binds" if len(free) == 1 else f"{' and '.join(free)} contradict each other"
 
 
 def changes(wish: Wish) -> dict[str, Wish]:
@@ -141,6 +167,7 @@ def changes(wish: Wish) -> dict[str, Wish]:
         "a full Q": replace(wish, diagonal=False),
         f"a full Q of {more} functions in a mixed basis": replace(wish, functions=more, diagonal=False, filter="mixed"),
         NO_LIMIT: replace(wish, high_gain=None),
+        f"--margin {MARGIN:g}": replace(wish, margin=min(wish.margin, MARGIN)),
     }
     return {words: changed for words, changed in other.items() if changed != wish}
 
@@ -154,10 +181,13 @@ def solvable(spec: Specification, wish: Wish) -> bool:
     return True
 
 
-def feasible(spec: Specification, wish: Wish) -> bool:
-    """Whether some Q meets what is asked at the frequencies where it is imposed first: a necessary condition."""
+def feasible(spec: Specification, wish: Wish, without: Sequence[str] = ()) -> bool:
+    """Whether some Q meets what is asked at the frequencies where it is imposed first: a necessary condition.
+
+    `without` names inequalities that are not asked.
+    """
     try:
-        sketch(parameter(spec, wish), wish, worlds(spec), np.asarray(spec.delta))
+        sketch(parameter(spec, wish), wish, worlds(spec), np.asarray(spec.delta), without)
     except DesignFailed:
         return False
     return True

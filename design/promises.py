@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from design.margin import Requirement
-from design.store import Loop
+from design.store import DelayRange, Loop
 
 ANY, SET, HERE, WALL = "any passive environment", "a set", "this environment", "a rigid wall only"
 FROZEN = "each frozen contact state of this environment (contact that makes and breaks is not covered)"
@@ -51,6 +51,11 @@ def promise(
     if whole_set:
         return SET
     return (WALL if rigid else FROZEN if walls else HERE) if closed_loop else None
+
+
+def switching_promise(span: DelayRange) -> str:
+    """Which delays of the forces a coupling is certified for that bears switching, in the environment of its loop."""
+    return f"delays switching within {span}"
 
 
 def promise_of(requirements: dict[str, Requirement], loop: Loop, whole_set: bool = False) -> str | None:

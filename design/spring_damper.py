@@ -19,12 +19,12 @@ from design.convex_concave import step
 from design.delayed import theorem4_delayed
 from design.failure import DesignFailed, Infeasible
 from design.frozen_environment import least_rms
-from design.gain_set import gain_set, gain_sets
+from design.gain_set import solve_within
 from design.margin import Requirement, closed_loop, theorem4
 from design.multiplier import shortage
 from design.result import Design
 from design.shaping import Shaping
-from design.solve import solve, solved
+from design.solve import solved
 from design.specification import RESERVE, Specification
 from design.switching_search import least_rms_switching
 
@@ -128,12 +128,12 @@ def stiffest_at(B: float, theta: int, delta: float, T: float) -> float:
     """
     usable = (1 - RESERVE) * delta
     k = cp.Variable(nonneg=True)
-    problem = cp.Problem(cp.Maximize(k), gain_set(k, cp.Constant(B / usable), theta, np.inf))
+    gains, what = cp.hstack([k, B / usable]), f"the largest stiffness beside B = {B:g} N s/m"
     try:
-        solve(problem, f"the largest stiffness beside B = {B:g} N s/m")
+        problem = solve_within(cp.Maximize(k), gains, (theta,), np.array([np.inf]), what)
     except Infeasible as error:
         line = f"B = {B:g} N s/m leaves no stiffness with delta = {delta:g} N s/m and theta = {theta}: use less B"
-        raise Infeasible(problem, error.results, line) from error
+        raise Infeasible(error.problem, error.results, line) from error
     K = float(solved(k)) * usable / T
     requirement = theorem4(SpringDamper([K], [B]).compliance(T), [theta], [delta])
     if not requirement.certified:
@@ -176,13 +176,12 @@ def _start(spec: Specification, sigma: Array, start: SpringDamper | None) -> tup
     if start is not None:
         wanted = np.concatenate([start.K * spec.T, start.B]) / np.tile(spec.usable, 2)
         objective = cp.Minimize(cp.norm(gains - wanted))
-    problem = cp.Problem(objective, gain_sets(gains, spec.theta, sigma))
     try:
-        solve(problem, "the set of gains")
+        solve_within(objective, gains, spec.theta, sigma, "the set of gains")
     except Infeasible as error:
         line = (
             f"Theorem 4 admits no spring-damper with theta = {spec.theta}, psi = {spec.psi}, delta = {spec.delta}: "
             "use less psi, a softer environment or more device damping"
         )
-        raise Infeasible(problem, error.results, line) from error
+        raise Infeasible(error.problem, error.results, line) from error
     return solved(gains), 1

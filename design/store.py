@@ -34,7 +34,28 @@ class Strict(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Immutable, and refuses fields that it does not know."""
 
 
-class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without a box has the digest that it always had
+class DelayRange(Strict, frozen=True):
+    """Delays that may be any from lo to hi, on every channel and anew at every tick."""
+
+    lo: Steps  # (m,) [samples]
+    hi: Steps  # (m,) [samples]
+
+    def __post_init__(self) -> None:
+        if len(self.lo) != len(self.hi) or any(not 0 <= a <= b for a, b in zip(self.lo, self.hi, strict=True)):
+            raise ValueError(f"delays from {list(self.lo)} to {list(self.hi)}, expected 0 <= lo <= hi on every channel")
+
+    def __str__(self) -> str:
+        """'[1, 2] samples', or '[1, 2], [0, 3] samples' where the channels differ."""
+        spans = [f"[{a}, {b}]" for a, b in zip(self.lo, self.hi, strict=True)]
+        return f"{', '.join(spans if len(set(spans)) > 1 else spans[:1])} samples"
+
+    def contains(self, other: DelayRange) -> bool:
+        """Whether every delay that `other` allows is allowed here; a constant theta is DelayRange(theta, theta)."""
+        below, above = zip(self.lo, other.lo, strict=True), zip(self.hi, other.hi, strict=True)
+        return all(a <= b for a, b in below) and all(a >= b for a, b in above)
+
+
+class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without box and jitter keeps the digest it had
     """All that enters a condition beside the coupling."""
 
     T: Positive  # [s]
@@ -44,6 +65,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without a
     delta: tuple[Positive, ...]  # (m,) damping that the devices guarantee [N s/m]
     environment: Network
     box: Box | None = None  # what else the environment may be
+    jitter: DelayRange | None = None  # what else the delays of the forces may be, switching at every tick
 
     def __post_init__(self) -> None:
         m = len(self.environment.contacts)
@@ -57,6 +79,17 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without a
                 environment(member.network, self.T)  # raises ValueError if nothing holds an internal node
             except ValueError as error:
                 raise ValueError(f"{member.name}: {error}" if self.box else str(error)) from None
+        if self.jitter:
+            self._check_jitter(self.jitter)
+
+    def _check_jitter(self, jitter: DelayRange) -> None:
+        if self.box or self.environment.walls:
+            other = "box" if self.box else "environment.walls"
+            raise ValueError(f"jitter and {other}: switching delays are judged in one linear environment")
+        if len(jitter.lo) != len(self.theta):
+            raise ValueError(f"jitter has {len(jitter.lo)} ranges for {len(self.theta)} channels")
+        if not jitter.contains(DelayRange(self.theta, self.theta)):
+            raise ValueError(f"theta is {list(self.theta)}, outside of its jitter, {jitter}")
 
     def members(self) -> tuple[Member, ...]:
         """The environment, and the vertices of its box where it has one."""
@@ -65,6 +98,10 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without a
     def at(self, network: Network) -> Loop:
         """The loop around this environment, known exactly."""
         return msgspec.structs.replace(self, environment=network, box=None)
+
+    def switching(self, jitter: DelayRange | None) -> Loop:
+        """The loop whose delays may switch within this range, or are the constant theta."""
+        return msgspec.structs.replace(self, jitter=jitter)
 
 
 class NoCoupling(Strict, frozen=True, tag_field="kind", tag="none"):
@@ -129,6 +166,15 @@ def _table(name: str, rows: Rows, height: int, width: int) -> Array:
 CouplingData = NoCoupling | SpringDamper | Compliance | InternalModel
 
 
+class SwitchingProof(Strict, frozen=True):
+    """What proves that the delays may switch within the loop's range (design.jitter_proof)."""
+
+    required: tuple[float, ...]  # (m,) [N s/m] with this multiplier, from a refined sweep
+    margin: float  # available / required
+    alpha: tuple[float, ...]  # (m,) multiplier [N/m], 0 where the delay does not vary
+    P: tuple[tuple[Rational, ...], ...]  # rationals "p/q"
+
+
 class Certificate(Strict, frozen=True):
     """What is claimed of a coupling in its loop, and what proves it."""
 
@@ -141,7 +187,8 @@ class Certificate(Strict, frozen=True):
     matrices: dict[str, tuple[tuple[Rational, ...], ...]]  # rationals "p/q"
     scenario: str  # digest of the loop and the coupling
     versions: dict[str, str]
-    seal: str = ""  # digest of all of the above
+    seal: str = ""  # digest of all other fields
+    switching: SwitchingProof | msgspec.UnsetType = msgspec.UNSET  # of a loop with jitter; left out of other files
 
 
 class Stored(Strict, frozen=True):

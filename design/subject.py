@@ -15,10 +15,10 @@ from controller.environment import GROUND, Network, Spring, environment
 from controller.lti import Lti, SingularLoop
 from controller.process import force_map
 from design.assess import closed_loop_of, theorem4_of
-from design.jitter import JitterProof, jitter_proof, jitter_refusal
+from design.jitter_multiplier import JitterProof, jitter_proof, jitter_refusal
 from design.jitter_part import switching_requirement
 from design.margin import Requirement, closed_loop, refusal
-from design.store import Condition
+from design.store import Condition, DelayRange, Loop
 
 #: Beyond this many samples a sweep takes seconds, and no device's damping is enough.
 LONGEST_DELAY = 100
@@ -75,15 +75,15 @@ class Subject:
         """The forces as they leave for the devices: F without Theta. Raises SingularLoop."""
         return replace(self, theta=(0,) * self.channels).F
 
-    def switching(self, lo: Sequence[int], hi: Sequence[int]) -> JitterProof:
-        """The damping that any switching of the forces' delays within [lo, hi] [samples] asks of the devices."""
+    def switching(self, span: DelayRange) -> JitterProof:
+        """The damping that any switching of the forces' delays within this range asks of the devices."""
+        if self.network is not None and not self.walls:
+            loop = Loop(self.T, self.theta, self.psi, self.theta, self.delta, self.network, jitter=span)
+            return switching_requirement(loop, self.coupling)
         try:
-            G = self.G
+            return jitter_proof(self.G, span.lo, span.hi, self.delta)
         except SingularLoop as error:
             return jitter_refusal(self.delta, str(error))
-        if self.network is None:
-            return jitter_proof(G, lo, hi, self.delta)
-        return switching_requirement(self.coupling, self.network, G, self.psi, lo, hi, self.delta)
 
     def requirement(self, condition: Condition) -> Requirement:
         """The damping that the condition asks of the devices."""

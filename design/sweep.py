@@ -15,17 +15,28 @@ Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)
 def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: int = 600) -> Array:
     """Sorted frequencies [rad/sample] in [low, high]: even in w and in log w, dense around each pole.
 
-    A pole r exp(j phi) bends the response over a width of about 1 - r around phi, however sharp it is.
+    A pole r exp(j phi) bends the response over a width of about 1 - r around phi, however sharp it is. One that
+    repeats counts once: of points that rounding alone holds apart the wrong one may be the higher, and hide the peak
+    beside the other.
     """
     even = np.linspace(low, high, points)
     logarithmic = np.geomspace(low, high, points)
-    poles = np.concatenate([g.poles() for g in systems]) if systems else np.zeros(0)
+    poles = _distinct(np.concatenate([g.poles() for g in systems])) if systems else np.zeros(0)
     width = np.maximum(1 - np.abs(poles), 1e-9)
     offsets = np.concatenate([[0.0], np.geomspace(0.05, 20, 12)])
     offsets = np.concatenate([-offsets, offsets])
     around = (np.abs(np.angle(poles))[:, None] + width[:, None] * offsets).ravel()
     grid = np.unique(np.concatenate([even, logarithmic, around]))
     return grid[(grid >= low) & (grid <= high)]
+
+
+def _distinct(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """One of each group of poles that lie within a hundredth of their distance to the circle."""
+    kept = np.zeros(0, dtype=np.complex128)
+    for pole in poles[poles.imag >= 0]:
+        if not (np.abs(kept - pole) < 0.01 * max(1 - abs(pole), 1e-9)).any():
+            kept = np.append(kept, pole)
+    return kept
 
 
 def supremum(response: Response, grid: Array) -> tuple[float, float]:

@@ -15,7 +15,8 @@ from controller.coupling import SpringDamper
 from controller.lti import Array
 from controller.process import force_map
 from design.frozen_environment import MOST_ROUNDS, SAMPLED_RESERVE, STUCK, Sampled, least_rms
-from design.jitter import half_widths, jitter_proof, nominal_over_step
+from design.jitter import half_widths, nominal_over_step
+from design.jitter_multiplier import jitter_proof
 from design.sampled import Complex
 from design.specification import RESERVE, Specification
 from design.sweep import hermitian, on_circle

@@ -41,7 +41,7 @@ class Wish:
         if self.high_gain is not None and not self.high_gain >= 1:
             raise ValueError(f"high_gain is {self.high_gain}, expected a factor of at least 1")
         if not 0 < self.margin < 1:
-            raise ValueError(f"margin is {self.margin}, expected a share of the damping between 0 and 1")
+            raise ValueError(f"margin is {self.margin}, allowed are shares of the damping above 0 and below 1")
 
     def poles(self, spec: Specification) -> Array:
         """Poles of the basis, (functions - 1,); those that an adapted basis starts from.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import termios
 import tty
@@ -23,6 +24,7 @@ from sim.command import numbers
 from sim.scenario import InputError, Scenario
 
 STRONGEST = 12.0  # [N] whatever a scenario allows
+USUAL_BAUD = 921_600
 
 
 def add_link_options(parser: argparse.ArgumentParser) -> None:
@@ -35,7 +37,8 @@ def add_link_options(parser: argparse.ArgumentParser) -> None:
         "--pace", default="1", metavar="P", help="slow motion for --emulate on a busy machine (default 1)"
     )
     link.add_argument("--arm", action="store_true", help="arm without being asked; else press a")
-    link.add_argument("--baud", default="921600", metavar="N", help="default 921600; checked against T")
+    baud = "of a UART, checked against T; none: USB without one (default 921600; none for a pseudo-terminal)"
+    link.add_argument("--baud", metavar="N|none", help=baud)
     link.add_argument("--quantile", default="0.99", metavar="Q", help="of the ages that theta covers (default 0.99)")
     link.add_argument("--guard", default="1e-4", metavar="SECONDS", help="added to it (default 1e-4)")
     link.add_argument("--measure", default="800", metavar="N", help="answers that are timed (default 800)")
@@ -53,11 +56,26 @@ def check_link(args: argparse.Namespace) -> Settings:
         raise InputError("no keyboard to arm with: give --arm, if nobody can get hurt")
     number(args, "quantile", 0.5, 1.0)
     number(args, "guard", 0.0, 0.1)
-    baud, measure = numbers("--baud", args.baud, int, 1)[0], numbers("--measure", args.measure, int, 1)[0]
-    for name, value, low, high in (("baud", baud, 1200, 20_000_000), ("measure", measure, 50, 100_000)):
-        if not low <= value <= high:
-            raise InputError(f"--{name} is {value}, allowed are {low} to {high}")
-    return Settings(baud=baud, measure=measure)
+    measure = numbers("--measure", args.measure, int, 1)[0]
+    if not 50 <= measure <= 100_000:
+        raise InputError(f"--measure is {measure}, allowed are 50 to 100000")
+    return Settings(baud=_baud(args), measure=measure)
+
+
+def _baud(args: argparse.Namespace) -> int | None:
+    """Of the UART in the line, None where there is none. Raises InputError.
+
+    A pseudo-terminal has none. Of /dev/ttyACM0 nobody can tell: native USB, or a chip with a UART behind it.
+    """
+    if args.baud is None:
+        pseudo = args.emulate or os.path.realpath(args.port).startswith("/dev/pts/")
+        return None if pseudo else USUAL_BAUD
+    if args.baud == "none":
+        return None
+    (baud,) = numbers("--baud", args.baud, int, 1)
+    if not 1200 <= baud <= 20_000_000:
+        raise InputError(f"--baud is {baud}, allowed are 1200 to 20000000, or none for a link without UART")
+    return baud
 
 
 def number(args: argparse.Namespace, name: str, low: float, high: float, default: float | None = None) -> float:
@@ -96,7 +114,7 @@ def hold_session(
     """From opening the port, or starting an emulator with the options `extra`, to the end of the session."""
     with ExitStack() as stack:
         path = args.port or stack.enter_context(spawned(args, seed, seconds, extra))
-        port = stack.enter_context(Port(path, int(args.baud)))
+        port = stack.enter_context(Port(path, session.settings.baud))
         keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
         live = Live(session, port, plan, args.arm or args.emulate, seconds, keyboard, _view(stack), float(args.pace))
         live.run()

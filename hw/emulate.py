@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import select
 import subprocess
 import sys
@@ -21,7 +22,13 @@ def spawned(args: argparse.Namespace, seed: int, seconds: float, extra: Sequence
     """The path of an emulator with the same loop and the faults of --fault, for as long as it is needed."""
     options = [f"--{name}={getattr(args, name)}" for name in PASSED_ON if getattr(args, name) is not None]
     options += [f"--fault={fault}" for fault in args.fault]
-    options += [f"--seed={seed}", f"--pace={args.pace}", f"--duration={seconds + SPARE:g}", *extra]
+    options += [
+        f"--parent={os.getpid()}",
+        f"--seed={seed}",
+        f"--pace={args.pace}",
+        f"--duration={seconds + SPARE:g}",
+        *extra,
+    ]
     child = subprocess.Popen(
         [sys.executable, "-m", "hw.emulator", *options],
         stdin=subprocess.DEVNULL,

@@ -155,7 +155,7 @@ def main(argv: list[str]) -> int:
     coulomb = numbers("--coulomb", args.coulomb, float, 1)[0]
     if not 0 <= coulomb <= 10:
         raise InputError(f"--coulomb is {coulomb:g}, allowed are 0 to 10 N")
-    pace = pace_from(args)
+    pace, parent = pace_from(args), numbers("--parent", args.parent, int, 1)[0]
     try:
         emulator = Emulator(nobody(scenario) if args.nobody else scenario, upsets, coulomb=coulomb)
     except ValueError as error:
@@ -169,7 +169,7 @@ def main(argv: list[str]) -> int:
     gc.collect()
     gc.freeze()
     gc.disable()
-    clockwork.run(seconds, lambda: bool(stops))
+    clockwork.run(seconds, lambda: bool(stops) or parent not in (0, os.getppid()))
     print(json.dumps(_summary(clockwork)), file=sys.stderr)
     return INTERRUPTED if signal.SIGINT in stops else DONE
 
@@ -207,6 +207,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--nobody", action="store_true", help="no person at the handles")
     parser.add_argument("--coulomb", default="0", metavar="NEWTON", help="dry friction at every motor (default 0)")
     parser.add_argument("--pace", default="1", metavar="P", help="slow motion for busy machines (default 1; host too)")
+    parser.add_argument("--parent", default="0", metavar="PID", help="end with this process, which must be the parent")
     parser.add_argument("--seed", metavar="N", default="0", help="for the faults (default 0)")
     return parser
 

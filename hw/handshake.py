@@ -67,7 +67,10 @@ def objections(info: Info, scenario: Scenario, limits: Limits, baud: int | None)
     if baud is not None:
         seconds, arithmetic = wire_time(baud, m)
         if seconds > scenario.T:
-            reasons.append(f"one STATE and one FORCE take {arithmetic}, more than T = {1e6 * scenario.T:g} us")
+            instead = "of a link without UART say --baud none"
+            reasons.append(
+                f"one STATE and one FORCE take {arithmetic}, more than T = {1e6 * scenario.T:g} us ({instead})"
+            )
     for i in range(m):
         damping, strongest = 1e-6 * info.osp_damping[i], 1e-6 * info.hard_limit[i] * info.force_step[i]
         if damping < scenario.delta[i] * (1 - 1e-6):

@@ -6,6 +6,7 @@ from hw.frame import State, distance
 from hw.plan import Ages
 from hw.safety import Fault
 
+LONGEST = 8  # STATEs per answer needed: a USB frame of 1 ms may bring several FORCEs, of which one margin is told
 TOLERANCE = 0.01  # of the device's clock against T, over the measurement
 
 
@@ -31,7 +32,7 @@ class Measurement:
             self.ages.append(round(self._theta * self._T_us) - margin)
             self._missed -= margin < 0  # it was missed, but came after all
         everything = len(self.ages) + self.missing
-        if everything < self._needed and counted < 2 * self._needed:
+        if everything < self._needed and counted < LONGEST * self._needed:
             return False
         part = 1 - len(self.ages) / (everything if everything >= self._needed else counted)
         if part > self._most_missing:

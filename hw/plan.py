@@ -24,6 +24,8 @@ from hw.safety import Fault
 from sim.couplings import Chosen, choose
 from sim.scenario import InputError, Scenario
 
+FALLBACK = ("spring-damper", "theorem4")  # what softer couplings are where the one asked for cannot be had
+
 
 @dataclass(frozen=True)
 class Ages:
@@ -94,6 +96,12 @@ class Rung:
     def name(self) -> str:
         return f"{self.chosen.kind} for theta = {list(self.scenario.theta)}"
 
+    @property
+    def held(self) -> int:
+        """Missed answers in a row through which the device may hold a force: so much the coupling's file proves."""
+        span = self.chosen.switching
+        return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
+
     def controller(self) -> Controller:
         return Law(self.law())
 
@@ -112,8 +120,15 @@ class Rung:
             "certificate": certificate_part(self.requirements[self.chosen.condition]),
             "certificates": {name: certificate_part(r) for name, r in self.requirements.items()},
             "promise": promise_of(self.requirements, self.scenario.loop(self.case)),
-            "remarks": list(self.chosen.notes),
+            "remarks": self.remarks(),
         }
+
+    def remarks(self) -> list[str]:
+        """What a reader should know of the coupling's file."""
+        if self.held < 1:
+            return list(self.chosen.notes)
+        answers = "1 missed answer" if self.held == 1 else f"{self.held} missed answers in a row"
+        return [*self.chosen.notes, f"a force that is held through {answers} is covered by the file's proof"]
 
 
 def rung(scenario: Scenario, case: str, name: str | None, condition: str | None, link: int) -> Rung:
@@ -140,14 +155,17 @@ def ladder(
 ) -> tuple[Rung, ...]:
     """The coupling for the measured delay and up to `spare` softer ones, each for one tick more.
 
-    Raises Fault where the first of them is not certified; where a softer one is not, the ladder ends.
+    A softer one is of the same kind or from the same file; where that is not certified for the longer delay, it is
+    the spring-damper by Theorem 4, which promises the most. Raises Fault where the first coupling is not certified;
+    where no softer one is, the ladder ends.
     """
-    rungs = [rung(scenario, case, name, condition, link)]
-    for _ in range(spare):
+    rungs, wanted = [rung(scenario, case, name, condition, link)], [(name, condition), FALLBACK]
+    while len(rungs) <= spare and wanted:
+        kind, by = wanted[0]
         try:
-            rungs.append(rung(scenario, case, name, condition, rungs[-1].link + 1))
+            rungs.append(rung(scenario, case, kind, by, rungs[-1].link + 1))
         except (Fault, InputError):
-            break
+            wanted.pop(0)
     return tuple(rungs)
 
 

@@ -8,6 +8,7 @@ from typing import Self
 from sim.scenario import InputError
 
 CHUNK = 4096  # bytes read at once; a tick brings a few dozen
+UNUSED = 9600  # baud that a port without UART is told: it does nothing, but 1200 resets many boards
 
 
 class PortLost(OSError):
@@ -17,15 +18,15 @@ class PortLost(OSError):
 class Port:
     """A port in raw mode: whole bytes in, whole bytes out, no echo, no flow control."""
 
-    def __init__(self, path: str, baud: int) -> None:
-        """Open `path` for ourselves alone. Raises InputError where that cannot be."""
+    def __init__(self, path: str, baud: int | None) -> None:
+        """Open `path` for ourselves alone, at `baud` where it has a UART. Raises InputError where that cannot be."""
         try:
             import serial
         except ImportError:
             raise InputError("--port needs pyserial: pip install 'haptic-loop[hw]'") from None
         self._error = serial.SerialException
         try:
-            self._serial = serial.Serial(path, baud, timeout=0, write_timeout=0, exclusive=True)
+            self._serial = serial.Serial(path, baud or UNUSED, timeout=0, write_timeout=0, exclusive=True)
         except (serial.SerialException, ValueError, OSError) as error:
             raise InputError(f"--port {path}: {error}") from None
         with suppress(Exception):  # where the driver knows it: the latency timer of FTDI chips goes from 16 ms to 1 ms

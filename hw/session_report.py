@@ -20,8 +20,9 @@ from hw.message import NO_MARGIN
 from hw.plan import Ages, Program, Rung
 from hw.safety import Stage
 from hw.session import Session
-from hw.trace import Recorder, result_of, save_npz
+from hw.trace import Recorder, result_of, save_npz, steady_ticks
 from sim.files import write_json
+from sim.growth import growths, told
 
 PERCENTILES = (50, 90, 99, 100)
 
@@ -32,7 +33,8 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     log = [{"t_s": 1e-6 * (e.t_us - begin), "stage": str(e.stage), "cause": e.cause} for e in session.log]
     parts = session.rung.part() if isinstance(session.rung, Rung) else {}
     empty = {"coupling": None, "certificate": None, "certificates": None, "promise": None, "theta": None}
-    return {
+    loop = isinstance(session.rung, Rung) and len(recorder) > 0
+    report = {
         "case": case,
         "scenario": session.scenario.name,
         **(empty | parts),
@@ -44,8 +46,12 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
             "T_s": session.scenario.T,
             "scenario_digest": session.scenario.digest,
             "pace": pace,  # below 1: slow motion, in which a link looks faster than it is
+            "encoder_step_m": list(session.units.encoder_step) if len(recorder) else None,
+            "steady_ticks": steady_ticks(recorder, session.units.force_step) if loop else [],
         },
     }
+    trace = result_of(recorder, session.units, session.scenario.T, report) if loop else None
+    return report | {"growth": [one.part() for one in growths(trace)] if trace else []}
 
 
 def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
@@ -65,7 +71,7 @@ def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
         part["age_us"] = _percentiles(session.config.theta * 1e6 * session.scenario.T - margins)
         part["rate_hz"] = float(arrays["received"].mean() / session.scenario.T)
         answered = arrays["received"].sum()
-        part["missed_percent"] = 100 * session.missed_while_driving / answered if answered else None
+        part["missed_percent"] = 100 * session.stream.missed_while_driving / answered if answered else None
     return part
 
 
@@ -81,20 +87,24 @@ def print_certificate(ages: Ages, link: int, rungs: Sequence[Rung], console: Con
         f"{len(ages.values) + ages.missing} never arrived: a link of {link} tick{'s' if link > 1 else ''}"
     )
     table = Table(title="certified for the delay measured, and softer in reserve")
-    for column in ("theta", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "promise"):
+    table.add_column("coupling", min_width=13)
+    for column in ("K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "promise"):
         table.add_column(column)
     for rung in rungs:
         part = rung.part()
         certificate = next(c for c in (part["certificate"], *part["certificates"].values()) if c["certified"])
         coupling = part["coupling"]
         table.add_row(
-            ", ".join(map(str, part["theta"])),
+            f"{coupling['kind']}, theta = {', '.join(map(str, part['theta']))}",
             *(_list(coupling[name]) for name in "KB"),
             f"{_list(certificate['required_damping'])} ({certificate['condition']}, {certificate['proof']})",
             _list(certificate["available_damping"]),
             part["promise"],
         )
     console.print(table)
+    for rung in rungs:
+        for remark in rung.remarks():
+            console.print(f"[dim]·[/] theta = {list(rung.scenario.theta)}: {remark}", highlight=False)
     if len(rungs) == 1:
         console.print("no reserve: nothing softer is certified, so late answers end the session")
 
@@ -113,6 +123,8 @@ def print_session(report: dict[str, Any], console: Console) -> None:
         console.print(
             f"link: {link['rate_hz']:.0f} answers a second, {link['missed_percent']:.2f} % missed; age {ages}"
         )
+    for i, part in enumerate(report["growth"], start=1):
+        console.print(f"growth at full gain, arming {i}, {told(part, report['run']['T_s'])}")
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link["counters"].items() if n)
     console.print(f"counted: {counted or 'nothing'}")
     console.print(f"[dim]·[/] {CAVEATS}")

@@ -45,6 +45,7 @@ class Steering:
 
     def _arm_once(self, session: Session, now: int) -> bytes:
         if self._asked:  # a softer coupling is ready, and nobody is there to arm it
-            return session.refuse(f"nobody to arm the softer coupling ({session.cause})", now)
+            softer = session.rung.name if session.rung else "none"
+            return session.refuse(f"nobody to arm the softer coupling, {softer}", now)
         self._asked = True
         return session.arm(now)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zlib
 from array import array
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 from zipfile import BadZipFile
@@ -65,6 +66,23 @@ class Recorder:
         }
 
 
+def steady_ticks(recorder: Recorder, force_step: Sequence[float]) -> list[list[int]]:
+    """[first, stop) of each arming in which the loop was one linear loop: full gain, until a cap or the slew rate cuts.
+
+    Missed ticks are not left out. `force_step` (m,) [N].
+    """
+    link = recorder.link()
+    asked = -np.round(link["asked"] / np.array(force_step))
+    cut = link["received"] & np.any(link["sent"] != asked, axis=1)
+    stretches = []
+    for arming in np.unique(link["arming"]):
+        full = np.flatnonzero((link["arming"] == arming) & (link["gain"] == 1.0))
+        if full.size:
+            count = int(np.argmax(cut[full])) if cut[full].any() else full.size
+            stretches.append([int(full[0]), int(full[0]) + count])
+    return stretches
+
+
 def result_of(recorder: Recorder, units: Units, T: float, meta: dict[str, Any]) -> Result:
     """The trace in the terms of sim.run. Handles and outside forces are not measured: nan, and no column."""
     link = recorder.link()
@@ -89,10 +107,7 @@ def save_npz(path: Path, result: Result, recorder: Recorder) -> Path:
 
 def load(path: Path) -> tuple[Result, dict[str, Array]]:
     """A trace with its link arrays. Raises InputError where the file holds no session of a bridge."""
-    try:
-        result = Result.load_npz(path)
-    except (TypeError, AttributeError, zlib.error) as error:
-        raise InputError(f"{path}: not a trace of this program ({error})") from None
+    result = Result.load_npz(path)
     try:
         with np.load(path, allow_pickle=False) as archive:
             link = {name: archive[f"link_{name}"] for name in LINK}

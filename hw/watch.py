@@ -39,6 +39,7 @@ class LinkWatch:
     missed: deque[int] = field(default_factory=deque)
     _late: int = 0  # in the window, kept as sums: adding up the window would take longer than all the rest of a tick
     _missed: int = 0
+    _untold: int = 0
 
     def order(self, state: State) -> tuple[str, int]:
         """FRESH, DUPLICATE or STALE, and by how many ticks a fresh one is ahead."""
@@ -69,8 +70,11 @@ class LinkWatch:
         self.missed.append(missed)
         self._late += late
         self._missed += missed
+        self._untold += margin is None
         if len(self.margins) > self.window:
-            self._late -= _is_late(self.margins.popleft())
+            oldest = self.margins.popleft()
+            self._late -= _is_late(oldest)
+            self._untold -= oldest is None
             self._missed -= self.missed.popleft()
         self.last = state
 
@@ -79,7 +83,7 @@ class LinkWatch:
         self.last = None
         self.margins.clear()
         self.missed.clear()
-        self._late = self._missed = 0
+        self._late = self._missed = self._untold = 0
 
     @property
     def late_part(self) -> float:
@@ -90,6 +94,11 @@ class LinkWatch:
     def missed_part(self) -> float:
         """The part of a whole window without an answer in time, late or lost."""
         return min(1.0, self._missed / self.window)
+
+    @property
+    def untold_part(self) -> float:
+        """The part of a whole window that told no margin: no FORCE came, or the device does not say."""
+        return self._untold / self.window
 
 
 def _is_late(margin: int | None) -> bool:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import NoReturn, TypeVar
+from typing import NoReturn, Protocol, TypeVar
 
 from rich.console import Console
 from rich.progress import Progress
@@ -18,6 +18,8 @@ from sim.files import folder
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
 
 DONE, DOES_NOT_HOLD, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+MOST_DAMPING = 1e4  # [N s/m] of a device, as models.device has it
 
 Number = TypeVar("Number", int, float)
 
@@ -83,6 +85,9 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     if args.T is not None:
         changes["T"] = numbers("--T", args.T, float, 1)[0]
     delta = None if args.delta is None else numbers("--delta", args.delta, float, scenario.channels)
+    for value in delta or ():
+        if not 0 <= value <= MOST_DAMPING:
+            raise InputError(f"--delta is {value:g}, allowed are 0 to {MOST_DAMPING:g} N s/m")
     return scenario.replace(delta, **changes) if changes or delta else scenario
 
 
@@ -134,6 +139,14 @@ def ranges(option: str, text: str, count: int) -> tuple[tuple[int, ...], tuple[i
     return lows, highs
 
 
+def as_option(error: ValueError, args: argparse.Namespace) -> str:
+    """The error's text; where the field that it begins with was given as an option, by the option's name."""
+    text = str(error)
+    name = text.split(" ", 1)[0].split("[", 1)[0]
+    given = name in vars(args) and getattr(args, name) is not None
+    return f"--{name.replace('_', '-')}{text[len(name) :]}" if given else text
+
+
 def seed_from(args: argparse.Namespace) -> int:
     """The seed, checked. Raises InputError."""
     (seed,) = numbers("--seed", args.seed, int, 1)
@@ -169,12 +182,22 @@ def console(args: argparse.Namespace) -> Console:
     return Console(stderr=args.json == "-", highlight=False)
 
 
-def progress_bar(description: str) -> tuple[Progress, Callable[[int, int], None]]:
+class Move(Protocol):
+    """Moves a progress bar to `done` of `total`, and may say what is being done."""
+
+    def __call__(self, done: int, total: int, what: str = ...) -> None: ...
+
+
+def progress_bar(description: str) -> tuple[Progress, Move]:
     """A bar on standard error that shows only on a terminal, and the function that moves it."""
     terminal = Console(stderr=True)
     bar = Progress(transient=True, console=terminal, disable=not terminal.is_terminal)
     task = bar.add_task(description, total=None)
-    return bar, lambda done, total: bar.update(task, completed=done, total=total)
+
+    def move(done: int, total: int, what: str = description) -> None:
+        bar.update(task, completed=done, total=total, description=what)
+
+    return bar, move
 
 
 def execute(main: Callable[[list[str]], int]) -> NoReturn:

@@ -11,8 +11,9 @@ from design.assess import specification
 from design.designs import KINDS, design_coupling
 from design.failure import DesignFailed
 from design.published import PUBLISHED
+from design.store import DelayRange
 from sim.scenario import InputError, Scenario
-from sim.stored import doubts, fitted, read_coupling
+from sim.stored import fitted, read_coupling, standing
 
 NAMES = ("none", "published", *KINDS)
 
@@ -26,6 +27,7 @@ class Chosen:
     condition: str
     phi: Array | None = None  # (m,) multiplier of Theorem 4 that the design found, if it needed one
     notes: tuple[str, ...] = ()  # what a reader should know of its origin
+    switching: DelayRange | None = None  # its file proves that any switching of the delays within it is safe here
 
 
 def choose(scenario: Scenario, case: str, name: str | None = None, condition: str | None = None) -> Chosen:
@@ -65,5 +67,5 @@ def _from_file(scenario: Scenario, case: str, name: str, condition: str | None) 
     stored = read_coupling(name)
     coupling = fitted(stored, name, scenario.channels, scenario.T)
     made_for = stored.certificate.condition if stored.certificate else "closed-loop"
-    notes = doubts(stored, scenario.loop(case))
-    return Chosen(Path(name).name, coupling, condition or made_for, notes=tuple(notes))
+    there = standing(stored, scenario.loop(case))
+    return Chosen(Path(name).name, coupling, condition or made_for, notes=there.notes, switching=there.switching)

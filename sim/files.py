@@ -35,7 +35,10 @@ def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path
             else:
                 file.write(content.encode() if isinstance(content, str) else content)
         os.chmod(name, 0o644)
-        os.replace(name, path)
+        try:
+            os.replace(name, path)
+        except OSError as error:
+            raise InputError(f"cannot write {path}: {error.strerror}") from None
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.lti import Array
-from sim.gain_ground import Ground
+from sim.gain_loop import MapLoop
 from sim.scenario import InputError
 
 #: what gains may be, as in design.audit: within these, all arithmetic is far from overflow
@@ -42,17 +42,15 @@ class Grid:
 
 
 def make_grid(
-    ground: Ground, n: int, K: Range | None, B: Range | None, scale: str | None, marks: tuple[Range, ...] = ()
+    ground: MapLoop, n: int, K: Range | None, B: Range | None, scale: str | None, marks: tuple[Range, ...] = ()
 ) -> Grid:
-    """n x n gains. Ranges that are not given come from the devices, and make room for the marks.
+    """n x n gains. Ranges that are not given come from the loop, and make room for the marks.
 
-    2 delta/((theta + 1) T) is the stiffest that any linear law may be against every passive environment, delta the
-    most that it may damp. Against a rigid wall the map is linear, up to 2.5 times these; against a given environment
-    far stiffer couplings can be safe, so it is logarithmic. Raises InputError.
+    K is about the loop's stiffness_scale, B about delta, the most that a linear law may damp. A linear map goes up to
+    2.5 times these, a logarithmic one from far below to far above. Raises InputError.
     """
-    scale = scale or ("linear" if ground.network is None else "log")
-    stiff = max(2 * d / ((n + 1) * ground.T) for d, n in zip(ground.delta, ground.theta, strict=True))
-    most = max(ground.delta)
+    scale = scale or ground.usual_scale
+    stiff, most = ground.stiffness_scale, max(ground.delta)
     if scale == "linear":
         wide = (2.5 * stiff / n, 2.5 * stiff), (0.0, 2.5 * most)
     else:

@@ -13,13 +13,12 @@ from controller.environment import GROUND, Network, Wall, environment
 from controller.gains import Gains, Stack, force_maps
 from controller.lti import Array, Lti
 from controller.process import Process
-from design.assess import theorem4_requirement
+from design.assess import CONDITIONS, theorem4_requirement
 from design.failure import DesignFailed
 from design.gain_map import closed_loop_ratios, theorem4_ratios
 from design.margin import Requirement, closed_loop, refusal
 from design.multiplier import shortage
 from design.specification import Specification
-from design.store import Condition
 from design.subject import Subject
 from models.device import Device, passivity_level
 from models.human import Population
@@ -60,6 +59,26 @@ class Ground:
             return HARD_WALL if self.one_sided else None
         return self.network if self.network.walls else None
 
+    @property
+    def usual_scale(self) -> str:
+        """Against a rigid wall couplings are all of one size; against an environment far stiffer ones can be safe."""
+        return "linear" if self.network is None else "log"
+
+    @property
+    def stiffness_scale(self) -> float:
+        """[N/m] 2 delta/((theta + 1) T): the stiffest that a linear law may be against every passive environment."""
+        return max(2 * d / ((n + 1) * self.T) for d, n in zip(self.delta, self.theta, strict=True))
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        return CONDITIONS
+
+    @property
+    def refusals(self) -> dict[str, str]:
+        """Conditions that say nothing of any cell, and why."""
+        reason = self.multiplier[1]
+        return {"theorem4": reason} if reason else {}
+
     @cached_property
     def environments(self) -> tuple[Lti | None, ...]:
         """The linear environments of every frozen contact state, all walls touching first; None is a rigid wall.
@@ -86,7 +105,7 @@ class Ground:
         walls: Contact = contact(self.walled, gains.compliance(i, self.channels), self.theta, self.psi, self.T)
         return Process(walls.open, *limits, walls)
 
-    def ratios(self, condition: Condition, gains: Gains) -> Array:
+    def ratios(self, condition: str, gains: Gains) -> Array:
         """Required over available damping, (n,); inf where no damping is enough. Of walls, in the worst state."""
         if condition == "closed-loop":
             states = [closed_loop_ratios(gains, E, self.theta, self.psi, self.delta) for E in self.environments]
@@ -96,7 +115,7 @@ class Ground:
             return np.full(len(gains), np.inf)
         return theorem4_ratios(gains, self.theta, self.delta, phi)
 
-    def requirement(self, condition: Condition, K: float, B: float) -> Requirement:
+    def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """The same for one coupling by design.margin, which a map is checked against."""
         if self.cutoff is None and (condition == "closed-loop" or not any(self.psi)):
             return self._subject.with_gains([K] * self.channels, [B] * self.channels).requirement(condition)

@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.lti import Array, Lti
-from design.assess import CONDITIONS
-from design.store import Condition
 from sim.cells import in_slices
 from sim.gain_grid import Grid
-from sim.gain_ground import Ground
+from sim.gain_loop import MapLoop
 from sim.gain_population import Holders
 from sim.gain_simulation import Plan, Points, no_points, simulated
 from sim.stability import MARGINAL
@@ -29,7 +27,7 @@ class Map:
     """Over the grid, (cells,) each, B running fastest; nan where the keyboard came first."""
 
     grid: Grid
-    ratio: dict[Condition, Array]  # condition -> required over available damping
+    ratio: dict[str, Array]  # condition -> required over available damping
     growth: Array  # [1/s] worst over the humans that were tried: all of them where none is unstable
     unstable: Array  # humans that make the cell unstable, at least
     points: Points
@@ -37,25 +35,25 @@ class Map:
     interrupted: bool
 
 
-def draw_map(ground: Ground, grid: Grid, holders: Holders, plan: Plan, progress: Progress) -> Map:
+def draw_map(ground: MapLoop, grid: Grid, holders: Holders, plan: Plan, progress: Progress) -> Map:
     """All stages; Ctrl-C keeps what is done."""
     gains = ground.gains(*grid.flat)
     seconds, n = {}, len(gains)
-    ratio: dict[Condition, Array] = {name: np.full(n, np.nan) for name in CONDITIONS}
+    ratio: dict[str, Array] = {name: np.full(n, np.nan) for name in ground.conditions}
     growth, unstable = np.full((2, n), np.nan)
     points, stopped = no_points(), False
 
     def ratios(part: slice) -> tuple[Array, ...]:
-        return tuple(ground.ratios(name, gains.take(part)) for name in CONDITIONS)
+        return tuple(ground.ratios(name, gains.take(part)) for name in ground.conditions)
 
     def population(part: slice) -> tuple[float, int]:
         return _population(holders, [stack[part.start] for stack in stacks], leading)
 
     begin = time.perf_counter()
-    _ = ground.multiplier  # once, before threads ask for it
+    _ = ground.refusals  # once, before threads ask for it
     done, stopped = in_slices(ratios, n, SLICE, lambda k, of: progress("certificates", k, of))
     for part, values in done:
-        for name, value in zip(CONDITIONS, values, strict=True):
+        for name, value in zip(ground.conditions, values, strict=True):
             ratio[name][part] = value
     seconds["certificates"] = time.perf_counter() - begin
     if not stopped:

@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.lti import Array
-from design.assess import CONDITIONS
 from design.audit_figures import edge
 from design.margin import Requirement
-from design.store import Condition
-from sim.gain_ground import Ground
+from sim.gain_loop import MapLoop
 from sim.gain_map import Map
 from sim.gain_population import Holders
 from sim.stability import MARGINAL
@@ -44,23 +42,23 @@ class Truth:
     columns: int
 
 
-def look(ground: Ground, holders: Holders, K: float, B: float, grid_K: Array) -> Mark:
+def look(ground: MapLoop, holders: Holders, K: float, B: float, grid_K: Array) -> Mark:
     """The coupling (K, B) on every channel."""
     gains = ground.gains(np.array([K]), np.array([B]))
     growth = _growth(ground, holders, K, B)
     tried = np.geomspace(min(grid_K[0], K), max(grid_K[-1], K), STEPS)
     row = ground.gains(tried, np.full(STEPS, gains.B[0]))
     stiffest: dict[str, float | None] = {}
-    for name in CONDITIONS:
+    for name in ground.conditions:
         safe = ground.ratios(name, row) < 1
         stiffest[name] = _last(tried, safe, lambda low, high, name=name: _edge(ground, name, low, high, B))
     calm = np.array([(_growth(ground, holders, k, B) <= MARGINAL).all() for k in tried])
     stiffest["population"] = _last(tried, calm, lambda low, high: _bisected(ground, holders, low, high, B))
-    requirement = {name: ground.requirement(name, K, B) for name in CONDITIONS}
+    requirement = {name: ground.requirement(name, K, B) for name in ground.conditions}
     return Mark(K, B, requirement, float(growth.max()), int((growth > MARGINAL).sum()), stiffest)
 
 
-def truth(ground: Ground, drawn: Map, condition: Condition) -> Truth | None:
+def truth(ground: MapLoop, drawn: Map, condition: str) -> Truth | None:
     """Columns of the map that cross the edge, evenly chosen; None where there is none."""
     grid, ratio = drawn.grid, drawn.ratio[condition].reshape(drawn.grid.shape)
     inside = ratio < 1
@@ -87,17 +85,17 @@ def _interpolated(K: Array, ratio: Array, k: int, scale: str) -> float:
     return float(K[k] + share * (K[k + 1] - K[k]))
 
 
-def _edge(ground: Ground, condition: Condition, low: float, high: float, B: float) -> float:
+def _edge(ground: MapLoop, condition: str, low: float, high: float, B: float) -> float:
     return edge(lambda K: ground.requirement(condition, K, B).ratio, low, high)
 
 
-def _growth(ground: Ground, holders: Holders, K: float, B: float) -> Array:
+def _growth(ground: MapLoop, holders: Holders, K: float, B: float) -> Array:
     """Of every human, in the worst contact state."""
     states = ground.force_maps(ground.gains(np.array([K]), np.array([B])))
     return np.max([holders.growth(stack[0])[0] for stack in states], axis=0)
 
 
-def _bisected(ground: Ground, holders: Holders, low: float, high: float, B: float) -> float:
+def _bisected(ground: MapLoop, holders: Holders, low: float, high: float, B: float) -> float:
     for _ in range(HALVINGS):
         middle = (low + high) / 2
         if (_growth(ground, holders, middle, B) <= MARGINAL).all():

@@ -13,10 +13,11 @@ from controller.gains import Gains
 from controller.lti import Array
 from models.device import Device
 from sim.gain_grid import Grid
-from sim.gain_ground import Ground, press_directions
+from sim.gain_ground import press_directions
+from sim.gain_loop import MapLoop
 from sim.gain_points import Trial, simulate_trials
 from sim.gain_population import Holders
-from sim.oscillation import slowest_seen
+from sim.oscillation import RUNAWAY, slowest_seen
 
 UNLIMITED = 1e6  # [N] force limit of a motor that does not saturate: the largest that a device may have
 BATCH = 20  # simulations in one MuJoCo batch
@@ -57,6 +58,11 @@ class Plan:
     duration: float  # [s]
     threshold: float  # [m] amplitude above which a handle oscillates
 
+    @property
+    def runaway_growth(self) -> float:
+        """[1/s] A mode that grows faster has diverged by the end of the trace, whether it swings or not."""
+        return 1.2 * np.log(RUNAWAY / self.start) / self.duration
+
 
 @dataclass(frozen=True, eq=False)
 class Points:
@@ -66,7 +72,7 @@ class Points:
     oscillates: NDArray[np.bool_]  # to the end of the trace, with any of the humans that were tried
     amplitude: Array  # [m] the largest among them that decided; inf: diverged
     frequency_hz: Array  # [Hz] of it; nan: diverged
-    growth: Array  # [1/s] of the exact linear loop's dominant audible mode, with the worst of these humans
+    growth: Array  # [1/s] of the exact loop's dominant mode, audible or running away, with the worst of these humans
 
     @property
     def near(self) -> NDArray[np.bool_]:
@@ -86,7 +92,7 @@ class Points:
 
 
 def simulated(
-    ground: Ground,
+    ground: MapLoop,
     grid: Grid,
     holders: Holders,
     plan: Plan,
@@ -113,18 +119,21 @@ def simulated(
     return _joined(parts), False
 
 
-def _trials(ground: Ground, gains: Gains, holders: Holders, plan: Plan) -> tuple[list[Trial], Array]:
+def _trials(ground: MapLoop, gains: Gains, holders: Holders, plan: Plan) -> tuple[list[Trial], Array]:
     """The trials of these gains, plan.trials of each in succession, and the growth of the worst of each."""
     audible, stack = slowest_seen(plan.duration), ground.force_maps(gains)[0]
     devices = plan.effects.on(ground.devices)
     trials, growth = [], []
     for i in range(len(gains)):
-        audibly = holders.growth(stack[i], audible=audible)[1]
-        worst = np.argsort(-audibly, kind="stable")[: plan.trials]
+        whole, audibly = holders.growth(stack[i], audible=audible)
+        runs_away = whole > plan.runaway_growth  # without a sound: what pushes outwards at rest
+        shown = np.where(runs_away, whole, audibly)
+        worst = np.argsort(-shown, kind="stable")[: plan.trials]
         process = ground.process(gains, i, devices)
         for human in worst.tolist():
-            trials.append(Trial(process, holders.links(human), plan.start * holders.mode(stack[i], human, audible)))
-        growth.append(audibly[worst[0]])
+            mode = holders.mode(stack[i], human, 0.0 if runs_away[human] else audible)
+            trials.append(Trial(process, holders.links(human), plan.start * mode))
+        growth.append(shown[worst[0]])
     return trials, np.array(growth)
 
 
@@ -132,7 +141,7 @@ def _points(
     cells: NDArray[np.intp],
     growth: Array,
     trials: list[Trial],
-    ground: Ground,
+    ground: MapLoop,
     plan: Plan,
     ticked: Callable[[int], None],
 ) -> Points:

@@ -1,4 +1,4 @@
-"""What a run with varying delays says: the delays it met, whether it grew, and what the certificates cover."""
+"""What a run with varying delays says: the delays it met, whether it grew, and what certificates cover."""
 
 from __future__ import annotations
 
@@ -6,43 +6,32 @@ from typing import Any
 
 import numpy as np
 
-from controller.coupling import Coupling
 from controller.delay import LOST, Ticks, ages
 from controller.jitter import Jitter
-from design.jitter_part import switching_part, switching_requirement
 from design.promises import finite
 from sim import report
 from sim.batch_engine import ExactBatchEngine
+from sim.couplings import Chosen
 from sim.exact_engine import HeldPlant
+from sim.jitter_coverage import certified_part
 from sim.loop import Record
 from sim.simulate import Assembly
 from sim.stability import clipped_ticks, close, dominant_mode
-from sim.switched import knocked, unlimited, without_theta
+from sim.switched import knocked, unlimited
 from sim.worst_switching import Period
 
 JUDGED = 4.0  # [s] at most of the linear loop from which a growth is read: later numbers may overflow
 
 
 def part(
-    assembly: Assembly, coupling: Coupling, period: Period | None, ticks: int, certified: bool
+    assembly: Assembly, chosen: Chosen, period: Period | None, ticks: int, certified: bool
 ) -> dict[str, Any] | None:
     """All that a report says of delays that vary; None where the scenario has no jitter."""
-    jitter = assembly.scenario.jitter
-    if jitter is None:
+    scenario = assembly.scenario
+    if scenario.jitter is None:
         return None
-    met = run_part(assembly, period, ticks) if assembly.scenario.switches else {}
-    return range_part(jitter) | met | certified_part(assembly, coupling, certified)
-
-
-def certified_part(assembly: Assembly, coupling: Coupling, certified: bool) -> dict[str, Any]:
-    """The jitter-proof requirement, and what the certificates cover; `certified` is about the constant theta."""
-    scenario, jitter = assembly.scenario, assembly.scenario.jitter
-    assert jitter is not None
-    if jitter.steady:
-        return {"jitter_proof": None} | coverage(jitter, certified, None)
-    G, span = without_theta(assembly, coupling), (jitter.lo, jitter.hi)
-    found = switching_requirement(coupling, scenario.environment, G, scenario.psi, *span, scenario.delta)
-    return {"jitter_proof": switching_part(found, G, *span)} | coverage(jitter, certified, found.requirement.certified)
+    met = run_part(assembly, period, ticks) if scenario.switches else {}
+    return range_part(scenario.jitter) | met | certified_part(scenario, chosen, certified)
 
 
 def range_part(jitter: Jitter) -> dict[str, Any]:
@@ -120,29 +109,6 @@ def _how(jitter: dict[str, Any]) -> str:
     if jitter["period"]:
         return f"growth by the eigenvalues of the product over the {jitter['period']['ticks']} ticks of a period"
     return f"growth of the linear loop after a knock, over {jitter['judged_s']:.3g} s under the run's delays"
-
-
-def coverage(jitter: Jitter, certified: bool, proof: bool | None) -> dict[str, Any]:
-    """Whether what is certified covers these delays: {"covered", "covers"}.
-
-    `certified` is about the constant theta, `proof` about every switching within the range (None where steady).
-    """
-    constants = (
-        "certificates are about constant delays" if certified else "nothing is certified, even for constant delays"
-    )
-    if jitter.steady:
-        text = "the delay is constant after all (theta): the certificates cover it" if certified else constants
-        return {"covered": certified, "covers": text}
-    lossy = jitter.loss > 0 or any(LOST in row for row in jitter.recorded)
-    if proof:
-        within = "jitter-proof in this environment: any switching of the delays within their range is covered"
-        losses = ", but a lost packet makes a force older than hi, which is not"
-        return {"covered": not lossy, "covers": within + (losses if lossy else "")}
-    advice = "a playout buffer (--playout) makes the delay constant"
-    return {
-        "covered": False,
-        "covers": f"{constants}; this coupling is not jitter-proof, so switching is not covered; {advice}",
-    }
 
 
 def _list(values: tuple[int, ...]) -> str:

@@ -45,8 +45,8 @@ def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
     half = x.shape[0] // 2
     diverged = ~(np.abs(x) < RUNAWAY).all(axis=(0, 1))
     calm = np.where(diverged, 0.0, x)
-    before, _ = _octaves(calm[:half], T)
-    after, line = _octaves(calm[half : 2 * half], T)  # (octaves, m, nsim)
+    before, _, _ = octaves(calm[:half], T)
+    after, line, _ = octaves(calm[half : 2 * half], T)  # (octaves, m, nsim)
     lasting = (after > threshold) & (after >= SUSTAINED * before)
     shown = np.where(lasting | ~lasting.any(axis=(0, 1)), after, 0.0).reshape(-1, x.shape[2])
     at = np.argmax(shown, axis=0)[None]
@@ -59,11 +59,13 @@ def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
     )
 
 
-def _octaves(x: Array, T: float) -> tuple[Array, Array]:
-    """Amplitude of each octave (that of a sinusoid of its power) and frequency of its strongest line."""
+def octaves(x: Array, T: float, trend: int = TREND) -> tuple[Array, Array, Array]:
+    """Of x (ticks, m, nsim) without a polynomial of degree `trend`: amplitude of each octave (that of a sinusoid of its
+    power) and frequency [Hz] of its strongest line, both (octaves, m, nsim), and its part of all lines, (octaves,).
+    """
     ticks = x.shape[0]
     window = np.hanning(ticks)
-    basis, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, ticks), TREND + 1))
+    basis, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, ticks), trend + 1))
     flat = x.reshape(ticks, -1)
     fast = flat - basis @ (basis.T @ flat)
     # a sinusoid of amplitude a has power a^2/2; a window w keeps sum w^2 of ticks
@@ -71,11 +73,12 @@ def _octaves(x: Array, T: float) -> tuple[Array, Array]:
     frequency = np.fft.rfftfreq(ticks, T)
     lowest = PERIODS / (ticks * T) * (1 - 1e-9)
     octave = np.floor(np.log2(np.maximum(frequency, lowest / 2) / lowest)).astype(int)
-    amplitudes, lines = [], []
+    amplitudes, lines, parts = [], [], []
     for k in range(octave.max() + 1):
         rows = np.flatnonzero(octave == k)
         if rows.size:
             amplitudes.append(np.sqrt(power[rows].sum(axis=0)))
             lines.append(frequency[rows][np.argmax(power[rows], axis=0)])
+            parts.append(rows.size / octave.size)
     shape = (len(amplitudes), *x.shape[1:])
-    return np.array(amplitudes).reshape(shape), np.array(lines).reshape(shape)
+    return np.array(amplitudes).reshape(shape), np.array(lines).reshape(shape), np.array(parts)

@@ -13,31 +13,36 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from controller.lti import Array
-from design.store import Condition
 from sim.files import write
 from sim.gain_map import Map
 from sim.gain_simulation import UNDECIDED
 from sim.plot import STYLES
 from sim.stability import MARGINAL
+from sim.surroundings import MODEL_KEPT
 
 STABLE, UNSTABLE = "#DDEBF4", "#F6D9C6"
 #: the broken line lies on the other, so that both are seen where they are the same
-LINES: dict[Condition, dict[str, Any]] = {
+LINES: dict[str, dict[str, Any]] = {
     "closed-loop": {"color": STYLES[2]["color"], "linestyle": "-", "linewidth": 3.6},
     "theorem4": {"color": STYLES[0]["color"], "linestyle": "--", "linewidth": 1.8},
+    MODEL_KEPT: {"color": STYLES[3]["color"], "linestyle": "-.", "linewidth": 1.8},
 }
 
 
 def plot_zwidth(drawn: Map, outcome: dict[str, Any], path: Path) -> Path:
     """Stiffness over damping; cells are the population's verdict, lines the certificates' edges, symbols MuJoCo's."""
     figure, axes = plt.subplots(figsize=(8, 5.6), layout="constrained")
-    axes.set(xscale=drawn.grid.scale, yscale=drawn.grid.scale, xlabel="B [N s/m]", ylabel="K [N/m]")
-    entries = [*_cells(axes, drawn, outcome), *_edges(axes, drawn), *_points(axes, drawn, outcome)]
+    about_environment = outcome["axes"] == "environment"
+    of = " of the environment's contacts" if about_environment else ""
+    axes.set(xscale=drawn.grid.scale, yscale=drawn.grid.scale, xlabel=f"B{of} [N s/m]", ylabel=f"K{of} [N/m]")
+    entries = [*_cells(axes, drawn, outcome), *_edges(axes, drawn, about_environment), *_points(axes, drawn, outcome)]
     for mark in outcome.get("marks", ()):
         axes.plot(mark["B"], mark["K"], "*", color="black", markersize=14, clip_on=False, zorder=5)
         axes.annotate(
             f"{mark['K']:g}, {mark['B']:g}", (mark["B"], mark["K"]), (9, 5), textcoords="offset points", zorder=5
         )
+    if about_environment:
+        entries += _designed_for(axes, drawn, outcome)
     figure.legend(handles=entries, loc="outside lower center", ncols=2, fontsize=8.5)
     figure.suptitle(_title(outcome), fontsize=11)
     try:
@@ -66,19 +71,30 @@ def _cell_edges(axis: Array, scale: str) -> Array:
     return np.exp(borders) if scale == "log" else borders
 
 
-def _edges(axes: Axes, drawn: Map) -> list[Line2D]:
+def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
     entries = []
-    for name, style in LINES.items():
-        ratio = drawn.ratio[name]
+    for name, ratio in drawn.ratio.items():
+        style = LINES[name]
         # the edge is where required damping is what is available; far from it the figure is only kept finite
         height = np.ma.masked_invalid(np.clip(ratio, 0, 4).reshape(drawn.grid.shape))
         safe, unsafe = bool((ratio < 1).any()), bool((ratio >= 1).any())
         if safe and unsafe:
             drawing = {"colors": style["color"], "linestyles": style["linestyle"], "linewidths": style["linewidth"]}
             axes.contour(drawn.grid.B, drawn.grid.K, height, [1], **drawing)
-        what = "below this edge" if safe and unsafe else "everything here" if safe else "nothing here"
+        side = "inside this edge" if about_environment else "below this edge"
+        what = side if safe and unsafe else "everything here" if safe else "nothing here"
         entries.append(Line2D([], [], label=f"{name} certifies {what}", **style))
     return entries
+
+
+def _designed_for(axes: Axes, drawn: Map, outcome: dict[str, Any]) -> list[Line2D]:
+    """The contact springs of the environment that the coupling was designed for, where they lie on the map."""
+    style: dict[str, Any] = {"marker": "P", "markersize": 9, "color": "black", "linestyle": "none"}
+    shown = [(s["B"], s["K"]) for s in outcome["designed_for"]["contact_springs"]]
+    for b, k in shown:
+        if drawn.grid.B[0] <= b <= drawn.grid.B[-1] and drawn.grid.K[0] <= k <= drawn.grid.K[-1]:
+            axes.plot(b, k, zorder=5, markeredgecolor="white", **style)
+    return [Line2D([], [], label="the springs that the coupling was designed for", **style)]
 
 
 def _points(axes: Axes, drawn: Map, outcome: dict[str, Any]) -> list[Line2D]:
@@ -106,6 +122,8 @@ def _points(axes: Axes, drawn: Map, outcome: dict[str, Any]) -> list[Line2D]:
 
 def _title(outcome: dict[str, Any]) -> str:
     what = "rigid wall" if outcome["rigid"] else outcome["scenario"]
+    if outcome["coupling"]:
+        what += f", {outcome['coupling']['kind']} coupling"
     if outcome["one_sided"]:
         what += ", one-sided"
     parts = [

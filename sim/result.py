@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Self
@@ -63,7 +64,7 @@ class Result:
                 return cls(**{name: archive[name] for name in _ARRAYS}, meta=json.loads(str(archive["meta"])))
         except OSError as error:
             raise InputError(f"{path}: {error.strerror or error}") from None
-        except (KeyError, ValueError, EOFError, BadZipFile) as error:
+        except (KeyError, ValueError, TypeError, AttributeError, EOFError, BadZipFile, zlib.error) as error:
             raise InputError(f"{path}: not a trace of this program ({error})") from None
 
     def save_csv(self, path: Path) -> Path:

@@ -41,6 +41,7 @@ from sim.mujoco_engine import INTEGRATORS, LEAPFROG
 from sim.result import Result
 from sim.scenario import InputError, Scenario
 from sim.simulate import ENGINES, Assembly, assemble, simulate
+from sim.stability import before_clipping
 from sim.substeps import LEAST, MOST, check_substeps, default_substeps
 from sim.worst_switching import Period
 
@@ -160,7 +161,7 @@ def _outcome(
     certificates = {name: certificate_part(requirement) for name, requirement in requirements.items()}
     simulated = samples * scenario.T
     certified = any(requirement.certified for requirement in requirements.values())
-    jitter, stability, unstable = jitter_report.part(assembly, chosen.coupling, period, samples, certified), None, None
+    jitter, stability, unstable = jitter_report.part(assembly, chosen, period, samples, certified), None, None
     if jitter and scenario.switches:
         stability = jitter_report.stability_part(assembly, record, jitter)
         unstable = stability["verdict"] == "unstable"
@@ -189,6 +190,8 @@ def _outcome(
             "T_s": scenario.T,
             "interrupted": record.interrupted,
             "scenario_digest": scenario.digest,
+            "encoder_step_m": assembly.process.encoder_step.tolist(),
+            "steady_ticks": [[0, before_clipping(record, assembly.process.force_limit)]],
         },
         "error": report.error_part(record, exact, assembly, unstable),
     }

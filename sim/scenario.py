@@ -15,7 +15,7 @@ import msgspec
 from controller.box import Box, UncertainSpring
 from controller.environment import Network, Spring, Wall, environment
 from controller.jitter import Jitter
-from design.store import Loop
+from design.store import DelayRange, Loop
 from models.device import Device, passivity_level, with_damping
 from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
 from models.quantity import require
@@ -116,6 +116,11 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.jitter is not None and not self.jitter.steady
 
     @property
+    def delay_range(self) -> DelayRange:
+        """What the delay of a force may be; of one that is lost nothing is said."""
+        return DelayRange(self.jitter.lo, self.jitter.hi) if self.jitter else DelayRange(self.theta, self.theta)
+
+    @property
     def delta(self) -> tuple[float, ...]:
         """The guaranteed damping of each device [N s/m]: all that certificates know of it."""
         return tuple(passivity_level(d) for d in self.device)
@@ -139,7 +144,10 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def loop(self, case: str) -> Loop:
         """All that a design may know: no device but its damping, no human."""
-        return Loop(self.T, self.theta, self.psi, self.reference_delays(case), self.delta, self.environment, self.box)
+        span = self.delay_range
+        jitter = span if self.switches and span.lo != span.hi else None
+        delays = (self.theta, self.psi, self.reference_delays(case))
+        return Loop(self.T, *delays, self.delta, self.environment, self.box, jitter)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import replace
 
 from sim.examine import Findings, Question, examine, merge
@@ -41,14 +41,19 @@ def _in_processes(question: Question, shards: int, progress: Progress) -> Findin
     batches, alone = question.batches(), replace(question, threads=1)
     # a forked child would inherit locks of MuJoCo's threads and of the progress bar
     context = multiprocessing.get_context("spawn")
+    strangers = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(shards, mp_context=context, initializer=_deaf_to_the_keyboard)
+    futures: list[Future[Findings]] = []
     try:
-        futures = [pool.submit(examine, alone, batch) for batch in batches]
+        futures += [pool.submit(examine, alone, batch) for batch in batches]
         for future in as_completed(futures):
             parts.append(future.result())
             progress(len(parts), len(batches))
     except KeyboardInterrupt:
-        return merge(parts, interrupted=True)
+        finished = [f.result() for f in futures if f.done() and not f.cancelled() and not f.exception()]
+        for worker in set(multiprocessing.active_children()) - strangers:
+            worker.terminate()  # a batch takes half a minute, and keeps nothing before its end
+        return merge(finished, interrupted=True)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
     return merge(parts)

@@ -105,6 +105,12 @@ def clipped_ticks(record: Record, force_limit: Array) -> NDArray[np.bool_]:
     return np.any(np.abs(record.f) >= force_limit[:, None], axis=(1, 2))
 
 
+def before_clipping(record: Record, force_limit: Array) -> int:
+    """Ticks before the first clipped one; all of them where there is none."""
+    clipped = clipped_ticks(record, force_limit)
+    return int(np.argmax(clipped)) if clipped.any() else clipped.size
+
+
 def growth_rate(eigenvalue: complex, T: float) -> float:
     """log|lambda| / T [1/s]."""
     modulus = abs(eigenvalue)

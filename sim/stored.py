@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from controller.coupling import Compliance, Coupling, InternalModel
 from design import store
 from design.certificate import verify
-from design.store import Loop, Stored
+from design.promises import switching_promise
+from design.store import DelayRange, Loop, Stored
 from sim.scenario import InputError
 
 
@@ -31,18 +33,36 @@ def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
     return coupling
 
 
-def doubts(stored: Stored, loop: Loop) -> list[str]:
-    """Why the certificate on file says nothing of the coupling in this loop: it fails, or is of another loop."""
-    lines = []
+@dataclass(frozen=True)
+class Standing:
+    """What a coupling's file is worth in a loop."""
+
+    notes: tuple[str, ...]  # what a reader should know of it
+    switching: DelayRange | None = None  # the file proves that any switching of the delays within it is safe here
+
+
+def standing(stored: Stored, loop: Loop) -> Standing:
+    """Whether the certificate on file holds, and what it says of the coupling in this loop."""
     try:
         reason = verify(stored).reason if stored.certificate else None
     except (ValueError, ArithmeticError) as error:
         reason = str(error)
-    if reason:
-        lines.append(f"the certificate in the coupling's file does not hold: {reason}")
-    differ = [n for n in loop.__struct_fields__ if n != "lam" and getattr(loop, n) != getattr(stored.loop, n)]
+    notes = [f"the certificate in the coupling's file does not hold: {reason}"] if reason else []
+    delays = ("theta", "jitter", "lam")  # lam matters to transparency only
+    differ = [n for n in loop.__struct_fields__ if n not in delays and getattr(loop, n) != getattr(stored.loop, n)]
+    proved = stored.certificate is not None and not reason and not differ
+    switching = stored.loop.jitter if proved else None
+    if switching and switching.contains(loop.jitter or DelayRange(loop.theta, loop.theta)):
+        if loop.theta != stored.loop.theta or loop.jitter not in (None, switching):
+            here = switching_promise(loop.jitter) if loop.jitter else f"the constant theta = {list(loop.theta)}"
+            notes.append(f"the file proves {switching_promise(switching)}, which covers {here}")
+        return Standing(tuple(notes), switching)
+    differ += ["theta"] if loop.theta != stored.loop.theta else []
+    if loop.jitter and proved:
+        made_for = switching_promise(switching) if switching else "constant delays"
+        notes.append(f"the file proves {made_for}: {switching_promise(loop.jitter)} are judged anew here")
     if differ:
-        lines.append(
+        notes.append(
             f"the coupling was stored for another loop (different {', '.join(differ)}), and is judged anew here"
         )
-    return lines
+    return Standing(tuple(notes), switching)

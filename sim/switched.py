@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from controller.coupling import Coupling
 from controller.delay import Ticks
@@ -65,13 +66,9 @@ def mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[i
 class Growth:
     """What a knock becomes under given delays; one entry per simulation."""
 
-    rate: Array  # (nsim,) [1/s] of the handles' speeds, last quarter over second; inf where numbers overflow
-    clipped: np.ndarray  # (nsim,) whether any force reached its limit
-
-    @property
-    def unstable(self) -> np.ndarray:
-        """(nsim,) whether the loop grows; a run that rests exactly at zero does not."""
-        return self.rate > 0
+    # (nsim,) [1/s] of the handles' speeds, last quarter over second; inf where numbers overflow, -inf at exact rest
+    rate: Array
+    clipped: NDArray[np.bool_]  # (nsim,) whether any force reached its limit
 
 
 def knocked(process: Process, engine: Engine, scene: Scene, states: int, ticks: int, nsim: int) -> Growth:
@@ -99,8 +96,6 @@ def knocked(process: Process, engine: Engine, scene: Scene, states: int, ticks: 
     return Growth(rate, clipped)
 
 
-def unlimited(process: Process, delays: Ticks | None = None) -> Process:
+def unlimited(process: Process) -> Process:
     """The linear process: no force limits, no encoder steps."""
-    free = np.full(process.channels, np.inf)
-    kept = process.delays if delays is None else delays
-    return replace(process, force_limit=free, encoder_step=np.zeros(process.channels), delays=kept)
+    return replace(process, force_limit=np.full(process.channels, np.inf), encoder_step=np.zeros(process.channels))

@@ -38,6 +38,7 @@ from sim.couplings import NAMES, Chosen, choose
 from sim.examine import ENGINES, Findings, Question
 from sim.files import write_json
 from sim.human_file import save_humans
+from sim.jitter_coverage import certified_part
 from sim.jitter_options import add_jitter_options, with_jitter
 from sim.population import MIXED, crowd_of
 from sim.scenario import InputError, Scenario
@@ -171,7 +172,7 @@ def _attack(scenario: Scenario, chosen: Chosen, seed: int, generations: int, out
 def _switching(scenario: Scenario, chosen: Chosen, findings: Findings, certified: bool) -> dict[str, Any]:
     """What delays that vary did to these humans, and whether that contradicts what is certified of them."""
     assert scenario.jitter is not None
-    covered = jitter_report.certified_part(assemble(scenario, chosen.coupling), chosen.coupling, certified)
+    covered = certified_part(scenario, chosen, certified)
     return verdict_report.switching_part(findings, jitter_report.range_part(scenario.jitter) | covered)
 
 

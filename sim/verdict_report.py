@@ -19,6 +19,7 @@ from sim.population import MIXED, crowd_of
 from sim.report import varying
 from sim.verdicts import unstable
 
+SETTLING = 4  # decay times of the slowest mode in a trace whose hands must be slower in its last quarter than before
 ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
 
 
@@ -59,8 +60,8 @@ def outcome(question: Question, findings: Findings, certified: bool, wall: float
 def switching_part(findings: Findings, covered: dict[str, Any]) -> dict[str, Any]:
     """How many humans grow under delays that vary; it holds unless certificates cover these delays and one grows."""
     exact, mujoco = findings.switching, findings.switching_mujoco
-    seen = np.isfinite(exact) | np.isinf(exact)
-    unstable, also = int((exact[seen] > 0).sum()), mujoco[~np.isnan(mujoco)]
+    seen = ~np.isnan(exact)
+    unstable, also = int((exact > 0).sum()), mujoco[~np.isnan(mujoco)]
     worst = int(np.nanargmax(exact)) if seen.any() else None
     return covered | {
         "unstable": {"exact": unstable, "mujoco": int((also > 0).sum()) if also.size else None},
@@ -135,15 +136,23 @@ def _traces(question: Question, findings: Findings) -> dict[str, Any] | None:
     if not question.ticks or not findings.index.size:
         return None
     measured, stable = np.isfinite(findings.trace), ~unstable(findings.exact)
-    return {
-        "duration_s": question.ticks * question.scenario.T,
+    duration = question.ticks * question.scenario.T
+    decay = _largest(-1 / findings.exact[findings.exact < 0])
+    decides = decay is None or duration >= SETTLING * decay
+    part = {
+        "duration_s": duration,
         "clipped_runs": int((findings.clipped > 0).sum()),
         "measured": int(measured.sum()),
         "largest_difference_per_s": _largest(np.abs(findings.trace - findings.exact)),
         "stable_and_settling": int((stable & (findings.settling < 1)).sum()),
         "stable": int(stable.sum()),
         "slowest_settling": _largest(findings.settling[stable]),
+        "slowest_decay_s": decay,
+        "settling_decides": decides,
     }
+    if not decides:
+        part["reason"] = f"the slowest mode decays in {decay:.3g} s: in {duration:g} s its hands need not be slower"
+    return part
 
 
 def _energy(findings: Findings) -> dict[str, Any]:
@@ -199,6 +208,8 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     if traces:
         rows.append(("traces", f"{traces['duration_s']:g} s each, {traces['clipped_runs']} clipped"))
         settled = f"{traces['stable_and_settling']} of {traces['stable']} stable loops slower at the end"
+        if not traces["settling_decides"]:
+            settled += f"; no verdict: {traces['reason']}"
         rows.append(("handles come to rest", settled))
     if audit := report.get("energy_audit"):
         rows.append(
@@ -222,7 +233,8 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     verdict = {True: "[green]yes[/]", False: "[red]no[/]"}.get(report["holds"])
     rows.append(("holds", verdict or str(report["reason"])))
     if report["interrupted"]:
-        rows.append(("interrupted", "what was finished is kept; an adversary's search is not"))
+        kept = f"{report['humans']} humans that were finished are kept; running batches and searches are not"
+        rows.append(("interrupted", kept))
     rows.append(("time", f"{report['wall_s']:.1f} s, {report['simulated_s_per_s']:.0f} simulated seconds per second"))
     return rows
 

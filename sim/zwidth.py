@@ -1,6 +1,6 @@
 """python -m sim.zwidth: the K-B map that haptics people draw - certified, exact for random humans, simulated.
 
-options -> Ground (the loop without its coupling) -> Grid of gains -> Map -> picture, CSV, JSON
+options -> the loop (Ground: K and B are the coupling's; Surroundings: the environment's) -> Grid -> Map -> files
 """
 
 from __future__ import annotations
@@ -9,6 +9,11 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from design.assess import CONDITIONS, assess
+from design.environment_map import contact_springs
+from design.promises import certificate_part, promise_of
+from design.set_check import check_set, set_part
+from design.summary import coupling_part
 from sim import zwidth_report
 from sim.command import (
     DOES_NOT_HOLD,
@@ -23,18 +28,22 @@ from sim.command import (
     numbers,
     out_folder,
     progress_bar,
+    require_constant_delay,
     rigid_loop,
     scenario_from,
     seed_from,
 )
+from sim.couplings import NAMES, Chosen, choose
 from sim.files import write_json
 from sim.gain_grid import Grid, Range, make_grid
 from sim.gain_ground import Ground, one_sided
+from sim.gain_loop import MapLoop
 from sim.gain_map import Map, draw_map
 from sim.gain_marks import look, truth
 from sim.gain_population import holders
 from sim.gain_simulation import Effects, Plan
 from sim.scenario import InputError, Scenario
+from sim.surroundings import Surroundings
 from sim.zwidth_text import print_map
 
 EXAMPLE = """python -m sim.zwidth --theta 1 --grid 30
@@ -46,10 +55,15 @@ FINEST = 1e-5  # [m] least default threshold: what a desk device's encoders reso
 def main(argv: list[str]) -> int:
     """Draw a map. 0: nothing contradicts it and every mark is certified, 1: else, 130: interrupted."""
     args = _parser().parse_args(argv)
+    of_coupling = args.coupling is None
+    args.grid, args.press = args.grid or ("60" if of_coupling else "24"), args.press or ("3" if of_coupling else "0")
     scenario = scenario_from(args)
-    ground = _ground(args, scenario)
+    require_constant_delay(scenario, "sim.zwidth")
+    _check_case(args)
     seed, humans = seed_from(args), _whole(args, "humans", 1, 100_000)
     marks = tuple(_pair("--mark", mark) for mark in args.mark or ())
+    chosen = _chosen(args, scenario)
+    ground: MapLoop = _surroundings(scenario, chosen) if chosen else _ground(args, scenario)
     grid = _grid(args, ground, marks)
     plan = _plan(args, ground)
     out = out_folder(args, "zwidth")
@@ -66,6 +80,7 @@ def main(argv: list[str]) -> int:
         )
     outcome = zwidth_report.outcome(ground, drawn, plan, {"humans": humans, "seed": seed})
     outcome |= {"scenario": None if args.rigid else scenario.name, "scenario_digest": scenario.digest}
+    outcome |= _coupling(args, scenario, chosen, seed) if chosen else {"axes": "coupling", "coupling": None}
     if not drawn.interrupted:
         zwidth_report.add_truth(outcome, {name: truth(ground, drawn, name) for name in drawn.ratio})
         zwidth_report.add_marks(outcome, [look(ground, crowd, *mark, grid.K) for mark in marks])
@@ -83,7 +98,11 @@ def _parser() -> Parser:
     add_loop_options(parser)
     add_rigid_option(parser)
     of_map = parser.add_argument_group("the map (K and B are the same on all channels)")
-    of_map.add_argument("--grid", default="60", metavar="N", help="rows and columns (default 60)")
+    names = ", ".join(NAMES)
+    fixed = f"this coupling, fixed, and K and B of the environment's contact springs on the axes: {names} or FILE.json"
+    of_map.add_argument("--coupling", metavar="NAME|FILE", help=f"{fixed} (default: K and B of the coupling)")
+    of_map.add_argument("--condition", choices=CONDITIONS, help="that such a coupling is designed for")
+    of_map.add_argument("--grid", metavar="N", help="rows and columns (default 60; 24 with --coupling)")
     of_map.add_argument("--K-range", metavar="LOW,HIGH", help="[N/m]; default from delta, theta and T")
     of_map.add_argument("--B-range", metavar="LOW,HIGH", help="[N s/m]; default from delta")
     of_map.add_argument("--scale", choices=("linear", "log"), help="default linear with --rigid, else log")
@@ -97,7 +116,8 @@ def _parser() -> Parser:
     points.add_argument(
         "--start", default="1e-3", metavar="METRES", help="first swing of motor or handle (default 1e-3)"
     )
-    points.add_argument("--press", default="3", metavar="NEWTONS", help="steady force of every hand (default 3)")
+    pressing = "steady force of every hand (default 3; 0 with --coupling, whose soft environments give way to it)"
+    points.add_argument("--press", metavar="NEWTONS", help=pressing)
     points.add_argument("--threshold", metavar="METRES", help="amplitude of an oscillation (default 2 steps or 1e-5)")
     points.add_argument("--quantisation", metavar="METRES", help="encoder step of every device")
     points.add_argument("--saturation", action="store_true", help="motors have their force limits")
@@ -110,10 +130,58 @@ def _parser() -> Parser:
     return parser
 
 
-def _ground(args: argparse.Namespace, scenario: Scenario) -> Ground:
-    """The loop. Raises InputError."""
+def _check_case(args: argparse.Namespace) -> None:
+    """Whether the options ask for a map of one kind. Raises InputError."""
     if args.case == "none":
-        raise InputError("--case none is the loop without coupling, and the map is of couplings: use --case I")
+        instead = "use --case I, or --coupling none for a map over environments"
+        raise InputError(f"--case none is the loop without coupling, and the map is of couplings: {instead}")
+    if args.coupling is None and args.condition:
+        raise InputError(f"--condition {args.condition}: without --coupling nothing is designed, and both are drawn")
+    for name in ("rigid", "wall", "velocity_filter"):
+        if args.coupling is not None and getattr(args, name):
+            what = "is about a map of spring-dampers; with --coupling the axes are the environment's"
+            raise InputError(f"--{name.replace('_', '-')} with --coupling {args.coupling}: it {what}")
+
+
+def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
+    """The coupling that stays as it is over the whole map, or None where the axes are the coupling's own gains."""
+    if args.coupling is None:
+        return None
+    if args.coupling == "optimal" and scenario.environment.walls:
+        raise InputError("environment.walls: an optimal coupling holds a linear model, so it cannot face walls")
+    return choose(scenario, args.case, args.coupling, args.condition)
+
+
+def _surroundings(scenario: Scenario, chosen: Chosen) -> Surroundings:
+    """The loop with that coupling. Raises InputError."""
+    who = scenario.device, scenario.population
+    try:
+        return Surroundings(*who, scenario.environment, scenario.T, scenario.theta, scenario.psi, chosen.coupling)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, seed: int) -> dict[str, Any]:
+    """The fixed coupling and what is promised of it where it was designed, in the scenario's own environment."""
+    loop = scenario.loop(args.case)
+    whole = check_set(loop, chosen.coupling, seed)
+    requirements = assess(loop, chosen.coupling, chosen.phi)
+    springs = contact_springs(loop.environment)
+    return {
+        "axes": "environment",
+        "coupling": coupling_part(chosen.kind, chosen.coupling, scenario.T),
+        "designed_for": {
+            "contact_springs": [{"between": s.between, "K": s.stiffness, "B": s.damping} for s in springs],
+            "certificates": {name: certificate_part(r) for name, r in requirements.items()},
+            "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
+            "set": whole and set_part(whole),
+        },
+        "remarks": list(chosen.notes),
+    }
+
+
+def _ground(args: argparse.Namespace, scenario: Scenario) -> Ground:
+    """The loop without its coupling. Raises InputError."""
     cutoff = None
     if args.velocity_filter is not None:
         cutoff = _number(args, "velocity_filter", 1e-3, 1e6, "Hz")
@@ -131,7 +199,7 @@ def _ground(args: argparse.Namespace, scenario: Scenario) -> Ground:
         raise error if isinstance(error, InputError) else InputError(str(error)) from None
 
 
-def _grid(args: argparse.Namespace, ground: Ground, marks: tuple[Range, ...]) -> Grid:
+def _grid(args: argparse.Namespace, ground: MapLoop, marks: tuple[Range, ...]) -> Grid:
     K, B = (
         None if getattr(args, f"{name}_range") is None else _pair(f"--{name}-range", getattr(args, f"{name}_range"))
         for name in "KB"
@@ -142,7 +210,7 @@ def _grid(args: argparse.Namespace, ground: Ground, marks: tuple[Range, ...]) ->
     return make_grid(ground, _whole(args, "grid", 4, 400), K, B, args.scale, marks)
 
 
-def _plan(args: argparse.Namespace, ground: Ground) -> Plan:
+def _plan(args: argparse.Namespace, ground: MapLoop) -> Plan:
     step = None if args.quantisation is None else _number(args, "quantisation", 0, 1e-2, "m")
     friction = None if args.friction is None else _number(args, "friction", 0, 1e3, "N")
     effects = Effects(step, friction, args.saturation)
@@ -154,7 +222,7 @@ def _plan(args: argparse.Namespace, ground: Ground) -> Plan:
     return Plan(effects, points, trials, start, press, duration, threshold)
 
 
-def _save(args: argparse.Namespace, ground: Ground, drawn: Map, outcome: dict[str, Any], out: Path) -> None:
+def _save(args: argparse.Namespace, ground: MapLoop, drawn: Map, outcome: dict[str, Any], out: Path) -> None:
     """The picture, the table and the report; `outcome` learns where they are."""
     files = [zwidth_report.save_csv(drawn, out / "map.csv")]
     if not args.no_plot:

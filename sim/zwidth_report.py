@@ -11,17 +11,20 @@ from typing import Any
 import numpy as np
 
 from controller.lti import Array
+from design.assess import CONDITIONS
 from design.promises import CAVEATS, certificate_part, finite
 from sim.files import write
-from sim.gain_ground import Ground
+from sim.gain_loop import MapLoop
 from sim.gain_map import Map
 from sim.gain_marks import Mark, Truth
 from sim.gain_simulation import UNDECIDED, Plan
 from sim.oscillation import slowest_seen
 from sim.stability import MARGINAL
 
+NOT_REACHED = "not reached before the interruption"
 
-def outcome(ground: Ground, drawn: Map, plan: Plan, population: dict[str, Any]) -> dict[str, Any]:
+
+def outcome(ground: MapLoop, drawn: Map, plan: Plan, population: dict[str, Any]) -> dict[str, Any]:
     """The whole map. Rows are stiffnesses; null is infinite, or not reached before an interruption."""
     known = np.isfinite(drawn.growth)
     unsafe = known & (drawn.growth > MARGINAL)
@@ -33,25 +36,26 @@ def outcome(ground: Ground, drawn: Map, plan: Plan, population: dict[str, Any]) 
         "delta": list(ground.delta),
         "velocity_filter_hz": ground.cutoff,
         "one_sided": ground.walled is not None,
+        "conditions": list(drawn.ratio),
         "grid": {"K": drawn.grid.K.tolist(), "B": drawn.grid.B.tolist(), "scale": drawn.grid.scale},
     }
     for name, ratio in drawn.ratio.items():
-        part[name] = {
+        reason = _nulls(ground, drawn, name)
+        part[name] = ({"reason": reason} if reason else {}) | {
             "required_over_available": _rows(drawn, ratio),
             "certified_cells": int((ratio < 1).sum()),
-            "contradicted_cells": int(((ratio < 1) & unsafe).sum()),
         }
-    if ground.multiplier[1]:
-        part["theorem4"]["reason"] = ground.multiplier[1]
+        if name in CONDITIONS:  # the population meets the loop that they are about
+            part[name]["contradicted_cells"] = int(((ratio < 1) & unsafe).sum())
     part["population"] = {
         **population,
         "growth_rate_per_s": _rows(drawn, drawn.growth),
         "unstable_humans_at_least": _rows(drawn, drawn.unstable),
         "stable_cells": int((known & ~unsafe).sum()),
         "decided_cells": int(known.sum()),
-    }
+    } | ({"reason": f"null: {NOT_REACHED}"} if np.isnan(drawn.growth).any() else {})
     part["simulation"] = _simulation(ground, drawn, plan)
-    contradicted = sum(part[name]["contradicted_cells"] for name in drawn.ratio)
+    contradicted = sum(part[name]["contradicted_cells"] for name in CONDITIONS)
     disagree = 0 if part["simulation"]["nonlinear"] else part["simulation"]["differ_from_linear"]
     part["holds"] = contradicted == 0 and disagree == 0
     part["interrupted"] = drawn.interrupted
@@ -60,7 +64,22 @@ def outcome(ground: Ground, drawn: Map, plan: Plan, population: dict[str, Any]) 
     return part
 
 
-def _simulation(ground: Ground, drawn: Map, plan: Plan) -> dict[str, Any]:
+def _nulls(ground: MapLoop, drawn: Map, name: str) -> str | None:
+    """Why a condition has cells without a figure, in words of one such cell; None where it has none."""
+    if name in ground.refusals:
+        return ground.refusals[name]
+    ratio, (K, B) = drawn.ratio[name], drawn.grid.flat
+    unreached, infinite = np.isnan(ratio), np.flatnonzero(np.isposinf(ratio))
+    parts = [f"null at {unreached.sum()} cells: {NOT_REACHED}"] if unreached.any() else []
+    if infinite.size:
+        first = infinite[0]
+        why = ground.requirement(name, float(K[first]), float(B[first])).reason or "the figure grows without end"
+        at = f"at K {K[first]:.4g}, B {B[first]:.4g}, {why}"
+        parts.append(f"null at {infinite.size} cells: no damping is enough; {at}")
+    return "; ".join(parts) or None
+
+
+def _simulation(ground: MapLoop, drawn: Map, plan: Plan) -> dict[str, Any]:
     points, (K, B) = drawn.points, drawn.grid.flat
     rows = [
         {

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from sim.gain_simulation import DECIDED, UNDECIDED
 from sim.oscillation import SUSTAINED
+from sim.surroundings import MODEL_KEPT
 
 
 def print_map(outcome: dict[str, Any], console: Console) -> None:
@@ -19,7 +20,10 @@ def print_map(outcome: dict[str, Any], console: Console) -> None:
     title = f"K {K[0]:.4g} to {K[-1]:.4g} N/m, B {B[0]:.4g} to {B[-1]:.4g} N s/m, {cells} couplings"
     table = Table(title=title, title_justify="left", show_header=False)
     errors = outcome.get("error", {})
-    for name in ("theorem4", "closed-loop"):
+    if outcome["axes"] == "environment":
+        for row in _designed_rows(outcome):
+            table.add_row(*row)
+    for name in outcome["conditions"]:
         error = errors.get(name)
         near = f"; edge within {100 * error['edge_relative_in_K']:.2g} % of design.margin" if error else ""
         table.add_row(f"certified, {name}", f"{_share(outcome[name]['certified_cells'], cells)}{near}")
@@ -39,13 +43,41 @@ def print_map(outcome: dict[str, Any], console: Console) -> None:
         console.print(f"[dim]·[/] {line}")
 
 
+def _designed_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
+    """The fixed coupling in the environment that it was designed for."""
+    designed = outcome["designed_for"]
+    each = (f"{' - '.join(s['between'])} {s['K']:g} N/m, {s['B']:g} N s/m" for s in designed["contact_springs"])
+    needs = "; ".join(
+        f"{name} needs {100 / part['margin']:.4g} % of the damping ({part['proof']})"
+        for name, part in designed["certificates"].items()
+        if part["margin"]
+    )
+    return [
+        ("coupling", f"{outcome['coupling']['kind']}, fixed"),
+        ("designed for", ", ".join(each)),
+        ("there", f"promise: {designed['promise'] or 'none'}; {needs or 'no damping is enough'}"),
+    ]
+
+
+def _about(outcome: dict[str, Any]) -> str:
+    """What the axes are, and what a certified cell promises."""
+    line = "K and B are those of every spring at a contact; each is certified for its environment alone, by a sweep"
+    if MODEL_KEPT not in outcome["conditions"]:
+        return f"{line}."
+    return (
+        f"{line}: closed-loop, the population and MuJoCo with the coupling's model set to the cell's environment, "
+        f"{MODEL_KEPT} with the model left at what the coupling was designed for."
+    )
+
+
 def _mark_line(mark: dict[str, Any], humans: int) -> str:
     ends = ", ".join(f"{name} {_stiffest(K)}" for name, K in mark["stiffest_K_at_this_B"].items())
     needs = ", ".join(
         f"{name} needs {max(mark[name]['required_damping'], key=lambda d: d or np.inf) or np.inf:.6g} of "
         f"{min(mark[name]['available_damping']):.6g} N s/m "
         f"({'[green]certified[/]' if mark[name]['certified'] else '[red]not certified[/]'})"
-        for name in ("theorem4", "closed-loop")
+        for name in mark["stiffest_K_at_this_B"]
+        if name != "population"
     )
     met = f"{mark['unstable_humans']} of {humans} humans make it unstable"
     return f"K {mark['K']:g}, B {mark['B']:g}: {needs}; {met}; stiffest at this B: {ends}"
@@ -70,10 +102,12 @@ def _effects(simulation: dict[str, Any]) -> str:
 def _remarks(outcome: dict[str, Any]) -> list[str]:
     lines = []
     simulation = outcome["simulation"]
-    for name in ("theorem4", "closed-loop"):
+    if outcome["axes"] == "environment":
+        lines += [*outcome["remarks"], _about(outcome)]
+    for name in outcome["conditions"]:
         if outcome[name].get("reason"):
             lines.append(f"{name}: {outcome[name]['reason']}.")
-        if outcome[name]["contradicted_cells"]:
+        if outcome[name].get("contradicted_cells"):
             lines.append(f"[red]CONTRADICTION[/]: {outcome[name]['contradicted_cells']} certified cells are unstable.")
     if not simulation["nonlinear"] and simulation["differ_from_linear"]:
         lines.append(f"[red]DISAGREEMENT[/]: MuJoCo and the linear loop at {simulation['differ_from_linear']} points.")

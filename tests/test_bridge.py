@@ -1,11 +1,16 @@
 """Whole sessions in virtual time: every fault, the exact engine's run, the delay into the design, traces, replays."""
 
 import json
+import re
 from contextlib import suppress
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from design.assess import assess
+from design.store import Stored, data_of
+from design.store import save as save_coupling
 from hw import replay, session_report
 from hw.emulator_core import Emulator
 from hw.fault_cases import CASES
@@ -14,19 +19,22 @@ from hw.frame import Decoder, Force, State, Stop, encode
 from hw.handshake import Units
 from hw.law import Law, fill
 from hw.message import Command, Phase
-from hw.plan import Ages, ladder, link_delay, rung
+from hw.plan import Ages, Rung, ladder, link_delay, rung
 from hw.rehearsal import Rehearsal
 from hw.safety import Fault, Limits, Stage
 from hw.session import Session, Settings
-from hw.trace import Recorder, load, result_of, save_npz
+from hw.trace import Recorder, load, result_of, save_npz, steady_ticks
 from hw.upset import Upset
 from models.scene import plant
+from sim import trace as trace_command
+from sim.couplings import choose
 from sim.engine import outside_forces
 from sim.exact_engine import hold
 from sim.result import Result
 from sim.scenario import InputError
 from sim.scenario import load as scenario_of
 from sim.simulate import assemble, simulate
+from sim.stability import close, dominant_mode
 
 FAST = Settings(measure=100)
 
@@ -89,7 +97,7 @@ def test_a_device_that_repeats_itself_is_lost_while_its_bytes_keep_coming(scenar
         now += 100
         session.receive(again, now)
     assert session.stage == Stage.LOST
-    assert session.log[-1].t_us - session.heard <= session.limits.watchdog_us + 100
+    assert session.log[-1].t_us - session.stream.heard <= session.limits.watchdog_us + 100
 
 
 @pytest.mark.parametrize(
@@ -269,6 +277,55 @@ def test_a_softer_coupling_takes_over_once_a_person_arms_it(scenario, rungs):
     assert any(np.any(m.applied) for m in rehearsal.moments[-100:])
 
 
+@pytest.fixture(scope="module")
+def optimal_rungs(scenario):
+    return ladder(scenario, "I", "optimal", None, 1, spare=1)
+
+
+def test_an_optimal_coupling_has_a_spring_damper_in_reserve(optimal_rungs, capsys):
+    """With one tick more no optimal coupling of the default basis is certified; by Theorem 4 a spring-damper is."""
+    fast, soft = optimal_rungs
+    assert (fast.chosen.kind, soft.chosen.kind) == ("optimal", "spring-damper")
+    assert (fast.link, soft.link) == (1, 2)
+    assert fast.requirements["closed-loop"].certified
+    assert soft.requirements["theorem4"].certified
+    assert soft.scenario.theta == (2, 2)
+    session_report.print_certificate(Ages((130,) * 100), 1, optimal_rungs, Console(width=160))
+    table = capsys.readouterr().out
+    assert re.search(r"│ optimal, theta = 1, 2 .*\(closed-loop, rational\).*this environment", table)
+    assert re.search(r"│ spring-damper, theta = 2, 2 .*\(theorem4, rational\).*any passive environment", table)
+    assert "no reserve" not in table
+
+
+def test_a_coupling_from_a_file_has_one_too(scenario, optimal_rungs, tmp_path):
+    path = tmp_path / "stiff.json"
+    save_coupling(Stored(scenario.loop("I"), data_of(optimal_rungs[0].chosen.coupling)), path)
+    rungs = ladder(scenario, "I", str(path), None, 1)
+    assert [r.chosen.kind for r in rungs] == ["stiff.json", "spring-damper", "spring-damper"]
+    assert [r.link for r in rungs] == [1, 2, 3]
+    assert all(r.certified for r in rungs)
+    with pytest.raises(Fault, match=r"the coupling stiff\.json is not certified for theta = \[2, 2\]"):
+        ladder(scenario, "I", str(path), None, 2)  # the one asked for is the one that is armed first, or none
+
+
+def test_the_spring_damper_follows_the_optimal_coupling(scenario, optimal_rungs, tmp_path):
+    """Late answers, a ramp to zero, the reserve armed by a person; and the trace of both replays bit by bit."""
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(lively(scenario), optimal_rungs, "down:jitter=0.0007@0.45", recorder=recorder)
+    session = rehearsal.run_until_armed(1.2)
+    assert (session.stage, session.rung) == (Stage.DISARMED, optimal_rungs[1])
+    session.arm(session.now)
+    rehearsal.run(1e-6 * session.now + 0.8)
+    assert session.stage == Stage.ARMED
+    session.stop("enough", session.now)
+    rehearsal.run(1e-6 * session.now + 0.2)
+    files = session_report.save(tmp_path, session, recorder, session_report.outcome("I", session, recorder, 0), False)
+    result, link = load(files[0])
+    assert [recipe.link_delay for recipe in replay.recipes_of(result)] == [1, 2]
+    assert replay.replay(result, link).identical
+    assert np.abs(link["sent"][link["arming"] == 1]).max() > 100
+
+
 # traces
 
 
@@ -436,6 +493,70 @@ def test_an_empty_or_a_damaged_trace_is_one_line(trace, tmp_path):
         (tmp_path / "damaged.npz").write_bytes(damaged)
         with suppress(InputError):  # a byte of the archive's own padding or of a name may not matter
             replay.main([str(tmp_path / "damaged.npz")])
+
+
+@pytest.mark.parametrize(("cap", "slew"), [(0.3, 2000.0), (12.0, 10.0)])
+def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
+    """Growth is told before the first force that the cap or the slew rate changed, as the counters saw it.
+
+    To two ticks: a force that is cut by less than a step is the same force.
+    """
+    recorder = Recorder(2)
+    session = Session(scenario, Limits((cap, cap), slew), FAST)
+    cuts = []
+
+    def record(row):
+        recorder(row)
+        cuts.append(session.counters.clipped + session.counters.slowed)
+
+    session.record = record
+    Rehearsal(session, Emulator(lively(scenario)), lambda ages: rungs).run_until_armed(1.2)
+    ((first, stop),) = steady_ticks(recorder, session.units.force_step)
+    assert (recorder.link()["gain"][first:] == 1.0).all()
+    full = np.diff(cuts, prepend=0)[first:]
+    assert 0 <= stop - first - int(np.argmax(full > 0)) <= 2
+    assert stop - first > 20
+
+
+class Dared(Rung):
+    """A coupling that passes for certified: what a certificate keeps out has to be seen once."""
+
+    certified = True
+
+
+@pytest.mark.parametrize(("name", "settles"), [("none", False), (None, True)])
+def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, settles):
+    """From the file alone: the exact engine's eigenvalue without coupling, to 2e-3 1/s (a rounded force is no linear
+    one), and with the certified one nothing that oscillates. On the ticks of full gain, before the cap is met.
+    """
+    made = rung(scenario, "I", None, None, 1) if settles else None
+    if made is None:
+        chosen = choose(scenario, "I", name, None)
+        made = Dared(1, scenario, "I", chosen, assess(scenario.loop("I"), chosen.coupling))
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(scenario, [made], recorder=recorder)
+    session = rehearsal.run_until_armed(2.0 if settles else 7.0)
+    session.stop("enough", session.now)
+    rehearsal.run(1e-6 * session.now + 0.2)
+    report = session_report.outcome("I", session, recorder, 0)
+    ((first, stop),) = report["run"]["steady_ticks"]
+    gain = recorder.link()["gain"]
+    assert (gain[first:stop] == 1.0).all()
+    assert gain[first - 1] < 1.0
+    path = session_report.save(tmp_path, session, recorder, report, False)[0]
+    assert trace_command.main([str(path), "--json", "-"]) == 0
+    (part,) = json.loads(capsys.readouterr().out)["growth"]
+    assert [part] == report["growth"]
+    if settles:
+        assert part["reason"].startswith("nothing oscillates")
+        return
+    assembly = assemble(scenario, made.chosen.coupling)
+    exact = dominant_mode(close(assembly.plant, assembly.F))
+    assert part["growth_rate_per_s"] == pytest.approx(exact.growth, abs=2e-3)
+    assert part["frequency_hz"] == pytest.approx(exact.frequency_hz, abs=1.0)
+    assert part["trend"] == "grows"
+    session_report.print_session(report | {"files": []}, Console(width=200))
+    assert re.search(r"growth at full gain, arming 1, ticks \d+ to \d+ .*: \+1.48", capsys.readouterr().out)
 
 
 def test_the_report_is_json_and_names_its_end(trace):

@@ -5,18 +5,24 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
+from hw import session_report
 from hw.clock import BLOCK, Clock, Pace
 from hw.conduct import PATIENCE, Told, check_state
 from hw.device import Device
+from hw.emulated_plant import nobody
 from hw.emulator_core import Emulator, info_of
+from hw.excitation import chirp
 from hw.faults import lively
 from hw.frame import Ack, Config, Force, State, config_crc, encode
+from hw.measurement import Measurement
 from hw.message import NO_MARGIN, Command, Phase
 from hw.plan import Ages, ladder
 from hw.rehearsal import Rehearsal
 from hw.safety import Fault, Limits, Stage
 from hw.session import Session, Settings
+from hw.trace import Recorder, result_of
 from hw.upset import Upset
+from sim.growth import growths
 from sim.scenario import load as scenario_of
 
 T_US = 1200
@@ -111,11 +117,11 @@ def hand_driven(scenario, rungs):
     session.receive(encode(info_of(scenario)), t)
     session.receive(encode(Ack(config_crc(session.config), 0)), t)
 
-    def send(phase, ticks=1, lasts=T_US, lie=None, counts=(0, 0)):
+    def send(phase, ticks=1, lasts=T_US, lie=None, counts=(0, 0), margin=17_900):
         nonlocal t, k
         t, k = t + lasts, k + ticks
         clock = t if lie is None else lie
-        session.receive(encode(State(phase, k & 0xFFFF, 0, 17_900, 0, 0, clock & 0xFFFFFFFF, counts, (0, 0))), t)
+        session.receive(encode(State(phase, k & 0xFFFF, 0, margin, 0, 0, clock & 0xFFFFFFFF, counts, (0, 0))), t)
 
     while session.stage == Stage.MEASURING:
         send(Phase.DISARMED)
@@ -141,6 +147,21 @@ def test_a_leap_of_the_tick_number_skips_neither_ramp_nor_jump(scenario, rungs):
     assert session.stage == Stage.ARMING  # a leap before the first force is none of its business
     send(Phase.ARMED, ticks=300)
     assert session.stage == Stage.STOPPED
+
+
+def test_a_device_that_stops_telling_margins_is_stopped(scenario, rungs):
+    """It applies what it is told and counts no miss, but whether answers come in time nobody knows any more."""
+    session, send = hand_driven(scenario, rungs)
+    for _ in range(250):
+        send(Phase.ARMED)
+    assert session.stage == Stage.ARMED
+    silent = 0
+    while session.stage == Stage.ARMED and silent < 200:
+        send(Phase.ARMED, margin=NO_MARGIN)
+        silent += 1
+    assert silent == 181
+    assert session.stage == Stage.STOPPED
+    assert session.cause == "90 % of the last 200 STATEs told no margin: nobody can say how late answers are"
 
 
 def test_a_clock_that_is_made_of_ticks_is_found_by_the_host(scenario, rungs):
@@ -191,7 +212,7 @@ def test_gaps_within_the_watchdog_are_allowed():
 @pytest.mark.parametrize("misses", [0, 1])
 def test_a_measurement_without_answers_ends(scenario, misses):
     """Whether or not the device counts what it does not hear."""
-    session, most = Session(scenario, Limits((12.0, 12.0)), Settings(measure=50)), 2 * (50 + 15)
+    session, most = Session(scenario, Limits((12.0, 12.0)), Settings(measure=50)), 8 * 50 + 2 * 15
     session.start(0)
     session.receive(encode(info_of(scenario)), 0)
     session.receive(encode(Ack(config_crc(session.config), 0)), 0)
@@ -208,3 +229,25 @@ def test_answers_that_never_arrive_count_in_the_quantile():
     assert ages.quantile(0.89) == 189
     with pytest.raises(Fault, match=r"10 % of the answers never arrived: no delay keeps 95 %"):
         ages.quantile(0.95)
+
+
+def test_a_link_that_brings_several_forces_at_once_is_measured():
+    """A USB frame of 1 ms with T = 0.3 ms: one margin for three FORCEs, of which none is missed."""
+    measurement = Measurement(50, 15, 3e-4, 0.2)
+    for k in range(1, 1000):
+        state = State(Phase.DISARMED, k, 0, 0, 0, 0, 300 * k, (0, 0), (0, 0))
+        if measurement.note(state, 3500 if k % 3 == 0 else None, 0):
+            break
+    assert measurement.result == Ages((1000,) * 50, 0)
+
+
+def test_an_identification_closes_no_loop_that_could_grow(scenario):
+    recorder = Recorder(2)
+    session = Session(scenario, Limits((1.0, 1.0)), Settings(measure=50))
+    session.record = recorder
+    tune = chirp(2, scenario.T, 1, 1.0, (3, 200), 0.5)
+    Rehearsal(session, Emulator(nobody(scenario)), lambda ages: [tune]).run_until_armed(0.6)
+    report = session_report.outcome("identify", session, recorder, 0)
+    assert len(recorder) > 400
+    assert report["growth"] == report["run"]["steady_ticks"] == []
+    assert growths(result_of(recorder, session.units, scenario.T, report)) == []

@@ -10,13 +10,15 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
-from design import jitter_exact
 from design.audit import main
-from design.jitter import blocks, half_widths, jitter_proof
-from design.jitter_lmi import block
+from design.jitter import blocks, half_widths, nominal_over_step
+from design.jitter_multiplier import jitter_proof
 from design.jitter_part import switching_part, switching_requirement
+from design.jitter_proof import prove_switching, storage
 from design.margin import closed_loop
+from design.rational import Matrix
 from design.solve import solve
+from design.store import DelayRange, Loop
 from sim.scenario import InputError
 
 T, DELTA = 1.2e-3, (1.37, 1.37)
@@ -26,6 +28,18 @@ SOFT = SpringDamper([878.767, 551.883], [0.386476, 0.521984])
 
 def sent(coupling=STIFF, T=T) -> Lti:
     return force_map(environment(FIGURE_4, T), coupling, (0, 0), (0, 0))
+
+
+def loop_of(lo, hi, delta=DELTA, network=FIGURE_4) -> Loop:
+    return Loop(T, lo, (0,) * len(lo), lo, delta, network, jitter=DelayRange(lo, hi))
+
+
+def block(z, G, alpha, lo, hi, damping):
+    """The condition's matrix for cvxpy at one z, affine in G (m, m), alpha (m,) and damping (m,) [N s/m]."""
+    c, h = nominal_over_step(np.array([z]), lo, hi)[0], half_widths(lo, hi)
+    passing, error = cp.diag(cp.Constant(c)) @ G, cp.diag(cp.Constant(h)) @ G
+    upper = (passing + cp.conj(passing).T) / 2 + cp.diag(damping / T - alpha / 2)
+    return cp.bmat([[upper, cp.conj(error).T], [error, cp.diag(2 * alpha)]])
 
 
 @pytest.mark.parametrize(("lo", "hi"), [(0, 0), (0, 1), (1, 2), (0, 3), (2, 5)])
@@ -60,7 +74,7 @@ def test_the_least_factor_is_that_of_a_convex_solver():
     s, a = cp.Variable(), cp.Variable(2, nonneg=True)  # alpha in units of delta/T, G in units of 1000 N/m
     scale = 1000.0
     conditions = [
-        block(complex(v), cp.Constant(g / scale), a, lo, hi, s * delta * (1 / scale), T)
+        block(complex(v), cp.Constant(g / scale), a, lo, hi, s * delta * (1 / scale))
         for v, g in zip(z, G.at(z), strict=True)
     ]
     problem = cp.Problem(cp.Minimize(s), [c + 0j >> 0 for c in conditions])
@@ -132,24 +146,26 @@ def test_what_is_refused():
 
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((1, 1), (1, 3)), ((1, 2), (1, 2))])
 def test_what_holds_is_proved_exactly(lo, hi):
-    found = switching_requirement(SOFT, FIGURE_4, sent(SOFT), (0, 0), lo, hi, DELTA)
+    found = switching_requirement(loop_of(lo, hi), SOFT)
     assert found.requirement.certified
     assert found.requirement.proof == "rational"
-    part = switching_part(found, sent(SOFT), lo, hi)
+    part = switching_part(found, sent(SOFT), DelayRange(lo, hi))
     # equal where nothing varies
     assert part["playout"]["required_damping"][0] <= part["required_damping"][0] * (1 + 1e-9)
     assert part["certified"]
 
 
 def test_what_does_not_hold_has_no_exact_proof():
-    found = switching_requirement(STIFF, FIGURE_4, sent(), (0, 0), (1, 1), (2, 2), DELTA)
+    loop = loop_of((1, 1), (2, 2))
+    found = switching_requirement(loop, STIFF)
     assert not found.requirement.certified
     assert found.requirement.proof == "sampled"
-    arguments = (FIGURE_4, T, (0, 0), (1, 1), (2, 2))
-    assert "violated" in jitter_exact.prove(STIFF, *arguments, DELTA, found.alpha)
+    assert str(prove_switching(loop, STIFF)).startswith("needs 2.041")
+    assert "violated" in storage(loop, STIFF, found.alpha)
     required = np.array(found.requirement.required)
-    assert jitter_exact.prove(STIFF, *arguments, tuple(required * (1 + 1e-4)), found.alpha) is None
-    assert jitter_exact.prove(STIFF, *arguments, tuple(required * (1 - 1e-4)), found.alpha) is not None
+    more, less = (loop_of((1, 1), (2, 2), tuple((required * f).tolist())) for f in (1 + 1e-4, 1 - 1e-4))
+    assert isinstance(storage(more, STIFF, found.alpha), Matrix)
+    assert isinstance(storage(less, STIFF, found.alpha), str)
 
 
 def test_a_wall_with_damping():

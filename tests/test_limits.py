@@ -7,7 +7,7 @@ import pytest
 
 from controller.environment import environment
 from controller.process import force_map
-from design import limits
+from design import limit_curve, limits, limits_report
 from design.ladder import LADDERS, SHORT, rung
 from design.limit_curve import AXES, Setting, measured, optimum, remembered, settings
 from design.limits import main
@@ -168,8 +168,8 @@ def test_interrupting_keeps_the_points_that_are_done(tmp_path, monkeypatch):
         (["--over", "delay=0:3"], "--over delay=0:3: delay starts at 0, but the channels differ by 1 samples"),
         (["--over", "delay=1.5:3"], "expected whole numbers of samples"),
         (["--points", "0"], "--points is 0, allowed are 1 to 100"),
-        (["--functions", "0"], "functions is 0, allowed are 1 to 200"),
-        (["--margin", "2"], "margin is 2.0, expected a share"),
+        (["--functions", "0"], "--functions is 0, allowed are 1 to 200"),
+        (["--margin", "2"], "--margin is 2.0, allowed are shares"),
         (["--case", "none"], "--case none has no coupling to design"),
         (["--ladder", "--over", "order"], "--over is for the curve, not for --ladder"),
         (["--ladder", "--diagonal"], "--diagonal is for the curve, not for --ladder"),
@@ -240,3 +240,24 @@ def test_the_ladder_is_a_command(tmp_path, monkeypatch):
     ]
     assert report["rows"][0]["rms_mismatch_db"] is None
     assert report["rows"][3]["relative_mismatch_db"] == pytest.approx(0.34, abs=0.005)
+
+
+# what is proved ---------------------------------------------------------------------------------------------------
+
+
+def test_a_point_says_what_is_proved_of_it(monkeypatch):
+    """Each design's own condition; a proof that fails leaves the point sampled, with the reason."""
+    setting = settings("order", LOOP, SMALL, 1)[0]
+    assert (optimum(setting).proof, optimum(setting).proof_reason) == ("rational", None)
+    infeasible = Setting(0.0, LOOP, Wish(functions=1, diagonal=True, filter="fir", high_gain=1.0))
+    assert optimum(infeasible).proof is None
+
+    def hopeless(*arguments):
+        raise limit_curve.NotProved("too many states")
+
+    monkeypatch.setattr(limit_curve, "prove", hopeless)
+    limit = measured(setting, "spring-damper", "theorem4", {})
+    assert (limit.proof, limit.proof_reason) == ("sampled", "too many states")
+    row = {"optimal": {"proof": "rational"}, "theorem4": {"proof": limit.proof}, "closed-loop": None}
+    assert limits_report._proofs(row) == "sampled: theorem4"
+    assert limits_report._proofs({"optimal": {"proof": None}}) == "-"

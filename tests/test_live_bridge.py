@@ -4,12 +4,15 @@ Nothing here judges timing: on a busy machine a session may end because the link
 any other. What must hold on every machine: a named end with its cause, no armed device left behind, a true trace.
 """
 
+import fcntl
 import json
 import os
 import select
 import signal
 import subprocess
 import sys
+import termios
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -18,11 +21,13 @@ import pytest
 from controller.jitter import Jitter
 from hw import bridge, identify, replay
 from hw import emulator as emulator_command
+from hw.desk import add_link_options, check_link
 from hw.live import Live
 from hw.plan import ladder, rung
 from hw.port import Port
 from hw.safety import ENDED, Limits, Stage
 from hw.session import Session, Settings
+from sim.command import Parser
 from sim.scenario import InputError
 from sim.scenario import load as scenario_of
 
@@ -112,12 +117,91 @@ def test_a_signal_ends_a_session_at_zero_force(emulator, scenario, rungs, name):
     assert live.signals == [getattr(signal, name)]
 
 
+class BridgeOnTerminal:
+    """hw.bridge with a terminal of its own, measuring for as long as the machine likes: nothing is armed."""
+
+    def __init__(self, out):
+        self.master, self.slave = os.openpty()
+        self.before = termios.tcgetattr(self.slave)
+        options = ["--emulate", "--case=I", "--pace=0.05", "--measure=100000", "--no-plot", f"--out={out}"]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "hw.bridge", *options],
+            env=os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm"},
+            stdin=self.slave,
+            stdout=self.slave,
+            stderr=self.slave,
+            start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+        )
+
+    @property
+    def settings(self):
+        return termios.tcgetattr(self.slave)
+
+    def read_until(self, word, patience=120.0):
+        """What it shows, until it shows `word` or is gone."""
+        shown, end = b"", time.monotonic() + patience
+        while word not in shown and time.monotonic() < end:
+            if select.select([self.master], [], [], 0.05)[0]:
+                shown += os.read(self.master, 65536)
+            elif self.process.poll() is not None:
+                break
+        return shown
+
+    def close(self):
+        self.process.kill()
+        self.process.wait()
+        os.close(self.master)
+        os.close(self.slave)
+
+
+def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
+    """With the dashboard drawing and single keys read; SIGQUIT by its key. All at once, since they mostly wait."""
+    bridges = {name: BridgeOnTerminal(tmp_path / name) for name in ("SIGQUIT", "SIGTERM", "SIGHUP")}
+    try:
+        for bridge_on in bridges.values():
+            assert b"measuring" in bridge_on.read_until(b"measuring")
+            assert not bridge_on.settings[3] & (termios.ICANON | termios.ECHO)
+        os.write(bridges["SIGQUIT"].master, b"\x1c")
+        for name in ("SIGTERM", "SIGHUP"):
+            os.kill(bridges[name].process.pid, getattr(signal, name))
+        for name, bridge_on in bridges.items():
+            shown = bridge_on.read_until(b"files: ")
+            assert bridge_on.process.wait(60) == 130
+            assert name.encode() in shown
+            assert bridge_on.settings == bridge_on.before
+            assert shown.rfind(b"\x1b[?25h") > shown.rfind(b"\x1b[?25l")  # the cursor is shown again
+    finally:
+        for bridge_on in bridges.values():
+            bridge_on.close()
+
+
 def test_an_exception_stops_the_device_first(emulator, scenario):
     def plan(ages):
         raise ZeroDivisionError("a mistake of ours")
 
     with pytest.raises(ZeroDivisionError):
         run(emulator, scenario, plan)
+
+
+def test_an_emulator_ends_with_the_bridge_that_started_it():
+    """However that ended: here by SIGKILL, which nobody can catch. An orphan would keep its terminal for minutes."""
+    code = (
+        "import argparse, os, time; from hw.emulate import spawned\n"
+        "args = argparse.Namespace(case='I', scenario=None, theta=None, psi=None, lam=None, delta=None, T=None)\n"
+        "args.fault, args.pace = [], '0.2'\n"
+        "with spawned(args, 0, 60.0) as path: print(path, flush=True); time.sleep(600)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    bridge_like = subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+    path = bridge_like.stdout.readline().strip()
+    assert Path(path).exists()
+    bridge_like.kill()
+    bridge_like.communicate()
+    end = time.monotonic() + 60
+    while Path(path).exists() and time.monotonic() < end:
+        time.sleep(0.02)
+    assert not Path(path).exists()
 
 
 def test_a_coupling_that_is_not_certified_is_not_armed(emulator, scenario):
@@ -146,6 +230,7 @@ def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
         (["--port", "/nowhere", "--arm"], "--port /nowhere"),
         (["--emulate", "--case", "none"], "no coupling"),
         (["--emulate", "--baud", "5"], "--baud is 5, allowed are"),
+        (["--emulate", "--baud", "no"], "--baud is 'no', expected a whole number"),
         (["--emulate", "--quantile", "2"], "--quantile is 2"),
         (["--emulate", "--guard", "nan"], "--guard is nan"),
         (["--emulate", "--measure", "1"], "--measure is 1"),
@@ -163,6 +248,39 @@ def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
     with pytest.raises(InputError) as error:
         bridge.main(options)
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "baud"),
+    [
+        (["--emulate"], None),
+        (["--emulate", "--baud", "115200"], 115_200),
+        (["--port", "/dev/ttyACM0", "--arm"], 921_600),  # may be an Uno, with a UART behind its USB chip
+        (["--port", "/dev/ttyACM0", "--arm", "--baud", "none"], None),
+        (["--port", "/dev/ttyUSB0", "--arm", "--baud", "2000000"], 2_000_000),
+    ],
+)
+def test_only_a_uart_has_a_baud_rate(options, baud):
+    parser = Parser("x", "", "")
+    add_link_options(parser)
+    assert check_link(parser.parse_args(options)).baud == baud
+
+
+def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
+    """By its own name, or by a link as socat makes them; the port opens all the same."""
+    master, slave = os.openpty()
+    link = tmp_path / "haptic"
+    link.symlink_to(os.ttyname(slave))
+    parser = Parser("x", "", "")
+    add_link_options(parser)
+    for path in (os.ttyname(slave), str(link)):
+        settings = check_link(parser.parse_args(["--port", path, "--arm"]))
+        assert settings.baud is None
+        with Port(path, settings.baud) as port:
+            assert port.write(b"\x01") == 1
+            assert os.read(master, 1) == b"\x01"
+    os.close(master)
+    os.close(slave)
 
 
 @pytest.mark.parametrize("module", [bridge, emulator_command, identify])

@@ -15,12 +15,12 @@ from controller.process import force_map
 from design.assess import specification
 from design.cone_program import Block, ConeProgram, vectors
 from design.cone_solver import solve_cones
-from design.cutting_planes import HIGH_HZ, PASSIVE_SHARE, SLACK, Problem, square_mismatch
+from design.cutting_planes import HIGH_HZ, PASSIVE_SHARE, SLACK, Problem, sketch, square_mismatch
 from design.failure import Infeasible
 from design.free_parameter import FreeParameter, GivenParameter
 from design.inequalities import passivity
 from design.margin import closed_loop
-from design.optimal import advice, design, parameter, world
+from design.optimal import advice, binding, changes, design, parameter, world, worlds
 from design.result import Design
 from design.specification import Specification
 from design.sweep import on_circle
@@ -358,7 +358,7 @@ def test_where_no_change_of_the_basis_helps_the_damping_is_named():
         ({"objective": "peak"}, "objective is 'peak', allowed are rms, sup"),
         ({"high_gain": 0.5}, "high_gain is 0.5, expected a factor of at least 1"),
         ({"high_gain": float("nan")}, "high_gain is nan"),
-        ({"margin": 0.0}, "margin is 0.0, expected a share"),
+        ({"margin": 0.0}, "margin is 0.0, allowed are shares"),
         ({"margin": 1.0}, "margin is 1.0"),
     ],
 )
@@ -395,3 +395,32 @@ def test_slow_poles_hide_no_violation_at_low_frequency():
     missed = passivity(world(spec), np.asarray(spec.delta)).missed(given, {}, SLACK)
     assert missed.size > 0
     assert missed.max() < 1e-5
+
+
+def test_what_is_in_the_way_is_what_the_others_can_do_without():
+    """Q = 0 meets all but the closed-loop condition. Here a stable V forbids what that asks; without it Q exists."""
+    wall = Network(("tip",), (Spring(("tip", "ground"), 2000.0, 0.2),))
+    spec = Specification(environment(wall, 1e-3), (0,), (0,), (0,), (0.02,))
+    wish = Wish(functions=4, filter="fir", high_gain=None)
+    assert binding(spec, wish) == "the closed-loop condition and a stable V contradict each other"
+    Q = sketch(parameter(spec, wish), wish, worlds(spec), np.array(spec.delta), ["a stable V"]).parameter(1e-3)
+    z = np.exp(1j * np.linspace(1e-3, np.pi, 2000))
+    assert (1 - spec.environment.at(z) @ Q.at(z)).real.min() < 0.02  # and V is what it gives up
+    late = replace(SPEC["I"], theta=(4, 4), lam=(4, 4))
+    assert binding(late, Wish(functions=4, filter="fir", high_gain=None)) == "the closed-loop condition binds"
+    assert "contradict each other" in advice(spec, wish)
+
+
+def test_a_margin_that_costs_the_solution_is_named():
+    """With nearly all of the damping left unused there is no coupling, with the default margin there is one."""
+    greedy = Wish(margin=0.99)
+    with pytest.raises(Infeasible, match=r"--margin 0\.005"):
+        design(SPEC["I"], greedy)
+    assert design(SPEC["I"], replace(greedy, margin=0.005)).requirement.certified
+
+
+def test_the_search_for_a_reason_says_how_far_it_is():
+    seen = []
+    advice(replace(SPEC["I"], theta=(4, 4), lam=(4, 4)), Wish(functions=1), lambda *at: seen.append(at[1:]))
+    assert seen == [(k, len(changes(Wish(functions=1)))) for k in range(len(seen))]
+    assert len(seen) > 3

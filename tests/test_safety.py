@@ -123,7 +123,8 @@ def test_wire_time_is_what_the_frames_take(baud, microseconds):
 def test_115200_baud_is_refused_with_the_arithmetic():
     reasons = objections(INFO, load(), Limits((12.0, 12.0)), 115_200)
     assert reasons == [
-        "one STATE and one FORCE take (32 + 16) bytes x 10 bits / 115200 baud = 4167 us, more than T = 1200 us"
+        "one STATE and one FORCE take (32 + 16) bytes x 10 bits / 115200 baud = 4167 us, more than T = 1200 us "
+        "(of a link without UART say --baud none)"
     ]
 
 

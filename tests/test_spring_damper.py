@@ -12,7 +12,7 @@ from controller.process import force_map
 from design.analysis import analysis
 from design.delayed import theorem4_delayed
 from design.failure import DesignFailed, Infeasible
-from design.gain_set import gain_set
+from design.gain_set import gain_set, solve_within
 from design.margin import closed_loop, theorem4
 from design.shaping import Shaping
 from design.solve import CROSS_CHECK, solve
@@ -234,3 +234,31 @@ def test_an_unknown_condition_is_refused():
 def test_too_much_damping_leaves_no_stiffness():
     with pytest.raises(Infeasible, match=r"B = 3 N s/m leaves no stiffness with delta = 1\.37"):
         stiffest_at(3.0, 1, 1.37, T)
+
+
+def largest_sum(theta, sigma, largest_gram):
+    gains = cp.Variable(2)
+    objective = cp.Maximize(gains[0] + 0.2 * gains[1])
+    solve_within(objective, gains, (theta,), np.array([sigma]), "a test", largest_gram=largest_gram)
+    return gains.value
+
+
+@pytest.mark.parametrize(("theta", "sigma"), [(1, np.inf), (5, np.inf), (12, np.inf), (2, 5.0), (7, 3.0)])
+def test_cones_at_frequencies_end_where_the_matrix_inequality_does(theta, sigma):
+    """The optimum to 5e-6: the cones may miss 2e-6 of the damping. The gains themselves lie on a flat boundary."""
+    by_matrix, by_cones = (largest_sum(theta, sigma, largest_gram) for largest_gram in (100, 0))
+    weights = np.array([1, 0.2])
+    assert by_cones @ weights == pytest.approx(by_matrix @ weights, rel=1e-5)
+    np.testing.assert_allclose(by_cones, by_matrix, rtol=3e-3)
+
+
+def test_a_long_delay_is_designed_for_in_seconds_and_passes_a_dense_sweep():
+    """50 samples; |y|^2 <= 4 delta (K T/2 + B) at 200001 frequencies, 1/125 of a ripple apart in phase."""
+    made = stiffest(specification(theta=(50, 50)))
+    z, n = np.exp(1j * np.linspace(0, np.pi, 200_001)), 51
+    for K, B in zip(made.coupling.K, made.coupling.B, strict=True):
+        y = K * T * np.polyval(np.ones(n), 1 / z) + B * (1 - z**-n)
+        needed = (np.abs(y) ** 2).max() / (4 * (K * T / 2 + B))
+        assert 0.9997 * 1.37 < needed < 1.37
+        # no linear law is stiffer than 2 delta/(n T), and a spring alone reaches half of that
+        assert 1.37 / (n * T) < K < 2 * 1.37 / (n * T)

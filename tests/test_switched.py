@@ -108,7 +108,7 @@ def test_greedy_ages_repeat_the_trajectory_that_chose_them():
     drawn = jitter.draw(np.random.default_rng(0), ticks)[:, :, None]
     rates = []
     for each in (delays, drawn):
-        free = unlimited(process, each)
+        free = replace(unlimited(process), delays=each)
         engine = ExactBatchEngine(held, free.force_limit)
         rates.append(knocked(free, engine, ASSEMBLY.scene, held.A.shape[1], ticks, 1).rate[0])
     assert rates[0] > 0 > rates[1]

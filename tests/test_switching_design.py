@@ -11,7 +11,7 @@ from controller.process import force_map
 from design.__main__ import main
 from design.assess import specification
 from design.failure import DesignFailed
-from design.jitter import jitter_proof
+from design.jitter_multiplier import jitter_proof
 from design.optimal import design as optimal_design
 from design.spring_damper import design
 from design.store import load as load_stored

@@ -1,13 +1,17 @@
 """A thousand humans at once give what each alone gives, in both engines, however the work is split."""
 
 import json
+import multiprocessing
+import os
+import signal
 import sys
+import threading
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
-from controller.coupling import NoCoupling
+from controller.coupling import NoCoupling, SpringDamper
 from design.published import CASE_I
 from models.crowd import Crowd, variants
 from models.device import RigidDevice
@@ -15,7 +19,7 @@ from models.human import Person
 from models.scene import build, plant
 from sim import examine as examine_module
 from sim import run as run_command
-from sim import shards
+from sim import shards, verdict_report
 from sim.batch_engine import ExactBatchEngine
 from sim.couplings import choose
 from sim.exact_engine import ExactEngine, hold
@@ -250,6 +254,31 @@ def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["interrupted"]
     assert report["humans"] == examine_module.BATCH
+
+
+def test_ctrl_c_ends_the_batches_that_run_in_other_processes():
+    """A batch of an hour and a half of simulated time each would otherwise be waited for."""
+    scenario = load("omega-pair")
+    question = Question(scenario, SpringDamper([500, 500], [0.4, 0.4]), 0, 250, 1, "mujoco", 50_000.0)
+    before = set(multiprocessing.active_children())
+    timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    found = validate(question, shards=2)
+    timer.join()
+    assert found.interrupted
+    assert found.index.size == 0
+    assert set(multiprocessing.active_children()) <= before
+
+
+@pytest.mark.parametrize("duration", [0.5, 60.0])
+def test_hands_that_had_no_time_to_rest_are_no_verdict(duration):
+    """Against the slowest eigenvalue of the same humans, by the exact engine."""
+    question = Question(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", duration)
+    found = validate(question)
+    traces = verdict_report.outcome(question, found, True, 1.0)["traces"]
+    assert traces["slowest_decay_s"] == pytest.approx(-1 / found.exact.max())
+    assert traces["settling_decides"] == (duration > 30)
+    assert ("reason" in traces) == (duration < 30)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,6 @@
 /* A two-axis device on the serial link: quadrature encoders, PWM and direction to two motor drivers, an enable line and
  * an emergency stop. For boards with native USB (Teensy 4, Due, Zero, Portenta): their write buffer holds an INFO and a
- * STATE at once. Put haptic_link.h beside it.
+ * STATE at once. Put haptic_link.h and haptic_frame.h beside it.
  *
  * Yours to change: the pins, the numbers of INFO (measure them; docs/protocol.md says what the host does with each), and
  * the five functions. Everything that keeps hands whole is in haptic_link.h: leave it as it is. */

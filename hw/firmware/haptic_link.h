@@ -1,5 +1,6 @@
 /* The device's side of the serial link in portable C99 (and C++11): no floats, no malloc, no clock and no port.
- * The rules and every byte: docs/protocol.md. The tests hold it to hw/device.py, the same machine, byte for byte.
+ * The rules and every byte: docs/protocol.md; the frames: haptic_frame.h. The tests hold it to hw/device.py, the same
+ * machine, byte for byte.
  *
  *   hl_init     once; the device is silent and its motors carry nothing
  *   hl_receive  for every byte that comes
@@ -10,9 +11,8 @@
 #ifndef HAPTIC_LINK_H
 #define HAPTIC_LINK_H
 
-#include <stdbool.h>
-#include <stddef.h>
-#include <stdint.h>
+#include "haptic_frame.h"
+
 #include <string.h>
 
 #ifndef HL_MAX_AXES
@@ -23,7 +23,6 @@
 #define HL_SLOTS 16                 /* forces that wait for their tick: a power of two above HL_MAX_THETA */
 #define HL_MAX_RELEASE_NS 20000000u /* longest hold and ramp together */
 #define HL_NO_MARGIN (-32767 - 1)   /* no FORCE came since the last STATE */
-#define HL_MAX_FRAME 175            /* longest frame of the protocol without its delimiter: INFO for eight axes */
 #define HL_MAX_OUT (HL_MAX_FRAME + 1 + 12 + 20 + 6 * HL_MAX_AXES) /* INFO, ACK and STATE in one tick */
 
 enum { HL_HELLO = 1, HL_INFO, HL_CONFIG, HL_ACK, HL_STATE, HL_FORCE, HL_STOP };
@@ -63,63 +62,14 @@ typedef struct {
 typedef struct {
     hl_info info;
     hl_config config;
-    bool configured, asked, answered, skipping;
+    bool configured, asked, answered;
     uint8_t phase, cause, refused, rejected, misses, held, ramp_left;
     uint16_t k, echo, run;
     uint32_t now, config_crc;
     int16_t margin, applied[HL_MAX_AXES], ramp_from[HL_MAX_AXES];
     hl_slot slot[HL_SLOTS];
-    uint8_t frame[HL_MAX_FRAME], length;
+    hl_receiver in;
 } hl_device;
-
-/* ---- bytes ------------------------------------------------------------------------------------------------------ */
-
-static inline uint8_t *hl_put16(uint8_t *p, uint16_t v)
-{
-    p[0] = (uint8_t)(v & 0xFFu);
-    p[1] = (uint8_t)(v >> 8);
-    return p + 2;
-}
-
-static inline uint8_t *hl_put32(uint8_t *p, uint32_t v)
-{
-    return hl_put16(hl_put16(p, (uint16_t)(v & 0xFFFFu)), (uint16_t)(v >> 16));
-}
-
-static inline uint16_t hl_get16(const uint8_t *p) { return (uint16_t)(p[0] | ((uint16_t)p[1] << 8)); }
-
-static inline int16_t hl_signed(uint16_t v) { return (int16_t)(v < 0x8000u ? (int32_t)v : (int32_t)v - 0x10000); }
-
-/* CRC-32 as in zlib and Ethernet, four bits at a time: 64 bytes of table. */
-static inline uint32_t hl_crc(const uint8_t *p, size_t n)
-{
-    static const uint32_t table[16] = {0x00000000u, 0x1DB71064u, 0x3B6E20C8u, 0x26D930ACu, 0x76DC4190u, 0x6B6B51F4u,
-                                       0x4DB26158u, 0x5005713Cu, 0xEDB88320u, 0xF00F9344u, 0xD6D6A3E8u, 0xCB61B38Cu,
-                                       0x9B64C2B0u, 0x86D3D2D4u, 0xA00AE278u, 0xBDBDF21Cu};
-    uint32_t crc = 0xFFFFFFFFu;
-    while (n--) {
-        crc ^= *p++;
-        crc = (crc >> 4) ^ table[crc & 15u];
-        crc = (crc >> 4) ^ table[crc & 15u];
-    }
-    return ~crc;
-}
-
-/* Makes a frame of the n payload bytes at frame[1], in place; its length. */
-static inline size_t hl_stuff(uint8_t *frame, size_t n)
-{
-    size_t code = 0, i;
-    hl_put32(frame + 1 + n, hl_crc(frame + 1, n));
-    n += 4;
-    for (i = 1; i <= n; i++)
-        if (frame[i] == 0) {
-            frame[code] = (uint8_t)(i - code);
-            code = i;
-        }
-    frame[code] = (uint8_t)(n + 1 - code);
-    frame[n + 1] = 0;
-    return n + 2;
-}
 
 /* ---- safety states ---------------------------------------------------------------------------------------------- */
 
@@ -253,31 +203,12 @@ static inline void hl_understand(hl_device *d, const uint8_t *p, size_t n, uint3
     else d->rejected++;
 }
 
-/* One byte that came at `now` [us]. Whatever cannot be read is counted and dropped up to the next delimiter. */
+/* One byte that came at `now` [us]. Whatever cannot be read is counted and dropped. */
 static inline void hl_receive(hl_device *d, uint8_t byte, uint32_t now)
 {
-    size_t i = 0, n = d->length;
-    if (byte != 0) {
-        if (d->length < HL_MAX_FRAME) d->frame[d->length++] = byte;
-        else if (!d->skipping) {
-            d->skipping = true;
-            d->rejected++;
-        }
-        return;
-    }
-    d->length = 0;
-    if (d->skipping || n == 0) {
-        d->skipping = false;
-        return;
-    }
-    while (i < n) {
-        uint8_t code = d->frame[i];
-        d->frame[i] = 0;
-        i += code;
-    }
-    /* the CRC-32 over a payload and its own CRC-32 is the same for all payloads */
-    if (i != n || n < 6 || hl_crc(d->frame + 1, n - 1) != 0x2144DF1Cu) d->rejected++;
-    else hl_understand(d, d->frame + 1, n - 5, now);
+    int n = hl_collect(&d->in, byte);
+    if (n < 0) d->rejected++;
+    else if (n > 0) hl_understand(d, d->in.bytes + 1, (size_t)n, now);
 }
 
 /* ---- the tick --------------------------------------------------------------------------------------------------- */
