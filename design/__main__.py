@@ -118,7 +118,7 @@ def _parser() -> Parser:
     ccl.add_argument("--compare", action="store_true", help="run every method, one state per channel (a minute)")
     optimal = parser.add_argument_group("optimal: the best Q in the pair with a model of the environment")
     optimal.add_argument("--functions", metavar="N", help="basis functions of each entry of Q (default 8)")
-    optimal.add_argument("--filter", choices=FILTERS, help="poles of the basis (default auto: by the delays)")
+    optimal.add_argument("--filter", choices=FILTERS, help="poles of the basis (default auto: by delays and functions)")
     optimal.add_argument("--objective", choices=OBJECTIVES, help="which mismatch is minimised (default rms)")
     optimal.add_argument("--high-gain", metavar="G", help="limit of |F|/|E| above 100 Hz, or none (default 1.5)")
     optimal.add_argument("--margin", metavar="SHARE", help="of the damping that stays unused (default 0.005)")

@@ -30,8 +30,11 @@ SOLVED = ("Solved", "AlmostSolved", "InsufficientProgress")
 NO_SOLUTION = ("PrimalInfeasible", "AlmostPrimalInfeasible")
 
 
-def solve_cones(program: ConeProgram, what: str) -> Array:
-    """A verified minimiser x. `what` names the program in the message of an error.
+def solve_cones(program: ConeProgram, what: str) -> tuple[Array, Array]:
+    """(a verified minimiser x, the multipliers). `what` names the program in the message of an error.
+
+    The multipliers are those of the equalities, then of the rows of each block, frequency by frequency: what x gains
+    when these move, so they only matter to someone who wants to move them, and are not verified.
 
     Raises Infeasible when the solver proves that there is none, DesignFailed otherwise.
     """
@@ -39,13 +42,13 @@ def solve_cones(program: ConeProgram, what: str) -> Array:
     attempts: list[Attempt] = []
     for name, options in LADDER.items():
         started = time.perf_counter()
-        solution = clarabel.DefaultSolver(P, q, A, b, cones, _settings(options)).solve()
+        solution: Any = clarabel.DefaultSolver(P, q, A, b, cones, _settings(options)).solve()
         status, x = str(solution.status), np.array(solution.x)
         reason = _doubt(program, status, x)
         value = None if reason else program.objective(x)
         attempts.append(Attempt(name, status, value, time.perf_counter() - started, reason))
         if reason is None:
-            return x
+            return x, np.array(solution.z)
         if status in NO_SOLUTION:
             raise Infeasible(program, attempts, f"{what} has no solution ({name}: {status})")
     statuses = ", ".join(f"{a.settings}: {a.status}" for a in attempts)

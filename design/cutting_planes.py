@@ -14,13 +14,14 @@ from scipy.linalg import block_diag
 
 from controller.coupling import InternalModel
 from controller.lti import Array
-from design.cone_program import Block, ConeProgram
+from design.cone_program import Block, ConeProgram, vectors
 from design.cone_solver import solve_cones
 from design.failure import DesignFailed
 from design.free_parameter import FreeParameter, GivenParameter
 from design.inequalities import (
     BOUND,
     Inequality,
+    Parameter,
     World,
     bounded_mismatch,
     high_frequency_limit,
@@ -49,14 +50,19 @@ def cut(Q: FreeParameter, wish: Wish, worlds: Sequence[World], delta: Array) -> 
     Raises Infeasible where the inequalities contradict each other, DesignFailed where they still fail after all rounds.
     """
     problem = Problem.of(Q, wish, worlds, delta)
-    imposed, missed = [one.imposed for one in problem.inequalities], []
+    optimum, rounds = cut_problem(problem)
+    return problem.Q.coupling(optimum.x), rounds
+
+
+def cut_problem(problem: Problem, imposed: Sequence[Array] | None = None) -> tuple[Optimum, int]:
+    """(the optimum with all the frequencies that had to be imposed, rounds), from these or the usual ones. As `cut`."""
+    imposed, missed = imposed or [one.imposed for one in problem.inequalities], []
     for rounds in range(1, MOST_ROUNDS + 1):
-        x, shared = problem.optimum(imposed)
-        coupling = Q.coupling(x)
-        given = GivenParameter(coupling)
-        missed = [one.missed(given, shared, SLACK) for one in problem.inequalities]
+        optimum = problem.optimum(imposed)
+        given = GivenParameter(problem.Q.coupling(optimum.x))
+        missed = [one.missed(given, optimum.shared, SLACK) for one in problem.inequalities]
         if not any(w.size for w in missed):
-            return coupling, rounds
+            return optimum, rounds
         imposed = [np.union1d(w, more) for w, more in zip(imposed, missed, strict=True)]
     names = ", ".join(one.name for one, w in zip(problem.inequalities, missed, strict=True) if w.size)
     raise DesignFailed(None, (), f"after {MOST_ROUNDS} rounds of cutting planes {names} still fails in between")
@@ -71,7 +77,17 @@ def sketch(
     """
     problem = Problem.of(Q, wish, worlds, delta)
     problem = replace(problem, inequalities=[one for one in problem.inequalities if one.name not in without])
-    return Q.coupling(problem.optimum([one.imposed for one in problem.inequalities])[0])
+    return Q.coupling(problem.optimum([one.imposed for one in problem.inequalities]).x)
+
+
+@dataclass(frozen=True, eq=False)
+class Optimum:
+    """The solution with the inequalities at some frequencies."""
+
+    x: Array  # (n,) coefficients of Q
+    shared: dict[str, float]
+    imposed: Sequence[Array]  # where, one array for each inequality [rad/sample]
+    multipliers: Sequence[Array]  # (k * d,), of the rows of each inequality
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +111,17 @@ class Problem:
         statics = [block for block in (static_stiffness(world, Q) for world in worlds) if block is not None]
         return cls(Q, worlds, squares, inequalities, statics)
 
-    def optimum(self, imposed: Sequence[Array]) -> tuple[Array, dict[str, float]]:
-        """(x, shared unknowns) with the inequalities at the frequencies `imposed`, one array for each.
+    @property
+    def shared(self) -> list[str]:
+        """The names of the unknowns beside Q."""
+        return list(dict.fromkeys(name for one in self.inequalities for name in one.shared))
+
+    def optimum(self, imposed: Sequence[Array]) -> Optimum:
+        """The solution with the inequalities at the frequencies `imposed`, one array for each.
 
         It is sought in coordinates where every direction of Q changes the loop alike.
         """
-        names = list(dict.fromkeys(name for one in self.inequalities for name in one.shared))
+        names = self.shared
         blocks = [one.unknowns(w, self.Q, names) for one, w in zip(self.inequalities, imposed, strict=True)]
         blocks += [block.padded(len(names)) for block in self.statics]
         A, b = mean_square_mismatch(self.worlds, self.Q)
@@ -117,8 +138,11 @@ class Problem:
             E=E,
             e=np.zeros(E.shape[0]),
         )
-        x = change @ solve_cones(program, "the optimal coupling")
-        return x[:size], dict(zip(names, x[size:].tolist(), strict=True))
+        y, multipliers = solve_cones(program, "the optimal coupling")
+        x = change @ y
+        ends = np.cumsum([E.shape[0], *(vectors(block.constant).size for block in blocks)])
+        each = np.split(multipliers, ends)[1 : len(imposed) + 1]
+        return Optimum(x[:size], dict(zip(names, x[size:].tolist(), strict=True)), imposed, each)
 
 
 def asked(wish: Wish, world: World, delta: Array) -> list[Inequality]:
@@ -137,14 +161,14 @@ def band(world: World) -> Array:
     return frequencies(world.environment, low=low, high=min(high, np.pi), points=80)
 
 
-def mean_square_mismatch(worlds: Sequence[World], Q: FreeParameter) -> tuple[Array, Array]:
+def mean_square_mismatch(worlds: Sequence[World], Q: Parameter) -> tuple[Array, Array]:
     """A and b with |A x - b|^2 the mean of `square_mismatch` over the worlds."""
     parts = [square_mismatch(world, Q) for world in worlds]
     root = np.sqrt(len(worlds))
     return np.vstack([A for A, _ in parts]) / root, np.concatenate([b for _, b in parts]) / root
 
 
-def square_mismatch(world: World, Q: FreeParameter) -> tuple[Array, Array]:
+def square_mismatch(world: World, Q: Parameter) -> tuple[Array, Array]:
     """A and b with |A x - b|^2 the mean over log frequency of |M|_F^2/|E|_F^2 in the band."""
     w = band(world)
     z = on_circle(w)

@@ -15,7 +15,7 @@ KINDS = {"spring-damper": ("theorem4", "closed-loop"), "ccl": ("theorem4",), "op
 METHODS = ("complementarity", "inner", "fixed-poles")
 
 #: where the poles of an optimal coupling's basis may lie, and which mismatch it minimises
-FILTERS = ("auto", "fir", "slow", "mixed")
+FILTERS = ("auto", "fir", "slow", "mixed", "repeated", "adapted")
 OBJECTIVES = ("rms", "sup")
 
 

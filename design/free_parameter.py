@@ -78,6 +78,10 @@ class GivenParameter:
 
     given: InternalModel
 
+    @property
+    def size(self) -> int:
+        return 0
+
     def at(self, z: Complex) -> Response:
         """Q(z) [m/N]."""
         Q = np.einsum("zk,kij->zij", basis(self.given.poles, z), self.given.Q)

@@ -20,6 +20,11 @@ CLOSED_LOOP, SWITCHING = "the closed-loop condition", "the condition for switchi
 class Parameter(Protocol):
     """Q with or without unknowns."""
 
+    @property
+    def size(self) -> int:
+        """The number of unknowns."""
+        ...
+
     def at(self, z: Complex) -> Response:
         """Q(z): what it is and how it changes with the unknowns."""
         ...
@@ -191,5 +196,5 @@ def _imposed(world: World, points: int) -> Array:
     return frequencies(world.environment, low=1e-3, points=points)
 
 
-def _swept(world: World, low: float = 1e-5) -> Array:
+def _swept(world: World, low: float = 1e-6) -> Array:
     return frequencies(world.environment, low=low, points=2000)

@@ -77,8 +77,8 @@ FULL = (
     *SHORT[4:],
     _optimal(16, high_gain=None),
     _optimal(16, diagonal=False, filter="mixed", high_gain=None),
-    _optimal(37, diagonal=False, filter="mixed", high_gain=None),
-    _optimal(37, diagonal=False, filter="mixed", high_gain=None, objective="sup"),
+    _optimal(37, diagonal=False, high_gain=None),
+    _optimal(37, diagonal=False, high_gain=None, objective="sup"),
 )
 LADDERS = {"short": SHORT, "full": FULL}
 

@@ -26,6 +26,7 @@ from design.free_parameter import FreeParameter
 from design.inequalities import CLOSED_LOOP, SWITCHING, World
 from design.jitter_multiplier import jitter_proof
 from design.margin import closed_loop
+from design.pole_descent import descend
 from design.result import Design
 from design.set_advice import Progress, set_advice
 from design.specification import Specification
@@ -77,9 +78,11 @@ def searched(spec: Specification, wish: Wish) -> tuple[InternalModel, Specificat
     Between the vertices of a box nothing is convex: the coupling is tried at points inside, and those where it violates
     the condition become further environments, the worst first.
     """
-    total, added = 0, 0
+    total, added, Q = 0, 0, parameter(spec, wish)
+    if wish.filter == "adapted":
+        Q, total = descend(Q, wish, worlds(spec), np.asarray(spec.delta))
     while True:
-        coupling, rounds = cut(parameter(spec, wish), wish, worlds(spec), np.asarray(spec.delta))
+        coupling, rounds = cut(Q, wish, worlds(spec), np.asarray(spec.delta))
         total += rounds
         violated = violators(spec, coupling, 1 - wish.margin / 2)
         if not violated or added == MOST_ADDITIONS:
