@@ -7,6 +7,7 @@ Names are loaded when they are first used: a command must not wait for what it d
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
     from design.margin import Requirement
     from design.result import Design
     from design.store import Loop
+
+if sys.argv[:1] == ["-m"]:  # a command starts, and may be interrupted; scripts do not need sim for a design
+    import sim  # noqa: F401
 
 __all__ = ["Design", "DesignFailed", "Loop", "Requirement", "certify", "design_coupling"]
 

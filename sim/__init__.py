@@ -12,11 +12,15 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from sim.interrupt import while_starting
+
 if TYPE_CHECKING:
     from sim.api import simulate, validate
     from sim.examine import Findings
     from sim.result import Result
     from sim.scenario import InputError, Scenario, load, parse
+
+while_starting()
 
 __all__ = ["Findings", "InputError", "Result", "Scenario", "load", "parse", "simulate", "validate"]
 
