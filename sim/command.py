@@ -13,13 +13,12 @@ from rich.progress import Progress
 
 from controller.lti import SingularLoop
 from design.failure import DesignFailed
+from models.device import MOST_DAMPING
 from sim.files import check_file, folder, nobody_reads
 from sim.interrupt import INTERRUPTED, begun
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
 
 DONE, DOES_NOT_HOLD, BAD_INPUT = 0, 1, 2  # and INTERRUPTED, which sim.interrupt has
-
-MOST_DAMPING = 1e4  # [N s/m] of a device, as models.device has it
 
 Number = TypeVar("Number", int, float)
 
