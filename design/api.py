@@ -1,4 +1,4 @@
-"""`from design import design_coupling, certify`: what python -m design does, for scripts. SI units."""
+"""`from design import design_coupling, certify, ..`: what python -m design does, for scripts. SI units."""
 
 from __future__ import annotations
 
@@ -9,15 +9,14 @@ from typing import Literal, TypedDict, Unpack
 from controller.coupling import Coupling
 from controller.process import force_map
 from design import designs, promises
-from design.argument import bare, known, of_kind
+from design.argument import bare, known, of_kind, one_of
 from design.assess import assess, specification
 from design.jitter_part import switching_requirement
 from design.margin import Requirement
 from design.result import Design
 from design.set_check import check_set
 from design.store import Loop, Stored, data_of
-from design.transparency import Transparency
-from design.transparency import transparency as figures_of
+from design.transparency import Transparency, transparency
 
 LOOP = 'a Loop, as scenario.loop("I") gives it'
 
@@ -52,8 +51,8 @@ def design_coupling(
     condition or loop that makes no sense, DesignFailed where no such coupling exists.
     """
     of_kind("loop", loop, Loop, LOOP)
-    if kind in designs.KINDS:
-        known(options, designs.OPTIONS[kind], f"kind {kind!r}")
+    one_of("kind", kind, designs.KINDS)
+    known(options, designs.OPTIONS[kind], f"kind {kind!r}")
     return designs.design_coupling(specification(loop), kind, condition, **options)
 
 
@@ -96,7 +95,7 @@ def promise(loop: Loop, requirements: dict[str, Requirement]) -> str | None:
     return promises.promise_of(requirements, loop, whole_set)
 
 
-def transparency(loop: Loop, coupling: Coupling | Design) -> Transparency:
+def transparency_of(loop: Loop, coupling: Coupling | Design) -> Transparency:
     """How close what the devices feel comes to the environment: figures of the mismatch (8), M = F - Lambda E.
 
     `mismatch_db` is its largest share of the environment between 0.5 and 80 Hz, `rms_mismatch_db` the mean one: 0 dB
@@ -108,7 +107,7 @@ def transparency(loop: Loop, coupling: Coupling | Design) -> Transparency:
     of_kind("loop", loop, Loop, LOOP)
     E = specification(loop).environment
     F = force_map(E, _fitting(loop, coupling), loop.theta, loop.psi)
-    return figures_of(F, E, loop.lam)
+    return transparency(F, E, loop.lam)
 
 
 def _fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:

@@ -103,7 +103,7 @@ def test_delays_that_vary_are_simulated():
         (lambda: validate(SHORT, duration=1e-3), "duration is 0.001, allowed are 0 and 0.0048 s or more"),
         (lambda: validate(SHORT, shards=0), "shards is 0"),
         (lambda: validate(SHORT.replace(device=(RigidDevice(friction=0.2),) * 2)), r"device\[0\].friction is 0.2 N"),
-        (lambda: design_coupling(SHORT.loop("I"), "rubber"), "coupling is 'rubber', allowed are spring-damper"),
+        (lambda: design_coupling(SHORT.loop("I"), "rubber"), "kind is 'rubber', allowed are spring-damper"),
         (lambda: certify(SHORT.loop("I"), SpringDamper([1.0], [0.0])), "K has 1 entries, .* has 2 contacts"),
     ],
 )
