@@ -32,5 +32,5 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
-    except ValueError as error:  # numbers that no device, or no certificate, can have
+    except (TypeError, ValueError) as error:  # numbers that no device, or no certificate, can have
         sys.exit(f"error: {error}")

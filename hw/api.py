@@ -75,12 +75,14 @@ def rehearse(
     def plan(ages: Ages) -> list[Rung]:
         delays.append(1e-6 * ages.median)
         link = link_delay(ages, 1e6 * scenario.T, QUANTILE, GUARD_US)
-        rungs.extend(
-            ladder(scenario, case, None, None, link) if alone is None else [_given(scenario, case, alone, link)]
-        )
+        found = ladder(scenario, case, None, None, link) if alone is None else [_given(scenario, case, alone, link)]
+        rungs.extend(found)
         return rungs
 
+    stopped: list[float] = []  # [s] after arming
+
     def stop(session: Session, now: int) -> bytes:
+        stopped.append(seconds)
         return session.stop("asked to", now)
 
     try:
@@ -89,7 +91,7 @@ def rehearse(
         raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
     rehearsal = Rehearsal(session, emulator, plan, seed=seed, actions=[(seconds, stop)])
     rehearsal.run_until_armed(seconds + 0.5)
-    return _outcome(rehearsal, recorder, rungs, delays[0] if delays else None)
+    return _outcome(rehearsal, recorder, rungs, delays, stopped)
 
 
 def _given(scenario: Scenario, case: str, coupling: Coupling, link: int) -> Rung:
@@ -108,21 +110,20 @@ def _given(scenario: Scenario, case: str, coupling: Coupling, link: int) -> Rung
     return made
 
 
-def _outcome(rehearsal: Rehearsal, recorder: Recorder, rungs: list[Rung], delay: float | None) -> Rehearsed:
+def _outcome(
+    rehearsal: Rehearsal, recorder: Recorder, rungs: list[Rung], delays: list[float], stopped: list[float]
+) -> Rehearsed:
     session, first = rehearsal.session, rungs[0] if rungs else None
-    scenario = session.scenario
-    ran = rehearsal.armed_us is not None
-    asked = next((event.t_us for event in session.log if event.cause == "asked to"), None)
-    since = None if asked is None or rehearsal.armed_us is None else 1e-6 * (asked - rehearsal.armed_us)
+    scenario, ran = session.scenario, rehearsal.armed_us is not None
     meta = {"scenario": scenario.name, "scenario_digest": scenario.digest, "stage": str(session.stage)}
     return Rehearsed(
         stage=str(session.stage),
         cause=session.cause,
-        delay=delay,
+        delay=delays[0] if delays else None,
         theta=first and first.scenario.theta,
         coupling=first and first.chosen.coupling,
         requirements=first.requirements if first else {},
         promise=promise_of(first.requirements, first.scenario.loop(first.case)) if first else None,
         result=result_of(recorder, session.units, scenario.T, meta) if ran and len(recorder) else None,
-        zero_after=rehearsal.zero_after(since) if since is not None else None,
+        zero_after=rehearsal.zero_after(stopped[0]) if stopped and ran else None,
     )
