@@ -33,4 +33,15 @@ def begun() -> None:
 
 def _leave(number: int, frame: FrameType | None) -> None:
     os.write(2, b"interrupted\n")
+    for child in _children():  # glfw, which mujoco imports, asks its library's version in one; it would complain
+        os.kill(child, signal.SIGKILL)
     os._exit(INTERRUPTED)
+
+
+def _children() -> list[int]:
+    """The processes that the imports have started; none where the system does not tell (it is Linux that does)."""
+    try:
+        with open(f"/proc/self/task/{os.getpid()}/children") as file:
+            return [int(number) for number in file.read().split()]
+    except OSError:
+        return []

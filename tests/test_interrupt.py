@@ -54,6 +54,18 @@ def test_ctrl_c_while_the_solver_is_imported(tmp_path):
     assert interrupted_after("cvxpy.atoms", ["design", "--coupling", "ccl"], tmp_path) == (130, ["interrupted"])
 
 
+@pytest.mark.skipif(not Path(f"/proc/self/task/{os.getpid()}/children").exists(), reason="no /proc/../children")
+def test_what_an_import_has_started_ends_too():
+    """glfw asks for its library's version in a child, which would find a broken pipe."""
+    code = (
+        "import subprocess, sys; from sim import interrupt;"
+        "subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)']); interrupt._leave(2, None)"
+    )
+    process = started("-c", code)
+    assert process.communicate(timeout=300) == ("", "interrupted\n")  # the child holds both pipes until it ends
+    assert process.returncode == 130
+
+
 def test_a_script_that_uses_the_library_keeps_its_own_handling():
     code = "import signal, sim, design, hw; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
     assert started("-c", code).communicate()[0] == "True\n"
