@@ -22,9 +22,8 @@ def main() -> None:
     if session.result is None or session.zero_after is None:
         raise InputError(f"no force was ever felt: the session was {session.stage}, {session.cause}")
     found = session.requirements["theorem4"]
-    print(
-        f"measured: {1e6 * (session.delay or 0.0):.0f} us from sample to force; spring-damper for theta = {session.theta}"
-    )
+    delay, theta = 1e6 * (session.delay or 0.0), list(session.theta or ())
+    print(f"measured: {delay:.0f} us from sample to force; spring-damper for theta = {theta}")
     print(f"needs {max(found.required):.4f} of {min(found.available):.2f} N s/m: certified = {found.certified}")
     moved = np.abs(session.result.x).max()
     print(f"{len(session.result.t)} ticks, ended {session.stage}; handles moved up to {1e3 * moved:.1f} mm")
