@@ -42,7 +42,7 @@ from sim.command import (
     scenario_from,
     seed_from,
 )
-from sim.files import folder, write_json
+from sim.files import out_file, write_json
 from sim.scenario import InputError, Scenario
 
 
@@ -51,11 +51,8 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
-    out = Path(args.out or f"out/design-{args.case}.json")
-    if out.is_dir():
-        raise InputError(f"--out {out}: is a folder, expected the file of the coupling")
     check_json(args)
-    folder(out.parent)
+    out = out_file(args.out, f"out/design-{args.case}.json", "the file of the coupling")
     loop = _loop(args, scenario_from(args))
     options = _options(args) | _switching(args, loop)
     if args.coupling == "optimal" and loop.environment.walls:

@@ -26,6 +26,16 @@ class Transparency:
     high_frequency_gain: float  # sup above 100 Hz of sigma_max(F) / sigma_max(E)
     band_hz: tuple[float, float]
 
+    @property
+    def mismatch_db(self) -> float:
+        """`relative_mismatch` in decibels; 0 dB is as wrong as feeling nothing."""
+        return decibels(self.relative_mismatch)
+
+    @property
+    def rms_mismatch_db(self) -> float:
+        """`rms_mismatch` in decibels."""
+        return decibels(self.rms_mismatch)
+
 
 def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
     """The figures for the force map F against Lambda E."""

@@ -32,7 +32,7 @@ class Result:
 
     def __post_init__(self) -> None:
         for name, ndim in _ARRAYS.items():
-            value = frozen(getattr(self, name), ndim)
+            value = frozen(getattr(self, name), ndim, name)
             object.__setattr__(self, name, value)
             if value.shape[0] != self.t.shape[0]:
                 raise ValueError(f"{name} has {value.shape[0]} samples, t has {self.t.shape[0]}")
