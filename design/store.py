@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -241,10 +242,24 @@ def sealed(certificate: Certificate) -> Certificate:
 
 def load(path: str | Path) -> Stored:
     """Read a stored coupling. Raises BadFile with one line that names the field, OSError if there is no file."""
+    content = Path(path).read_bytes()
+    if not content.strip():
+        raise BadFile(f"{path}: is empty, expected a coupling as python -m design stores it")
     try:
-        return msgspec.json.decode(Path(path).read_bytes(), type=Stored)
+        return msgspec.json.decode(content, type=Stored)
+    except msgspec.ValidationError as error:
+        raise BadFile(f"{path}: is no stored coupling: {' '.join(str(error).split())}") from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise BadFile(f"{path}: {' '.join(str(error).split())}") from None
+        raise BadFile(f"{path}: {_place(content, str(error))}{' '.join(str(error).split())}") from None
+
+
+def _place(content: bytes, message: str) -> str:
+    """Number and beginning of the line that a message points to as "(byte N)", or nothing."""
+    found = re.search(r"\(byte (\d+)\)", message)
+    if not found:
+        return ""
+    above = content[: int(found[1])].count(b"\n")
+    return f"line {above + 1}, {content.splitlines()[above].decode(errors='replace').strip()[:40]!r}: "
 
 
 def save(stored: Stored, path: str | Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import NoReturn, Protocol, TypeVar
 
 from rich.console import Console
 from rich.progress import Progress
+from threadpoolctl import threadpool_limits
 
 from controller.lti import SingularLoop
 from design.failure import DesignFailed
@@ -202,8 +204,11 @@ def progress_bar(description: str) -> tuple[Progress, Move]:
 
 def execute(main: Callable[[list[str]], int]) -> NoReturn:
     """Run a command and leave with its exit code; bad input is one line on standard error."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of processes that this one starts
     try:
-        code = main(sys.argv[1:])
+        # the matrices here are small: more BLAS threads only wait for each other, and the last digits depend on them
+        with threadpool_limits(1, user_api="blas"):
+            code = main(sys.argv[1:])
         sys.stdout.flush()
     except (InputError, SingularLoop) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from controller.box import Member
 from controller.coupling import Coupling
@@ -91,6 +92,7 @@ class Findings:
         return disagree(self.exact, self.mujoco) | disagree(self.exact, self.trace) | switching
 
 
+@threadpool_limits.wrap(limits=1, user_api="blas")  # the same bits in every process, wherever it runs
 def examine(question: Question, indices: Sequence[int], ticked: Callable[[int], None] = lambda ticks: None) -> Findings:
     """Decide and simulate the humans of `indices`, who all meet the same environment.
 

@@ -244,6 +244,7 @@ def test_a_forger_who_repairs_the_digests_still_has_to_prove():
         (b"7806.0", b"-7806.0", "K is [-7806.0, 3137.0]"),
         (b'"theta": [', b'"theta": [0, ', "theta has 3 entries"),
         (b'"proof": "rational"', b'"proof": "faith"', "$.certificate.proof"),
+        (b"7806.0", b"NaN", ", 'NaN,': JSON is malformed"),
     ],
 )
 def test_a_bad_file_is_one_line_that_names_the_field(tmp_path, old, new, names):
@@ -256,3 +257,13 @@ def test_a_bad_file_is_one_line_that_names_the_field(tmp_path, old, new, names):
         load(path)
     assert names in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"), [(b" \n", "is empty"), (b"[]", "is no stored coupling"), (b"{", "truncated")]
+)
+def test_a_file_of_something_else_is_one_line(tmp_path, content, said):
+    path = tmp_path / "coupling.json"
+    path.write_bytes(content)
+    with pytest.raises(BadFile, match=f"coupling.json: .*{said}"):
+        load(path)

@@ -1,7 +1,10 @@
 """Every command's --help ends with an example of that command, and its arguments are what the command takes."""
 
 import importlib
+import os
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -72,3 +75,17 @@ def test_help_says_what_every_option_is(module, capsys, monkeypatch):
     silent = [action.option_strings or action.dest for action in seen if not action.help]
     assert seen
     assert not silent
+
+
+def test_commands_compute_with_one_blas_thread():
+    """The last digits of a result depend on how a sum is shared; an environment that asks for two changes nothing."""
+    script = (
+        "import sys, scipy.linalg; from threadpoolctl import threadpool_info; from sim.command import execute\n"
+        "count = lambda: {lib['num_threads'] for lib in threadpool_info() if lib['user_api'] == 'blas'}\n"
+        "print(count()); execute(lambda words: print(count()) or 0)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "2"}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    if "{2}" not in done.stdout:
+        pytest.skip("no BLAS with threads of its own here")
+    assert done.stdout.split() == ["{2}", "{1}"]

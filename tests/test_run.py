@@ -119,7 +119,7 @@ BAD = [
     (["--lam", "5"], "lam[0] is 5, allowed are 0 to theta + psi = 1"),
     (["--T", "1.2"], "T is 1.2, allowed are 1e-06 to 0.1 s"),
     (["--T", "nan"], "T is nan"),
-    (["--delta", "-1"], "damping is -1"),
+    (["--delta", "-1"], "--delta is -1, allowed are 0 to 10000 N s/m"),
     (["--scenario", "nix.toml"], "scenario nix.toml: No such file"),
     (["--substeps", "0"], "--substeps is 0, allowed are 1 to 10000"),
     (["--duration", "inf"], "duration is inf"),
