@@ -18,6 +18,7 @@ from controller.lti import SingularLoop
 from design.failure import DesignFailed
 from sim.files import folder
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
+from sim.screen import Screen
 
 DONE, DOES_NOT_HOLD, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -179,9 +180,9 @@ def out_folder(args: argparse.Namespace, command: str) -> Path:
     return folder(Path(args.out or f"out/{command}-{args.case}"))
 
 
-def console(args: argparse.Namespace) -> Console:
+def console(args: argparse.Namespace) -> Screen:
     """Where tables go: standard error when standard output is taken by --json -."""
-    return Console(stderr=args.json == "-", highlight=False)
+    return Screen(stderr=args.json == "-", highlight=False)
 
 
 class Move(Protocol):
