@@ -73,7 +73,7 @@ def _ratio(numerator: float, denominator: float) -> float:
 
 
 def _rms(mismatch, environment: Lti, grid: Array) -> float:
-    """sqrt of the mean over log frequency between the ends of `grid`, where it is dense enough to find what is sharp."""
+    """sqrt of the mean over log frequency between the ends of `grid`, which is dense where the ratio may be sharp."""
 
     def square(logarithm: Array) -> Array:
         w = np.exp(logarithm)

@@ -25,7 +25,8 @@ class Screen(Console):
             self._width = own
 
     def _needed(self, table: Table) -> int:
-        for width in range(self.width, WIDEST, STEP):
+        least = 4 * len(table.columns) + 1  # frames and padding, and one character for each column
+        for width in range(max(self.width, least), WIDEST, STEP):
             lines = self.render_lines(table, self.options.update(width=width), pad=False)
             if not any(CUT in part.text for line in lines for part in line):
                 return width
