@@ -17,6 +17,7 @@ from design.designs import FILTERS, KINDS, METHODS, OBJECTIVES, compare_methods,
 from design.failure import DesignFailed
 from design.jitter_part import switching_part, switching_requirement
 from design.jitter_proof import sent
+from design.listed import listed
 from design.price import cost_part, price
 from design.promises import ANY, HERE, certificate_part, promise_of, switching_promise
 from design.result import Design
@@ -262,17 +263,17 @@ def _table(outcome: dict[str, Any]) -> Table:
     coupling, certificate, transparent = outcome["coupling"], outcome["certificate"], outcome["transparency"]
     table = Table(title=f"{coupling['kind']}, case {outcome['case']}, {certificate['condition']}", show_header=False)
     if coupling["K"]:
-        table.add_row("K [N/m]", _list(coupling["K"]))
-        table.add_row("B [N s/m]", _list(coupling["B"]))
+        table.add_row("K [N/m]", listed(coupling["K"]))
+        table.add_row("B [N s/m]", listed(coupling["B"]))
     for part in outcome["certificates"].values():
         word = "certified" if part["certified"] else "not certified"
-        required = _list(part["required_damping"])
-        available = _list(part["available_damping"])
+        required = listed(part["required_damping"])
+        available = listed(part["available_damping"])
         table.add_row(f"damping, {part['condition']}", f"needs {required} of {available} N s/m: {word}")
     if part := outcome["jitter_proof"]:
         word = "certified" if part["certified"] else "not certified"
         span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))
-        needs = f"needs {_list(part['required_damping'])}: {word} (proof: {part['proof']})"
+        needs = f"needs {listed(part['required_damping'])}: {word} (proof: {part['proof']})"
         table.add_row("damping, any switching", f"{span} samples: {needs}")
     for row in set_rows(outcome["set"]) if outcome["set"] else []:
         table.add_row(*row)
@@ -313,10 +314,6 @@ def _costs(rows: list[dict[str, Any]]) -> Table:
             row["coupling"], " / ".join(needs), str(row["violated"]), f"{' / '.join(rms)} dB", f"{' / '.join(sup)} dB"
         )
     return table
-
-
-def _list(values: list[float | None]) -> str:
-    return ", ".join("inf" if v is None else f"{v:.6g}" for v in values)
 
 
 if __name__ == "__main__":

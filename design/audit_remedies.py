@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 
 from controller.coupling import SpringDamper
 from design.audit_figures import edge
+from design.listed import listed
 from design.margin import Requirement
 from design.store import Condition
 from design.subject import Subject
@@ -36,7 +37,7 @@ def remedies(subject: Subject, requirement: Requirement) -> list[Remedy]:
         found.append(
             _smaller(
                 lambda x: subject.with_gains(coupling.K, x * coupling.B),
-                lambda x: f"smaller B: {_list((x * coupling.B).tolist())} N s/m",
+                lambda x: f"smaller B: {listed((x * coupling.B).tolist(), 5)} N s/m",
                 condition,
             )
         )
@@ -57,7 +58,7 @@ def _fewer_samples(subject: Subject, condition: Condition, name: str) -> Remedy 
     for fewer in range(1, max(steps) + 1):
         less = tuple(max(n - fewer, 0) for n in steps)
         tried.append(
-            Remedy(f"less delay: {name} = {_list(less)}", replace(subject, **{name: less}).requirement(condition))
+            Remedy(f"less delay: {name} = {listed(less, 5)}", replace(subject, **{name: less}).requirement(condition))
         )
         if tried[-1].requirement.certified:
             return tried[-1]
@@ -79,7 +80,3 @@ def _smaller(vary: Callable[[float], Subject], describe: Callable[[float], str],
             return Remedy(describe(mildest), requirement(mildest))
     best = min(FACTORS, key=lambda x: requirement(x).ratio)
     return Remedy(describe(best), requirement(best))
-
-
-def _list(values: Sequence[float]) -> str:
-    return ", ".join(f"{v:.5g}" for v in values)

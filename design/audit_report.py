@@ -15,6 +15,7 @@ from design.audit_figures import Stiffest, Tolerance, stiffest, tolerance
 from design.audit_remedies import remedies
 from design.human_structure import separate_humans_part
 from design.jitter_part import switching_part
+from design.listed import listed
 from design.margin import Requirement
 from design.promises import ANY, CAVEATS, certificate_part, promise
 from design.set_check import SetCheck, set_part, set_rows
@@ -149,7 +150,7 @@ def print_report(report: dict[str, Any], console: Console) -> None:
 
 def _verdict(report: dict[str, Any]) -> str:
     coupling = report["coupling"]
-    gains = f" K {_list(coupling['K'])} N/m, B {_list(coupling['B'])} N s/m" if coupling["K"] else ""
+    gains = f" K {listed(coupling['K'])} N/m, B {listed(coupling['B'])} N s/m" if coupling["K"] else ""
     outcome = f"[green]certified[/] for {report['promise']}" if report["certified"] else "[red]not certified[/]"
     if report["promise"] and not report["certified"]:
         outcome += f" for the set, only for {report['promise']}"
@@ -158,7 +159,7 @@ def _verdict(report: dict[str, Any]) -> str:
 
 def _needs(part: dict[str, Any]) -> str:
     word = "[green]certified[/]" if part["certified"] else "[red]not certified[/]"
-    return f"{_list(part['required_damping'])} of {_list(part['available_damping'])} N s/m: {word}"
+    return f"{listed(part['required_damping'])} of {listed(part['available_damping'])} N s/m: {word}"
 
 
 def _error(key: str, sign: str) -> Callable[[dict[str, Any]], str]:
@@ -212,13 +213,13 @@ def _remarks(report: dict[str, Any]) -> list[str]:
                 lines.append(f"{condition}{name}: {reason}.")
     for helping in report["helps"]:
         enough = "enough" if helping["certified"] else "not enough alone"
-        need = f"{helping['condition']} then needs {_list(helping['required_damping'])} N s/m, {enough}"
+        need = f"{helping['condition']} then needs {listed(helping['required_damping'])} N s/m, {enough}"
         lines.append(f"What helps: {helping['change']} ({need}).")
     if (part := report["jitter-proof"]) is not None:
         lines += _switching_remarks(part)
     if (part := report["separate-humans"]) is not None and len(set(part["weights"])) > 1:
         proof = ", proved exactly" if part["proof"] == "rational" else ""
-        weights = f"weights {_list(part['weights'])}"
+        weights = f"weights {listed(part['weights'])}"
         lines.append(f"As each human holds devices of his own ({weights}) it needs {_needs(part)}{proof}.")
     return [*lines, report["not_covered"]]
 
@@ -231,9 +232,9 @@ def _switching_remarks(part: dict[str, Any]) -> list[str]:
         return [*lines, f"jitter-proof: {part['reason']}."]
     buffered = part["playout"]
     enough = "certified" if buffered["certified"] else "not certified"
-    needs = f"{_list(buffered['required_damping'])} N s/m: {enough}"
-    return [*lines, f"A playout buffer to the constant {_list(part['hi'])} needs {needs}.", part["not_covered"]]
-
-
-def _list(values: Sequence[float | None]) -> str:
-    return ", ".join("-" if v is None else f"{v:.6g}" for v in values)
+    needs = f"{listed(buffered['required_damping'])} N s/m: {enough}"
+    return [
+        *lines,
+        f"A playout buffer to the constant {listed(part['hi'])} needs {needs}.",
+        part["not_covered"],
+    ]

@@ -17,6 +17,7 @@ from design.certificate import Verdict, verify
 from design.export_c import c_source
 from design.export_control import control_source
 from design.exported import Block, NothingToExport, Trial, coupling_block, data, process_block, trial
+from design.listed import listed
 from design.promises import HERE, switching_promise
 from design.store import SpringDamper, Stored
 from sim.command import DOES_NOT_HOLD, DONE, Parser, add_output_options, check_json, console, execute, seed_from
@@ -96,7 +97,7 @@ def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> Block:
 def _gains(stored: Stored) -> str:
     coupling = stored.coupling
     if isinstance(coupling, SpringDamper):
-        return f"spring-damper, K = {_list(coupling.K)} N/m, B = {_list(coupling.B)} N s/m"
+        return f"spring-damper, K = {listed(coupling.K)} N/m, B = {listed(coupling.B)} N s/m"
     return f"coupling of kind {coupling.__struct_config__.tag}"
 
 
@@ -104,7 +105,7 @@ def _promise(stored: Stored, verdict: Verdict) -> str:
     claim = stored.certificate
     if claim is None or not verdict.proved:
         return f"NOT CERTIFIED: {verdict.reason}"
-    needs = f"needs {_list(claim.required)} of {_list(claim.available)} N s/m of device damping"
+    needs = f"needs {listed(claim.required)} of {listed(claim.available)} N s/m of device damping"
     delays = f"; {switching_promise(stored.loop.jitter)}, in {HERE}" if stored.loop.jitter else ""
     how = f"{claim.condition}, proof: {claim.proof}"
     return f"Certified for {claim.promise}{delays} ({how}): {needs}; linear forces only."
@@ -146,10 +147,6 @@ def _table(outcome: dict[str, Any]) -> Table:
     table.add_row("certificate", "[green]proved[/]" if proved else f"[red]none[/]: {outcome['certificate']['reason']}")
     table.add_row("test vector", f"{outcome['test']['ticks']} ticks, in the file")
     return table
-
-
-def _list(values: tuple[float, ...]) -> str:
-    return ", ".join(f"{v:.6g}" for v in values)
 
 
 if __name__ == "__main__":

@@ -90,13 +90,6 @@ def lemma4(Delta_V: Matrix, Phi: Matrix) -> Matrix:
     return symmetric([[one - Phi, -Phi], [-Phi, Delta_V - Phi]])
 
 
-def e_hat_printed(E: Lti, psi: Sequence[int]) -> Lti:
-    """E-hat = z/(z-1) Psi E (11), as printed: its pole at z = 1 makes (15) empty."""
-    m = E.inputs
-    one = np.eye(m)
-    return Lti(one, one, one, one, E.T) @ (delay(psi, E.T) @ E)
-
-
 def e_hat_regular(E: Lti, psi: Sequence[int]) -> Lti:
     """E-hat less its pole at z = 1, plus E(1)/2; E(1) must be symmetric and >= 0."""
     return regular_part(delay(psi, E.T) @ E)
@@ -105,13 +98,6 @@ def e_hat_regular(E: Lti, psi: Sequence[int]) -> Lti:
 def theta_hat(theta: Sequence[int], T: float = 1.0) -> Lti:
     """(12) in these units: blockdiag(1 + 1/z + ... + z^-theta_i) / 2."""
     return Lti.diag(*(_window(n, T) for n in theta))
-
-
-def v_hat_printed(V: Lti, theta: Sequence[int]) -> Lti:
-    """V-hat = (1 - 1/z)(V - Theta-hat) in the realisation (16)."""
-    m = V.inputs
-    one, zero = np.eye(m), np.zeros((m, m))
-    return Lti(zero, one, -one, one, V.T) @ (V - theta_hat(theta, V.T))
 
 
 def v_hat_regular(V: Lti, theta: Sequence[int]) -> Ports:

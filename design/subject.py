@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -17,6 +16,7 @@ from controller.process import force_map
 from design.assess import closed_loop_of, theorem4_of
 from design.jitter_multiplier import JitterProof, jitter_proof, jitter_refusal
 from design.jitter_part import switching_requirement
+from design.listed import listed
 from design.margin import Requirement, closed_loop, refusal
 from design.store import Condition, DelayRange, Loop
 
@@ -38,14 +38,14 @@ class Subject:
     def __post_init__(self) -> None:
         for name in ("theta", "psi"):
             if not all(0 <= n <= LONGEST_DELAY for n in getattr(self, name)):
-                raise ValueError(f"{name} is {_list(getattr(self, name))}, allowed are 0 to {LONGEST_DELAY} samples")
+                raise ValueError(f"{name} is {listed(getattr(self, name))}, allowed are 0 to {LONGEST_DELAY} samples")
         if not all(0 < d < np.inf for d in self.delta):
-            raise ValueError(f"delta is {_list(self.delta)}, expected positive dampings in N s/m")
+            raise ValueError(f"delta is {listed(self.delta)}, expected positive dampings in N s/m")
         if self.network is None and not isinstance(self.coupling, SpringDamper):
             raise ValueError("a rigid wall needs a spring-damper in front of it")
         if self.network is None and any(self.psi):
             raise ValueError(
-                f"psi is {_list(self.psi)}: behind a rigid wall no loop with a delayed environment is stable"
+                f"psi is {listed(self.psi)}: behind a rigid wall no loop with a delayed environment is stable"
             )
 
     @property
@@ -112,7 +112,3 @@ class Subject:
         # what is behind a wall's coupling does not matter to Theorem 4
         network = self.network or Network(("contact",), masses={"contact": 1.0})
         return theorem4_of(network, self.T, self.coupling, self.theta, self.psi, self.delta)
-
-
-def _list(values: Sequence[float]) -> str:
-    return ", ".join(f"{v:g}" for v in values)

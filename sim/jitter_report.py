@@ -8,6 +8,7 @@ import numpy as np
 
 from controller.delay import LOST, Ticks, ages
 from controller.jitter import Jitter
+from design.listed import listed
 from design.promises import finite
 from sim import report
 from sim.batch_engine import ExactBatchEngine
@@ -101,7 +102,7 @@ def stability_part(assembly: Assembly, record: Record, jitter: dict[str, Any]) -
         "frequency_hz": report.dominant_frequency(record, assembly.scenario.T),
         **constant,
         "reason": _how(jitter)
-        + f"; the eigenvalues are those of the constant delay theta = {_list(assembly.scenario.theta)}",
+        + f"; the eigenvalues are those of the constant delay theta = {listed(assembly.scenario.theta)}",
     }
 
 
@@ -109,7 +110,3 @@ def _how(jitter: dict[str, Any]) -> str:
     if jitter["period"]:
         return f"growth by the eigenvalues of the product over the {jitter['period']['ticks']} ticks of a period"
     return f"growth of the linear loop after a knock, over {jitter['judged_s']:.3g} s under the run's delays"
-
-
-def _list(values: tuple[int, ...]) -> str:
-    return ", ".join(map(str, values))

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from controller.lti import Array
+from design.listed import listed
 from design.promises import ANY, CAVEATS, finite
 from design.set_check import set_rows
 from sim.loop import Record
@@ -169,13 +170,13 @@ def _rows(report: dict[str, Any]) -> list[tuple[str, str]]:
     coupling, stability, transparent = report["coupling"], report["stability"], report["transparency"]
     rows = []
     if coupling["K"]:
-        rows.append(("coupling K / B", f"{_list(coupling['K'])} N/m / {_list(coupling['B'])} N s/m"))
+        rows.append(("coupling K / B", f"{listed(coupling['K'], 5)} N/m / {listed(coupling['B'], 5)} N s/m"))
     for part in report["certificates"].values():
         proof = ", proved exactly" if part["proof"] == "rational" else ""
         word = f"[green]certified[/]{proof}" if part["certified"] else "[red]not certified[/]"
-        need = _list(part["required_damping"])
+        need = listed(part["required_damping"], 5)
         rows.append(
-            (f"damping, {part['condition']}", f"needs {need} of {_list(part['available_damping'])} N s/m: {word}")
+            (f"damping, {part['condition']}", f"needs {need} of {listed(part['available_damping'], 5)} N s/m: {word}")
         )
     rows += set_rows(report["set"]) if report["set"] else []
     rows.append(("promise", f"holds for {report['promise']}" if report["promise"] else "none"))
@@ -246,7 +247,7 @@ def varying(jitter: dict[str, Any]) -> list[tuple[str, str]]:
     if proof := jitter.get("jitter_proof"):
         exact = ", proved exactly" if proof["proof"] == "rational" else ""
         word = f"[green]certified[/]{exact}" if proof["certified"] else "[red]not certified[/]"
-        needs = f"needs {_list(proof['required_damping'])} of {_list(proof['available_damping'])} N s/m: {word}"
+        needs = f"needs {listed(proof['required_damping'], 5)} of {listed(proof['available_damping'], 5)} N s/m: {word}"
         rows.append(("damping, any switching", needs))
     return [*rows, ("these delays covered", "[green]yes[/]" if jitter["covered"] else "[yellow]no[/]")]
 
@@ -259,10 +260,6 @@ def _force_error(part: dict[str, Any]) -> str:
 
 def _verdict(word: str | None) -> str:
     return {"stable": "[green]stable[/]", "unstable": "[red]unstable[/]"}.get(word or "", "not decided")
-
-
-def _list(values: list[float | None]) -> str:
-    return ", ".join("inf" if v is None else f"{v:.5g}" for v in values)
 
 
 def _db(value: float | None) -> str:

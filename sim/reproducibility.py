@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from design.assess import assess
+from design.listed import listed
 from design.published import PRINTED_TAU_DB, PUBLISHED
 from sim.scenario import Scenario, load
 
@@ -23,18 +24,18 @@ def _gains(scenario: Scenario, case: str, outcome: dict[str, Any]) -> list[Row]:
     printed, got = PUBLISHED[case], outcome["coupling"]
     need = assess(scenario.loop(case), printed)
     theorem4, closed_loop = (need[name].required for name in ("theorem4", "closed-loop"))
-    here = "none" if got["K"] is None else f"K = {_list(got['K'])}, B = {_list(got['B'])}"
+    here = "none" if got["K"] is None else f"K = {listed(got['K'], 5)}, B = {listed(got['B'], 5)}"
     return [
         {
             "what": "gains [N/m], [N s/m]",
-            "paper": f"K = {_list(printed.K)}, B = {_list(printed.B)}",
+            "paper": f"K = {listed(printed.K, 5)}, B = {listed(printed.B, 5)}",
             "here": here,
             "why": "the printed gains are no solution of the paper's own problem (next row)",
         },
         {
             "what": "damping that the printed gains need [N s/m]",
-            "paper": f"at most {_list(scenario.delta)}",
-            "here": f"{_list(theorem4)} by Theorem 4; {_list(closed_loop)} in this environment",
+            "paper": f"at most {listed(scenario.delta, 5)}",
+            "here": f"{listed(theorem4, 5)} by Theorem 4; {listed(closed_loop, 5)} in this environment",
             "why": "Theorem 4 as printed is strictly infeasible (E-hat has a pole at z = 1); mended, it refuses them",
         },
     ]
@@ -57,7 +58,3 @@ def _figure(case: str, stability: dict[str, Any]) -> Row:
         "here": f"{stability['exact_verdict']}: {growth}",
         "why": "agrees; masses and stiffness of the devices are assumed",
     }
-
-
-def _list(values: Any) -> str:
-    return ", ".join(f"{v:.5g}" for v in values)

@@ -5,19 +5,18 @@ import numpy as np
 import pytest
 
 from controller.coupling import SpringDamper
+from controller.delay import delay
 from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.lti import Lti
 from design.analysis import analysis
 from design.coordinates import balanced, unit_coupling, unit_environment
 from design.lmi import (
     Ports,
-    e_hat_printed,
     e_hat_regular,
     lemma1,
     lemma2,
     lemma3,
     theta_hat,
-    v_hat_printed,
     v_hat_regular,
 )
 from design.margin import theorem4
@@ -27,6 +26,20 @@ from design.sweep import frequencies, hermitian, on_circle
 T = 1.2e-3
 DELTA = (1.37, 1.37)
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
+
+
+def e_hat_printed(E, psi):
+    """E-hat = z/(z-1) Psi E (11), as printed: its pole at z = 1 makes (15) empty."""
+    m = E.inputs
+    one = np.eye(m)
+    return Lti(one, one, one, one, E.T) @ (delay(psi, E.T) @ E)
+
+
+def v_hat_printed(V, theta):
+    """V-hat = (1 - 1/z)(V - Theta-hat) in the realisation (16)."""
+    m = V.inputs
+    one, zero = np.eye(m), np.zeros((m, m))
+    return Lti(zero, one, -one, one, V.T) @ (V - theta_hat(theta, V.T))
 
 
 def random_stable(rng, order, m=2):
