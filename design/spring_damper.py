@@ -92,7 +92,7 @@ def _for_this_environment(
             f"delta = {spec.delta}: use more device damping, less delay, or other starts"
         )
         raise DesignFailed(None, (), line)
-    coupling = SpringDamper(coupling.K, np.where(coupling.B < NEGLIGIBLE * spec.usable, 0.0, coupling.B))
+    coupling = SpringDamper(coupling.K, np.where(NEGLIGIBLE * spec.usable > coupling.B, 0.0, coupling.B))
     F = force_map(spec.environment, coupling, spec.theta, spec.psi)
     requirement = closed_loop(F, spec.delta)
     return Design(coupling, "closed-loop", "rms", rms, requirement, searches, time.perf_counter() - started)
