@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NoReturn
 
 from rich.console import Console
 from rich.table import Table
@@ -23,6 +23,10 @@ class Screen(Console):
             super().print(*objects, **how)
         finally:
             self._width = own
+
+    def on_broken_pipe(self) -> NoReturn:
+        """A reader that has seen enough is no failure: sim.command ends with what the command has found so far."""
+        raise BrokenPipeError
 
     def _needed(self, table: Table) -> int:
         least = 4 * len(table.columns) + 1  # frames and padding, and one character for each column

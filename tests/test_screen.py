@@ -2,6 +2,7 @@
 
 import ast
 import io
+import os
 import re
 from pathlib import Path
 
@@ -48,3 +49,11 @@ def test_every_report_is_printed_on_a_screen():
         if any(isinstance(call.func, ast.Name) and call.func.id == "Console" for call in calls):
             bare.add(path.name)
     assert bare == {"command.py", "dashboard.py"}
+
+
+def test_a_reader_who_leaves_is_no_failure():
+    """Rich alone would exit with 1, which here says that something does not hold."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with pytest.raises(BrokenPipeError), open(writer, "w", closefd=True) as file:
+        Screen(file=file).print("x" * 100_000)
