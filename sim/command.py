@@ -19,6 +19,7 @@ from models.device import MOST_DAMPING
 from sim.files import check_file, folder, nobody_reads
 from sim.interrupt import INTERRUPTED, begun
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
+from sim.screen import Screen
 
 DONE, DOES_NOT_HOLD, BAD_INPUT = 0, 1, 2  # and INTERRUPTED, which sim.interrupt has
 
@@ -170,15 +171,7 @@ def out_folder(args: argparse.Namespace, command: str) -> Path:
     return folder(Path(args.out or f"out/{command}-{args.case}"))
 
 
-class Screen(Console):
-    """A console that does not mind being read only in part: `| head -1` changes neither the work nor its exit code."""
-
-    def on_broken_pipe(self) -> None:  # rich itself would leave with 1, our "it does not hold"
-        self.quiet = True
-        nobody_reads()
-
-
-def console(args: argparse.Namespace) -> Console:
+def console(args: argparse.Namespace) -> Screen:
     """Where tables go: standard error when standard output is taken by --json -."""
     return Screen(stderr=args.json == "-", highlight=False)
 
