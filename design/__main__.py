@@ -15,6 +15,7 @@ from design.assess import CONDITIONS, assess, specification
 from design.certificate import NotProved, prove
 from design.designs import FILTERS, KINDS, METHODS, OBJECTIVES, compare_methods, design_coupling
 from design.failure import DesignFailed
+from design.frozen_environment import STIFFEST
 from design.jitter_part import switching_part, switching_requirement
 from design.jitter_proof import sent
 from design.listed import listed
@@ -261,6 +262,8 @@ def _table(outcome: dict[str, Any]) -> Table:
     table = Table(title=f"{coupling['kind']}, case {outcome['case']}, {certificate['condition']}", show_header=False)
     if coupling["K"]:
         table.add_row("K [N/m]", listed(coupling["K"]))
+        if max(coupling["K"]) > 0.999 * STIFFEST:
+            table.add_row("", f"{STIFFEST:g} N/m is where the search ends, no optimum of its own")
         table.add_row("B [N s/m]", listed(coupling["B"]))
     for part in outcome["certificates"].values():
         word = "certified" if part["certified"] else "not certified"
