@@ -1,8 +1,7 @@
 """Mass, friction and transmission of one axis from a record of forces and displacements.
 
 Output error: the parameters of hw.axis_model whose simulated displacement is nearest to the encoder's, in the
-least-squares sense. Residuals are correlated (rounding, friction that the model has not), so the covariance is the
-sandwich (J'J)^-1 J' R J (J'J)^-1 with Bartlett weights (Newey and West 1987).
+least-squares sense, where a standstill counts as few samples (hw.standstill). How far the estimate scatters: hw.spread.
 """
 
 from __future__ import annotations
@@ -15,10 +14,11 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from controller.lti import Array
 from hw.axis_model import COULOMB, Flags, Model
+from hw.spread import spread
 
-BANDWIDTH = 60  # [ticks] over which residuals may be correlated
 EVALUATIONS = 60  # of a search, without those for derivatives
 ONE_SIDED_95 = 1.6449  # normal quantile
+VAGUE = 0.1  # standard error of b, as a part of b, above which nothing is said of it
 MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a transmission mode is looked for first
 PARTS = (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mass, that the motor may have
 FRICTIONS = (1e-5, 0.01, 0.05)  # Coulomb friction that a search begins with, of the force's span
@@ -50,11 +50,11 @@ def identify(x: Array, force: Array, used: Flags, T: float, step: float, rigid: 
     """
     if np.ptp(x[used]) < 20 * step:
         raise ValueError(f"the axis moved by {np.ptp(x[used]) / step:.0f} encoder steps, at least 20 are needed")
-    whole = Model(x, force, used, T, rigid=True)
+    whole = Model(x, force, used, T, step, rigid=True)
     smooth = _without_coulomb(whole, np.array([np.log(mass), 0.0]))
     if rigid:
         return _settled(whole, _with_coulomb(whole, smooth.x, step), step)
-    model = Model(x, force, used, T, rigid=False)
+    model = Model(x, force, used, T, step, rigid=False)
     tries = [_without_coulomb(model, start) for start in _starts(model, smooth.x)]
     return _settled(model, _with_coulomb(model, min(tries, key=lambda fit: fit.cost).x, step), step)
 
@@ -83,18 +83,24 @@ def _with_coulomb(model: Model, near: Array, step: float) -> OptimizeResult:
         # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
         options = {"x_scale": "jac", "max_nfev": EVALUATIONS, "diff_step": 1e-5, "ftol": 1e-6}
         fits.append(least_squares(model.residual, start, bounds=bounds, **options))
-        if np.sqrt(2 * fits[-1].cost / fits[-1].fun.size) <= model.allowed(step):
+        if model.rms(fits[-1].fun) <= model.allowed(step):
             break
     return min(fits, key=lambda fit: fit.cost)
 
 
 def _settled(model: Model, fit: OptimizeResult, step: float) -> Estimate:
-    estimate = _estimate(model, fit.x, fit.fun, fit.jac, step)
-    allowed = model.allowed(step)
-    if estimate.rms > allowed:
+    rms, allowed = model.rms(fit.fun), model.allowed(step)
+    if rms > allowed:
         raise ValueError(
-            f"the model leaves {estimate.steps:.2g} encoder steps rms unexplained, at most {allowed / step:.2g} may be "
+            f"the model leaves {rms / step:.2g} encoder steps rms unexplained, at most {allowed / step:.2g} may be "
             "(friction of another kind, a hand at the handle, gravity, or a slipping drive?)"
+        )
+    estimate = _estimate(model, fit.x, rms, step)
+    vague = estimate.errors["viscous"] / estimate.viscous
+    if vague > VAGUE:
+        raise ValueError(
+            f"the record does not tell viscous from dry friction: {estimate.viscous:.3g} N s/m, standard error "
+            f"{100 * vague:.0f} %, at most {100 * VAGUE:.0f} % may be; take one with more force or a longer one"
         )
     return estimate
 
@@ -126,8 +132,9 @@ def _starts(model: Model, whole: Array) -> list[Array]:
     return list(best.values())[:STARTS]
 
 
-def _estimate(model: Model, p: Array, residual: Array, jacobian: Array, step: float) -> Estimate:
-    covariance = _sandwich(jacobian, residual)
+def _estimate(model: Model, p: Array, rms: float, step: float) -> Estimate:
+    scatter = spread(model, p, step)
+    covariance = scatter.covariance
     m1, b = np.exp(p[0]), np.exp(p[1])
     gradient = np.zeros(p.size)
     gradient[0], mass, k, mode = m1, m1, None, None
@@ -140,16 +147,6 @@ def _estimate(model: Model, p: Array, residual: Array, jacobian: Array, step: fl
         "viscous": float(b * np.sqrt(covariance[1, 1])),
         "coulomb": float(np.sqrt(covariance[2, 2])),
     }
-    rms = float(np.sqrt(np.mean(residual**2)))
-    delta = max(0.0, float(b) - ONE_SIDED_95 * errors["viscous"])
+    above = max(0.0, float(b * scatter.bias[1]))  # on average; a bias to the safe side is left where it is
+    delta = max(0.0, float(b) - above - ONE_SIDED_95 * errors["viscous"])
     return Estimate(float(mass), float(m1), float(b), float(p[2]), k, mode, errors, delta, rms, rms / step)
-
-
-def _sandwich(J: Array, residual: Array) -> Array:
-    scores = J * residual[:, None]
-    middle = scores.T @ scores
-    for lag in range(1, min(BANDWIDTH, len(scores) - 1)):
-        shared = scores[lag:].T @ scores[:-lag]
-        middle += (1 - lag / BANDWIDTH) * (shared + shared.T)
-    bread = np.linalg.pinv(J.T @ J)
-    return bread @ middle @ bread
