@@ -16,7 +16,8 @@ from controller.lti import Array
 from hw.axis_model import COULOMB, Flags, Model
 from hw.spread import spread
 
-EVALUATIONS = 60  # of a search, without those for derivatives
+EVALUATIONS = 60, 30  # of a search without Coulomb friction and with it, less those for derivatives
+POLISH = 6  # steps at the end, with friction integrated more finely
 ONE_SIDED_95 = 1.6449  # normal quantile
 VAGUE = 0.1  # standard error of b, as a part of b, above which nothing is said of it
 MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a transmission mode is looked for first
@@ -51,12 +52,15 @@ def identify(x: Array, force: Array, used: Flags, T: float, step: float, rigid: 
     if np.ptp(x[used]) < 20 * step:
         raise ValueError(f"the axis moved by {np.ptp(x[used]) / step:.0f} encoder steps, at least 20 are needed")
     whole = Model(x, force, used, T, step, rigid=True)
-    smooth = _without_coulomb(whole, np.array([np.log(mass), 0.0]))
+    stiff = _with_coulomb(whole, _without_coulomb(whole, np.array([np.log(mass), 0.0])).x)
     if rigid:
-        return _settled(whole, _with_coulomb(whole, smooth.x, step), step)
-    model = Model(x, force, used, T, step, rigid=False)
-    tries = [_without_coulomb(model, start) for start in _starts(model, smooth.x)]
-    return _settled(model, _with_coulomb(model, min(tries, key=lambda fit: fit.cost).x, step), step)
+        return _settled(whole, stiff.x)
+    model, fits = Model(x, force, used, T, step, rigid=False), []
+    for start in _starts(model, stiff.x):
+        fits.append(_search(model, start))
+        if model.rms(fits[-1].fun) <= model.allowed():
+            break
+    return _settled(model, min(fits, key=lambda fit: fit.cost).x)
 
 
 def _without_coulomb(model: Model, start: Array) -> OptimizeResult:
@@ -69,33 +73,62 @@ def _without_coulomb(model: Model, start: Array) -> OptimizeResult:
         return model.residual(np.insert(p, COULOMB, 0.0))
 
     bounds = (start - REACH, start + REACH)
-    return least_squares(residual, start, x_scale="jac", bounds=bounds, max_nfev=EVALUATIONS)
+    return least_squares(residual, start, x_scale="jac", bounds=bounds, max_nfev=EVALUATIONS[0])
 
 
-def _with_coulomb(model: Model, near: Array, step: float) -> OptimizeResult:
+def _with_coulomb(model: Model, near: Array) -> OptimizeResult:
     """All parameters, from a start that lacks c: hardly any at first, then more as long as much is unexplained."""
-    strongest = np.ptp(model.force)
-    free = np.arange(near.size + 1) != COULOMB
     fits = []
     for part in FRICTIONS:
-        start = np.insert(near, COULOMB, part * strongest)
-        bounds = (np.where(free, start - REACH, 0.0), np.where(free, start + REACH, strongest))
-        # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
-        options = {"x_scale": "jac", "max_nfev": EVALUATIONS, "diff_step": 1e-5, "ftol": 1e-6}
-        fits.append(least_squares(model.residual, start, bounds=bounds, **options))
-        if model.rms(fits[-1].fun) <= model.allowed(step):
+        fits.append(_search(model, np.insert(near, COULOMB, part * np.ptp(model.force))))
+        if model.rms(fits[-1].fun) <= model.allowed():
             break
     return min(fits, key=lambda fit: fit.cost)
 
 
-def _settled(model: Model, fit: OptimizeResult, step: float) -> Estimate:
-    rms, allowed = model.rms(fit.fun), model.allowed(step)
+def _search(model: Model, start: Array) -> OptimizeResult:
+    strongest = np.ptp(model.force)
+    start = start.copy()
+    start[COULOMB] = np.clip(start[COULOMB], FRICTIONS[0] * strongest, strongest / 2)
+    free = np.arange(start.size) != COULOMB
+    bounds = (np.where(free, start - REACH, 0.0), np.where(free, start + REACH, strongest))
+    # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
+    options = {"x_scale": "jac", "max_nfev": EVALUATIONS[1], "diff_step": 1e-5, "ftol": 1e-6}
+    return least_squares(model.residual, start, bounds=bounds, **options)
+
+
+def _polished(model: Model, p: Array) -> Array:
+    """The nearest parameters from close by: Gauss-Newton steps as long as they help, halved where they do not.
+
+    A search that stops where its sum of squares hardly changes may be several standard errors away.
+    """
+    residual = model.residual(p)
+    for _ in range(POLISH):
+        J = model.jacobian(p)
+        centred = np.sqrt(model.weight)[:, None] * (J - np.average(J, axis=0, weights=model.weight))
+        change = np.linalg.lstsq(centred, residual, rcond=None)[0]
+        for part in (1.0, 0.5, 0.25):
+            other = p + part * change
+            other[COULOMB] = max(0.0, other[COULOMB])
+            left = model.residual(other)
+            if left @ left < residual @ residual:
+                break
+        else:
+            break
+        p, residual = other, left
+    return p
+
+
+def _settled(coarse: Model, p: Array) -> Estimate:
+    model, step = coarse.finer(), coarse.step
+    p = _polished(model, p)
+    rms, allowed = model.rms(model.residual(p)), model.allowed()
     if rms > allowed:
         raise ValueError(
             f"the model leaves {rms / step:.2g} encoder steps rms unexplained, at most {allowed / step:.2g} may be "
             "(friction of another kind, a hand at the handle, gravity, or a slipping drive?)"
         )
-    estimate = _estimate(model, fit.x, rms, step)
+    estimate = _estimate(model, p, rms)
     vague = estimate.errors["viscous"] / estimate.viscous
     if vague > VAGUE:
         raise ValueError(
@@ -105,8 +138,8 @@ def _settled(model: Model, fit: OptimizeResult, step: float) -> Estimate:
     return estimate
 
 
-def _starts(model: Model, whole: Array) -> list[Array]:
-    """Where to begin with a transmission: the modes and splits of the mass that fit the spectrum best.
+def _starts(model: Model, stiff: Array) -> list[Array]:
+    """Where to begin with a transmission: the modes and splits of a stiff device's mass that fit the spectrum best.
 
     A search in time alone stops at any mode but the right one. The spectrum is that of the steps x[k+1] - x[k], which
     begin and end at rest, over that of the forces; it is compared in decibels, where the force had something to say.
@@ -117,23 +150,23 @@ def _starts(model: Model, whole: Array) -> list[Array]:
     loud = np.flatnonzero(np.abs(force) > 0.2 * np.abs(force).max())
     loud = loud[:: max(1, loud.size // SPECTRUM)]
     measured, z = np.log(np.abs(moved[loud] / force[loud]) + 1e-12), z[loud]
-    points, mass = [], float(np.exp(whole[0]))
+    points, mass = [], float(np.exp(stiff[0]))
     for hz, part in product(MODES_HZ, PARTS):
         m1, m2 = part * mass, (1 - part) * mass
         k = (2 * np.pi * hz) ** 2 * m1 * m2 / mass
-        point = np.array([np.log(m1), max(whole[1], -2.0), 0.0, np.log(m2), np.log(k)])
+        point = np.array([np.log(m1), max(stiff[1], -2.0), stiff[COULOMB], np.log(m2), np.log(k)])
         A, B = model.matrices(point, model.T)
         G = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, np.broadcast_to(B[:, None], (z.size, len(A), 1)))
         apart = np.log(np.abs((z - 1) * G[:, 0, 0]) + 1e-12) - measured
         points.append((float(np.abs(apart).mean()), point))  # absolute: a few bins of a resonance may lie far apart
     best: dict[float, Array] = {}
     for _, point in sorted(points, key=lambda entry: entry[0]):
-        best.setdefault(round(float(point[0]), 6), np.delete(point, COULOMB))  # the best mode of every split
+        best.setdefault(round(float(point[0]), 6), point)  # the best mode of every split
     return list(best.values())[:STARTS]
 
 
-def _estimate(model: Model, p: Array, rms: float, step: float) -> Estimate:
-    scatter = spread(model, p, step)
+def _estimate(model: Model, p: Array, rms: float) -> Estimate:
+    scatter = spread(model, p)
     covariance = scatter.covariance
     m1, b = np.exp(p[0]), np.exp(p[1])
     gradient = np.zeros(p.size)
@@ -149,4 +182,4 @@ def _estimate(model: Model, p: Array, rms: float, step: float) -> Estimate:
     }
     above = max(0.0, float(b * scatter.bias[1]))  # on average; a bias to the safe side is left where it is
     delta = max(0.0, float(b) - above - ONE_SIDED_95 * errors["viscous"])
-    return Estimate(float(mass), float(m1), float(b), float(p[2]), k, mode, errors, delta, rms, rms / step)
+    return Estimate(float(mass), float(m1), float(b), float(p[2]), k, mode, errors, delta, rms, rms / model.step)

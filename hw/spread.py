@@ -20,7 +20,6 @@ from hw.standstill import worth
 
 BANDWIDTH = 60  # [ticks] over which residuals may be correlated
 RECORDS = 60  # that might have been
-SHIFT = 1e-5  # of log parameters, and of Coulomb friction in newtons, for derivatives
 ROUNDING = 1 / 12  # variance of an error that is uniform within a step
 WIDEST = 0.2  # standard deviations of the parameters' logarithms beyond which they are not drawn
 
@@ -33,38 +32,30 @@ class Spread:
     bias: Array  # (p,) that the records that might have been have on average
 
 
-def spread(model: Model, p: Array, step: float, seed: int = 0) -> Spread:
-    """Of the estimate p (p,) from `model`'s record, at `step` [m] of the encoder."""
-    J = _jacobian(model, p)
+def spread(model: Model, p: Array, seed: int = 0) -> Spread:
+    """Of the estimate p (p,) from `model`'s record."""
+    J = model.jacobian(p)
     residual = model.error(p)
     covariance = _sandwich(J, residual, model.weight)
     share = model.weight / model.weight.sum()
-    noise = np.sqrt(max(0.0, float(share @ residual**2) / step**2 - ROUNDING))  # [counts]
+    noise = np.sqrt(max(0.0, float(share @ residual**2) / model.step**2 - ROUNDING))  # [counts]
     generator = np.random.default_rng(seed)
     root = _root(covariance)
-    misses = np.array([_miss(model, p, root, J, step, noise, generator) for _ in range(RECORDS)])
+    misses = np.array([_miss(model, p, root, J, noise, generator) for _ in range(RECORDS)])
     return Spread(covariance + np.cov(misses.T), misses.mean(axis=0))
 
 
-def _miss(
-    model: Model, p: Array, root: Array, J: Array, step: float, noise: float, generator: np.random.Generator
-) -> Array:
+def _miss(model: Model, p: Array, root: Array, J: Array, noise: float, generator: np.random.Generator) -> Array:
     """By how much a record that might have been is estimated wrong (p,)."""
     other = p + np.clip(root @ generator.standard_normal(p.size), -WIDEST, WIDEST)
     other[COULOMB] = max(0.0, other[COULOMB])
-    exact = model.simulate(other)[model.used] / step + generator.uniform()
+    exact = model.simulate(other)[model.used] / model.step + generator.uniform()
     counts = np.round(exact + noise * generator.standard_normal(exact.size))
     weight = worth(counts)
-    error = step * (counts - exact)
+    error = model.step * (counts - exact)
     root_weight = np.sqrt(weight)
     centred = root_weight[:, None] * (J - np.average(J, axis=0, weights=weight))
     return np.linalg.pinv(centred) @ (root_weight * (error - np.average(error, weights=weight)))
-
-
-def _jacobian(model: Model, p: Array) -> Array:
-    """Of the displacement that counts, (N, p); central differences, of Coulomb friction too."""
-    shifts = SHIFT * np.eye(p.size)
-    return np.stack([(model.simulate(p + s) - model.simulate(p - s))[model.used] for s in shifts], axis=1) / (2 * SHIFT)
 
 
 def _root(covariance: Array) -> Array:
