@@ -22,7 +22,7 @@ COULOMB = 2  # where Coulomb friction is among the parameters
 SHIFT = 1e-5  # of log parameters, and of Coulomb friction in newtons, for derivatives
 UNEXPLAINED = 0.7, 1.5e-3  # encoder steps rms (rounding alone leaves 0.29), or this part of the motion's rms
 SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
-COARSE, FINE = 4, 8  # substeps of a tick for which it is held: in a search, and at its end
+COARSE, FINE = 3, 8  # substeps of a tick for which it is held: in a search, and at its end
 
 
 class Model:
@@ -77,6 +77,11 @@ class Model:
         shifts = SHIFT * np.eye(p.size)
         columns = [(self.simulate(p + s) - self.simulate(p - s))[self.used] for s in shifts]
         return np.stack(columns, axis=1) / (2 * SHIFT)
+
+    def slopes(self, p: Array) -> Array:
+        """Derivatives of what is subtracted in residual() (used, p)."""
+        J = self.jacobian(p)
+        return np.sqrt(self.weight)[:, None] * (J - np.average(J, axis=0, weights=self.weight))
 
     def rms(self, residual: Array) -> float:
         """[m] of the error behind a residual."""

@@ -7,7 +7,6 @@ least-squares sense, where a standstill counts as few samples (hw.standstill). H
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
@@ -15,17 +14,15 @@ from scipy.optimize import OptimizeResult, least_squares
 from controller.lti import Array
 from hw.axis_model import COULOMB, Flags, Model
 from hw.spread import spread
+from hw.spectrum import spectral_starts
 
 EVALUATIONS = 60, 30  # of a search without Coulomb friction and with it, less those for derivatives
-POLISH = 6  # steps at the end, with friction integrated more finely
+POLISH = 8  # steps at the end, with friction integrated more finely
+ENOUGH = 1e-6  # part of the sum of squares, from which on a step is the last one
 ONE_SIDED_95 = 1.6449  # normal quantile
 VAGUE = 0.1  # standard error of b, as a part of b, above which nothing is said of it
-MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a transmission mode is looked for first
-PARTS = (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mass, that the motor may have
 FRICTIONS = (1e-5, 0.01, 0.05)  # Coulomb friction that a search begins with, of the force's span
-STARTS = 3  # of the search in time
 REACH = 3.0  # of a search, in logarithms
-SPECTRUM = 250  # frequencies that are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +53,7 @@ def identify(x: Array, force: Array, used: Flags, T: float, step: float, rigid: 
     if rigid:
         return _settled(whole, stiff.x)
     model, fits = Model(x, force, used, T, step, rigid=False), []
-    for start in _starts(model, stiff.x):
+    for start in spectral_starts(model, stiff.x):
         fits.append(_search(model, start))
         if model.rms(fits[-1].fun) <= model.allowed():
             break
@@ -93,8 +90,8 @@ def _search(model: Model, start: Array) -> OptimizeResult:
     free = np.arange(start.size) != COULOMB
     bounds = (np.where(free, start - REACH, 0.0), np.where(free, start + REACH, strongest))
     # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
-    options = {"x_scale": "jac", "max_nfev": EVALUATIONS[1], "diff_step": 1e-5, "ftol": 1e-6}
-    return least_squares(model.residual, start, bounds=bounds, **options)
+    options = {"x_scale": "jac", "max_nfev": EVALUATIONS[1], "ftol": 1e-4}
+    return least_squares(model.residual, start, lambda p: -model.slopes(p), bounds=bounds, **options)
 
 
 def _polished(model: Model, p: Array) -> Array:
@@ -104,10 +101,8 @@ def _polished(model: Model, p: Array) -> Array:
     """
     residual = model.residual(p)
     for _ in range(POLISH):
-        J = model.jacobian(p)
-        centred = np.sqrt(model.weight)[:, None] * (J - np.average(J, axis=0, weights=model.weight))
-        change = np.linalg.lstsq(centred, residual, rcond=None)[0]
-        for part in (1.0, 0.5, 0.25):
+        change = np.linalg.lstsq(model.slopes(p), residual, rcond=None)[0]
+        for part in (1.0, 0.5, 0.1):
             other = p + part * change
             other[COULOMB] = max(0.0, other[COULOMB])
             left = model.residual(other)
@@ -115,7 +110,10 @@ def _polished(model: Model, p: Array) -> Array:
                 break
         else:
             break
+        gain = 1 - (left @ left) / (residual @ residual)
         p, residual = other, left
+        if gain < ENOUGH:
+            break
     return p
 
 
@@ -136,33 +134,6 @@ def _settled(coarse: Model, p: Array) -> Estimate:
             f"{100 * vague:.0f} %, at most {100 * VAGUE:.0f} % may be; take one with more force or a longer one"
         )
     return estimate
-
-
-def _starts(model: Model, stiff: Array) -> list[Array]:
-    """Where to begin with a transmission: the modes and splits of a stiff device's mass that fit the spectrum best.
-
-    A search in time alone stops at any mode but the right one. The spectrum is that of the steps x[k+1] - x[k], which
-    begin and end at rest, over that of the forces; it is compared in decibels, where the force had something to say.
-    """
-    n = len(model.force)
-    force, moved = np.fft.rfft(model.force), np.fft.rfft(np.diff(model.x, append=model.x[-1]))
-    z = np.exp(2j * np.pi * np.arange(force.size) / n)
-    loud = np.flatnonzero(np.abs(force) > 0.2 * np.abs(force).max())
-    loud = loud[:: max(1, loud.size // SPECTRUM)]
-    measured, z = np.log(np.abs(moved[loud] / force[loud]) + 1e-12), z[loud]
-    points, mass = [], float(np.exp(stiff[0]))
-    for hz, part in product(MODES_HZ, PARTS):
-        m1, m2 = part * mass, (1 - part) * mass
-        k = (2 * np.pi * hz) ** 2 * m1 * m2 / mass
-        point = np.array([np.log(m1), max(stiff[1], -2.0), stiff[COULOMB], np.log(m2), np.log(k)])
-        A, B = model.matrices(point, model.T)
-        G = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, np.broadcast_to(B[:, None], (z.size, len(A), 1)))
-        apart = np.log(np.abs((z - 1) * G[:, 0, 0]) + 1e-12) - measured
-        points.append((float(np.abs(apart).mean()), point))  # absolute: a few bins of a resonance may lie far apart
-    best: dict[float, Array] = {}
-    for _, point in sorted(points, key=lambda entry: entry[0]):
-        best.setdefault(round(float(point[0]), 6), point)  # the best mode of every split
-    return list(best.values())[:STARTS]
 
 
 def _estimate(model: Model, p: Array, rms: float) -> Estimate:

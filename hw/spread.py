@@ -19,7 +19,7 @@ from hw.axis_model import COULOMB, Model
 from hw.standstill import worth
 
 BANDWIDTH = 60  # [ticks] over which residuals may be correlated
-RECORDS = 60  # that might have been
+RECORDS = 40  # that might have been
 ROUNDING = 1 / 12  # variance of an error that is uniform within a step
 WIDEST = 0.2  # standard deviations of the parameters' logarithms beyond which they are not drawn
 
