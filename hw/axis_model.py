@@ -28,7 +28,9 @@ COARSE, FINE = 3, 8  # substeps of a tick for which it is held: in a search, and
 class Model:
     """p = [log m1, log b, c, log m2, log k] -> simulated displacement."""
 
-    def __init__(self, x: Array, force: Array, used: Flags, T: float, step: float, rigid: bool, substeps: int = COARSE) -> None:
+    def __init__(
+        self, x: Array, force: Array, used: Flags, T: float, step: float, rigid: bool, substeps: int = COARSE
+    ) -> None:
         self.x, self.force, self.used, self.T, self.step, self.rigid = x, force, used, T, step, rigid
         self.substeps = substeps
         self.weight = worth(np.round(x[used] / step))

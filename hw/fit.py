@@ -13,11 +13,11 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from controller.lti import Array
 from hw.axis_model import COULOMB, Flags, Model
-from hw.spread import spread
 from hw.spectrum import spectral_starts
+from hw.spread import spread
 
 EVALUATIONS = 60, 30  # of a search without Coulomb friction and with it, less those for derivatives
-POLISH = 8  # steps at the end, with friction integrated more finely
+POLISH = 15  # steps at the end, with friction integrated more finely
 ENOUGH = 1e-6  # part of the sum of squares, from which on a step is the last one
 ONE_SIDED_95 = 1.6449  # normal quantile
 VAGUE = 0.1  # standard error of b, as a part of b, above which nothing is said of it
@@ -51,13 +51,16 @@ def identify(x: Array, force: Array, used: Flags, T: float, step: float, rigid: 
     whole = Model(x, force, used, T, step, rigid=True)
     stiff = _with_coulomb(whole, _without_coulomb(whole, np.array([np.log(mass), 0.0])).x)
     if rigid:
-        return _settled(whole, stiff.x)
-    model, fits = Model(x, force, used, T, step, rigid=False), []
+        fine = whole.finer()
+        return _settled(fine, _polished(fine, stiff.x))
+    model = Model(x, force, used, T, step, rigid=False)
+    fine, ends = model.finer(), []
     for start in spectral_starts(model, stiff.x):
-        fits.append(_search(model, start))
-        if model.rms(fits[-1].fun) <= model.allowed():
+        p = _polished(fine, _search(model, start).x)
+        ends.append((fine.rms(fine.residual(p)), p))
+        if ends[-1][0] <= fine.allowed():
             break
-    return _settled(model, min(fits, key=lambda fit: fit.cost).x)
+    return _settled(fine, min(ends, key=lambda end: end[0])[1])
 
 
 def _without_coulomb(model: Model, start: Array) -> OptimizeResult:
@@ -117,10 +120,8 @@ def _polished(model: Model, p: Array) -> Array:
     return p
 
 
-def _settled(coarse: Model, p: Array) -> Estimate:
-    model, step = coarse.finer(), coarse.step
-    p = _polished(model, p)
-    rms, allowed = model.rms(model.residual(p)), model.allowed()
+def _settled(model: Model, p: Array) -> Estimate:
+    step, rms, allowed = model.step, model.rms(model.residual(p)), model.allowed()
     if rms > allowed:
         raise ValueError(
             f"the model leaves {rms / step:.2g} encoder steps rms unexplained, at most {allowed / step:.2g} may be "

@@ -17,7 +17,7 @@ from hw.axis_model import COULOMB, Model
 
 MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a mode is looked for first
 PARTS = (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mass, that the motor may have
-STARTS = 3  # of the search in time
+STARTS = 2  # of the search in time
 SPECTRUM = 250  # frequencies that are compared first
 FLOOR = 1e-12  # of a ratio whose logarithm is taken
 OUTLIER = 0.1  # of a logarithm, from which it counts less: friction spoils the low frequencies, a resonance is narrow

@@ -1,4 +1,4 @@
-"""How often the bound of hw.identify is above the truth: random devices on the emulated plant, encoder and forces rounded.
+"""How often the bound of hw.identify is above the truth: random devices, encoder and forces rounded.
 
 PYTHONPATH=. python tests/benchmarks/bound_coverage.py --cases 120     (some minutes; --first 120 goes on from there)
 
