@@ -19,6 +19,7 @@ from hw.standstill import worth
 from hw.trace import Recorder
 from hw.upset import Upset
 from models.device import RigidDevice
+from sim.result import Result
 from sim.scenario import InputError, load
 
 STEP = 5e-6  # [m] a coarse encoder: half of an Omega's 0.01 mm
@@ -194,3 +195,9 @@ def test_a_record_that_cannot_tell_the_frictions_apart_gives_no_bound():
     x = step * np.round(played(force, T, 0.5, 0.3, 0.05) / step + 0.3)
     with pytest.raises(ValueError, match="does not tell viscous from dry friction"):
         identify(x, force, np.ones(x.size, dtype=bool), T, step, rigid=True)
+
+
+def test_a_trace_whose_forces_have_another_shape_is_refused():
+    two, one = np.zeros((3, 2)), np.zeros((3, 1))
+    with pytest.raises(ValueError, match="f has 1 channels, x has 2"):
+        Result(np.arange(3.0), x=two, f=one, x_handle=two, v_handle=two, w=two, meta={})
