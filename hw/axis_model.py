@@ -2,7 +2,7 @@
 
 The model is the device's: motor (m1) with viscous friction b and Coulomb friction c, transmission spring k, handle
 (m2); the rigid one has the motor alone. Between ticks it is exact for a held force (expm); Coulomb friction is
-c tanh(v/v0), held for a quarter of a tick.
+c tanh(v/v0), held for an eighth of a tick.
 """
 
 from __future__ import annotations
@@ -14,20 +14,30 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from controller.lti import Array
+from hw.standstill import worth
 
 Flags = NDArray[np.bool_]
 
 COULOMB = 2  # where Coulomb friction is among the parameters
+SHIFT = 1e-5  # of log parameters, and of Coulomb friction in newtons, for derivatives
 UNEXPLAINED = 0.7, 1.5e-3  # encoder steps rms (rounding alone leaves 0.29), or this part of the motion's rms
 SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
-SUBSTEPS = 4  # per tick for which it is held
+COARSE, FINE = 3, 8  # substeps of a tick for which it is held: in a search, and at its end
 
 
 class Model:
     """p = [log m1, log b, c, log m2, log k] -> simulated displacement."""
 
-    def __init__(self, x: Array, force: Array, used: Flags, T: float, rigid: bool) -> None:
-        self.x, self.force, self.used, self.T, self.rigid = x, force, used, T, rigid
+    def __init__(
+        self, x: Array, force: Array, used: Flags, T: float, step: float, rigid: bool, substeps: int = COARSE
+    ) -> None:
+        self.x, self.force, self.used, self.T, self.step, self.rigid = x, force, used, T, step, rigid
+        self.substeps = substeps
+        self.weight = worth(np.round(x[used] / step))
+
+    def finer(self) -> Model:
+        """The same record, friction integrated more finely."""
+        return Model(self.x, self.force, self.used, self.T, self.step, self.rigid, FINE)
 
     def matrices(self, p: Array, T: float) -> tuple[Array, Array]:
         """The plant held for T: s+ = A s + B u with s = [positions; velocities]."""
@@ -45,19 +55,39 @@ class Model:
 
     def simulate(self, p: Array) -> Array:
         """Displacement (N,) [m] from rest."""
-        substeps = SUBSTEPS if p[COULOMB] else 1
+        substeps = self.substeps if p[COULOMB] else 1
         A, B = self.matrices(p, self.T / substeps)
         play = _play_rigid if self.rigid else _play_compliant
         return np.array(play(A.tolist(), B.tolist(), float(p[COULOMB]), self.force.tolist(), substeps))
 
-    def allowed(self, step: float) -> float:
-        """What a fit may leave unexplained [m] rms, at `step` [m] of the encoder."""
-        return max(UNEXPLAINED[0] * step, UNEXPLAINED[1] * float(np.std(self.x[self.used])))
+    def allowed(self) -> float:
+        """What a fit may leave unexplained [m] rms."""
+        return max(UNEXPLAINED[0] * self.step, UNEXPLAINED[1] * float(np.std(self.x[self.used])))
 
-    def residual(self, p: Array) -> Array:
+    def error(self, p: Array) -> Array:
         """Measured less simulated (used,) [m]; where the origin lies is not known."""
         error = (self.x - self.simulate(p))[self.used]
-        return np.nan_to_num(error - error.mean(), nan=1e3, posinf=1e3, neginf=-1e3)
+        error -= np.average(error, weights=self.weight)
+        return np.nan_to_num(error, nan=1e3, posinf=1e3, neginf=-1e3)
+
+    def residual(self, p: Array) -> Array:
+        """What a fit makes small: the error (used,) [m], times the root of what a sample is worth."""
+        return np.sqrt(self.weight) * self.error(p)
+
+    def jacobian(self, p: Array) -> Array:
+        """Derivatives of the displacement (used, p) by central differences."""
+        shifts = SHIFT * np.eye(p.size)
+        columns = [(self.simulate(p + s) - self.simulate(p - s))[self.used] for s in shifts]
+        return np.stack(columns, axis=1) / (2 * SHIFT)
+
+    def slopes(self, p: Array) -> Array:
+        """Derivatives of what is subtracted in residual() (used, p)."""
+        J = self.jacobian(p)
+        return np.sqrt(self.weight)[:, None] * (J - np.average(J, axis=0, weights=self.weight))
+
+    def rms(self, residual: Array) -> float:
+        """[m] of the error behind a residual."""
+        return float(np.sqrt(residual @ residual / self.weight.sum()))
 
 
 def _play_rigid(A: list[list[float]], B: list[float], c: float, force: list[float], substeps: int) -> list[float]:

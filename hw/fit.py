@@ -1,30 +1,28 @@
 """Mass, friction and transmission of one axis from a record of forces and displacements.
 
 Output error: the parameters of hw.axis_model whose simulated displacement is nearest to the encoder's, in the
-least-squares sense. Residuals are correlated (rounding, friction that the model has not), so the covariance is the
-sandwich (J'J)^-1 J' R J (J'J)^-1 with Bartlett weights (Newey and West 1987).
+least-squares sense, where a standstill counts as few samples (hw.standstill). How far the estimate scatters: hw.spread.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from controller.lti import Array
 from hw.axis_model import COULOMB, Flags, Model
+from hw.spectrum import spectral_starts
+from hw.spread import spread
 
-BANDWIDTH = 60  # [ticks] over which residuals may be correlated
-EVALUATIONS = 60  # of a search, without those for derivatives
+EVALUATIONS = 60, 30  # of a search without Coulomb friction and with it, less those for derivatives
+POLISH = 15  # steps at the end, with friction integrated more finely
+ENOUGH = 1e-6  # part of the sum of squares, from which on a step is the last one
 ONE_SIDED_95 = 1.6449  # normal quantile
-MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a transmission mode is looked for first
-PARTS = (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mass, that the motor may have
+VAGUE = 0.1  # standard error of b, as a part of b, above which nothing is said of it
 FRICTIONS = (1e-5, 0.01, 0.05)  # Coulomb friction that a search begins with, of the force's span
-STARTS = 3  # of the search in time
 REACH = 3.0  # of a search, in logarithms
-SPECTRUM = 250  # frequencies that are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,13 +48,19 @@ def identify(x: Array, force: Array, used: Flags, T: float, step: float, rigid: 
     """
     if np.ptp(x[used]) < 20 * step:
         raise ValueError(f"the axis moved by {np.ptp(x[used]) / step:.0f} encoder steps, at least 20 are needed")
-    whole = Model(x, force, used, T, rigid=True)
-    smooth = _without_coulomb(whole, np.array([np.log(mass), 0.0]))
+    whole = Model(x, force, used, T, step, rigid=True)
+    stiff = _with_coulomb(whole, _without_coulomb(whole, np.array([np.log(mass), 0.0])).x)
     if rigid:
-        return _settled(whole, _with_coulomb(whole, smooth.x, step), step)
-    model = Model(x, force, used, T, rigid=False)
-    tries = [_without_coulomb(model, start) for start in _starts(model, smooth.x)]
-    return _settled(model, _with_coulomb(model, min(tries, key=lambda fit: fit.cost).x, step), step)
+        fine = whole.finer()
+        return _settled(fine, _polished(fine, stiff.x))
+    model = Model(x, force, used, T, step, rigid=False)
+    fine, ends = model.finer(), []
+    for start in spectral_starts(model, stiff.x):
+        p = _polished(fine, _search(model, start).x)
+        ends.append((fine.rms(fine.residual(p)), p))
+        if ends[-1][0] <= fine.allowed():
+            break
+    return _settled(fine, min(ends, key=lambda end: end[0])[1])
 
 
 def _without_coulomb(model: Model, start: Array) -> OptimizeResult:
@@ -69,65 +73,73 @@ def _without_coulomb(model: Model, start: Array) -> OptimizeResult:
         return model.residual(np.insert(p, COULOMB, 0.0))
 
     bounds = (start - REACH, start + REACH)
-    return least_squares(residual, start, x_scale="jac", bounds=bounds, max_nfev=EVALUATIONS)
+    return least_squares(residual, start, x_scale="jac", bounds=bounds, max_nfev=EVALUATIONS[0])
 
 
-def _with_coulomb(model: Model, near: Array, step: float) -> OptimizeResult:
+def _with_coulomb(model: Model, near: Array) -> OptimizeResult:
     """All parameters, from a start that lacks c: hardly any at first, then more as long as much is unexplained."""
-    strongest = np.ptp(model.force)
-    free = np.arange(near.size + 1) != COULOMB
     fits = []
     for part in FRICTIONS:
-        start = np.insert(near, COULOMB, part * strongest)
-        bounds = (np.where(free, start - REACH, 0.0), np.where(free, start + REACH, strongest))
-        # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
-        options = {"x_scale": "jac", "max_nfev": EVALUATIONS, "diff_step": 1e-5, "ftol": 1e-6}
-        fits.append(least_squares(model.residual, start, bounds=bounds, **options))
-        if np.sqrt(2 * fits[-1].cost / fits[-1].fun.size) <= model.allowed(step):
+        fits.append(_search(model, np.insert(near, COULOMB, part * np.ptp(model.force))))
+        if model.rms(fits[-1].fun) <= model.allowed():
             break
     return min(fits, key=lambda fit: fit.cost)
 
 
-def _settled(model: Model, fit: OptimizeResult, step: float) -> Estimate:
-    estimate = _estimate(model, fit.x, fit.fun, fit.jac, step)
-    allowed = model.allowed(step)
-    if estimate.rms > allowed:
+def _search(model: Model, start: Array) -> OptimizeResult:
+    strongest = np.ptp(model.force)
+    start = start.copy()
+    start[COULOMB] = np.clip(start[COULOMB], FRICTIONS[0] * strongest, strongest / 2)
+    free = np.arange(start.size) != COULOMB
+    bounds = (np.where(free, start - REACH, 0.0), np.where(free, start + REACH, strongest))
+    # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
+    options = {"x_scale": "jac", "max_nfev": EVALUATIONS[1], "ftol": 1e-4}
+    return least_squares(model.residual, start, lambda p: -model.slopes(p), bounds=bounds, **options)
+
+
+def _polished(model: Model, p: Array) -> Array:
+    """The nearest parameters from close by: Gauss-Newton steps as long as they help, halved where they do not.
+
+    A search that stops where its sum of squares hardly changes may be several standard errors away.
+    """
+    residual = model.residual(p)
+    for _ in range(POLISH):
+        change = np.linalg.lstsq(model.slopes(p), residual, rcond=None)[0]
+        for part in (1.0, 0.5, 0.1):
+            other = p + part * change
+            other[COULOMB] = max(0.0, other[COULOMB])
+            left = model.residual(other)
+            if left @ left < residual @ residual:
+                break
+        else:
+            break
+        gain = 1 - (left @ left) / (residual @ residual)
+        p, residual = other, left
+        if gain < ENOUGH:
+            break
+    return p
+
+
+def _settled(model: Model, p: Array) -> Estimate:
+    step, rms, allowed = model.step, model.rms(model.residual(p)), model.allowed()
+    if rms > allowed:
         raise ValueError(
-            f"the model leaves {estimate.steps:.2g} encoder steps rms unexplained, at most {allowed / step:.2g} may be "
+            f"the model leaves {rms / step:.2g} encoder steps rms unexplained, at most {allowed / step:.2g} may be "
             "(friction of another kind, a hand at the handle, gravity, or a slipping drive?)"
+        )
+    estimate = _estimate(model, p, rms)
+    vague = estimate.errors["viscous"] / estimate.viscous
+    if vague > VAGUE:
+        raise ValueError(
+            f"the record does not tell viscous from dry friction: {estimate.viscous:.3g} N s/m, standard error "
+            f"{100 * vague:.0f} %, at most {100 * VAGUE:.0f} % may be; take one with more force or a longer one"
         )
     return estimate
 
 
-def _starts(model: Model, whole: Array) -> list[Array]:
-    """Where to begin with a transmission: the modes and splits of the mass that fit the spectrum best.
-
-    A search in time alone stops at any mode but the right one. The spectrum is that of the steps x[k+1] - x[k], which
-    begin and end at rest, over that of the forces; it is compared in decibels, where the force had something to say.
-    """
-    n = len(model.force)
-    force, moved = np.fft.rfft(model.force), np.fft.rfft(np.diff(model.x, append=model.x[-1]))
-    z = np.exp(2j * np.pi * np.arange(force.size) / n)
-    loud = np.flatnonzero(np.abs(force) > 0.2 * np.abs(force).max())
-    loud = loud[:: max(1, loud.size // SPECTRUM)]
-    measured, z = np.log(np.abs(moved[loud] / force[loud]) + 1e-12), z[loud]
-    points, mass = [], float(np.exp(whole[0]))
-    for hz, part in product(MODES_HZ, PARTS):
-        m1, m2 = part * mass, (1 - part) * mass
-        k = (2 * np.pi * hz) ** 2 * m1 * m2 / mass
-        point = np.array([np.log(m1), max(whole[1], -2.0), 0.0, np.log(m2), np.log(k)])
-        A, B = model.matrices(point, model.T)
-        G = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, np.broadcast_to(B[:, None], (z.size, len(A), 1)))
-        apart = np.log(np.abs((z - 1) * G[:, 0, 0]) + 1e-12) - measured
-        points.append((float(np.abs(apart).mean()), point))  # absolute: a few bins of a resonance may lie far apart
-    best: dict[float, Array] = {}
-    for _, point in sorted(points, key=lambda entry: entry[0]):
-        best.setdefault(round(float(point[0]), 6), np.delete(point, COULOMB))  # the best mode of every split
-    return list(best.values())[:STARTS]
-
-
-def _estimate(model: Model, p: Array, residual: Array, jacobian: Array, step: float) -> Estimate:
-    covariance = _sandwich(jacobian, residual)
+def _estimate(model: Model, p: Array, rms: float) -> Estimate:
+    scatter = spread(model, p)
+    covariance = scatter.covariance
     m1, b = np.exp(p[0]), np.exp(p[1])
     gradient = np.zeros(p.size)
     gradient[0], mass, k, mode = m1, m1, None, None
@@ -140,16 +152,6 @@ def _estimate(model: Model, p: Array, residual: Array, jacobian: Array, step: fl
         "viscous": float(b * np.sqrt(covariance[1, 1])),
         "coulomb": float(np.sqrt(covariance[2, 2])),
     }
-    rms = float(np.sqrt(np.mean(residual**2)))
-    delta = max(0.0, float(b) - ONE_SIDED_95 * errors["viscous"])
-    return Estimate(float(mass), float(m1), float(b), float(p[2]), k, mode, errors, delta, rms, rms / step)
-
-
-def _sandwich(J: Array, residual: Array) -> Array:
-    scores = J * residual[:, None]
-    middle = scores.T @ scores
-    for lag in range(1, min(BANDWIDTH, len(scores) - 1)):
-        shared = scores[lag:].T @ scores[:-lag]
-        middle += (1 - lag / BANDWIDTH) * (shared + shared.T)
-    bread = np.linalg.pinv(J.T @ J)
-    return bread @ middle @ bread
+    above = max(0.0, float(b * scatter.bias[1]))  # on average; a bias to the safe side is left where it is
+    delta = max(0.0, float(b) - above - ONE_SIDED_95 * errors["viscous"])
+    return Estimate(float(mass), float(m1), float(b), float(p[2]), k, mode, errors, delta, rms, rms / model.step)

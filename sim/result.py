@@ -36,6 +36,8 @@ class Result:
             object.__setattr__(self, name, value)
             if value.shape[0] != self.t.shape[0]:
                 raise ValueError(f"{name} has {value.shape[0]} samples, t has {self.t.shape[0]}")
+        if self.f.shape != self.x.shape:
+            raise ValueError(f"f has {self.f.shape[1]} channels, x has {self.x.shape[1]}")
 
     @classmethod
     def from_record(cls, assembly: Assembly, record: Record, meta: dict[str, Any]) -> Self:

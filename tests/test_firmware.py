@@ -435,11 +435,25 @@ def test_the_example_sketch_counts_edges_and_obeys_its_button(sketch):
 def test_the_example_sketch_does_not_wait_for_a_host_that_reads_nothing_nor_catch_up(sketch):
     sketch.feed(Config(1, 4, 4, 0, (24000, 24000), (24000, 24000)))
     sketch.run(1200)
-    sketch.lib.stub_room(31)  # a STATE of two axes is 32 bytes
+    sketch.lib.stub_room(0)
     assert sketch.run(12_000) == []
     sketch.lib.stub_room(1000)
-    (state,) = sketch.run(1200)
-    assert state.tick == 12
+    assert [state.tick for state in sketch.run(1200)] == [11, 12]  # the newest that waited, and the next one
     sketch.now += 100_000  # the board was held up for 83 periods
     (state,) = sketch.run(1200)
     assert (state.tick, state.phase, state.cause) == (13, Phase.STOPPED, Cause.DEVICE)
+
+
+@needs_gxx
+@pytest.mark.parametrize("room", [1, 31, 63])
+def test_a_board_with_a_small_write_buffer_sends_whole_frames(sketch, room):
+    """A pass of the loop every 50 us: 24 pieces in a period. What has no time to leave is dropped whole."""
+    sketch.lib.stub_room(room)
+    sketch.feed(Hello(7))
+    (about,) = [m for m in sketch.run(10_000) if isinstance(m, Info)]
+    assert about.axes == 2
+    sketch.feed(Config(1, 4, 4, 0, (24000, 24000), (24000, 24000)))
+    sketch.run(4_000)
+    ticks = [m.tick for m in sketch.run(12_000)]
+    assert len(ticks) == 10 if room > 1 else 4 <= len(ticks) < 10
+    assert ticks == sorted(set(ticks))

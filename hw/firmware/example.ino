@@ -1,6 +1,10 @@
 /* A two-axis device on the serial link: quadrature encoders, PWM and direction to two motor drivers, an enable line and
- * an emergency stop. For boards with native USB (Teensy 4, Due, Zero, Portenta): their write buffer holds an INFO and a
- * STATE at once. Put haptic_link.h and haptic_frame.h beside it.
+ * an emergency stop. Written for Teensy 4, whose Serial is native USB. On another board check three things: that Serial is
+ * the port you plug in (some boards call their native USB SerialUSB), that its core has availableForWrite() and it returns
+ * more than 0 on an idle line (print it once: where it is always 0, nothing is ever sent), and what it returns then. Two
+ * axes send an INFO of 68 bytes and STATEs of 32; where the idle line takes less than both at once, they wait in `queue`
+ * and leave piece by piece, which delays a STATE: the host measures that as part of the round trip. Put haptic_link.h and
+ * haptic_frame.h beside it.
  *
  * Yours to change: the pins, the numbers of INFO (measure them; docs/protocol.md says what the host does with each), and
  * the five functions. Everything that keeps hands whole is in haptic_link.h: leave it as it is. */
@@ -19,6 +23,8 @@ static const uint16_t FULL_FORCE = 24000; /* steps of 500 uN at PWM 255, here 12
 static hl_device device;
 static volatile int32_t position[AXES];
 static uint32_t due;
+static uint8_t queue[HL_MAX_OUT]; /* bytes that the board's buffer had no room for yet */
+static size_t queued, gone;       /* how many there are, and how many of them have left */
 
 static void edge(uint8_t axis) /* one count for every edge of channel A */
 {
@@ -51,10 +57,25 @@ static void writeForces(const int16_t *force)
 /* The next byte, -1 where none waits. */
 static int serialRead() { return Serial.available() > 0 ? Serial.read() : -1; }
 
-/* All or nothing, and never waiting: a device that waits for its host has no watchdog. */
+/* As much of the queue as the board takes now, and never waiting: a device that waits for its host has no watchdog. */
+static void serialPump()
+{
+  int room = Serial.availableForWrite();
+  if (gone == queued || room <= 0) return;
+  size_t n = queued - gone < (size_t)room ? queued - gone : (size_t)room;
+  gone += Serial.write(queue + gone, n);
+}
+
+/* All of it or nothing, so that no frame is ever cut in two: it is dropped while older bytes are on their way, and takes
+ * the place of older bytes of which none has left. */
 static void serialWrite(const uint8_t *data, size_t n)
 {
-  if (Serial.availableForWrite() >= (int)n) Serial.write(data, n);
+  serialPump();
+  if ((gone > 0 && gone < queued) || n > sizeof queue) return;
+  for (size_t i = 0; i < n; i++) queue[i] = data[i];
+  queued = n;
+  gone = 0;
+  serialPump();
 }
 
 static uint32_t timeUs() { return (uint32_t)micros(); }
@@ -89,6 +110,7 @@ void loop()
   int byte = 0;
   for (uint8_t n = 0; n < 64 && (byte = serialRead()) >= 0; n++) /* a flood of bytes must not keep the tick waiting */
     hl_receive(&device, (uint8_t)byte, timeUs());
+  serialPump();
   if (digitalRead(STOP_BUTTON) == HIGH) {
     digitalWrite(ENABLE, LOW);
     hl_estop(&device);

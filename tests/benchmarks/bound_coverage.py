@@ -1,0 +1,129 @@
+"""How often the bound of hw.identify is above the truth: random devices, encoder and forces rounded.
+
+PYTHONPATH=. python tests/benchmarks/bound_coverage.py --cases 120     (some minutes; --first 120 goes on from there)
+
+Every case draws a device from its own seed: rigid, or compliant every fourth time; mass 0.1 to 0.5 kg, viscous friction
+0.3 to 2 N s/m, Coulomb friction 0 to 0.05 N (none at all in a fifth of them), encoder 1 to 20 um, standing anywhere
+within a step, half of them with white noise of 0.2 or 0.4 steps. The excitation is the command's own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from hw.emulated_plant import EmulatedPlant, nobody
+from hw.excitation import chirp
+from hw.fit import Estimate, identify
+from models.device import RigidDevice
+from sim.scenario import load
+
+FORCE_STEP = 4e-4  # [N] of the wire
+NOISE = (0.0, 0.0, 0.2, 0.4)  # [encoder steps]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A device, and how it is looked at."""
+
+    seed: int
+    rigid: bool
+    mass: float  # [kg]
+    motor: float  # part of the mass, where there is a transmission
+    stiffness: float  # [N/m] of it
+    viscous: float  # [N s/m]
+    coulomb: float  # [N]
+    step: float  # [m]
+    noise: float  # [steps]
+    seconds: float = 2.5  # of the chirp
+
+
+def case(seed: int) -> Case:
+    """The random case of a seed."""
+    draw = np.random.default_rng(seed)
+    return Case(
+        seed,
+        rigid=seed % 4 != 3,
+        mass=draw.uniform(0.1, 0.5),
+        motor=draw.uniform(0.2, 0.5),
+        stiffness=draw.uniform(8e3, 25e3),
+        viscous=float(np.exp(draw.uniform(np.log(0.3), np.log(2.0)))),
+        coulomb=draw.choice([0.0, *draw.uniform(0.0, 0.05, 4)]),
+        step=float(np.exp(draw.uniform(np.log(1e-6), np.log(2e-5)))),
+        noise=draw.choice(NOISE),
+    )
+
+
+def estimated(c: Case) -> Estimate:
+    """What is estimated from a record of it. Raises ValueError where nothing is."""
+    base, draw = load("omega-pair"), np.random.default_rng((c.seed, 1))
+    if c.rigid:
+        device = RigidDevice(mass=c.mass, damping=c.viscous)
+    else:
+        masses = {"motor_mass": c.motor * c.mass, "handle_mass": (1 - c.motor) * c.mass}
+        device = msgspec.structs.replace(
+            base.device[0], damping=c.viscous, delta=None, transmission_stiffness=c.stiffness, **masses
+        )
+    scenario = nobody(base.replace(device=(device,) * base.channels))
+    plant = EmulatedPlant(scenario, np.full(base.channels, c.step), c.coulomb)
+    signal = chirp(base.channels, base.T, 1, 1.0, (3.0, 200.0), c.seconds).signal
+    late = np.vstack([np.zeros(base.channels), signal[:-1]])
+    applied = -FORCE_STEP * np.round(late / FORCE_STEP)  # the device feels -f
+    x, origin = [], draw.uniform()
+    for force in applied:
+        x.append(c.step * np.round(plant.s[0] / c.step + origin + c.noise * draw.standard_normal()))
+        plant.advance(-force)
+    return identify(np.array(x), applied[:, 0], np.ones(len(x), dtype=bool), base.T, c.step, c.rigid)
+
+
+def judged(seed: int) -> tuple[Case, Estimate | str, float]:
+    """The case, what came of it, and how long it took [s]."""
+    c, begin = case(seed), time.perf_counter()
+    try:
+        found: Estimate | str = estimated(c)
+    except ValueError as error:
+        found = str(error)
+    return c, found, time.perf_counter() - begin
+
+
+def report(results: Iterable[tuple[Case, Estimate | str, float]]) -> None:
+    """One line per case, then the figures."""
+    excess, scaled, none, longest = [], [], 0, 0.0
+    for c, found, seconds in results:
+        longest = max(longest, seconds)
+        kind = "rigid" if c.rigid else "compliant"
+        what = f"{c.seed:4d} {kind:9s} m {c.mass:.3f} b {c.viscous:.3f} c {c.coulomb:.4f} {1e6 * c.step:5.1f} um"
+        if isinstance(found, str):
+            none += 1
+            print(f"{what} noise {c.noise}: none: {found}", flush=True)
+            continue
+        excess.append(100 * (found.delta / c.viscous - 1))
+        scaled.append((found.viscous - c.viscous) / found.errors["viscous"])
+        off = 100 * (found.viscous / c.viscous - 1)
+        print(f"{what} noise {c.noise}: b {off:+.3f} %, bound {excess[-1]:+.3f} %, {seconds:.1f} s", flush=True)
+    over = sum(e > 0 for e in excess)
+    print(f"{len(excess)} bounds, {over} above the truth, the worst by {max(excess):+.3f} %; none in {none} cases")
+    print(f"bounds below the truth: median {-np.median(excess):.2f} %, most {-min(excess):.2f} %")
+    print(f"errors over standard errors: mean {np.mean(scaled):+.2f}, deviation {np.std(scaled):.2f}")
+    print(f"longest case {longest:.1f} s")
+
+
+def main() -> None:
+    """Cases --first to --first + --cases, two at a time."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", type=int, default=120)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    args = parser.parse_args()
+    with ProcessPoolExecutor(args.workers) as pool:
+        report(pool.map(judged, range(args.first, args.first + args.cases)))
+
+
+if __name__ == "__main__":
+    main()
