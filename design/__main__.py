@@ -124,7 +124,7 @@ def _parser() -> Parser:
     optimal.add_argument("--objective", choices=OBJECTIVES, help="which mismatch is minimised (default rms)")
     optimal.add_argument("--high-gain", metavar="G", help="limit of |F|/|E| above 100 Hz, or none (default 1.5)")
     optimal.add_argument("--margin", metavar="SHARE", help="of the damping that stays unused (default 0.005)")
-    parser.add_argument("--samples", metavar="N", help=f"random points inside a box, beside the search (default {SAMPLES})")
+    parser.add_argument("--samples", metavar="N", help=f"random points in a box, beside the search (default {SAMPLES})")
     both = parser.add_argument_group("ccl and optimal")
     both.add_argument("--full", action="store_true", help="across channels (default: diagonal)")
     add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case>.json)")

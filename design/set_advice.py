@@ -46,7 +46,7 @@ def set_advice(
         more = f", nor with {len(hopeless) - 1} more of the {len(others)} vertices" if len(hopeless) > 1 else ""
         why = f"beside the nominal environment there is none with {hopeless[0]}{more}"
     else:
-        why = "each vertex has one beside the nominal environment, but not all of them and the points between them together"
+        why = "each vertex has one beside the nominal environment, but not all of them together with the points between"
     hopeful = [words for words, other in changes.items() if step() and feasible(spec, other)]
     assert spec.shrunk  # a box came with it
     smaller = ((f, replace(spec, others=spec.shrunk(f), regions=())) for f in SMALLER)

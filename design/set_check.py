@@ -131,7 +131,7 @@ def search_words(part: dict[str, Any]) -> str:
     """What was found between the vertices, in a line."""
     ratio = "no damping is enough" if part["worst_ratio"] is None else f"{part['worst_ratio']:.4f} of the damping"
     found = "[red]violated[/]" if part["violated"] else "no violation found"
-    return f"searched, not proved: {found} in {part['environments']} environments; worst {ratio}, at {part['worst']}"
+    return f"searched, not proved: {found}, {part['environments']} points tried; worst {ratio}, at {part['worst']}"
 
 
 def _inside_part(check: SetCheck) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from controller.lti import Array
 Ratio = Callable[[Member], float]  # required over available damping
 Progress = Callable[[int, int], None]  # points tried, of about how many
 
-ON_EDGES, ALONG = 400, (3, 9)  # points on the edges of a region, and on each of them: least, most
+ON_EDGES, ALONG = 240, (3, 9)  # points on the edges of a region, and on each of them: least, most
 DRAWN, SEED = 48, 0xFACE  # points on faces and inside of each region
 STARTS, APART, SAME = 4, 0.2, 0.05  # of the compass search in a region; least distance of starts, and of tops
 FIRST, LAST = 1 / 16, 1 / 128  # its steps, in widths of the ranges
@@ -52,7 +52,6 @@ def search(regions: Sequence[Region], ratio: Ratio, progress: Progress = lambda 
     tops: list[Found] = []
 
     for region, some in zip(regions, points, strict=True):
-
         known: dict[bytes, float] = {}
 
         def need(point: Array, region: Region = region, known: dict[bytes, float] = known) -> float:

@@ -122,7 +122,7 @@ def _parser() -> Parser:
     parser.add_argument("--adversary", action="store_true", help="also search for the worst passive human")
     parser.add_argument("--generations", default="150", metavar="N", help="of the adversary's search (default 150)")
     spread = (
-        "what the humans meet: the nominal environment, or in turn all vertices of the box and as many other points of it, the worst found first"
+        "what the humans meet: the nominal environment, or in turn all vertices of the box and as many others of it"
     )
     parser.add_argument("--environments", choices=ENVIRONMENTS, default="nominal", help=f"{spread} (default nominal)")
     parser.add_argument("--no-plot", action="store_true", help="write no picture")

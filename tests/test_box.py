@@ -19,7 +19,6 @@ from design.audit import main as audit_main
 from design.certificate import NotProved, prove, verify
 from design.check import main as check_main
 from design.failure import Infeasible
-from design.margin import closed_loop
 from design.set_check import check_set, set_part
 from design.store import Loop, Stored, data_of, digest, load, sealed
 from design.store import SpringDamper as StoredSpringDamper
