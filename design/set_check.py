@@ -129,9 +129,9 @@ def search_part(searched: Searched) -> dict[str, Any]:
 
 def search_words(part: dict[str, Any]) -> str:
     """What was found between the vertices, in a line."""
-    ratio = "no damping is enough" if part["worst_ratio"] is None else f"{part['worst_ratio']:.4f} of the damping"
     found = "[red]violated[/]" if part["violated"] else "no violation found"
-    return f"searched, not proved: {found}, {part['environments']} points tried; worst {ratio}, at {part['worst']}"
+    ratio = "no damping is enough" if part["worst_ratio"] is None else f"worst ratio {part['worst_ratio']:.4f}"
+    return f"searched, not proved: {found}, {ratio} in {part['environments']} points, at {part['worst']}"
 
 
 def _inside_part(check: SetCheck) -> dict[str, Any]:
