@@ -50,7 +50,7 @@ bench: .venv/ready
 .venv/ready: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + \
 	  sys.version.split()[0] + ": make PYTHON=python3.11")'
-	@echo 'setting up .venv: about a minute, once'
+	@echo 'setting up .venv: one to two minutes, once; pip says nothing meanwhile'
 	@$(PYTHON) -m venv .venv
 	@$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
 	@touch $@

@@ -44,7 +44,7 @@ class SpringDamper:
 
     def __post_init__(self) -> None:
         for name in "KB":
-            object.__setattr__(self, name, frozen(getattr(self, name), 1))
+            object.__setattr__(self, name, frozen(getattr(self, name), 1, name))
         if self.K.shape != self.B.shape:
             raise ValueError(f"K has {self.K.size} channels and B has {self.B.size}; give one of each per device")
         if not (np.isfinite(self.K).all() and (self.K > 0).all()):
@@ -96,8 +96,8 @@ class InternalModel:
         def __init__(self, poles: ArrayLike, Q: ArrayLike) -> None: ...
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "poles", frozen(self.poles, 1))
-        object.__setattr__(self, "Q", frozen(self.Q, 3))
+        object.__setattr__(self, "poles", frozen(self.poles, 1, "poles"))
+        object.__setattr__(self, "Q", frozen(self.Q, 3, "Q"))
         functions, rows, columns = self.Q.shape
         if functions != self.poles.size + 1 or rows != columns:
             raise ValueError(f"Q has shape {self.Q.shape}, expected ({self.poles.size + 1}, channels, channels)")

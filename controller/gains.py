@@ -34,7 +34,7 @@ class Gains:
 
     def __post_init__(self) -> None:
         for name in "KB":
-            object.__setattr__(self, name, frozen(getattr(self, name), 1))
+            object.__setattr__(self, name, frozen(getattr(self, name), 1, name))
         if self.K.shape != self.B.shape:
             raise ValueError(f"K has {self.K.size} entries and B has {self.B.size}")
         if not ((self.K > 0) & (np.inf > self.K)).all():

@@ -17,11 +17,16 @@ class SingularLoop(ValueError):
     """A feedback interconnection whose algebraic loop has no solution."""
 
 
-def frozen(value: ArrayLike, ndim: int) -> Array:
-    """A read-only float64 copy of `value`, which must have `ndim` axes."""
-    array = np.array(value, dtype=np.float64)
+def frozen(value: ArrayLike, ndim: int, name: str = "") -> Array:
+    """A read-only float64 copy of `value`, which must have `ndim` axes. Raises ValueError beginning with `name`."""
+    expected = "a list of numbers" if ndim == 1 else f"an array of numbers with {ndim} axes"
+    came = f"{name} is {value!r}, " if name else ""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{came}expected {expected}") from None
     if array.ndim != ndim:
-        raise ValueError(f"expected an array with {ndim} axes, got shape {array.shape}")
+        raise ValueError(f"{came}expected {expected}, got shape {array.shape}")
     array.setflags(write=False)
     return array
 
@@ -42,7 +47,7 @@ class Lti:
 
     def __post_init__(self) -> None:
         for name in "ABCD":
-            object.__setattr__(self, name, frozen(getattr(self, name), 2))
+            object.__setattr__(self, name, frozen(getattr(self, name), 2, name))
         (n, m), p = self.B.shape, self.C.shape[0]
         shapes = {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m)}
         for name, shape in shapes.items():

@@ -44,7 +44,7 @@ class Process:
 
     def __post_init__(self) -> None:
         for name in ("force_limit", "encoder_step"):
-            value = frozen(getattr(self, name), 1)
+            value = frozen(getattr(self, name), 1, name)
             object.__setattr__(self, name, value)
             if value.shape != (self.F.inputs,):
                 raise ValueError(f"{name} has {value.size} entries for {self.F.inputs} channels")

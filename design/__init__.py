@@ -1,29 +1,53 @@
 """Conditions, figures of merit and designs for virtual couplings. It sees a device only through its damping.
 
-    from design import design_coupling, certify
+    from design import design_coupling, certify, promise, transparency_of
 
-Names are loaded when they are first used: a command must not wait for what it does not need.
+design_coupling(loop, kind)         a Design: the best coupling of a kind for a loop, scenario.loop("I"); see Options
+certify(loop, coupling)             a Requirement by each condition: how much damping the coupling needs, and where
+promise(loop, requirements)         for which environments that makes it safe for every passive human, in words
+transparency_of(loop, coupling)     figures of Transparency: how close what one feels comes to the environment
+DesignFailed                        a ValueError: there is no such coupling
+
+help(design.certify) and the like say more. Names are loaded when they are first used: a command must not wait for
+what it does not need.
 """
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from design.api import certify, design_coupling
+    from design.api import Options, certify, design_coupling, promise, transparency_of
     from design.failure import DesignFailed
     from design.margin import Requirement
     from design.result import Design
     from design.store import Loop
+    from design.transparency import Transparency
 
-__all__ = ["Design", "DesignFailed", "Loop", "Requirement", "certify", "design_coupling"]
+if sys.argv[:1] == ["-m"]:  # a command starts, and may be interrupted; scripts do not need sim for a design
+    import sim  # noqa: F401
+
+__all__ = [
+    "Design",
+    "DesignFailed",
+    "Loop",
+    "Options",
+    "Requirement",
+    "Transparency",
+    "certify",
+    "design_coupling",
+    "promise",
+    "transparency_of",
+]
 
 _HOMES = {
     "Design": "design.result",
     "DesignFailed": "design.failure",
     "Loop": "design.store",
     "Requirement": "design.margin",
+    "Transparency": "design.transparency",
 }
 
 
@@ -31,3 +55,8 @@ def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'design' has no attribute {name!r}")
     return getattr(import_module(_HOMES.get(name, "design.api")), name)
+
+
+def __dir__() -> list[str]:
+    """For help() and completion: what is for scripts, and what every package has."""
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]

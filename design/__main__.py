@@ -15,6 +15,7 @@ from design.assess import CONDITIONS, assess, specification
 from design.certificate import NotProved, prove
 from design.designs import FILTERS, KINDS, METHODS, OBJECTIVES, compare_methods, design_coupling
 from design.failure import DesignFailed
+from design.frozen_environment import STIFFEST
 from design.jitter_part import switching_part, switching_requirement
 from design.jitter_proof import sent
 from design.listed import listed
@@ -42,7 +43,7 @@ from sim.command import (
     scenario_from,
     seed_from,
 )
-from sim.files import folder, write_json
+from sim.files import out_file, write_json
 from sim.scenario import InputError, Scenario
 
 
@@ -51,11 +52,8 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
-    out = Path(args.out or f"out/design-{args.case}.json")
-    if out.is_dir():
-        raise InputError(f"--out {out}: is a folder, expected the file of the coupling")
     check_json(args)
-    folder(out.parent)
+    out = out_file(args.out, f"out/design-{args.case}.json", "the file of the coupling")
     loop = _loop(args, scenario_from(args))
     options = _options(args) | _switching(args, loop)
     if args.coupling == "optimal" and loop.environment.walls:
@@ -265,6 +263,8 @@ def _table(outcome: dict[str, Any]) -> Table:
     table = Table(title=f"{coupling['kind']}, case {outcome['case']}, {certificate['condition']}", show_header=False)
     if coupling["K"]:
         table.add_row("K [N/m]", listed(coupling["K"]))
+        if max(coupling["K"]) > 0.999 * STIFFEST:
+            table.add_row("", f"{STIFFEST:g} N/m is where the search ends, no optimum of its own")
         table.add_row("B [N s/m]", listed(coupling["B"]))
     for part in outcome["certificates"].values():
         word = "certified" if part["certified"] else "not certified"

@@ -1,34 +1,58 @@
-"""`from design import design_coupling, certify`: what python -m design does, for scripts. SI units."""
+"""`from design import design_coupling, certify, ..`: what python -m design does, for scripts. SI units."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Literal, TypedDict, Unpack
 
 from controller.coupling import Coupling
-from design import designs
+from controller.process import force_map
+from design import designs, promises
+from design.argument import bare, known, of_kind, one_of
 from design.assess import assess, specification
 from design.jitter_part import switching_requirement
 from design.margin import Requirement
 from design.result import Design
 from design.set_check import check_set
 from design.store import Loop, Stored, data_of
+from design.transparency import Transparency, transparency
+
+LOOP = 'a Loop, as scenario.loop("I") gives it'
 
 
-def design_coupling(loop: Loop, kind: str = "spring-damper", condition: str | None = None, **options: Any) -> Design:
+class Options(TypedDict, total=False):
+    """What else can be asked of a kind, see design.designs.OPTIONS; design.wish.Wish says more about the last five."""
+
+    order: int  # ccl: states per channel
+    method: str  # ccl: complementarity, inner or fixed-poles
+    diagonal: bool  # ccl, optimal: no gain across channels
+    switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of delays that vary
+    functions: int  # optimal: basis functions per entry of Q
+    filter: str  # optimal: where the poles of the basis are
+    objective: Literal["rms", "sup"]  # optimal: of the mismatch relative to the environment
+    high_gain: float | None  # optimal: times the environment that the devices may feel at high frequency
+    margin: float  # optimal: share of the damping that stays unused
+
+
+def design_coupling(
+    loop: Loop, kind: str = "spring-damper", condition: str | None = None, **options: Unpack[Options]
+) -> Design:
     """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
 
     `kind` is "spring-damper", "ccl" or "optimal"; `condition` is "theorem4" (any passive environment) or "closed-loop"
-    (this environment), None for the kind's own. `options` are those of the kind: order, method, diagonal for ccl, the
-    fields of design.wish.Wish for optimal, and switching = (lo, hi) for delays that vary (it is not taken from
-    loop.jitter).
+    (this environment), None for the kind's own. `options` are those of the kind, see Options; switching is not taken
+    from loop.jitter.
 
     Returns a Design: `coupling` (for a spring-damper with K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the damping
     that it needs, from a sweep of the coupling alone), `figure` and `objective` (what was minimised, and its value).
 
-    Raises ValueError for a kind, condition or loop that makes no sense, DesignFailed (design.failure) where no such
-    coupling exists.
+    Raises TypeError for an argument of another type or an option that the kind does not have, ValueError for a kind,
+    condition or loop that makes no sense, DesignFailed where no such coupling exists.
     """
+    of_kind("loop", loop, Loop, LOOP)
+    one_of("kind", kind, designs.KINDS)
+    known(options, designs.OPTIONS[kind], f"kind {kind!r}")
     return designs.design_coupling(specification(loop), kind, condition, **options)
 
 
@@ -44,16 +68,51 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement]:
     where it binds, and `proof`: "rational" where exact arithmetic confirms it, "sampled" where a refined sweep says so.
     A condition that no damping satisfies has infinite `required` and a `reason`.
 
-    Raises ValueError where coupling and loop do not fit each other, SingularLoop where their algebraic loop has no
-    solution.
+    Raises TypeError for an argument of another type, ValueError where coupling and loop do not fit each other,
+    SingularLoop where their algebraic loop has no solution.
     """
+    of_kind("loop", loop, Loop, LOOP)
     phi = coupling.phi if isinstance(coupling, Design) else None
-    bare = coupling.coupling if isinstance(coupling, Design) else coupling
-    Stored(loop, data_of(bare))  # refuses a coupling of another number of channels
-    requirements: dict[str, Requirement] = dict(assess(loop, bare, phi))
-    if whole := check_set(loop, bare, samples=0):
+    alone = _fitting(loop, coupling)
+    requirements: dict[str, Requirement] = dict(assess(loop, alone, phi))
+    if whole := check_set(loop, alone, samples=0):
         _, worst = whole.worst if whole.proved else whole.worst_found
         requirements["closed-loop"] = replace(worst, proof="rational" if whole.proved else "sampled")
     if loop.jitter:
-        requirements["jitter-proof"] = switching_requirement(loop, bare).requirement
+        requirements["jitter-proof"] = switching_requirement(loop, alone).requirement
     return requirements
+
+
+def promise(loop: Loop, requirements: dict[str, Requirement]) -> str | None:
+    """For which environments `certify(loop, coupling)` says that a coupling is safe, in words; None where for none.
+
+    "any passive environment", "a set" (the loop's environment and its box), "this environment", or each contact state
+    of an environment with walls. Raises TypeError for an argument of another type.
+    """
+    of_kind("loop", loop, Loop, LOOP)
+    of_kind("requirements", requirements, dict, "what certify returned")
+    held = requirements["closed-loop"]
+    whole_set = loop.box is not None and held.certified and held.proof == "rational"
+    return promises.promise_of(requirements, loop, whole_set)
+
+
+def transparency_of(loop: Loop, coupling: Coupling | Design) -> Transparency:
+    """How close what the devices feel comes to the environment: figures of the mismatch (8), M = F - Lambda E.
+
+    `mismatch_db` is its largest share of the environment between 0.5 and 80 Hz, `rms_mismatch_db` the mean one: 0 dB
+    is as wrong as feeling nothing. `dc_ratio` is the share of the static stiffness that is felt. In the loop's own
+    environment; of one with walls, touching them all.
+
+    Raises TypeError and ValueError as `certify` does.
+    """
+    of_kind("loop", loop, Loop, LOOP)
+    E = specification(loop).environment
+    F = force_map(E, _fitting(loop, coupling), loop.theta, loop.psi)
+    return transparency(F, E, loop.lam)
+
+
+def _fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:
+    """The coupling alone. Raises ValueError where it is one of another number of channels."""
+    alone = bare(coupling)
+    Stored(loop, data_of(alone))
+    return alone

@@ -17,6 +17,7 @@ from dataclasses import replace
 from controller.coupling import Compliance, SpringDamper
 from controller.lti import Array, Lti
 from design import spring_damper
+from design.argument import of_kind, one_of, whole
 from design.cone_complementarity import bisect
 from design.delayed import theorem4_delayed
 from design.designs import METHODS
@@ -48,8 +49,9 @@ def design(
 
     Raises Infeasible if Theorem 4 admits no spring-damper to start from, DesignFailed if no result is certified.
     """
-    if method not in METHODS:
-        raise ValueError(f"method is {method!r}, expected one of {', '.join(METHODS)}")
+    whole("order", order, 1)
+    of_kind("diagonal", diagonal, bool, "True or False")
+    one_of("method", method, METHODS)
     if method == "fixed-poles" and (order, diagonal) != (1, True):
         raise ValueError("method 'fixed-poles' is for one state per channel, diagonal")
     started = time.perf_counter()

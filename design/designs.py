@@ -11,6 +11,13 @@ from design.specification import Specification
 #: name -> the conditions that it can be made for, its own first
 KINDS = {"spring-damper": ("theorem4", "closed-loop"), "ccl": ("theorem4",), "optimal": ("closed-loop",)}
 
+#: kind -> what else can be asked of it, in words of design.api.Options
+OPTIONS = {
+    "spring-damper": ("switching",),
+    "ccl": ("order", "method", "diagonal"),
+    "optimal": ("functions", "filter", "diagonal", "objective", "high_gain", "margin", "switching"),
+}
+
 #: how a state-space coupling of fixed order may be sought
 METHODS = ("complementarity", "inner", "fixed-poles")
 

@@ -21,7 +21,7 @@ from design.listed import listed
 from design.promises import HERE, SET, switching_promise
 from design.store import SpringDamper, Stored
 from sim.command import DOES_NOT_HOLD, DONE, Parser, add_output_options, check_json, console, execute, seed_from
-from sim.files import folder, write, write_json
+from sim.files import out_file, write, write_json
 from sim.scenario import InputError
 from sim.stored import read_coupling
 
@@ -114,12 +114,9 @@ def _promise(stored: Stored, verdict: Verdict) -> str:
 
 
 def _destination(args: argparse.Namespace, block: Block) -> Path:
-    path = Path(args.out or f"out/export/{Path(args.coupling).stem}-{block.name}{SUFFIX[args.format]}")
-    if path.is_dir():
-        raise InputError(f"--out {path}: is a folder, expected a file")
+    path = out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}{SUFFIX[args.format]}")
     if path.resolve() == Path(args.coupling).resolve():
         raise InputError(f"--out {path}: is the coupling that is exported; name another file")
-    folder(path.parent)
     return path
 
 

@@ -81,7 +81,8 @@ def _parser() -> Parser:
 
 def _names(args: argparse.Namespace) -> list[str]:
     """The couplings that were asked for. Raises InputError."""
-    asked: str = args.coupling or ("none" if args.case == "none" else "none,spring-damper")
+    usual = "none" if args.case == "none" else "none,spring-damper"
+    asked: str = usual if args.coupling is None else args.coupling
     names = asked.split(",")
     if "" in names:
         raise InputError(f"--coupling is {args.coupling!r}, expected names separated by commas")
@@ -99,6 +100,8 @@ def _chosen(scenario: Scenario, args: argparse.Namespace, names: list[str]) -> t
     for name in names:
         plain, _, condition = name.rpartition(":")
         known = plain and condition in CONDITIONS
+        if plain in NAMES and not known:
+            raise InputError(f"--coupling {name}: the condition is {condition!r}, allowed are {', '.join(CONDITIONS)}")
         try:
             chosen[name] = choose(scenario, args.case, plain if known else name, condition if known else args.condition)
         except DesignFailed as error:

@@ -71,8 +71,11 @@ def _floats(W: Integers) -> Floats:
 
 def _whitening(W: Floats) -> Integers | None:
     """R in integers such that R'WR is nearly a multiple of the identity, or None where W is far from definite."""
-    scale = 1 / np.sqrt(np.diag(W)) if (np.diag(W) > 0).all() else np.ones(W.shape[0])
-    unit = scale[:, None] * W * scale
+    with np.errstate(all="ignore"):
+        scale = 1 / np.sqrt(np.diag(W)) if (np.diag(W) > 0).all() else np.ones(W.shape[0])
+        unit = scale[:, None] * W * scale
+    if not np.isfinite(unit).all():  # entries beyond all proportion to the diagonal
+        return None
     for added in (0.0, GROWTH):
         try:
             L = cholesky(unit + added * np.eye(W.shape[0]), lower=True)

@@ -65,7 +65,10 @@ def refuted_in_floating_point(G: Exact, P: Matrix) -> bool:
     A, B, C, D, p = (m.floats() for m in (G.A, G.B, G.C, G.D, P))
     J = np.hstack([A, B])
     direct = np.block([[p, C.T], [C, D + D.T]])
-    M = direct.copy() - J.T @ p @ J
+    with np.errstate(all="ignore"):
+        M = direct.copy() - J.T @ p @ J
+    if not np.isfinite(M).all():
+        return False
     k = (2 * G.order + 8) * UNIT
     error = k / (1 - k) * (np.abs(direct) + np.abs(J.T) @ np.abs(p) @ np.abs(J))
     scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(M)), np.diag(error)) + np.finfo(float).tiny)

@@ -31,6 +31,8 @@ from design.switching_search import least_rms_switching
 #: The sequence stops when a step improves the norm by less than this, relatively.
 SETTLED = 1e-6
 MOST_STEPS = 60
+#: A damper of less than this share of the device's damping is none: solvers leave 1e-9 where the optimum has zero.
+NEGLIGIBLE = 1e-6
 
 
 def design(
@@ -90,6 +92,7 @@ def _for_this_environment(
             f"delta = {spec.delta}: use more device damping, less delay, or other starts"
         )
         raise DesignFailed(None, (), line)
+    coupling = SpringDamper(coupling.K, np.where(NEGLIGIBLE * spec.usable > coupling.B, 0.0, coupling.B))
     F = force_map(spec.environment, coupling, spec.theta, spec.psi)
     requirement = closed_loop(F, spec.delta)
     return Design(coupling, "closed-loop", "rms", rms, requirement, searches, time.perf_counter() - started)
@@ -165,7 +168,7 @@ def excess_limits(spec: Specification, phi: Array | None) -> Array:
 
 def _coupling(spec: Specification, gains: Array) -> SpringDamper:
     k, b = np.split(np.maximum(gains, 0.0), 2)
-    return SpringDamper(k * spec.usable / spec.T, b * spec.usable)
+    return SpringDamper(k * spec.usable / spec.T, np.where(b < NEGLIGIBLE, 0.0, b) * spec.usable)
 
 
 def _start(spec: Specification, sigma: Array, start: SpringDamper | None) -> tuple[Array, int]:

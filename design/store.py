@@ -21,6 +21,7 @@ from controller.environment import Network, environment
 from controller.lti import Array, Lti
 
 Rows = tuple[tuple[float, ...], ...]
+LARGEST_COEFFICIENT = 1e12  # of a coupling, SI units
 Condition = Literal["closed-loop", "theorem4"]
 Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=100)], ...]
 Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=4000)]
@@ -152,15 +153,25 @@ class InternalModel(Strict, frozen=True, tag_field="kind", tag="internal-model")
     def __post_init__(self) -> None:
         if any(len(rows) != len(self.Q[0]) or any(len(row) != len(rows) for row in rows) for rows in self.Q):
             raise ValueError("Q has coefficients that are not square matrices of one size")
+        for rows in self.Q:
+            _require_sensible("Q", rows)
         self.build(1.0)
 
     def build(self, T: float) -> coupling.Coupling:
         return coupling.InternalModel(self.poles, self.Q)
 
 
+def _require_sensible(name: str, rows: Rows) -> None:
+    """Raise ValueError where a coefficient is so large that arithmetic would overflow before it could be judged."""
+    for value in (value for row in rows for value in row):
+        if not abs(value) <= LARGEST_COEFFICIENT:
+            raise ValueError(f"{name} has an entry {value:g}, allowed are up to {LARGEST_COEFFICIENT:g}")
+
+
 def _table(name: str, rows: Rows, height: int, width: int) -> Array:
     if len(rows) != height or any(len(row) != width for row in rows):
         raise ValueError(f"{name} has rows of {[len(row) for row in rows]} entries, expected {height} x {width}")
+    _require_sensible(name, rows)
     return np.array(rows, dtype=float).reshape(height, width)
 
 

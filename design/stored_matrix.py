@@ -25,4 +25,7 @@ def refuted_rows(name: str, block: Exact, rows: Sequence[Sequence[str]]) -> str 
         P = Matrix.of(rows, (n, n))
     except (ValueError, ZeroDivisionError) as error:
         return f"{name} has an entry that is not a rational number: {error}"
-    return prove_positive_real(block, P)
+    try:
+        return prove_positive_real(block, P)
+    except OverflowError:
+        return f"{name} has an entry beyond the range of floating point"

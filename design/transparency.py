@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from controller.delay import delay
 from controller.lti import Array, Lti
+from design.quadrature import integral
 from design.sweep import frequencies, on_circle, supremum
 
 BAND_HZ = (0.5, 80.0)
@@ -17,7 +18,7 @@ BAND_HZ = (0.5, 80.0)
 
 @dataclass(frozen=True)
 class Transparency:
-    """Figures of the mismatch M = F - Lambda E; ratios, not decibels."""
+    """Figures of the mismatch M = F - Lambda E; ratios, not decibels: 1 (0 dB) is as wrong as feeling nothing."""
 
     tau: float  # (25): sup sigma_max(M) / inf sigma_min(E) up to band_hz[1]
     relative_mismatch: float  # sup over the band of sigma_max(M) / sigma_max(E)
@@ -25,6 +26,16 @@ class Transparency:
     dc_ratio: float  # sigma_max F(1) / sigma_max E(1): the share of the static stiffness that is felt
     high_frequency_gain: float  # sup above 100 Hz of sigma_max(F) / sigma_max(E)
     band_hz: tuple[float, float]
+
+    @property
+    def mismatch_db(self) -> float:
+        """`relative_mismatch` in decibels; 0 dB is as wrong as feeling nothing."""
+        return decibels(self.relative_mismatch)
+
+    @property
+    def rms_mismatch_db(self) -> float:
+        """`rms_mismatch` in decibels."""
+        return decibels(self.rms_mismatch)
 
 
 def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
@@ -53,7 +64,7 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
     return Transparency(
         tau=_ratio(peak, least),
         relative_mismatch=supremum(relative, grid)[0],
-        rms_mismatch=_rms(mismatch, environment, grid),
+        rms_mismatch=_rms(mismatch, environment, frequencies(F, environment, low=low, high=high, points=60)),
         dc_ratio=_ratio(float(np.linalg.norm(F.dc(), 2)), float(static[0])) if static[0] > rounding else np.nan,
         high_frequency_gain=_high_frequency_gain(F, environment, 100.0 * per_hz),
         band_hz=band_hz,
@@ -72,11 +83,15 @@ def _ratio(numerator: float, denominator: float) -> float:
 
 
 def _rms(mismatch, environment: Lti, grid: Array) -> float:
-    """sqrt of the mean over log frequency, by the trapezoidal rule on the pole-dense grid."""
-    E = environment.at(on_circle(grid))
-    square = (np.abs(mismatch(grid)) ** 2).sum(axis=(1, 2)) / (np.abs(E) ** 2).sum(axis=(1, 2))
+    """sqrt of the mean over log frequency between the ends of `grid`, which is dense where the ratio may be sharp."""
+
+    def square(logarithm: Array) -> Array:
+        w = np.exp(logarithm)
+        E = environment.at(on_circle(w))
+        return (np.abs(mismatch(w)) ** 2).sum(axis=(1, 2)) / (np.abs(E) ** 2).sum(axis=(1, 2))
+
     logarithm = np.log(grid)
-    return float(np.sqrt(np.trapezoid(square, logarithm) / (logarithm[-1] - logarithm[0])))
+    return float(np.sqrt(integral(square, logarithm) / (logarithm[-1] - logarithm[0])))
 
 
 def _high_frequency_gain(F: Lti, environment: Lti, above: float) -> float:

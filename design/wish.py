@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.lti import Array
+from design.argument import number, of_kind, one_of, whole
 from design.designs import FILTERS, OBJECTIVES
 from design.specification import Specification
 
@@ -32,15 +33,13 @@ class Wish:
     switching: tuple[Sequence[int], Sequence[int]] | None = None  # (lo, hi) [samples]: ages of forces that may switch
 
     def __post_init__(self) -> None:
-        if not 1 <= self.functions <= 200:
-            raise ValueError(f"functions is {self.functions}, allowed are 1 to 200")
-        if self.filter not in FILTERS:
-            raise ValueError(f"filter is {self.filter!r}, allowed are {', '.join(FILTERS)}")
-        if self.objective not in OBJECTIVES:
-            raise ValueError(f"objective is {self.objective!r}, allowed are {', '.join(OBJECTIVES)}")
-        if self.high_gain is not None and not self.high_gain >= 1:
+        whole("functions", self.functions, 1, 200)
+        one_of("filter", self.filter, FILTERS)
+        one_of("objective", self.objective, OBJECTIVES)
+        of_kind("diagonal", self.diagonal, bool, "True or False")
+        if self.high_gain is not None and not number("high_gain", self.high_gain, "a factor, or None") >= 1:
             raise ValueError(f"high_gain is {self.high_gain}, expected a factor of at least 1")
-        if not 0 < self.margin < 1:
+        if not 0 < number("margin", self.margin) < 1:
             raise ValueError(f"margin is {self.margin}, allowed are shares of the damping above 0 and below 1")
 
     def poles(self, spec: Specification) -> Array:

@@ -1,10 +1,6 @@
 """Design three couplings for one loop and compare what each promises, what it costs and how transparent it is."""
 
-from controller.process import force_map
-from design import certify, design_coupling
-from design.assess import specification
-from design.promises import promise_of
-from design.transparency import decibels, transparency
+from design import certify, design_coupling, promise, transparency_of
 from sim import load
 
 LOOP = load("omega-pair").loop("I")
@@ -12,16 +8,14 @@ WISHES = [("spring-damper", "theorem4"), ("spring-damper", "closed-loop"), ("opt
 
 
 def main() -> None:
-    E = specification(LOOP).environment
     print(f"{'coupling':28} {'needs N s/m':>12} {'worst dB':>9} {'rms dB':>7}  certified for")
     for kind, condition in WISHES:
         design = design_coupling(LOOP, kind, condition)
-        F = force_map(E, design.coupling, LOOP.theta, LOOP.psi)
-        figures = transparency(F, E, LOOP.lam)
+        figures = transparency_of(LOOP, design)
         needed = max(design.requirement.required)
-        worst, rms = decibels(figures.relative_mismatch), decibels(figures.rms_mismatch)
-        promise = promise_of(certify(LOOP, design), LOOP)
-        print(f"{kind + ', ' + condition:28} {needed:12.4f} {worst:9.2f} {rms:7.2f}  {promise}")
+        worst, rms = figures.mismatch_db, figures.rms_mismatch_db
+        covered = promise(LOOP, certify(LOOP, design))
+        print(f"{kind + ', ' + condition:28} {needed:12.4f} {worst:9.2f} {rms:7.2f}  {covered}")
 
 
 if __name__ == "__main__":

@@ -6,6 +6,9 @@ port -> handshake -> delay -> coupling and certificate -> arm -> run -> ramp out
 from __future__ import annotations
 
 import argparse
+import os
+import signal
+import sys
 from collections.abc import Sequence
 
 from design.assess import CONDITIONS
@@ -58,7 +61,12 @@ def main(argv: list[str]) -> int:
     live = hold_session(args, session, plan, seconds, seed)
     outcome = session_report.outcome(args.case, session, recorder, live.dropped, float(args.pace))
     outcome["files"] = [str(p) for p in session_report.save(out, session, recorder, outcome, not args.no_plot)]
-    session_report.print_session(outcome, console(args))
+    try:
+        session_report.print_session(outcome, console(args))
+    except OSError:
+        if signal.SIGHUP not in live.signals:
+            raise
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - the terminal is gone, and with it whoever would read this
     if args.json:
         write_json(args.json, outcome)
     if live.signals:

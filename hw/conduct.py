@@ -13,7 +13,8 @@ from hw.safety import DRIVING, Fault, Stage
 
 REMEMBERED = 64  # forces on their way, of which at most theta matter
 TOLERANCE = 1  # [steps] for a firmware that rounds otherwise
-PATIENCE = 5  # ticks, less those that are right again
+PATIENCE = 5  # ticks in a row
+FORGETTING = 8  # right ticks that make up for a wrong one: seldom wrong is stopped too, just later
 
 
 def check_state(state: State, config: Config, stage: Stage, gain: float) -> None:
@@ -40,7 +41,7 @@ class Told:
         self._forces: dict[int, tuple[int, ...]] = {}  # by the tick that they are for
         self._last: State | None = None
         self._run = (0, 0)  # fewest and most forces latched since arming, where STATEs were lost
-        self._unlike = 0
+        self._unlike = self._holding = 0
 
     def tell(self, tick: int, steps: tuple[int, ...]) -> None:
         """`steps` answer `tick`."""
@@ -53,6 +54,9 @@ class Told:
 
         Raises Fault where that goes on.
         """
+        self._holding = self._holding + 1 if state.phase == Phase.HOLDING else 0
+        if self._holding > self._config.hold:
+            raise Fault(f"the device holds a force for {self._holding} ticks, {self._config.hold} are agreed")
         told, last = self._forces.pop(state.tick, None), self._last
         self._last = state
         if last is None or state.phase == Phase.DISARMED:
@@ -63,8 +67,8 @@ class Told:
         if ticks > 1:
             return False
         wrong = not self._could(state, last.applied, told)
-        self._unlike = max(0, self._unlike + (1 if wrong else -1))
-        if self._unlike >= PATIENCE:
+        self._unlike = max(0, self._unlike + (FORGETTING if wrong else -1))
+        if self._unlike > FORGETTING * (PATIENCE - 1):
             what = f"told {told}" if state.phase == Phase.ARMED else f"to hold {last.applied}"
             raise Fault(f"the device applies {state.applied} steps, it was {what}, and so for {PATIENCE} ticks")
         return wrong

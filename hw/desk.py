@@ -8,7 +8,7 @@ import sys
 import termios
 import tty
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 from hw.dashboard import Dashboard
@@ -139,4 +139,5 @@ def _keys() -> Iterator[int]:
     try:
         yield keyboard
     finally:
-        termios.tcsetattr(keyboard, termios.TCSANOW, before)
+        with suppress(termios.error):  # it may have been closed
+            termios.tcsetattr(keyboard, termios.TCSANOW, before)

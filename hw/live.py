@@ -87,7 +87,7 @@ class Live:
         else:
             self._write(self.session.poll(self.now()))
         if self._keyboard in ready:
-            self._pressed(os.read(self._keyboard, 64).decode(errors="replace"))
+            self._pressed()
 
     def _steer(self) -> None:
         """What is not an answer: couplings for the measured delay, arming and the planned end, signals."""
@@ -110,13 +110,23 @@ class Live:
         except Fault as fault:
             self._write(session.refuse(str(fault), self.now()))
             return
+        if self._keyboard is not None and select.select([self._keyboard], [], [], 0)[0]:
+            self._pressed()  # of now: an `a` from before may not arm what was not there to be armed
         gc.collect()  # the solver is loaded now
         gc.freeze()
         self.port.discard()
         self._write(session.load(rungs, self.now()))
 
-    def _pressed(self, keys: str) -> None:
-        for key in keys:
+    def _pressed(self) -> None:
+        """Do what was typed; a terminal that is gone is a person who is gone, as SIGHUP says it."""
+        assert self._keyboard is not None
+        keys = b""
+        with suppress(OSError):
+            keys = os.read(self._keyboard, 64)
+        if not keys:
+            self._keyboard = None
+            self.signals.append(signal.SIGHUP)
+        for key in keys.decode(errors="replace"):
             self._write(self._steering.press(key, self.session, self.now()))
 
     def _write(self, data: bytes) -> None:

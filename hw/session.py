@@ -23,6 +23,7 @@ from hw.safety import DRIVING, ENDED, Fault, Limits, Stage
 from hw.stream import USUAL, Settings, Stream, answer
 from sim.scenario import Scenario
 
+STOPPING_US = 50_000  # in which a device that was stopped must say so
 ARMING_US = 500_000  # in which a device must follow ARM
 
 
@@ -221,14 +222,20 @@ class Session:
     # the stream
 
     def _on_state(self, state: State) -> bytes:
+        if self.stage == Stage.CONNECTING:  # another session's device: to zero force first
+            return encode(Stop(Reason.FAULT)) if _drives(state) else b""
         if self.info is None or state.axes != self.info.axes:
             self.counters.unexpected += 1
             return b""
         if self.stage in ENDED:
-            drives = state.phase in (Phase.ARMED, Phase.HOLDING)
-            return encode(Stop(self._reason)) if drives else b""
-        if self.stage in (Stage.CONNECTING, Stage.CONFIGURING):
-            return b""
+            unlatched = self.stage == Stage.ESTOP and state.phase != Phase.ESTOP
+            return encode(Stop(self._reason)) if _drives(state) or unlatched else b""
+        if self.stage == Stage.CONFIGURING:
+            if not _drives(state):
+                return b""
+            if self.now - self.entered > STOPPING_US:
+                raise Fault("the device is armed, and nobody asked it to")
+            return encode(Stop(Reason.DONE))
         ticks = self.stream.news(state, self.now)
         if not ticks:
             return b""
@@ -295,3 +302,7 @@ class Session:
         self._reason, self.stream.drive = reason, None
         self._enter(stage, cause)
         return encode(Stop(reason))
+
+
+def _drives(state: State) -> bool:
+    return state.phase in (Phase.ARMED, Phase.HOLDING)

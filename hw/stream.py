@@ -87,6 +87,9 @@ class Stream:
         late, missed = self.watch.late_part, self.watch.missed_part
         if missed > self._settings.missed + late:
             raise Fault(f"{100 * missed:.0f} % of the last {self._settings.window} ticks had no answer in time")
+        if self.watch.gap_part > self._settings.missed:
+            part = f"{100 * self.watch.gap_part:.0f} % of {self._settings.window} ticks"
+            raise Fault(f"no STATE came of {part}: nobody can say what the device did")
         if self.watch.untold_part > UNTOLD:
             most = f"{100 * UNTOLD:g} % of the last {self._settings.window} STATEs"
             raise Fault(f"{most} told no margin: nobody can say how late answers are")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-import zlib
 from array import array
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from hw.handshake import Units
 from hw.message import NO_MARGIN
 from hw.trace_check import complaint
 from sim.files import write
-from sim.result import Result
+from sim.result import DAMAGED, Result
 from sim.scenario import InputError
 
 #: what the link adds, one entry per tick: name -> axes of the array
@@ -98,11 +97,20 @@ def save_npz(path: Path, result: Result, recorder: Recorder) -> Path:
     """An npz that sim.result reads, with the arrays of LINK beside its own."""
     link = {f"link_{name}": recorder.link()[name] for name in LINK}
     own = {name: getattr(result, name) for name in ("t", "x", "f", "x_handle", "v_handle", "w")}
+    arrays: dict[str, Any] = {**own, **link, "meta": np.array(json.dumps(result.meta))}
 
     def content(file: BinaryIO) -> None:
-        np.savez_compressed(file, allow_pickle=False, meta=np.array(json.dumps(result.meta)), **own, **link)
+        np.savez_compressed(file, allow_pickle=False, digest=np.array(digest(arrays)), **arrays)
 
     return write(path, content)
+
+
+def digest(arrays: Mapping[str, Array]) -> str:
+    """SHA-256 of everything in a trace: it tells a record from one that was changed, cut or put together."""
+    whole = hashlib.sha256()
+    for name in sorted(arrays):
+        whole.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape} ".encode() + arrays[name].tobytes())
+    return whole.hexdigest()
 
 
 def load(path: Path) -> tuple[Result, dict[str, Array]]:
@@ -110,8 +118,9 @@ def load(path: Path) -> tuple[Result, dict[str, Array]]:
     result = Result.load_npz(path)
     try:
         with np.load(path, allow_pickle=False) as archive:
-            link = {name: archive[f"link_{name}"] for name in LINK}
-    except (OSError, KeyError, ValueError, EOFError, BadZipFile, zlib.error):
+            arrays = {name: archive[name] for name in archive.files}
+            link = {name: arrays[f"link_{name}"] for name in LINK}
+    except (OSError, *DAMAGED):
         raise InputError(f"{path}: a trace, but not of a bridge's session; hw.bridge writes one") from None
     n, m = result.x.shape
     for name, axes in LINK.items():
@@ -121,4 +130,6 @@ def load(path: Path) -> tuple[Result, dict[str, Array]]:
             )
     if wrong := complaint(result, link):
         raise InputError(f"{path}: no session of hw.bridge: {wrong}")
+    if str(arrays.pop("digest", "")) != digest(arrays):
+        raise InputError(f"{path}: was changed after hw.bridge wrote it: its digest is another")
     return result, link

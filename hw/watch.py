@@ -37,9 +37,11 @@ class LinkWatch:
     last: State | None = None
     margins: deque[int | None] = field(default_factory=deque)  # per fresh tick; None: no answer came
     missed: deque[int] = field(default_factory=deque)
+    gaps: deque[int] = field(default_factory=deque)  # ticks before a fresh one of which no STATE came
     _late: int = 0  # in the window, kept as sums: adding up the window would take longer than all the rest of a tick
     _missed: int = 0
     _untold: int = 0
+    _gaps: int = 0
 
     def order(self, state: State) -> tuple[str, int]:
         """FRESH, DUPLICATE or STALE, and by how many ticks a fresh one is ahead."""
@@ -57,8 +59,9 @@ class LinkWatch:
 
     def note(self, state: State) -> None:
         """Take in a fresh STATE."""
-        missed = 0
+        missed = gap = 0
         if self.last is not None:
+            gap = distance(state.tick, self.last.tick) - 1
             missed = (state.misses - self.last.misses) & 0xFF
             self.counters.device_errors += (state.crc_errors - self.last.crc_errors) & 0xFF
         margin = None if state.margin_us == NO_MARGIN else state.margin_us
@@ -68,14 +71,17 @@ class LinkWatch:
         self.counters.late += late
         self.margins.append(margin)
         self.missed.append(missed)
+        self.gaps.append(gap)
         self._late += late
         self._missed += missed
+        self._gaps += gap
         self._untold += margin is None
         if len(self.margins) > self.window:
             oldest = self.margins.popleft()
             self._late -= _is_late(oldest)
             self._untold -= oldest is None
             self._missed -= self.missed.popleft()
+            self._gaps -= self.gaps.popleft()
         self.last = state
 
     def restart(self) -> None:
@@ -83,7 +89,8 @@ class LinkWatch:
         self.last = None
         self.margins.clear()
         self.missed.clear()
-        self._late = self._missed = self._untold = 0
+        self.gaps.clear()
+        self._late = self._missed = self._untold = self._gaps = 0
 
     @property
     def late_part(self) -> float:
@@ -94,6 +101,11 @@ class LinkWatch:
     def missed_part(self) -> float:
         """The part of a whole window without an answer in time, late or lost."""
         return min(1.0, self._missed / self.window)
+
+    @property
+    def gap_part(self) -> float:
+        """The part of a whole window, or more, of which no STATE came."""
+        return self._gaps / self.window
 
     @property
     def untold_part(self) -> float:

@@ -6,6 +6,8 @@ import msgspec
 
 from models.quantity import require
 
+MOST_DAMPING = 1e4  # [N s/m]
+
 
 class CompliantDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="compliant", tag_field="kind"):
     """A motor with encoder, joined to the handle by a transmission spring.
@@ -60,7 +62,7 @@ def with_damping(device: Device, damping: float) -> Device:
 def _check_common(device: Device, masses: tuple[str, ...]) -> None:
     for name in masses:
         require(name, getattr(device, name), 1e-6, 1e3, "kg")
-    require("damping", device.damping, 0.0, 1e4, "N s/m")
+    require("damping", device.damping, 0.0, MOST_DAMPING, "N s/m")
     require("force_limit", device.force_limit, 1e-3, 1e6, "N")
     require("encoder_step", device.encoder_step, 0.0, 1e-2, "m")
     require("friction", device.friction, 0.0, 1e3, "N")

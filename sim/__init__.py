@@ -1,8 +1,16 @@
 """Where the two worlds meet: scenarios, engines, the loop, and what a run is worth.
 
-    from sim import Scenario, load, simulate, validate
+    from sim import Scenario, load, parse, simulate, validate, plot_run
 
-Names are loaded when they are first used: a command must not wait for what it does not need.
+load("omega-pair"), parse(text)     a Scenario, from a TOML file, by name, or from text; Scenario.replace changes it
+Scenario.loop("I")                  all that a design may know of it, for the package `design`
+simulate(scenario, coupling)        a Result: what happens with the people of the scenario, tick by tick
+validate(scenario, coupling)        Findings: what happens with so many random ones
+plot_run(result, path, ...)         a picture of a Result
+InputError                          a ValueError: something to put right, in one line
+
+help(sim.simulate) and the like say more. Names are loaded when they are first used: a command must not wait for what
+it does not need.
 """
 
 from __future__ import annotations
@@ -12,15 +20,26 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from sim.interrupt import while_starting
+
 if TYPE_CHECKING:
     from sim.api import simulate, validate
     from sim.examine import Findings
+    from sim.plot import plot_run
     from sim.result import Result
     from sim.scenario import InputError, Scenario, load, parse
 
-__all__ = ["Findings", "InputError", "Result", "Scenario", "load", "parse", "simulate", "validate"]
+while_starting()
 
-_HOMES = {"simulate": "sim.api", "validate": "sim.api", "Findings": "sim.examine", "Result": "sim.result"}
+__all__ = ["Findings", "InputError", "Result", "Scenario", "load", "parse", "plot_run", "simulate", "validate"]
+
+_HOMES = {
+    "simulate": "sim.api",
+    "validate": "sim.api",
+    "Findings": "sim.examine",
+    "plot_run": "sim.plot",
+    "Result": "sim.result",
+}
 
 
 class _Package(ModuleType):
@@ -36,6 +55,10 @@ class _Package(ModuleType):
         value = getattr(import_module(_HOMES.get(name, "sim.scenario")), name)
         setattr(self, name, value)
         return value
+
+    def __dir__(self) -> list[str]:
+        """For help() and completion: what is for scripts, and what every package has."""
+        return [*__all__, *(name for name in vars(self) if name.startswith("__"))]
 
 
 sys.modules[__name__].__class__ = _Package

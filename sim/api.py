@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 from controller.coupling import Coupling, NoCoupling
+from design.argument import COUPLING, bare, number, of_kind, one_of, whole
 from design.result import Design
 from sim import report
 from sim.command import require_linear
 from sim.drawn import switching
 from sim.examine import ENGINES, Findings, Question
 from sim.loop import Progress
+from sim.mujoco_engine import INTEGRATORS, LEAPFROG
 from sim.result import Result
 from sim.scenario import InputError, Scenario
 from sim.shards import validate as examine_all
+from sim.simulate import ENGINES as ALONE
 from sim.simulate import assemble
 from sim.simulate import simulate as close_loop
 from sim.substeps import LEAST, MOST, check_substeps, default_substeps
 
 MOST_HUMANS = 1_000_000
+SCENARIO = 'a Scenario, as load("omega-pair") gives it'
 
 
 def simulate(
@@ -37,18 +41,22 @@ def simulate(
     [1/s] of the trace and of the exact loop, the verdict, ticks at the force limit (None under delays that vary).
 
     Raises ValueError (InputError where the scenario is at fault) for an engine, integrator or number of substeps that
-    is not possible, SingularLoop where the algebraic loop of environment and coupling has no solution.
+    is not possible, TypeError for an argument of another type, SingularLoop where the algebraic loop of environment and
+    coupling has no solution.
     """
-    bare = _bare(coupling)
-    assembly = assemble(scenario, bare)
+    of_kind("scenario", scenario, Scenario, SCENARIO)
+    alone, seed = _bare(coupling), whole("seed", seed, 0)
+    one_of("engine", engine, ALONE)
+    one_of("integrator", integrator, (*INTEGRATORS, LEAPFROG))
+    if substeps is not None:
+        substeps = whole("substeps", substeps, 1, MOST)
+    assembly = assemble(scenario, alone)
     if scenario.switches:
-        assembly, _ = switching(assembly, bare, seed, scenario.samples)
+        assembly, _ = switching(assembly, alone, seed, scenario.samples)
     warnings: list[str] = []
     if engine == "mujoco" and substeps is None:
         substeps = default_substeps(assembly, integrator)
     elif engine == "mujoco" and substeps is not None:
-        if not 1 <= substeps <= MOST:
-            raise InputError(f"substeps is {substeps}, allowed are 1 to {MOST}")
         warnings = check_substeps(assembly, integrator, substeps)
     record = close_loop(assembly, engine, integrator, substeps or LEAST)
     mujoco = engine == "mujoco"
@@ -84,22 +92,21 @@ def validate(
     Returns Findings, n = humans: `exact` and `mujoco` (n,) growth rates [1/s], positive where a human makes the loop
     unstable, `radius` (n,) of the exact loop, `frequency` (n,) [Hz], `disagreements` (n,) of the engines, and more.
 
-    Raises InputError for walls or Coulomb friction (verdicts are of linear loops), ValueError for numbers out of range.
+    Raises InputError for walls or Coulomb friction (verdicts are of linear loops), ValueError for numbers out of range,
+    TypeError for an argument of another type.
     """
+    of_kind("scenario", scenario, Scenario, SCENARIO)
+    alone = _bare(coupling)
     require_linear(scenario, "validate")
-    if not 1 <= humans <= MOST_HUMANS:
-        raise InputError(f"humans is {humans}, allowed are 1 to {MOST_HUMANS}")
-    if engine not in ENGINES:
-        raise InputError(f"engine is {engine!r}, allowed are {', '.join(ENGINES)}")
+    humans, seed = whole("humans", humans, 1, MOST_HUMANS), whole("seed", seed, 0)
+    shards = whole("shards", shards, 1)
+    one_of("engine", engine, ENGINES)
+    duration = number("duration", duration, "a number of seconds")
     if not (duration == 0 or duration >= 4 * scenario.T):
         raise InputError(f"duration is {duration:g}, allowed are 0 and {4 * scenario.T:g} s or more")
-    if shards < 1:
-        raise InputError(f"shards is {shards}, allowed are 1 or more")
     links = scenario.population.links
-    return examine_all(Question(scenario, _bare(coupling), seed, humans, links, engine, duration), shards, progress)
+    return examine_all(Question(scenario, alone, seed, humans, links, engine, duration), shards, progress)
 
 
 def _bare(coupling: Coupling | Design | None) -> Coupling:
-    if coupling is None:
-        return NoCoupling()
-    return coupling.coupling if isinstance(coupling, Design) else coupling
+    return NoCoupling() if coupling is None else bare(coupling, f"{COUPLING}, or None for the loop without one")

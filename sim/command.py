@@ -7,7 +7,6 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import NoReturn, Protocol, TypeVar
 
 from rich.console import Console
@@ -16,12 +15,13 @@ from threadpoolctl import threadpool_limits
 
 from controller.lti import SingularLoop
 from design.failure import DesignFailed
-from sim.files import folder
+from models.device import MOST_DAMPING
+from sim.files import check_file, folder, nobody_reads
+from sim.interrupt import INTERRUPTED, begun
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
+from sim.screen import Screen
 
-DONE, DOES_NOT_HOLD, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
-
-MOST_DAMPING = 1e4  # [N s/m] of a device, as models.device has it
+DONE, DOES_NOT_HOLD, BAD_INPUT = 0, 1, 2  # and INTERRUPTED, which sim.interrupt has
 
 Number = TypeVar("Number", int, float)
 
@@ -55,10 +55,12 @@ def add_loop_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_output_options(
-    parser: argparse.ArgumentParser, out: str = "DIR", what: str = "folder for files (default out/<command>-<case>)"
+    parser: argparse.ArgumentParser,
+    out: str = "DIR",
+    what: str = "folder for files, made if it is not there (default out/<command>-<case>)",
 ) -> None:
     """Where results go, and the seed."""
-    output = parser.add_argument_group("output")
+    output = parser.add_argument_group("output", "the folder of a FILE that you name must exist")
     output.add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
     output.add_argument("--out", metavar=out, help=what)
     output.add_argument("--seed", metavar="N", default="0", help="for random draws; recorded (default 0)")
@@ -159,18 +161,8 @@ def seed_from(args: argparse.Namespace) -> int:
 
 def check_json(args: argparse.Namespace) -> None:
     """Whether the file of --json can be written, before any work is done. Raises InputError."""
-    if not args.json or args.json == "-":
-        return
-    path = Path(args.json)
-    if path.is_dir():
-        raise InputError(f"--json {path}: is a folder, expected a file or -")
-    if not path.parent.is_dir():
-        raise InputError(f"--json {path}: the folder {path.parent} does not exist")
-    try:
-        with TemporaryFile(dir=path.parent):
-            pass
-    except OSError as error:
-        raise InputError(f"--json {path}: cannot write to {path.parent}: {error.strerror}") from None
+    if args.json and args.json != "-":
+        check_file("--json", Path(args.json), "a file or -")
 
 
 def out_folder(args: argparse.Namespace, command: str) -> Path:
@@ -179,9 +171,9 @@ def out_folder(args: argparse.Namespace, command: str) -> Path:
     return folder(Path(args.out or f"out/{command}-{args.case}"))
 
 
-def console(args: argparse.Namespace) -> Console:
+def console(args: argparse.Namespace) -> Screen:
     """Where tables go: standard error when standard output is taken by --json -."""
-    return Console(stderr=args.json == "-", highlight=False)
+    return Screen(stderr=args.json == "-", highlight=False)
 
 
 class Move(Protocol):
@@ -203,13 +195,18 @@ def progress_bar(description: str) -> tuple[Progress, Move]:
 
 
 def execute(main: Callable[[list[str]], int]) -> NoReturn:
-    """Run a command and leave with its exit code; bad input is one line on standard error."""
+    """Run a command and leave with its exit code; bad input is one line on standard error.
+
+    Whoever reads standard output may stop at any line (`| head -1`): the command's own exit code stays what it is,
+    also under `set -o pipefail`.
+    """
+    code: str | int | None
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of processes that this one starts
     try:
+        begun()
         # the matrices here are small: more BLAS threads only wait for each other, and the last digits depend on them
         with threadpool_limits(1, user_api="blas"):
             code = main(sys.argv[1:])
-        sys.stdout.flush()
     except (InputError, SingularLoop) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         code = BAD_INPUT
@@ -219,7 +216,10 @@ def execute(main: Callable[[list[str]], int]) -> NoReturn:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         code = INTERRUPTED
+    except SystemExit as end:  # argparse, after --help
+        code = end.code
+    try:
+        sys.stdout.flush()
     except BrokenPipeError:
-        sys.stderr.close()
-        code = DONE
+        nobody_reads()
     sys.exit(code)

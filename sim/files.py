@@ -1,4 +1,8 @@
-"""Writing files so that a reader never sees half of one."""
+"""Writing files so that a reader never sees half of one.
+
+One rule for all commands: a folder is made where the user names a folder (--out DIR) or names nothing (out/..); the
+folder of a file that the user names (--json, --video, --out FILE) must exist, for a typing error must not make one.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,27 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from sim.scenario import InputError
+
+
+def check_file(option: str, path: Path, expected: str = "a file") -> Path:
+    """Whether a file that the user named can be written, before any work is done. Raises InputError."""
+    if path.is_dir():
+        raise InputError(f"{option} {path}: is a folder, expected {expected}")
+    if not path.parent.is_dir():
+        raise InputError(f"{option} {path}: the folder {path.parent} does not exist")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise InputError(f"{option} {path}: cannot write to {path.parent}: {error.strerror}") from None
+    return path
+
+
+def out_file(named: str | None, default: str, expected: str = "a file") -> Path:
+    """The file of --out, by the rule above. Raises InputError."""
+    if named is None:
+        folder(Path(default).parent)
+    return check_file("--out", Path(default if named is None else named), expected)
 
 
 def folder(path: Path) -> Path:
@@ -49,6 +74,17 @@ def write_json(destination: str | Path, data: dict[str, Any]) -> None:
     """JSON to a file, or to standard output for '-'. Not-a-number and infinity are refused by construction."""
     text = json.dumps(data, indent=2, allow_nan=False) + "\n"
     if str(destination) == "-":
-        sys.stdout.write(text)
+        try:
+            sys.stdout.write(text)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            nobody_reads()
     else:
         write(Path(destination), text)
+
+
+def nobody_reads() -> None:
+    """What is still written to standard output goes nowhere: its reader has left."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, sys.stdout.fileno())
+    os.close(nowhere)

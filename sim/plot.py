@@ -28,7 +28,7 @@ STYLES: tuple[dict[str, Any], ...] = (
 def plot_run(
     result: Result, path: Path, title: str, frequency_hz: float, ideal: tuple[Array, float | None] | None = None
 ) -> Path:
-    """Displacements and forces over the whole run, and six periods of `frequency_hz` where it is strongest.
+    """Displacements and forces over the whole run, and about six periods of `frequency_hz` where forces turn sharply.
 
     `ideal`: forces (N, m) [N] of the ideal environment, drawn behind the others, and how far they are from it [%].
     """
@@ -51,7 +51,7 @@ def plot_run(
     handles, labels = axes[1, 0].get_legend_handles_labels()
     order = np.argsort(labels)
     figure.legend([handles[i] for i in order], [labels[i] for i in order], loc="outside lower center", ncols=6)
-    axes[0, 1].set_title("zoom: where the forces change fastest", fontsize=10)
+    axes[0, 1].set_title("zoom: where the forces turn most sharply", fontsize=10)
     for column in range(2):
         axes[1, column].set_xlabel("time [s]")
         axes[1, column].margins(x=0.01)
@@ -67,13 +67,14 @@ def plot_run(
 
 
 def _draw_ideal(axes: Array, result: Result, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
-    """The ideal forces, broad and pale behind the rendered ones; cut where they are more than three times as large."""
+    """The ideal forces, broad and pale in each device's colour; cut where they are more than three times as large."""
     forces, percent = ideal
-    label = "ideal environment" + ("" if percent is None else f" (force error {percent:.2g} %)")
+    label = "pale: ideal environment" + ("" if percent is None else f" (force error {percent:.2g} %)")
     for axis, part in zip(axes, parts, strict=True):
         most = 3 * max(map(abs, axis.get_ylim()))
-        lines = axis.plot(result.t[part], forces[part], color="#BBBBBB", linewidth=2.5, zorder=1)
-        lines[0].set_label(label)
+        for i, force in enumerate(forces[part].T):
+            axis.plot(result.t[part], force, color=STYLES[i % len(STYLES)]["color"], alpha=0.3, linewidth=3, zorder=1)
+        axis.plot([], [], color="#BBBBBB", linewidth=3, label=label)
         low, high = axis.get_ylim()
         axis.set_ylim(max(low, -most), min(high, most))
 
@@ -113,14 +114,24 @@ def _calmest_last(values: Array) -> list[int]:
 
 
 def _zoom(result: Result, frequency_hz: float) -> slice:
-    """The stretch in which the force changes fastest from sample to sample."""
+    """Six periods where the forces turn most sharply; more where they turn less than six times in them."""
     n = result.t.size
     T = result.t[1] - result.t[0] if n > 1 else 1.0
     width = min(n, max(60, round(6 / (max(frequency_hz, 1.0) * T))))
-    agitation = np.concatenate([[0.0], (np.diff(result.f, axis=0) ** 2).sum(axis=1)])
-    total = np.concatenate([[0.0], np.cumsum(agitation)])
-    first = int(np.argmax(total[width:] - total[:-width])) if n > width else 0
-    return slice(first, first + width)
+    bend = np.concatenate([[0.0], (np.diff(result.f, n=2, axis=0) ** 2).sum(axis=1), [0.0]])[:n]
+    total = np.concatenate([[0.0], np.cumsum(bend)])
+    while True:
+        first = int(np.argmax(total[width:] - total[:-width])) if n > width else 0
+        part = slice(first, first + width)
+        if 4 * width > n or _turns(result.f[part]) >= 6:
+            return part
+        width *= 2
+
+
+def _turns(f: Array) -> int:
+    """How often the force that does so most turns round; (k, m)."""
+    signs = (np.sign(column[column != 0]) for column in np.diff(f, axis=0).T)
+    return max((int(np.count_nonzero(np.diff(sign))) for sign in signs), default=0)
 
 
 def plot_population(mass: Array, damping: Array, growth: Array, path: Path, title: str) -> Path:

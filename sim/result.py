@@ -32,7 +32,7 @@ class Result:
 
     def __post_init__(self) -> None:
         for name, ndim in _ARRAYS.items():
-            value = frozen(getattr(self, name), ndim)
+            value = frozen(getattr(self, name), ndim, name)
             object.__setattr__(self, name, value)
             if value.shape[0] != self.t.shape[0]:
                 raise ValueError(f"{name} has {value.shape[0]} samples, t has {self.t.shape[0]}")
@@ -64,7 +64,7 @@ class Result:
                 return cls(**{name: archive[name] for name in _ARRAYS}, meta=json.loads(str(archive["meta"])))
         except OSError as error:
             raise InputError(f"{path}: {error.strerror or error}") from None
-        except (KeyError, ValueError, TypeError, AttributeError, EOFError, BadZipFile, zlib.error) as error:
+        except DAMAGED as error:
             raise InputError(f"{path}: not a trace of this program ({error})") from None
 
     def save_csv(self, path: Path) -> Path:
@@ -79,4 +79,6 @@ class Result:
         return write(path, content)
 
 
+#: what NumPy and zipfile raise of a file that is no npz, is damaged, or holds something else
+DAMAGED = (KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, BadZipFile, zlib.error)
 _ARRAYS = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}

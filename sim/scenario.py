@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any, Self, get_args
 
 import msgspec
+import numpy as np
 
 from controller.box import Box, UncertainSpring
 from controller.environment import Network, Spring, Wall, environment
 from controller.jitter import Jitter
 from design.store import DelayRange, Loop
-from models.device import Device, passivity_level, with_damping
+from models.device import MOST_DAMPING, Device, passivity_level, with_damping
 from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
 from models.quantity import require
 
@@ -135,7 +136,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return hashlib.sha256(msgspec.json.encode(self, order="sorted")).hexdigest()
 
     def reference_delays(self, case: str) -> tuple[int, ...]:
-        """Lambda of a case: what `lam` says, else 0 in case II and theta + psi otherwise."""
+        """Lambda of a case: what `lam` says, else 0 in case II and theta + psi otherwise. Raises InputError."""
+        if case not in CASES:
+            raise InputError(f"case is {case!r}, allowed are {', '.join(CASES)}")
         if self.lam is not None:
             return self.lam
         if case == "II":
@@ -143,26 +146,40 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return tuple(t + p for t, p in zip(self.theta, self.psi, strict=True))
 
     def loop(self, case: str) -> Loop:
-        """All that a design may know: no device but its damping, no human."""
+        """All that a design may know: no device but its damping, no human. `case` is "none", "I" or "II".
+
+        Raises InputError for another case.
+        """
         span = self.delay_range
         jitter = span if self.switches and span.lo != span.hi else None
         delays = (self.theta, self.psi, self.reference_delays(case))
         return Loop(self.T, *delays, self.delta, self.environment, self.box, jitter)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
-        """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping."""
-        if delta is not None and len(delta) != self.channels:
-            raise InputError(f"delta has {len(delta)} entries for {self.channels} channels")
+        """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping [N s/m].
+
+        As strict as a file, and what comes out is what a file would have given: lists become tuples.
+        Raises InputError naming the field, what came and what is allowed.
+        """
+        fields = {name: getattr(self, name) for name in self.__struct_fields__} | changes
         try:
             if delta is not None:
-                changes["device"] = tuple(with_damping(d, b) for d, b in zip(self.device, delta, strict=True))
-            return msgspec.structs.replace(self, **changes)
+                damping = _strictly({"delta": delta}, _Damping).delta
+                if len(damping) != self.channels:
+                    raise InputError(f"delta has {len(damping)} entries for {self.channels} channels")
+                fields["device"] = tuple(with_damping(d, b) for d, b in zip(self.device, damping, strict=True))
+            return _strictly(fields, type(self))
+        except InputError:
+            raise
         except ValueError as error:
             raise InputError(str(error)) from None
 
 
 def load(source: str | Path = DEFAULT) -> Scenario:
     """A scenario from a TOML file, or one of the built-in ones by name. Raises InputError."""
+    if not isinstance(source, str | Path):
+        kind = type(source).__name__
+        raise InputError(f"scenario is {source!r} ({kind}), expected a TOML file or one of: {', '.join(built_in())}")
     path = SCENARIOS / f"{source}.toml" if str(source) in built_in() else Path(source)
     try:
         text = path.read_text(encoding="utf-8")
@@ -188,6 +205,36 @@ def parse(text: str, source: str = "scenario") -> Scenario:
     except ValueError as error:
         raise InputError(f"{source}: environment: {error}") from None
     return scenario
+
+
+class _Damping(msgspec.Struct, frozen=True):
+    delta: tuple[float, ...]  # [N s/m]
+
+    def __post_init__(self) -> None:
+        for i, damping in enumerate(self.delta):
+            require(f"delta[{i}]", damping, 0.0, MOST_DAMPING, "N s/m")
+
+
+def _strictly(fields: dict[str, Any], kind: Any) -> Any:
+    """The fields as `kind`, by the rules of a file. Raises InputError."""
+    raw = {name: _plain(name, value) for name, value in fields.items()}
+    try:
+        return msgspec.convert(raw, kind)
+    except msgspec.ValidationError as error:
+        raise InputError(_located(str(error), raw)) from None
+
+
+def _plain(name: str, value: Any) -> Any:
+    """Structs, tuples, and numpy's numbers and arrays as what a file holds. Raises InputError."""
+
+    def of_numpy(part: Any) -> Any:
+        if isinstance(part, np.ndarray | np.generic):
+            return part.tolist()
+        raise InputError(f"{name} holds {part!r} ({type(part).__name__}), which no scenario can have")
+
+    if isinstance(value, set | frozenset | bytes | bytearray):  # msgspec would take them for lists and text
+        return of_numpy(value)
+    return msgspec.to_builtins(value, enc_hook=of_numpy)
 
 
 def built_in() -> list[str]:

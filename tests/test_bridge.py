@@ -23,7 +23,7 @@ from hw.plan import Ages, Rung, ladder, link_delay, rung
 from hw.rehearsal import Rehearsal
 from hw.safety import Fault, Limits, Stage
 from hw.session import Session, Settings
-from hw.trace import Recorder, load, result_of, save_npz, steady_ticks
+from hw.trace import Recorder, digest, load, result_of, save_npz, steady_ticks
 from hw.upset import Upset
 from models.scene import plant
 from sim import trace as trace_command
@@ -423,7 +423,9 @@ def test_a_trace_whose_recipe_is_broken_is_bad_input(trace, tmp_path):
 def _spoil(path, to, **changes):
     with np.load(path) as archive:
         arrays = {name: archive[name] for name in archive.files}
-    np.savez_compressed(to, **(arrays | {name: change(arrays) for name, change in changes.items()}))
+    changed = arrays | {name: change(arrays) for name, change in changes.items()}
+    changed.pop("digest")
+    np.savez_compressed(to, digest=np.array(digest(changed)), **changed)
     return to
 
 
@@ -480,9 +482,25 @@ def test_a_spoiled_trace_is_one_line(trace, tmp_path, changes, words):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize(
+    "name", ["t", "f", "link_tick", "link_margin_us", "link_status", "link_sent", "meta", "digest"]
+)
+def test_a_trace_changed_by_hand_is_refused(trace, tmp_path, name):
+    """Also where no force of the replay would show it; so is one that is cut off."""
+    with np.load(trace[0][0]) as archive:
+        arrays = {key: archive[key] for key in archive.files}
+    other = {"meta": np.array(str(arrays["meta"]).replace("true", "false", 1)), "digest": np.array("")}
+    changed = arrays | {name: other[name] if name in other else arrays[name][::-1]}
+    cut = {key: values[:-5] if values.ndim else values for key, values in arrays.items()}
+    for spoiled in (changed, cut):
+        np.savez_compressed(tmp_path / "trace.npz", **spoiled)
+        with pytest.raises(InputError, match="was changed after"):
+            replay.main([str(tmp_path / "trace.npz")])
+
+
 def test_an_empty_or_a_damaged_trace_is_one_line(trace, tmp_path):
     with np.load(trace[0][0]) as archive:
-        empty = {name: archive[name] if name == "meta" else archive[name][:0] for name in archive.files}
+        empty = {name: archive[name][:0] if archive[name].ndim else archive[name] for name in archive.files}
     np.savez_compressed(tmp_path / "empty.npz", **empty)
     with pytest.raises(InputError, match="has no ticks"):
         replay.main([str(tmp_path / "empty.npz")])

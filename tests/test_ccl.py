@@ -159,8 +159,8 @@ def test_the_comparison_names_every_method():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"method": "bisection"}, "method is 'bisection', expected one of complementarity, inner, fixed-poles"),
-        ({"order": 0}, "order is 0, expected one state per channel or more"),
+        ({"method": "bisection"}, "method is 'bisection', allowed are complementarity, inner, fixed-poles"),
+        ({"order": 0}, "order is 0, allowed are 1 or more"),
         ({"order": 2, "method": "fixed-poles"}, "method 'fixed-poles' is for one state per channel"),
     ],
 )

@@ -14,6 +14,7 @@ from design.published import PUBLISHED
 from design.store import (
     BadFile,
     Compliance,
+    InternalModel,
     Loop,
     NoCoupling,
     SpringDamper,
@@ -244,6 +245,7 @@ def test_a_forger_who_repairs_the_digests_still_has_to_prove():
         (b"7806.0", b"-7806.0", "K is [-7806.0, 3137.0]"),
         (b'"theta": [', b'"theta": [0, ', "theta has 3 entries"),
         (b'"proof": "rational"', b'"proof": "faith"', "$.certificate.proof"),
+        (b"7806.0", b"1e400", "$.coupling.K[0]"),
         (b"7806.0", b"NaN", ", 'NaN,': JSON is malformed"),
     ],
 )
@@ -267,3 +269,18 @@ def test_a_file_of_something_else_is_one_line(tmp_path, content, said):
     path.write_bytes(content)
     with pytest.raises(BadFile, match=f"coupling.json: .*{said}"):
         load(path)
+
+
+def test_coefficients_that_no_coupling_has_are_refused():
+    with pytest.raises(ValueError, match=r"Q has an entry 1e\+80, allowed are up to 1e\+12"):
+        InternalModel((), (((1e80, 0.0), (0.0, 1e80)),))
+    with pytest.raises(ValueError, match=r"D has an entry -1e\+13"):
+        Compliance((), (), ((),), ((-1e13,),))
+
+
+def test_an_entry_of_a_proof_beyond_floating_point_is_no_proof():
+    good = certified(DEFAULT, STIFF, "closed-loop")
+    rows = [list(row) for row in good.certificate.matrices["P"]]
+    rows[0][0] = "1" + "0" * 400
+    forged = sealed(change(good.certificate, matrices={"P": tuple(map(tuple, rows))}))
+    assert "beyond the range of floating point" in verify(change(good, certificate=forged)).reason

@@ -13,9 +13,9 @@ from hw.emulated_plant import nobody
 from hw.emulator_core import Emulator, info_of
 from hw.excitation import chirp
 from hw.faults import lively
-from hw.frame import Ack, Config, Force, State, config_crc, encode
+from hw.frame import Ack, Config, Force, State, Stop, config_crc, encode
 from hw.measurement import Measurement
-from hw.message import NO_MARGIN, Command, Phase
+from hw.message import NO_MARGIN, Command, Phase, Reason
 from hw.plan import Ages, ladder
 from hw.rehearsal import Rehearsal
 from hw.safety import Fault, Limits, Stage
@@ -68,8 +68,19 @@ def test_a_force_that_nobody_asked_for_is_a_fault_after_a_few_ticks(phase, force
     told.unlike(state(0), 1)
     for tick in range(1, PATIENCE):
         assert told.unlike(state(tick, (force[0] * tick, force[1]), phase), 1)
-    with pytest.raises(Fault, match=r"it was (told None|to hold \(4, 0\)), and so for 5 ticks"):
+    with pytest.raises(Fault, match=r"it was told None, and so for 5 ticks|holds a force for 5 ticks, 4 are agreed"):
         told.unlike(state(PATIENCE, (force[0] * PATIENCE, force[1]), phase), 1)
+
+
+def test_a_device_that_is_wrong_every_other_tick_is_found_out_later():
+    told = Told(CONFIG)
+    told.unlike(state(0), 1)
+    for tick in range(1, 9):
+        told.tell(tick - CONFIG.theta, (0, 0))
+        assert told.unlike(state(tick, (300 * (tick % 2), 0)), 1) == bool(tick % 2)
+    told.tell(9 - CONFIG.theta, (0, 0))
+    with pytest.raises(Fault, match="the device applies"):
+        told.unlike(state(9, (300, 0)), 1)
 
 
 def test_a_disarmed_device_has_no_force():
@@ -162,6 +173,53 @@ def test_a_device_that_stops_telling_margins_is_stopped(scenario, rungs):
     assert silent == 181
     assert session.stage == Stage.STOPPED
     assert session.cause == "90 % of the last 200 STATEs told no margin: nobody can say how late answers are"
+
+
+def test_a_device_that_keeps_every_other_state_to_itself_is_stopped(scenario, rungs):
+    """A force is judged from one tick to the next: where a fifth of the ticks is untold, nobody can."""
+    session, send = hand_driven(scenario, rungs)
+    for _ in range(250):
+        send(Phase.ARMED)
+    told = 0
+    while session.stage == Stage.ARMED and told < 100:
+        send(Phase.ARMED, ticks=2, lasts=2 * T_US)
+        told += 1
+    assert told == 41
+    assert session.stage == Stage.STOPPED
+    assert session.cause == "no STATE came of 20 % of 200 ticks: nobody can say what the device did"
+
+
+def test_a_device_that_holds_longer_than_agreed_is_stopped(scenario, rungs):
+    session, send = hand_driven(scenario, rungs)
+    for _ in range(250):
+        send(Phase.ARMED)
+    for _ in range(session.config.hold):
+        send(Phase.HOLDING)
+    assert session.stage == Stage.ARMED
+    send(Phase.HOLDING)
+    assert (session.stage, session.cause) == (Stage.STOPPED, "the device holds a force for 5 ticks, 4 are agreed")
+
+
+def test_an_emergency_stop_is_told_until_the_device_has_latched_it(scenario, rungs):
+    session, _ = hand_driven(scenario, rungs)
+    session.estop("space bar", 0)
+    told = session.receive(encode(State(Phase.DISARMED, 900, 0, 0, 0, 0, 0, (0, 0), (0, 0))), 0)
+    assert told == encode(Stop(Reason.ESTOP))
+    assert session.receive(encode(State(Phase.ESTOP, 901, 0, 0, 0, 0, 0, (0, 0), (0, 0))), 0) == b""
+
+
+@pytest.mark.parametrize("configuring", [False, True])
+def test_a_device_that_drives_before_anybody_asked_is_told_to_stop(scenario, configuring):
+    session = Session(scenario, Limits((12.0, 12.0)))
+    session.start(0)
+    if configuring:
+        session.receive(encode(info_of(scenario)), 0)
+    driving = State(Phase.ARMED, 5, 0, 100, 0, 0, 0, (0, 0), (12_000, 0))
+    assert encode(Stop(Reason.DONE if configuring else Reason.FAULT)) in session.receive(encode(driving), 1000)
+    assert session.stage == (Stage.CONFIGURING if configuring else Stage.CONNECTING)
+    session.receive(encode(driving._replace(tick=70)), 70_000)
+    if configuring:
+        assert (session.stage, session.cause) == (Stage.STOPPED, "the device is armed, and nobody asked it to")
 
 
 def test_a_clock_that_is_made_of_ticks_is_found_by_the_host(scenario, rungs):

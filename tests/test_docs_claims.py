@@ -2,6 +2,8 @@
 
 import ast
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -53,3 +55,16 @@ def test_every_row_of_the_reproducibility_table_shows_its_evidence():
 def test_every_claim_test_is_used_by_the_documentation():
     used = {test for name in DOCS for _, test in MENTION.findall((ROOT / "docs" / name).read_text(encoding="utf-8"))}
     assert sorted(defined_in("test_claims.py") - used) == []
+
+
+def test_documented_commands_leave_the_repository_clean():
+    """What they write into the folder that they are run in is ignored by git."""
+    if shutil.which("git") is None or not (ROOT / ".git").exists():
+        pytest.skip("no git, or no clone")
+    texts = [page.read_text(encoding="utf-8") for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))]
+    blocks = re.findall(r"^```(?:sh|console)\n(.*?)^```", "".join(texts), flags=re.DOTALL | re.MULTILINE)
+    written = {name for block in blocks for name in re.findall(r"--(?:out|video|json) ([\w./-]+)", block)}
+    files = sorted(name for name in written if not name.startswith(("/", "out/")))
+    assert len(files) >= 5
+    done = subprocess.run(["git", "check-ignore", *files], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stdout.split() == files

@@ -89,6 +89,14 @@ def test_a_matrix_definite_by_less_than_the_rounding_is_not_proved():
     assert not strictly_positive(S)
 
 
+def test_entries_beyond_all_proportion_prove_nothing_and_say_so_quietly(recwarn):
+    for size in (10**200, 10**400, 10**4000):
+        assert not strictly_positive(Matrix.of([[1, size], [size, 1]]))
+        assert not strictly_positive(Matrix.of([[Fraction(1, size), 1], [1, 1]]))
+        assert strictly_positive(Matrix.of([[size, 1], [1, Fraction(2, size)]]))
+    assert not recwarn.list
+
+
 def hilbert(n: int, shift: Fraction = Fraction(0)) -> Matrix:
     return Matrix.of([[Fraction(1, i + j + 1) - (shift if i == j else 0) for j in range(n)] for i in range(n)])
 

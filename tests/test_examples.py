@@ -21,6 +21,26 @@ SAYS = {
 }
 
 
+def test_a_device_without_damping_ends_the_example_with_one_line(tmp_path):
+    text = (ROOT / "examples/your_own_device.py").read_text()
+    assert '"damping": 0.9' in text
+    (tmp_path / "mine.py").write_text(text.replace('"damping": 0.9', '"damping": 0.0'))
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "mine.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert done.stderr == "error: delta is [0.0, 0.0]: a device without damping can promise no human anything\n"
+
+
+def test_examples_import_only_what_is_for_scripts():
+    ours = {"sim", "design", "hw", "controller.coupling", "models.device"}
+    for path in EXAMPLES:
+        imported = set(re.findall(r"^(?:from|import) ((?:sim|design|hw|controller|models)\S*)", path.read_text(), re.M))
+        assert imported <= ours, path.name
+        assert "sim" in imported
+
+
 def test_every_example_is_tested_and_short():
     assert {path.stem for path in EXAMPLES} == set(SAYS)
     assert all(len(path.read_text().splitlines()) < 60 for path in EXAMPLES)

@@ -15,6 +15,7 @@ import termios
 import time
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -174,6 +175,51 @@ def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
     finally:
         for bridge_on in bridges.values():
             bridge_on.close()
+
+
+class Designing:
+    """A session that waits for a coupling, and a port that swallows everything."""
+
+    stage, measurement = Stage.MEASURED, SimpleNamespace(result=None)
+
+    def load(self, rungs, now):
+        self.stage = Stage.DISARMED if self.stage == Stage.MEASURED else self.stage
+        return b""
+
+    def arm(self, now):
+        raise AssertionError("armed by a key from before there was anything to arm")
+
+    def stop(self, cause, now):
+        self.stage = Stage.FINISHED
+        return b""
+
+    def fileno(self):
+        return self.idle
+
+    def discard(self):
+        pass
+
+
+@pytest.mark.parametrize(("typed", "stage"), [(b"a", Stage.DISARMED), (b"aq", Stage.FINISHED)])
+def test_a_key_typed_during_the_design_does_not_arm(typed, stage):
+    """It waits in the terminal's buffer until the session is disarmed: it is read before; other keys still count."""
+    keyboard, person = os.pipe()
+    session = Designing()
+    session.idle, other = os.pipe()
+
+    def plan(ages):
+        os.write(person, typed)
+        return []
+
+    live = Live(session, session, plan, False, 1.0, keyboard)
+    live._load()
+    assert select.select([keyboard], [], [], 0)[0] == []
+    assert session.stage == stage
+    os.close(person)
+    live._pressed()  # the terminal is gone
+    assert live.signals == [signal.SIGHUP]
+    for end in (keyboard, session.idle, other):
+        os.close(end)
 
 
 def test_an_exception_stops_the_device_first(emulator, scenario):

@@ -1,5 +1,6 @@
 """Scenarios are strict: every impossible one gives one line that names the field."""
 
+import numpy as np
 import pytest
 
 from controller.environment import FIGURE_4
@@ -52,6 +53,11 @@ def test_a_missing_file_names_what_there_is(name, message):
         load(name)
 
 
+def test_a_scenario_is_loaded_by_name_or_file():
+    with pytest.raises(InputError, match=r"scenario is 3 \(int\), expected a TOML file or one of: .*omega-pair"):
+        load(3)
+
+
 def test_a_file_that_is_no_text(tmp_path):
     (tmp_path / "x.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match="UTF-8"):
@@ -76,11 +82,61 @@ def test_replacing_checks_again():
     assert scenario.replace(delta=(2.0, 0.8)).delta == (2.0, 0.8)
     for change, message in [
         ({"theta": (1, 2, 3)}, "theta has 3 entries"),
-        ({"delta": (1.0, -1.0)}, "damping is -1"),
+        ({"delta": (1.0, -1.0)}, r"delta\[1\] is -1, allowed are 0 to 10000 N s/m"),
         ({"delta": (1.0,)}, "delta has 1 entries for 2 channels"),
     ]:
         with pytest.raises(InputError, match=message):
             scenario.replace(**change)
+
+
+@pytest.mark.parametrize("name", built_in())
+def test_replacing_nothing_changes_nothing(name):
+    scenario = load(name)
+    same = scenario.replace(name=scenario.name)
+    assert same == scenario
+    assert same.digest == scenario.digest
+
+
+def test_what_a_script_has_becomes_what_a_file_has():
+    """Lists, numpy's arrays and numbers, whole numbers where any are allowed."""
+    scenario = load().replace(theta=[1, 3], psi=np.array([1, 0]), T=np.float64(1e-3), duration=2, delta=np.ones(2))
+    assert (scenario.theta, scenario.psi, scenario.delta) == ((1, 3), (1, 0), (1.0, 1.0))
+    assert [type(value) for value in (*scenario.psi, scenario.T, scenario.duration)] == [int, int, float, float]
+    assert scenario.digest == load().replace(theta=(1, 3), psi=(1, 0), T=1e-3, duration=2.0, delta=(1.0, 1.0)).digest
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"theta": (1.5, 1)}, "theta[0] = 1.5: expected `int`, got `float`"),
+        ({"theta": np.array([1.5, 1])}, "theta[0] = 1.5: expected `int`, got `float`"),
+        ({"theta": (True, 1)}, "theta[0] = True: expected `int`, got `bool`"),
+        ({"theta": 1}, "theta = 1: expected `array`, got `int`"),
+        ({"theta": "12"}, "theta = '12': expected `array`, got `str`"),
+        ({"theta": {1, 2}}, "theta holds {1, 2} (set), which no scenario can have"),
+        ({"T": "1"}, "T = '1': expected `float`, got `str`"),
+        ({"T": True}, "T = True: expected `float`, got `bool`"),
+        ({"T": 1j}, "T holds 1j (complex), which no scenario can have"),
+        ({"name": b"x"}, "name holds b'x' (bytes), which no scenario can have"),
+        ({"human": None}, "human: expected `array`, got `null`"),
+        ({"device": ("a", "b")}, "device[0] = 'a': expected `object`, got `str`"),
+        ({"delta": 1.0}, "delta = 1.0: expected `array`, got `float`"),
+        ({"delta": (1.0, "x")}, "delta[1] = 'x': expected `float`, got `str`"),
+        ({"delta": (float("nan"), 1.0)}, "delta[0] is nan, allowed are 0 to 10000 N s/m"),
+        ({"thta": (1, 1)}, "unknown field `thta` (did you mean `theta`?)"),
+    ],
+)
+def test_replacing_is_as_strict_as_a_file(change, message):
+    with pytest.raises(InputError) as caught:
+        load().replace(**change)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize("case", ["III", "i", "", None, 1])
+def test_a_case_that_is_none_is_refused(case):
+    with pytest.raises(InputError) as caught:
+        load().loop(case)
+    assert str(caught.value) == f"case is {case!r}, allowed are none, I, II"
 
 
 def test_the_digest_knows_every_number():

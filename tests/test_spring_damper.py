@@ -51,6 +51,15 @@ def test_the_known_optimum_is_reached_from_any_start(case, norm, start):
     assert found.requirement.certified
 
 
+@pytest.mark.parametrize("condition", ["theorem4", "closed-loop"])
+def test_a_damper_of_nothing_is_zero(condition):
+    """Without delay Colgate's KT/2 + B <= delta makes every damper cost stiffness: before a stiff wall none is best."""
+    wall = Network(("c",), (Spring(("c", "ground"), 1e4),))
+    found = design(specification((0,), wall, (0,), (0,), (0.5,)), condition)
+    assert found.coupling.B[0] == 0.0
+    assert found.requirement.certified
+
+
 def test_the_objective_is_the_norm_of_the_coupling_returned():
     spec = specification()
     found = design(spec)

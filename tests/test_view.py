@@ -29,7 +29,7 @@ from sim.view.flat import Flat
 from sim.view.grip import DAMPING, STIFFNESS, Grip, gripped
 from sim.view.layout import COLUMNS, channels, envelope, places, scale
 from sim.view.live import loop, typed
-from sim.view.overlay import keys_help, overlay
+from sim.view.overlay import apart, keys_help, overlay
 from sim.view.pace import Pace
 from sim.view.session import Session, rest
 from sim.view.setting import Menu, changed, first_setting
@@ -316,12 +316,26 @@ def test_the_overlay_says_growth_and_certificates(none, published):
     assert said["growth"] == "+1.48 1/s at 84.0 Hz: unstable"
     assert said["this environment"] == "needs 1.723 of 1.37 N s/m: NOT certified"
     assert said["any environment"] == "no certificate"
-    assert "0 overruns" in said["time"]
+    assert "0 overruns" in said["clock"]
     said = dict(overlay(session(published).frame(0.1), live=False))
     assert said["this environment"] == "needs 1.399 of 1.37 N s/m: NOT certified"
     assert said["any environment"] == "needs 7.843 of 1.37 N s/m: NOT certified"
     assert said["time"] == "0.1 s"
     assert (GIVEN in dict(keys_help(True)).values(), GIVEN in dict(keys_help(False)).values()) == (True, False)
+
+
+def test_a_refusal_is_said_whole_and_once(none):
+    """However long; in a window it stands by itself, where no bodies are."""
+    running = session(none)
+    press(running, "Insert")
+    frame = running.frame(0.1)
+    assert frame.note == "given: there is no coupling from a file (start with --coupling FILE.json)"
+    long = replace(frame, note=" ".join(["reason"] * 60))
+    rest_of_it, refused = apart(overlay(long, live=True))
+    assert " ".join(value for _, value in refused) == long.note
+    assert "last" not in dict(rest_of_it)
+    short = overlay(replace(frame, note="theta+1"), live=True)
+    assert apart(short) == (short, [])
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 700, 3333])
@@ -421,7 +435,7 @@ def test_a_film_is_the_same_every_time(tmp_path, capsys):
         run("--video", str(tmp_path / f"{name}.gif"), *words, "--json", str(tmp_path / f"{name}.json"))
     assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
     with Image.open(tmp_path / "a.gif") as image:
-        assert (image.size, image.n_frames, image.info["duration"]) == ((640, 480), 11, 100)
+        assert (image.size, image.n_frames, image.info["duration"]) == ((640, 640), 11, 100)
     told = json.loads((tmp_path / "a.json").read_text())
     assert [(e["event"], e["coupling"], e["theta"]) for e in told["events"]] == [
         ("start", "none", [1, 2]),
@@ -441,7 +455,9 @@ def test_flat_pictures_show_where_things_are(none):
     frame = session(none).frame(0.05)
 
     def middle(q):
-        picture = painter.picture(replace(frame, q=np.array([0, 0, q, 0.0])))[:310]  # above the plots
+        picture = painter.picture(replace(frame, q=np.array([0, 0, q, 0.0])))[
+            256:480
+        ]  # between the words and the plots
         return np.flatnonzero((picture == (0, 115, 178)).all(axis=2).any(axis=0)).mean()
 
     # in pixels, each end rounded; 520 of them are two steps and two arrows, 0.42 m
@@ -466,11 +482,12 @@ def test_pictures_by_opengl(backend, none):
         moved = painter.picture(replace(frame, q=frame.q + 0.05))
     finally:
         painter.close()
-    assert one.shape == (480, 640, 3)
+    assert one.shape == (640, 640, 3)
     assert np.array_equal(one, again)
     changed = (one != moved).any(axis=2)
-    assert changed[:317].sum() > 1000
-    assert not changed[317:].any()  # the plots do not depend on positions
+    assert changed[256:480].sum() > 1000
+    assert not changed[:256].any()  # no body reaches into the words,
+    assert not changed[480:].any()  # nor into the plots
 
 
 def test_without_opengl_there_are_flat_pictures_and_a_line(tmp_path, monkeypatch, capsys):
@@ -537,15 +554,23 @@ def test_case_none_begins_without_a_coupling_and_takes_one_later(tmp_path):
 BAD = [
     (("--video", "a.png"), "--video a.png: the name must end in .gif or .mp4"),
     (("--video", "nowhere/a.gif"), "the folder nowhere does not exist"),
+    (("--video", "/proc/a.gif"), "--video /proc/a.gif: cannot write to /proc"),
     (("--video", "a.gif", "--fps", "12"), "--fps is 12, allowed are 1 to 100, and for a .gif only what divides 100"),
-    (("--video", "a.gif", "--duration", "0"), "--duration is 0, allowed are up to 3600 s"),
-    (("--coupling", "soft"), "--coupling is 'soft', allowed are none, published, designed, optimal or a FILE.json"),
+    (("--video", "a.gif", "--duration", "0"), "--duration is 0, allowed are more than 0 and up to 3600 s"),
+    (("--video", "a.gif", "--duration", "-1"), "--duration is -1, allowed are more than 0 and up to 3600 s"),
+    (
+        ("--coupling", "soft"),
+        "'soft', allowed are none, published, spring-damper, optimal, ccl, designed or a FILE.json",
+    ),
     (("--coupling", "absent.json"), "absent.json: No such file"),
     (("--case", "none", "--coupling", "designed"), "that case is the loop without coupling"),
     (("--script", "none"), "--script: 'none', expected SECONDS:EVENT"),
     (("--script=-1:none",), "--script: '-1:none', expected SECONDS:EVENT with 0 to 3600 s"),
     (("--script", ""), "--script is empty"),
-    (("--script", "0:soft"), "'0:soft' is no event, allowed are none, published, designed, optimal, given, theta+1"),
+    (
+        ("--script", "0:soft"),
+        "'0:soft' is no event, allowed are none, published, designed, optimal, ccl, given, theta+1",
+    ),
     (("--script", "0:push3=1"), "'0:push3=1', allowed are push1 to push2 with up to 100 N"),
     (("--script", "0:push1=1..2"), "allowed are push1 to push2"),
     (("--coupling", "none", "--script", "1:theta-2"), "theta would be [-1, 0]"),

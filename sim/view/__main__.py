@@ -25,7 +25,7 @@ from sim.command import (
 )
 from sim.files import write_json
 from sim.scenario import InputError
-from sim.view.events import COUPLINGS, GIVEN, Couple, Script, parse_script
+from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Script, parse_script
 from sim.view.film import Picture, check_film, save_film
 from sim.view.flat import Flat
 from sim.view.overlay import keys_help
@@ -77,9 +77,9 @@ def _parser() -> Parser:
     keys = ", ".join(f"{name} {word}" for name, word in keys_help(given=True))
     parser = Parser("sim.view", f"Feel the loop in a window, or film it.\n\nKeys: {keys}.", EXAMPLE)
     add_loop_options(parser)
-    names = ", ".join(COUPLINGS)
-    parser.add_argument("--coupling", metavar="NAME|FILE", help=f"to begin with: {names} or FILE.json")
-    parser.add_argument("--condition", choices=CONDITIONS, help="of 'designed' and 'optimal' (default: each one's own)")
+    what = f"to begin with: {', '.join(_names())} or FILE.json; designed is spring-damper"
+    parser.add_argument("--coupling", metavar="NAME|FILE", help=what)
+    parser.add_argument("--condition", choices=CONDITIONS, help="of a design (default: each one's own)")
     parser.add_argument("--script", metavar="EVENTS", help=f"what happens when [s] (default of a video: '{SCRIPT}')")
     parser.add_argument(
         "--duration", metavar="SECONDS", help="default: a window until it is closed, a video until after its script"
@@ -106,7 +106,7 @@ def _wish(args: argparse.Namespace) -> Wish:
     """Raises InputError; GIF counts in hundredths of a second."""
     duration = None if args.duration is None else numbers("--duration", args.duration, float, 1)[0]
     if duration is not None and not 0 < duration <= LONGEST:
-        raise InputError(f"--duration is {duration:g}, allowed are up to {LONGEST} s")
+        raise InputError(f"--duration is {duration:g}, allowed are more than 0 and up to {LONGEST} s")
     (fps,) = numbers("--fps", args.fps, int, 1)
     if not 1 <= fps <= 100 or (str(args.video).endswith(".gif") and 100 % fps):
         raise InputError(f"--fps is {fps}, allowed are 1 to 100, and for a .gif only what divides 100")
@@ -133,12 +133,16 @@ def _label(args: argparse.Namespace) -> str:
         return "none"
     if name is None:
         return "designed"
-    for label, kind in COUPLINGS.items():
-        if name in (label, kind):
-            return label
+    if (label := LABELS.get(name, name)) in COUPLINGS:
+        return label
     if Path(name).suffix != ".json":
-        raise InputError(f"--coupling is {name!r}, allowed are {', '.join(COUPLINGS)} or a FILE.json")
+        raise InputError(f"--coupling is {name!r}, allowed are {', '.join(_names())} or a FILE.json")
     return GIVEN
+
+
+def _names() -> list[str]:
+    """The couplings as the other commands call them, and as the window does."""
+    return list(dict.fromkeys([*LABELS, *COUPLINGS]))
 
 
 def _film(args: argparse.Namespace, session: Session, wish: Wish) -> dict[str, Any]:

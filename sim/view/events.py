@@ -9,7 +9,9 @@ from dataclasses import dataclass
 from sim.scenario import InputError
 
 #: what a user calls a coupling -> what sim.couplings calls it
-COUPLINGS = {"none": "none", "published": "published", "designed": "spring-damper", "optimal": "optimal"}
+COUPLINGS = {"none": "none", "published": "published", "designed": "spring-damper", "optimal": "optimal", "ccl": "ccl"}
+#: the other way round: a user may say it as the other commands do
+LABELS = {kind: label for label, kind in COUPLINGS.items()}
 GIVEN = "given"  # the coupling of --coupling FILE.json
 DELAYS = ("theta", "psi")
 STRONGEST = 100.0  # [N] a push
@@ -93,8 +95,8 @@ def words(event: Event) -> str:
 
 
 def _event(entry: str, what: str, channels: int) -> Event:
-    if what in (*COUPLINGS, GIVEN):
-        return Couple(what)
+    if (label := LABELS.get(what, what)) in (*COUPLINGS, GIVEN):
+        return Couple(label)
     if what == "restart":
         return Restart()
     if delay := re.fullmatch(r"(theta|psi)([+-]\d{1,4})", what):

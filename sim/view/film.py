@@ -31,6 +31,11 @@ def check_film(path: Path) -> None:
         raise InputError(f"--video {path}: is a folder, expected a file")
     if not path.parent.is_dir():
         raise InputError(f"--video {path}: the folder {path.parent} does not exist")
+    try:
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise InputError(f"--video {path}: cannot write to {path.parent}: {error.strerror}") from None
     if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
         raise InputError(f"--video {path}: MP4 needs ffmpeg, which is not on the PATH; a .gif needs nothing")
 

@@ -16,6 +16,7 @@ from sim.view.layout import (
     PLOT,
     SIZE,
     STEP,
+    WORDS,
     Colour,
     channels,
     colour,
@@ -48,7 +49,7 @@ class Flat:
             pen.text((8, top), label, BLACK, self._font)
             pen.text((130, top), value, BLACK, self._font)
             top += 15
-        self._bodies(pen, frame, max(top, below - 60 * self.scene.channels), below)
+        self._bodies(pen, frame, max(top, round(WORDS * height)), below)
         self._forces(pen, frame, below + 18, height - 18)
         return np.asarray(image)
 

@@ -24,8 +24,9 @@ ALARM: Colour = (1.0, 0.15, 0.15)  # a force at its limit
 APART = 0.11  # [m] between devices, across their motion
 STEP = 0.09  # [m] between the bodies of one device at rest, along their motion
 LONGEST = 0.12  # [m] arrow of a force at its limit
-SIZE = (640, 480)  # pixels of a video
-PLOT = 0.34  # share of the picture's height that the forces take
+SIZE = (640, 640)  # pixels of a video
+WORDS = 0.40  # share of a video's height, at its top, that is left to words
+PLOT = 0.25  # share of the picture's height, at its bottom, that the forces take
 COLUMNS = 250  # spans of the plotted forces, each with its least and largest
 
 

@@ -13,7 +13,7 @@ from mujoco import viewer
 
 from sim.view.events import KEYS
 from sim.view.grip import Grip
-from sim.view.overlay import columns, keys_help, overlay
+from sim.view.overlay import apart, columns, keys_help, overlay
 from sim.view.session import Frame, Session
 from sim.view.stage import Stage
 
@@ -57,7 +57,7 @@ def show(session: Session, stage: Stage, until: float | None = None) -> None:
     try:
         with window:
             with window.lock():
-                stage.aim(window.cam, (0.0, 0.0, -0.12), 2.4)  # between the words and the plots
+                stage.aim(window.cam, (0.0, 0.0, 0.2), 3.0)  # between the words and the plots
             loop(session, stage, window, time.perf_counter, time.sleep, until)
     finally:  # the viewer must have left OpenGL before Python ends
         for thread in set(threading.enumerate()) - threads:
@@ -92,9 +92,10 @@ def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Grip | None:
             window.user_scn.ngeom = 0
             stage.draw(window.user_scn, frame)
     window.sync()
-    said, keys = columns(overlay(frame, live=True)), columns(keys_help(frame.setting.menu.given is not None))
+    (said, refused), keys = apart(overlay(frame, live=True)), keys_help(frame.setting.menu.given is not None)
     font, grid = mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos
-    window.set_texts([(font, grid.mjGRID_TOPLEFT, *said), (font, grid.mjGRID_TOPRIGHT, *keys)])
+    places = {grid.mjGRID_TOPLEFT: said, grid.mjGRID_TOPRIGHT: keys, grid.mjGRID_BOTTOMLEFT: refused}
+    window.set_texts([(font, place, *columns(lines)) for place, lines in places.items() if lines])
     if window.viewport is not None:
         window.set_figures(stage.figures(frame, window.viewport))
     return grip

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from sim.view.layout import PLOT, SIZE
+from sim.view.layout import PLOT, SIZE, WORDS
 from sim.view.overlay import columns, overlay
 from sim.view.session import Frame
 from sim.view.stage import Stage
@@ -57,10 +57,10 @@ class Offscreen:
         self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
         self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
         self._option, self._grip, self._camera = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
-        stage.aim(self._camera, (-0.4, 0.0, 0.36), 1.7)  # they stand below and to the right of the words
+        stage.aim(self._camera, (0.0, 0.0, 0.0), 1.3)
 
     def picture(self, frame: Frame) -> NDArray[np.uint8]:
-        """(height, width, 3): the scene with its overlay, above the forces."""
+        """(height, width, 3): what is said of the loop, the scene, the forces, from top to bottom."""
         stage, (width, height) = self.stage, SIZE
         stage.show(frame.q)
         mujoco.mjv_updateScene(
@@ -74,8 +74,10 @@ class Offscreen:
         )
         stage.draw(self._scene, frame)
         below = round(PLOT * height)
-        above = mujoco.MjrRect(0, below, width, height - below)
-        mujoco.mjr_render(above, self._scene, self._context)
+        top = round(WORDS * height)
+        mujoco.mjr_render(mujoco.MjrRect(0, below, width, height - below - top), self._scene, self._context)
+        above = mujoco.MjrRect(0, height - top, width, top)
+        mujoco.mjr_rectangle(above, 0.93, 0.93, 0.93, 1.0)
         said = columns(overlay(frame, live=False))
         mujoco.mjr_overlay(
             mujoco.mjtFont.mjFONT_NORMAL,

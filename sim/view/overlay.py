@@ -12,7 +12,7 @@ from sim.view.session import HISTORY, Frame
 
 Lines = list[tuple[str, str]]
 
-WIDTH = 54  # characters of a line
+WIDTH = 60  # characters of a line
 
 
 def overlay(frame: Frame, live: bool) -> Lines:
@@ -31,12 +31,11 @@ def overlay(frame: Frame, live: bool) -> Lines:
     if np.any(frame.push):
         lines.append(("push", f"{', '.join(f'{p:+.2f}' for p in frame.push)} N"))
     clock = f"{frame.t:.1f} s"
+    lines.append(("time", clock if not live else f"{clock}, real time x {frame.factor:.2f}"))
     if live:
-        clock += f", real time x {frame.factor:.2f}, {frame.overruns} overruns ({frame.lost:.2f} s lost)"
-    lines.append(("time", clock))
+        lines.append(("clock", f"{frame.overruns} overruns, {frame.lost:.2f} s lost"))
     if frame.note:
-        note = textwrap.shorten(frame.note, 3 * WIDTH, placeholder=" ..")
-        first, *rest = textwrap.wrap(note, WIDTH)
+        first, *rest = textwrap.wrap(frame.note, WIDTH)
         lines += [("last", first), *(("", line) for line in rest)]
     return lines
 
@@ -51,8 +50,15 @@ def needs(requirement: Requirement) -> str:
 
 
 def keys_help(given: bool) -> Lines:
-    """The keys and what they ask for; `given` where there is a coupling from a file."""
-    return [(name, words(event)) for name, event in KEYS.values() if given or event != Couple(GIVEN)]
+    """The keys and what they ask for; `given` where there is a coupling from a file. The mouse comes last."""
+    keys = [(name, words(event)) for name, event in KEYS.values() if given or event != Couple(GIVEN)]
+    return [*keys, ("double click", "take a body"), ("Ctrl+right", "draw it")]
+
+
+def apart(lines: Lines) -> tuple[Lines, Lines]:
+    """The lines, and what was last refused, where that takes several lines."""
+    at = next((i for i, (label, _) in enumerate(lines) if label == "last"), len(lines))
+    return (lines[:at], lines[at:]) if len(lines) - at > 1 else (lines, [])
 
 
 def columns(lines: Lines) -> tuple[str, str]:

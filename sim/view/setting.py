@@ -77,7 +77,7 @@ def attempt(setting: Setting, event: Couple | Delay) -> Setting | str:
 def _choose(menu: Menu, scenario: Scenario, label: str) -> Chosen:
     if label == GIVEN:
         if menu.given is None:
-            raise InputError("given: there is no coupling from a file (start with --coupling FILE.json)")
+            raise InputError("there is no coupling from a file (start with --coupling FILE.json)")
         return choose(scenario, menu.case, menu.given)
     name = COUPLINGS[label]
     return choose(scenario, menu.case, name, menu.condition if name in KINDS else None)

@@ -1,0 +1,145 @@
+"""Ctrl-C at any time, and readers who stop reading: one line, the right exit code, no traceback."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from design.store import SpringDamper, Stored, save
+from sim.command import execute
+from sim.files import check_file, out_file
+from sim.scenario import InputError, load
+
+ROOT = Path(__file__).parent.parent
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+
+
+def started(*words, **options):
+    return subprocess.Popen(
+        [sys.executable, *words], env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options
+    )
+
+
+def interrupted_after(module, command, cwd):
+    """SIGINT as soon as Python reports that `module` is imported: a time in the command's life, on any machine."""
+    process = started("-X", "importtime", "-m", *command, cwd=cwd)
+    for line in process.stderr:
+        if line.rpartition("|")[2].strip() == module:
+            break
+    process.send_signal(signal.SIGINT)
+    _, rest = process.communicate()
+    lines = [line for line in rest.splitlines() if not line.startswith("import time:")]
+    return process.returncode, lines
+
+
+@pytest.mark.parametrize("module", ["sim", "mujoco", "sim.command"])
+def test_ctrl_c_while_a_command_is_imported(module, tmp_path):
+    assert interrupted_after(module, ["sim.run", "--no-plot"], tmp_path) == (130, ["interrupted"])
+    assert not (tmp_path / "out").exists() or module == "sim.command"  # nothing was begun
+
+
+@pytest.mark.parametrize(
+    ("command", "module"),
+    [("design", "design"), ("hw.bridge", "msgspec")],
+)
+def test_ctrl_c_in_the_other_packages(command, module, tmp_path):
+    assert interrupted_after(module, [command], tmp_path) == (130, ["interrupted"])
+
+
+def test_ctrl_c_while_the_solver_is_imported(tmp_path):
+    """After the command has begun: cvxpy is imported by the design."""
+    assert interrupted_after("cvxpy.atoms", ["design", "--coupling", "ccl"], tmp_path) == (130, ["interrupted"])
+
+
+@pytest.mark.skipif(not Path(f"/proc/self/task/{os.getpid()}/children").exists(), reason="no /proc/../children")
+def test_what_an_import_has_started_ends_too():
+    """glfw asks for its library's version in a child, which would find a broken pipe."""
+    code = (
+        "import subprocess, sys; from sim import interrupt;"
+        "subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(600)']); interrupt._leave(2, None)"
+    )
+    process = started("-c", code)
+    assert process.communicate(timeout=300) == ("", "interrupted\n")  # the child holds both pipes until it ends
+    assert process.returncode == 130
+
+
+def test_a_script_that_uses_the_library_keeps_its_own_handling():
+    code = "import signal, sim, design, hw; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
+    assert started("-c", code).communicate()[0] == "True\n"
+
+
+def test_a_module_of_others_keeps_its_own_handling(tmp_path):
+    (tmp_path / "theirs.py").write_text("import signal, sim\nprint(signal.getsignal(signal.SIGINT).__name__)\n")
+    assert started("-m", "theirs", cwd=tmp_path).communicate()[0] == "default_int_handler\n"
+    package = tmp_path / "others"
+    package.mkdir()  # whose __init__ runs while sys.argv is still ["-m"]
+    (package / "__init__.py").write_text((tmp_path / "theirs.py").read_text())
+    (package / "__main__.py").write_text("")
+    assert started("-m", "others", cwd=tmp_path).communicate()[0] == "default_int_handler\n"
+
+
+def test_an_ignored_ctrl_c_stays_ignored(tmp_path):
+    """nohup, and `command &` in a script, have SIGINT ignored."""
+    words = ["-c", "import os, signal, sys; signal.signal(2, signal.SIG_IGN); os.execv(sys.executable, sys.argv[1:])"]
+    process = started(*words, sys.executable, "-X", "importtime", "-m", "sim.run", "--help", cwd=tmp_path)
+    for line in process.stderr:
+        if line.rpartition("|")[2].strip() == "numpy":
+            break
+    process.send_signal(signal.SIGINT)
+    assert "usage: python -m sim.run" in process.communicate()[0]
+    assert process.returncode == 0
+
+
+AUDIT = ["design.audit", "--K", "2870,2320", "--B", "5.47,5.55"]  # not certified: exit code 1
+
+
+@pytest.mark.parametrize(
+    ("command", "code"),
+    [
+        (["sim.run", "--duration", "0.3", "--no-plot"], 0),
+        (["sim.run", "--help"], 0),
+        ([*AUDIT, "--json", "-"], 1),
+    ],
+)
+def test_a_reader_that_leaves_does_not_change_the_exit_code(command, code, tmp_path):
+    """As `| head -1`, but leaving before the first line, so that every write finds nobody."""
+    with started("-m", *command, cwd=tmp_path) as process:
+        process.stdout.close()
+        errors = process.stderr.read()
+    assert process.returncode == code
+    assert "Broken" not in errors
+    assert "Traceback" not in errors
+    if "--help" not in command:
+        assert list(tmp_path.glob("out/*/report.json"))  # the work is done all the same
+
+
+def test_the_folder_of_a_file_that_is_named_must_exist(tmp_path):
+    with pytest.raises(InputError, match=r"--json .*nix/a.json: the folder .*nix does not exist"):
+        check_file("--json", tmp_path / "nix/a.json")
+    with pytest.raises(InputError, match=r"--out .*nix/a.json: the folder .*nix does not exist"):
+        out_file(str(tmp_path / "nix/a.json"), "out/a.json")
+    with pytest.raises(InputError, match="is a folder, expected the file of the coupling"):
+        out_file(str(tmp_path), "out/a.json", "the file of the coupling")
+    assert not (tmp_path / "nix").exists()
+    default = tmp_path / "out/deep/a.json"
+    assert out_file(None, str(default)) == default
+    assert default.parent.is_dir()
+    assert not default.exists()
+
+
+@pytest.mark.parametrize("command", [["design"], ["design.export", "coupling.json"]])
+def test_no_command_makes_the_folder_of_a_file(command, tmp_path, monkeypatch, capsys):
+    from design.__main__ import main as design
+    from design.export import main as export
+
+    monkeypatch.chdir(tmp_path)
+    save(Stored(load().loop("I"), SpringDamper((878.7, 551.8), (0.3864, 0.5219))), "coupling.json")
+    monkeypatch.setattr(sys, "argv", ["x", *command[1:], "--out", "nix/a.c"])
+    with pytest.raises(SystemExit) as end:
+        execute(design if command == ["design"] else export)
+    assert end.value.code == 2
+    assert capsys.readouterr().err == "error: --out nix/a.c: the folder nix does not exist\n"
+    assert not Path("nix").exists()

@@ -1,0 +1,50 @@
+"""Tables on narrow terminals: no number loses a digit."""
+
+import ast
+import io
+import re
+from pathlib import Path
+
+import pytest
+from rich.table import Table
+
+from sim.screen import Screen
+
+ROOT = Path(__file__).parent.parent
+NUMBERS = ["7.8429", "18.895", "-11.19", "0.71449", "1.3699"]
+
+
+def printed(table: Table, width: int) -> str:
+    text = io.StringIO()
+    screen = Screen(file=text, width=width)
+    screen.print(table)
+    screen.print("x" * 10)
+    assert screen.width == width
+    return text.getvalue()
+
+
+@pytest.mark.parametrize("width", [10, 30, 45, 60, 100])
+@pytest.mark.parametrize("fold", [True, False])
+def test_numbers_are_whole(width, fold):
+    table = Table("a name of a few words", *(f"heading {n}" for n in "abcde"), title="what it is")
+    table.columns[0].overflow = "fold" if fold else "ellipsis"
+    table.add_row("spring-damper:closed-loop", *NUMBERS)
+    lines = printed(table, width).splitlines()
+    assert re.findall(r"-?\d+\.\d+", " ".join(lines)) == NUMBERS
+    assert "…" not in "".join(lines)
+
+
+def test_a_table_that_fits_is_as_it_was():
+    table = Table("a", "b")
+    table.add_row("1.5", "some words that wrap where the terminal ends")
+    assert max(map(len, printed(table, 40).splitlines())) == 40
+
+
+def test_every_report_is_printed_on_a_screen():
+    """A bare rich Console cuts: only the progress bar and the bridge's dashboard (of a fixed width) may use one."""
+    bare = set()
+    for path in (file for world in ("design", "sim", "hw") for file in (ROOT / world).rglob("*.py")):
+        calls = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
+        if any(isinstance(call.func, ast.Name) and call.func.id == "Console" for call in calls):
+            bare.add(path.name)
+    assert bare == {"command.py", "dashboard.py"}
