@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 
 from controller.environment import Network, Spring
+from controller.lti import Array
 
 Range = tuple[float, float]
 
@@ -54,6 +55,14 @@ class Member:
 
 
 @dataclass(frozen=True)
+class _State:
+    """An uncertain thing that is there, or one that is absent: the ranges that it then has, and what it is in them."""
+
+    ranges: tuple[Range, ...]  # those of some width
+    value: Callable[[Sequence[float]], Spring | float]
+
+
+@dataclass(frozen=True)
 class _Part:
     """One uncertain thing: what it is at each of its vertices, and somewhere in between."""
 
@@ -61,6 +70,7 @@ class _Part:
     corners: tuple[Spring | float, ...]
     own: Spring | float  # as it is in the environment
     draw: Callable[[np.random.Generator], Spring | float]
+    states: tuple[_State, ...]  # there, or absent
 
     def label(self, value: Spring | float) -> str:
         if not isinstance(value, Spring):
@@ -68,6 +78,15 @@ class _Part:
         if not (value.stiffness or value.damping):
             return f"{self.place} absent"
         return f"{self.place} {value.stiffness:.4g} N/m, {value.damping:.4g} N s/m"
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A part of a box in which nothing but numbers varies: which contacts are there and which absent is decided."""
+
+    low: Array  # (n,) the ends of the ranges
+    high: Array  # (n,)
+    at: Callable[[str, Array], Member]  # a name, and a point between low and high
 
 
 def members(network: Network, box: Box | None) -> tuple[Member, ...]:
@@ -88,6 +107,12 @@ def members(network: Network, box: Box | None) -> tuple[Member, ...]:
     corners = (c for c in product(*(part.corners for part in parts)) if c != tuple(part.own for part in parts))
     vertices = (_member(f"vertex {i}", network, parts, corner) for i, corner in enumerate(corners, start=1))
     return (nominal, *vertices)
+
+
+def regions(network: Network, box: Box) -> tuple[Region, ...]:
+    """The box as one region for every way in which its contacts can be there or absent."""
+    parts = _parts(network, box)
+    return tuple(_region(network, parts, states) for states in product(*(part.states for part in parts)))
 
 
 def inside(network: Network, box: Box, count: int, seed: int) -> tuple[Member, ...]:
@@ -160,7 +185,22 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
         k, d, coin = rng.uniform(stiffness[0], stiffness[1]), rng.uniform(damping[0], damping[1]), rng.random()
         return absent if uncertain.absent and coin < 0.5 else Spring(own.between, k, d)
 
-    return _Part(f"{a}-{b}", tuple(corners), own, draw)
+    states = [_spring_state(own.between, stiffness, damping)]
+    if uncertain.absent:
+        states.append(_State((), lambda _: absent))
+    return _Part(f"{a}-{b}", tuple(corners), own, draw, tuple(states))
+
+
+def _spring_state(between: tuple[str, str], stiffness: Range, damping: Range) -> _State:
+    """A spring that is there; of its two ranges those without width are no coordinates."""
+    free = [low < high for low, high in (stiffness, damping)]
+
+    def value(point: Sequence[float]) -> Spring:
+        given = iter(point)
+        k, d = (next(given) if f else limits[0] for f, limits in zip(free, (stiffness, damping), strict=True))
+        return Spring(between, float(k), float(d))
+
+    return _State(tuple(r for f, r in zip(free, (stiffness, damping), strict=True) if f), value)
 
 
 def _mass_part(network: Network, node: str, limits: Range) -> _Part:
@@ -170,7 +210,19 @@ def _mass_part(network: Network, node: str, limits: Range) -> _Part:
     _require_inside(f"box.masses.{node}", limits, own, "kg")
     if limits[0] == limits[1]:
         raise ValueError(f"box.masses.{node} is {limits[0]:g} to {limits[1]:g} kg: nothing is uncertain")
-    return _Part(node, limits, own, lambda rng: rng.uniform(limits[0], limits[1]))
+    state = _State((limits,), lambda point: float(point[0]))
+    return _Part(node, limits, own, lambda rng: rng.uniform(limits[0], limits[1]), (state,))
+
+
+def _region(network: Network, parts: Sequence[_Part], states: Sequence[_State]) -> Region:
+    low, high = np.array([r for state in states for r in state.ranges], dtype=float).reshape(-1, 2).T
+    ends = np.cumsum([len(state.ranges) for state in states])[:-1]
+
+    def at(name: str, point: Array) -> Member:
+        values = [s.value(x.tolist()) for s, x in zip(states, np.split(point, ends), strict=True)]
+        return _member(name, network, parts, values)
+
+    return Region(low, high, at)
 
 
 def _member(name: str, network: Network, parts: Sequence[_Part], values: Sequence[Spring | float]) -> Member:

@@ -71,7 +71,8 @@ def main(argv: list[str]) -> int:
         raise InputError(as_option(error, args)) from None
     F = force_map(spec.environment, design.coupling, loop.theta, loop.psi)
     requirements = assess(loop, design.coupling, design.phi)
-    whole = check_set(loop, design.coupling, seed, samples)
+    with (bar := progress_bar("searching the box"))[0]:
+        whole = check_set(loop, design.coupling, seed, samples, bar[1])
     outcome = {
         "case": args.case,
         "seed": seed,
@@ -121,7 +122,7 @@ def _parser() -> Parser:
     optimal.add_argument("--objective", choices=OBJECTIVES, help="which mismatch is minimised (default rms)")
     optimal.add_argument("--high-gain", metavar="G", help="limit of |F|/|E| above 100 Hz, or none (default 1.5)")
     optimal.add_argument("--margin", metavar="SHARE", help="of the damping that stays unused (default 0.005)")
-    parser.add_argument("--samples", metavar="N", help=f"environments drawn from inside a box (default {SAMPLES})")
+    parser.add_argument("--samples", metavar="N", help=f"random points in a box, beside the search (default {SAMPLES})")
     both = parser.add_argument_group("ccl and optimal")
     both.add_argument("--full", action="store_true", help="across channels (default: diagonal)")
     add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case>.json)")
@@ -228,7 +229,7 @@ def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path) -> dic
     What is not proved for a whole set, or for switching delays, is kept as what it is: a coupling for the nominal
     environment, or for constant delays.
     """
-    if whole and whole.certificate and design.condition == "closed-loop":
+    if whole and whole.proved and design.condition == "closed-loop":
         certificate, reason = whole.certificate, None
     else:
         loop = loop if design.condition == "theorem4" else loop.at(loop.environment)

@@ -60,7 +60,8 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement]:
     """What both conditions, "theorem4" and "closed-loop", ask of a coupling in its loop.
 
     With a box around the loop's environment closed-loop is about the environment and every vertex: the figure is that
-    of the one that asks the most, proved only if all are (inside the box nothing is proved). With a range of delays,
+    of the one that asks the most, proved only if all are. Between the vertices nothing is proved, but searched: a
+    violation found there (design.worst_member) is the figure then, and not certified. With a range of delays,
     loop.jitter, there is a third, "jitter-proof": what any switching within the range asks.
 
     Each Requirement has `required` and `available` (m,) [N s/m], `certified` (required < available), the frequency [Hz]
@@ -75,8 +76,8 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement]:
     alone = _fitting(loop, coupling)
     requirements: dict[str, Requirement] = dict(assess(loop, alone, phi))
     if whole := check_set(loop, alone, samples=0):
-        _, worst = whole.worst
-        requirements["closed-loop"] = replace(worst, proof="rational" if whole.certificate else "sampled")
+        _, worst = whole.worst if whole.proved else whole.worst_found
+        requirements["closed-loop"] = replace(worst, proof="rational" if whole.proved else "sampled")
     if loop.jitter:
         requirements["jitter-proof"] = switching_requirement(loop, alone).requirement
     return requirements

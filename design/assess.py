@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from controller.box import inside, members, shrunk
+from controller.box import members, regions, shrunk
 from controller.contact import frozen_states, held
 from controller.coupling import Compliance, Coupling, SpringDamper
 from controller.environment import Network, environment
@@ -15,8 +15,6 @@ from design.delayed import theorem4_delayed
 from design.margin import Requirement, closed_loop, refusal, theorem4, theorem4_per_channel
 from design.specification import Specification
 from design.store import Condition, Loop, data_of
-
-TRIED, TRIAL_SEED = 64, 0xB0C5  # points of a box where a design is tried; a seed that no check is likely to draw from
 
 CONDITIONS: tuple[Condition, ...] = ("theorem4", "closed-loop")
 
@@ -32,9 +30,8 @@ def specification(loop: Loop) -> Specification:
         _, *vertices = members(loop.environment, box if factor == 1 else shrunk(loop.environment, box, factor))
         return {vertex.name: environment(vertex.network, loop.T) for vertex in vertices}
 
-    drawn = {m.name: environment(m.network, loop.T) for m in inside(loop.environment, box, TRIED, TRIAL_SEED)}
-    delays = (loop.theta, loop.psi, loop.lam)
-    return Specification(E, *delays, loop.delta, others=others(), inside=drawn, shrunk=others)
+    delays, parts = (loop.theta, loop.psi, loop.lam), regions(loop.environment, box)
+    return Specification(E, *delays, loop.delta, others=others(), regions=parts, shrunk=others)
 
 
 def assess(loop: Loop, coupling: Coupling, phi: Array | None = None) -> dict[str, Requirement]:

@@ -25,6 +25,7 @@ from sim.command import (
     execute,
     numbers,
     out_folder,
+    progress_bar,
     ranges,
     rigid_loop,
     scenario_from,
@@ -53,7 +54,9 @@ def main(argv: list[str]) -> int:
     out = out_folder(args, "audit")
 
     begin = time.perf_counter()
-    whole = None if args.rigid else check_set(scenario.loop(args.case), subject.coupling, seed)
+    with (bar := progress_bar("searching the box"))[0]:
+        loop = None if args.rigid else scenario.loop(args.case)
+        whole = loop and check_set(loop, subject.coupling, seed, progress=bar[1])
     outcome = {
         "case": args.case,
         "scenario": None if args.rigid else scenario.name,

@@ -176,6 +176,7 @@ def no_compliance(coupling: controller_coupling.Coupling) -> str:
 def _promise(loop: Loop, condition: Condition) -> Literal["any passive environment", "a set", "this environment"]:
     if condition == "theorem4":
         return "this environment" if any(loop.psi) else "any passive environment"
+    # proved at every vertex; whether it is kept between them is searched by design.set_check and design.check
     return "a set" if loop.box else "this environment"
 
 

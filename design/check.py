@@ -8,9 +8,11 @@ from typing import Any
 from rich.table import Table
 
 from design.certificate import Verdict, verify
-from design.promises import HERE, switching_promise
+from design.promises import HERE, SET, switching_promise
+from design.set_check import search_box, search_part, search_words, violated_between
 from design.store import Stored, SwitchingProof
-from sim.command import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute
+from design.worst_member import Searched
+from sim.command import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute, progress_bar
 from sim.files import write_json
 from sim.scenario import InputError
 from sim.stored import read_coupling
@@ -26,11 +28,22 @@ def main(argv: list[str]) -> int:
         verdict = verify(stored)
     except (ValueError, ArithmeticError) as error:
         raise InputError(f"{args.coupling}: {error}") from None
-    result = _result(stored, verdict, time.perf_counter() - begin)
+    searched = _searched(stored) if verdict.proved else None
+    if searched and not searched.worst[0].ratio < 1:
+        verdict = Verdict(False, violated_between(searched.worst[0].member, searched.worst[0].ratio))
+    result = _result(stored, verdict, searched, time.perf_counter() - begin)
     console(args).print(_table(result))
     if args.json:
         write_json(args.json, result)
     return DONE if verdict.proved else DOES_NOT_HOLD
+
+
+def _searched(stored: Stored) -> Searched | None:
+    """The search between the vertices, again, where the file promises a set."""
+    if not (stored.certificate and stored.certificate.promise == SET):
+        return None
+    with (bar := progress_bar("searching the box between its vertices"))[0]:
+        return search_box(stored.loop, stored.coupling.build(stored.loop.T), bar[1])
 
 
 def _parser() -> Parser:
@@ -42,7 +55,7 @@ def _parser() -> Parser:
     return parser
 
 
-def _result(stored: Stored, verdict: Verdict, seconds: float) -> dict[str, Any]:
+def _result(stored: Stored, verdict: Verdict, searched: Searched | None, seconds: float) -> dict[str, Any]:
     """The machine-readable result; figures are null where the file carries no certificate."""
     claim = stored.certificate
     return {
@@ -52,6 +65,7 @@ def _result(stored: Stored, verdict: Verdict, seconds: float) -> dict[str, Any]:
         "promise": claim.promise if claim and verdict.proved else None,
         "proof": claim.proof if claim and verdict.proved else None,
         "vertices": len(stored.loop.members()) - 1 if stored.loop.box else None,
+        "between": searched and search_part(searched),
         "required_damping": claim and claim.required,
         "available_damping": stored.loop.delta,
         "margin": claim and claim.margin,
@@ -76,10 +90,15 @@ def _switching(stored: Stored, verdict: Verdict) -> dict[str, Any] | None:
 
 
 def _table(result: dict[str, Any]) -> Table:
-    title = "proved, in exact arithmetic" if result["proved"] else "not proved"
+    title = "not proved"
+    if result["proved"]:
+        title = "proved, in exact arithmetic"
+        if result["between"]:
+            title += ", at every vertex; between them searched, not proved"
     table = Table(title=title, show_header=False, title_justify="left")
     switching = result["switching"] or {}
     rows = {key: value for key, value in result.items() if key not in ("proved", "switching")}
+    rows["between"] = result["between"] and search_words(result["between"])
     rows |= {f"switching, {key}": value for key, value in switching.items() if key not in ("lo", "hi")}
     for key, value in rows.items():
         if value is not None:

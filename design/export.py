@@ -18,7 +18,7 @@ from design.export_c import c_source
 from design.export_control import control_source
 from design.exported import Block, NothingToExport, Trial, coupling_block, data, process_block, trial
 from design.listed import listed
-from design.promises import HERE, switching_promise
+from design.promises import HERE, SET, switching_promise
 from design.store import SpringDamper, Stored
 from sim.command import DOES_NOT_HOLD, DONE, Parser, add_output_options, check_json, console, execute, seed_from
 from sim.files import out_file, write, write_json
@@ -108,6 +108,8 @@ def _promise(stored: Stored, verdict: Verdict) -> str:
     needs = f"needs {listed(claim.required)} of {listed(claim.available)} N s/m of device damping"
     delays = f"; {switching_promise(stored.loop.jitter)}, in {HERE}" if stored.loop.jitter else ""
     how = f"{claim.condition}, proof: {claim.proof}"
+    if claim.promise == SET:
+        how += "; at the vertices, between them nothing is proved: design.check searches there"
     return f"Certified for {claim.promise}{delays} ({how}): {needs}; linear forces only."
 
 

@@ -17,7 +17,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from controller.box import Member
 from controller.coupling import InternalModel
+from controller.environment import environment
 from controller.lti import Lti
 from controller.process import force_map
 from design.cutting_planes import SLACK, asked, cut, sketch
@@ -32,9 +34,10 @@ from design.set_advice import Progress, set_advice
 from design.specification import Specification
 from design.transparency import transparency
 from design.wish import MARGIN, Wish
+from design.worst_member import Found, search
 
 USUAL = Wish()
-ADDED, MOST_ADDITIONS = 4, 5  # points inside a box that become environments at a time, and how often at most
+ADDED, MOST_ADDITIONS = 3, 8  # points of a box that become environments at a time, and how often at most
 NO_LIMIT = "no limit above 100 Hz"
 EASIER = (1.5, 2, 3, 5, 10, 20, 50)  # times the damping, tried to say how far a request is from having a solution
 
@@ -47,7 +50,7 @@ def design(spec: Specification, wish: Wish = USUAL, progress: Progress = lambda 
     """
     started = time.perf_counter()
     try:
-        coupling, spec, rounds = searched(spec, wish)
+        coupling, spec, rounds = searched(spec, wish, progress)
     except Infeasible as error:
         raise Infeasible(error.problem, error.results, advice(spec, wish, progress)) from error
     maps = [force_map(E, coupling, spec.theta, spec.psi) for E in environments(spec)]
@@ -72,11 +75,13 @@ def _missed(ratio: float, wish: Wish) -> str:
     return f"the optimum needs {ratio:.6f} of the damping when it is swept again; {advice}"
 
 
-def searched(spec: Specification, wish: Wish) -> tuple[InternalModel, Specification, int]:
+def searched(
+    spec: Specification, wish: Wish, progress: Progress = lambda what, done, total: None
+) -> tuple[InternalModel, Specification, int]:
     """(coupling, the specification with the points of the box that had to be added, rounds).
 
-    Between the vertices of a box nothing is convex: the coupling is tried at points inside, and those where it violates
-    the condition become further environments, the worst first.
+    Between the vertices of a box nothing is convex: what a search finds to violate the condition there becomes further
+    environments, until it finds nothing. Raises DesignFailed where it still does after MOST_ADDITIONS times.
     """
     total, added, Q = 0, 0, parameter(spec, wish)
     if wish.filter == "adapted":
@@ -84,18 +89,35 @@ def searched(spec: Specification, wish: Wish) -> tuple[InternalModel, Specificat
     while True:
         coupling, rounds = cut(Q, wish, worlds(spec), np.asarray(spec.delta))
         total += rounds
-        violated = violators(spec, coupling, 1 - wish.margin / 2)
-        if not violated or added == MOST_ADDITIONS:
+        worst = violators(spec, coupling, 1 - wish.margin / 2, progress)
+        if not worst:
             return coupling, spec, total
+        if added == MOST_ADDITIONS:
+            raise DesignFailed(None, (), _still_violated(worst[0]))
         added += 1
-        spec = replace(spec, others={**spec.others, **{name: spec.inside[name] for name in violated[:ADDED]}})
+        more = {found.member.name: environment(found.member.network, spec.T) for found in worst[:ADDED]}
+        spec = replace(spec, others={**spec.others, **more})
 
 
-def violators(spec: Specification, coupling: InternalModel, most: float) -> list[str]:
-    """The points inside where more than this share of the damping is needed, the worst first."""
-    maps = {name: force_map(E, coupling, spec.theta, spec.psi) for name, E in spec.inside.items()}
-    ratios = {name: closed_loop(F, spec.delta).ratio for name, F in maps.items()}
-    return sorted((name for name in ratios if ratios[name] > most), key=lambda name: -ratios[name])
+def violators(
+    spec: Specification, coupling: InternalModel, most: float, progress: Progress = lambda what, done, total: None
+) -> list[Found]:
+    """Where in the box more than this share of the damping is needed, the worst first; a search finds them."""
+
+    def ratio(member: Member) -> float:
+        F = force_map(environment(member.network, spec.T), coupling, spec.theta, spec.psi)
+        return closed_loop(F, spec.delta).ratio
+
+    found = search(spec.regions, ratio, lambda done, total: progress("searching the box", done, total))
+    return [one for one in found.worst if one.ratio > most]
+
+
+def _still_violated(found: Found) -> str:
+    return (
+        f"after {MOST_ADDITIONS} rounds of adding the worst environments of the box to the design it is still violated "
+        f"between the vertices: {found.ratio:.4f} of the damping is needed at {found.member.name}; "
+        "give narrower ranges, or ask for more functions"
+    )
 
 
 def parameter(spec: Specification, wish: Wish) -> FreeParameter:

@@ -44,7 +44,7 @@ def promise(
     """For which environments a coupling is certified, given which conditions hold.
 
     `rigid` if E is a rigid wall that is never left, `walls` if contact is made and broken, `whole_set` if closed-loop
-    is proved at every vertex of a box around E.
+    is proved at every vertex of a box around E and a search has found no violation between them.
     """
     if theorem4:
         return ANY

@@ -46,10 +46,10 @@ def set_advice(
         more = f", nor with {len(hopeless) - 1} more of the {len(others)} vertices" if len(hopeless) > 1 else ""
         why = f"beside the nominal environment there is none with {hopeless[0]}{more}"
     else:
-        why = "each vertex has one beside the nominal environment, but not all of them and the points inside together"
+        why = "each vertex has one beside the nominal environment, but not all of them together with the points between"
     hopeful = [words for words, other in changes.items() if step() and feasible(spec, other)]
     assert spec.shrunk  # a box came with it
-    smaller = ((f, replace(spec, others=spec.shrunk(f), inside={})) for f in SMALLER)
+    smaller = ((f, replace(spec, others=spec.shrunk(f), regions=())) for f in SMALLER)
     share = next((f for f, less in smaller if step() and solvable(less, wish)), None)
     step()
     limit = binding(spec, wish)

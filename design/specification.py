@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from controller.box import Region
 from controller.delay import delay
 from controller.lti import Array, Lti
 from design.margin import dampings
@@ -28,7 +29,7 @@ class Specification:
     W1: Lti | None = None  # weight on the left of (22); the identity if None
     W2: Lti | None = None  # diagonal weight on its right; low_pass if None
     others: Mapping[str, Lti] = field(default_factory=dict)  # by name: what else the environment may be, for `optimal`
-    inside: Mapping[str, Lti] = field(default_factory=dict)  # points of a box, where the design is tried
+    regions: tuple[Region, ...] = ()  # the box of the others, in which the design is searched for violations
     shrunk: Callable[[float], Mapping[str, Lti]] | None = None  # the others of a box with ranges so many times as wide
 
     def __post_init__(self) -> None:

@@ -63,7 +63,8 @@ def main(argv: list[str]) -> int:
         raise InputError("--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco")
     if scenario.switches:
         assembly, period = switching(assembly, chosen.coupling, seed, scenario.samples)
-    whole = check_set(scenario.loop(args.case), chosen.coupling, seed)
+    with (bar := progress_bar("searching the box"))[0]:
+        whole = check_set(scenario.loop(args.case), chosen.coupling, seed, progress=bar[1])
     substeps, warnings = _settled(args, assembly, asked)
 
     with (bar := progress_bar("simulating"))[0]:

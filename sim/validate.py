@@ -59,7 +59,8 @@ def main(argv: list[str]) -> int:
     links = LINKS[args.links] if args.links else scenario.population.links
     out = out_folder(args, "validate")
     chosen = choose(scenario, args.case, args.coupling, args.condition)
-    whole = check_set(scenario.loop(args.case), chosen.coupling, seed)
+    with (bar := progress_bar("searching the box"))[0]:
+        whole = check_set(scenario.loop(args.case), chosen.coupling, seed, progress=bar[1])
     environments = _environments(args, whole)
     question = Question(
         scenario, chosen.coupling, seed, humans, links, args.engine, duration, environments=environments
@@ -82,7 +83,7 @@ def main(argv: list[str]) -> int:
         outcome["holds"] = outcome["holds"] and outcome["switching"]["holds"]
     attacked, ratio = scenario, requirements["closed-loop"].ratio
     if environments and whole:
-        member, requirement = whole.worst
+        member, requirement = whole.worst_found
         attacked, ratio = scenario.replace(environment=member.network, box=None), requirement.ratio
     worst = (
         _attack(attacked, chosen, seed, generations, outcome) if args.adversary and not findings.interrupted else None
@@ -121,7 +122,7 @@ def _parser() -> Parser:
     parser.add_argument("--adversary", action="store_true", help="also search for the worst passive human")
     parser.add_argument("--generations", default="150", metavar="N", help="of the adversary's search (default 150)")
     spread = (
-        "what the humans meet: the nominal environment, or in turn all vertices of the box and as many points inside"
+        "what the humans meet: the nominal environment, or in turn all vertices of the box and as many others of it"
     )
     parser.add_argument("--environments", choices=ENVIRONMENTS, default="nominal", help=f"{spread} (default nominal)")
     parser.add_argument("--no-plot", action="store_true", help="write no picture")
@@ -144,12 +145,16 @@ def _shards(args: argparse.Namespace) -> int:
 
 
 def _environments(args: argparse.Namespace, whole: SetCheck | None) -> tuple[Member, ...]:
-    """Members of the set and as many from inside it, or none where all meet the nominal one. Raises InputError."""
+    """Members of the set and as many others of it, the worst that was found first; none where all meet the nominal one.
+
+    Raises InputError.
+    """
     if args.environments == "nominal":
         return ()
     if whole is None:
         raise InputError("--environments box: the scenario has no box (docs/scenario.md says how to give one)")
-    return (*whole.members, *whole.samples[: len(whole.members)])
+    others = (whole.searched.worst[0].member, *whole.samples)
+    return (*whole.members, *others[: len(whole.members)])
 
 
 def _duration(args: argparse.Namespace, scenario: Scenario) -> float:

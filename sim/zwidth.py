@@ -164,7 +164,8 @@ def _surroundings(scenario: Scenario, chosen: Chosen) -> Surroundings:
 def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, seed: int) -> dict[str, Any]:
     """The fixed coupling and what is promised of it where it was designed, in the scenario's own environment."""
     loop = scenario.loop(args.case)
-    whole = check_set(loop, chosen.coupling, seed)
+    with (bar := progress_bar("searching the box"))[0]:
+        whole = check_set(loop, chosen.coupling, seed, progress=bar[1])
     requirements = assess(loop, chosen.coupling, chosen.phi)
     springs = contact_springs(loop.environment)
     return {
