@@ -171,8 +171,8 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
         own, present = nothing, nothing
     else:
         raise ValueError(f"{field}: no spring is there; one that may come to be needs a stiffness and absent = true")
-    stiffness = uncertain.stiffness or (present.stiffness,) * 2
-    damping = uncertain.damping or (present.damping,) * 2
+    stiffness = uncertain.stiffness or (present.stiffness, present.stiffness)
+    damping = uncertain.damping or (present.damping, present.damping)
     if not uncertain.absent and stiffness[0] == stiffness[1] and damping[0] == damping[1]:
         raise ValueError(f"{field}: nothing is uncertain; give stiffness or damping a range, or absent = true")
     pairs = dict.fromkeys(product(stiffness, damping))

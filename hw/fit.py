@@ -7,6 +7,7 @@ least-squares sense, where a standstill counts as few samples (hw.standstill). H
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
@@ -93,8 +94,9 @@ def _search(model: Model, start: Array) -> OptimizeResult:
     free = np.arange(start.size) != COULOMB
     bounds = (np.where(free, start - REACH, 0.0), np.where(free, start + REACH, strongest))
     # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
-    options = {"x_scale": "jac", "max_nfev": EVALUATIONS[1], "ftol": 1e-4}
-    return least_squares(model.residual, start, lambda p: -model.slopes(p), bounds=bounds, **options)
+    options: dict[str, Any] = {"x_scale": "jac", "max_nfev": EVALUATIONS[1], "ftol": 1e-4}
+    slopes: Any = lambda p: -model.slopes(p)  # noqa: E731 - SciPy's stub takes names only
+    return least_squares(model.residual, start, slopes, bounds=bounds, **options)
 
 
 def _polished(model: Model, p: Array) -> Array:
