@@ -6,6 +6,7 @@ from scipy.integrate import quad
 
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.lti import Lti
 from controller.process import force_map
 from design.published import CASE_I
 from design.quadrature import integral
@@ -77,6 +78,27 @@ def test_integral_of_a_sharp_peak():
 
 def test_integral_of_nothing():
     assert integral(np.zeros_like, np.linspace(0, 1, 5)) == 0
+
+
+def test_integral_of_what_is_only_rounding():
+    """Halving gains nothing in noise, whatever its size: the work stays bounded, and the sum near the mean."""
+    noise, asked = np.random.default_rng(1), []
+
+    def rounding(x):
+        asked.append(x.size)
+        return size * noise.random(x.size)
+
+    for size in (1e-32, 1e-6, 1.0):
+        assert integral(rounding, np.linspace(0, 1, 60)) == pytest.approx(size / 2, rel=0.3)
+    assert sum(asked) < 500_000
+
+
+def test_a_map_that_is_the_environment_itself_has_no_mismatch():
+    """What is left of F - Lambda E in other coordinates is rounding, which no halving makes smaller."""
+    assert transparency(E, E, (0, 0)).rms_mismatch < 1e-10
+    state = np.eye(E.order) + np.triu(np.ones((E.order, E.order)), 1)
+    same = Lti(state @ E.A @ np.linalg.inv(state), state @ E.B, E.C @ np.linalg.inv(state), E.D, E.T)
+    assert transparency(same, E, (0, 0)).rms_mismatch < 1e-9
 
 
 def test_what_needs_no_force_makes_tau_infinite():
