@@ -12,19 +12,19 @@ from rich.table import Table
 from controller.coupling import Coupling
 from controller.process import force_map
 from design.assess import CONDITIONS, assess, specification
+from design.audit.subject import LONGEST_DELAY
+from design.box.check import SAMPLES, SetCheck, check_set, set_part, set_rows
+from design.box.price import cost_part, price
 from design.certificate import NotProved, prove
 from design.designs import FILTERS, KINDS, METHODS, OBJECTIVES, compare_methods, design_coupling
 from design.failure import DesignFailed
-from design.frozen_environment import STIFFEST
-from design.jitter_part import switching_part, switching_requirement
-from design.jitter_proof import sent
+from design.gains.frozen_environment import STIFFEST
+from design.jitter.part import switching_part, switching_requirement
+from design.jitter.proof import sent
 from design.listed import listed
-from design.price import cost_part, price
 from design.promises import ANY, HERE, certificate_part, promise_of, switching_promise
 from design.result import Design
-from design.set_check import SAMPLES, SetCheck, check_set, set_part, set_rows
 from design.store import Certificate, DelayRange, Loop, Stored, data_of, save
-from design.subject import LONGEST_DELAY
 from design.summary import coupling_part, transparency_part
 from design.transparency import transparency
 from sim.command import (

@@ -11,10 +11,10 @@ from controller.process import force_map
 from design import designs, promises
 from design.argument import bare, known, of_kind, one_of
 from design.assess import assess, specification
-from design.jitter_part import switching_requirement
+from design.box.check import check_set
+from design.jitter.part import switching_requirement
 from design.margin import Requirement
 from design.result import Design
-from design.set_check import check_set
 from design.store import Loop, Stored, data_of
 from design.transparency import Transparency, transparency
 
@@ -22,7 +22,10 @@ LOOP = 'a Loop, as scenario.loop("I") gives it'
 
 
 class Options(TypedDict, total=False):
-    """What else can be asked of a kind, see design.designs.OPTIONS; design.wish.Wish says more about the last five."""
+    """What else can be asked of a kind, see design.designs.OPTIONS.
+
+    design.parameter.wish.Wish says more about the last five.
+    """
 
     order: int  # ccl: states per channel
     method: str  # ccl: complementarity, inner or fixed-poles
@@ -61,7 +64,7 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement]:
 
     With a box around the loop's environment closed-loop is about the environment and every vertex: the figure is that
     of the one that asks the most, proved only if all are. Between the vertices nothing is proved, but searched: a
-    violation found there (design.worst_member) is the figure then, and not certified. With a range of delays,
+    violation found there (design.box.worst_member) is the figure then, and not certified. With a range of delays,
     loop.jitter, there is a third, "jitter-proof": what any switching within the range asks.
 
     Each Requirement has `required` and `available` (m,) [N s/m], `certified` (required < available), the frequency [Hz]

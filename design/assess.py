@@ -11,7 +11,7 @@ from controller.environment import Network, environment
 from controller.lti import Array, Lti
 from controller.process import force_map
 from design.certificate import NotProved, no_compliance, prove
-from design.delayed import theorem4_delayed
+from design.condition.delayed import theorem4_delayed
 from design.margin import Requirement, closed_loop, refusal, theorem4, theorem4_per_channel
 from design.specification import Specification
 from design.store import Condition, Loop, data_of
@@ -37,8 +37,8 @@ def specification(loop: Loop) -> Specification:
 def assess(loop: Loop, coupling: Coupling, phi: Array | None = None) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
 
-    closed-loop is about the nominal environment alone (design.set_check asks for the rest of its box) and the constant
-    theta (design.jitter_part asks for the rest of its range); where there are walls it is about the frozen contact
+    closed-loop is about the nominal environment alone (design.box.check asks for the rest of its box) and the constant
+    theta (design.jitter.part asks for the rest of its range); where there are walls it is about the frozen contact
     state that asks for most.
     """
     loop = loop.at(loop.environment).switching(None)
@@ -100,7 +100,7 @@ def theorem4_requirement(
     if not any(psi):
         return theorem4(V, theta, delta)
     if phi is None:
-        from design.multiplier import shortage  # only an environment with delay inside needs the solver
+        from design.semidefinite.multiplier import shortage  # only an environment with delay inside needs the solver
 
         try:
             phi = shortage(Specification(E, theta, psi, theta, delta))

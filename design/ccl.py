@@ -18,16 +18,16 @@ from controller.coupling import Compliance, SpringDamper
 from controller.lti import Array, Lti
 from design import spring_damper
 from design.argument import of_kind, one_of, whole
-from design.cone_complementarity import bisect
-from design.delayed import theorem4_delayed
+from design.condition.delayed import theorem4_delayed
 from design.designs import METHODS
 from design.failure import DesignFailed
-from design.fixed_order import FixedOrder
-from design.fixed_poles import FixedPoles
-from design.inner_convex import descend
+from design.fixed_order.cone_complementarity import bisect
+from design.fixed_order.fixed_poles import FixedPoles
+from design.fixed_order.inner_convex import descend
+from design.fixed_order.realisation import FixedOrder
 from design.margin import Requirement, theorem4
-from design.multiplier import shortage
 from design.result import Design, Row
+from design.semidefinite.multiplier import shortage
 from design.shaping import Shaping
 from design.specification import Specification
 

@@ -2,7 +2,7 @@
 
 closed-loop: F(1) is exactly symmetric and positive semidefinite, and with F(z) = F(1) + (z - 1) R(z) the block
     R + Delta_D/T - F(1)/2
-is strictly positive real (design.positive_real). On |z| = 1 the Hermitian part of F(1)/(z - 1) is -F(1)/2, so
+is strictly positive real (design.proof.positive_real). On |z| = 1 the Hermitian part of F(1)/(z - 1) is -F(1)/2, so
 He[F/(z-1)] > -Delta_D/T there; the same certificate shows that F is stable.
 
 theorem4, psi = 0: with H = V - Theta-hat (11), (12), V-hat = (1 - 1/z) H/T, H(1) is exactly symmetric, and with
@@ -16,9 +16,9 @@ Phi = 0 satisfies Lemma 4, whatever the environment.
 With a box around the environment the same is proved for the environment (P) and for every vertex (P1, P2, ..); nothing
 is proved of the environments in between, or of one that changes.
 
-A loop whose delays may switch within a range carries a second proof, of any switching (design.jitter_proof).
+A loop whose delays may switch within a range carries a second proof, of any switching (design.jitter.proof).
 
-theorem4, psi >= 1: a multiplier Phi, stored too, and two blocks (design.delayed_proof); it is of this environment.
+theorem4, psi >= 1: a multiplier Phi, stored too, and two blocks (design.proof.delayed); it is of this environment.
 """
 
 from __future__ import annotations
@@ -35,17 +35,18 @@ import scipy
 
 from controller import coupling as controller_coupling
 from controller.environment import environment
-from design import exact, margin
-from design.delayed import theorem4_delayed
-from design.delayed_proof import coupling_block, environment_block
-from design.exact import Exact
-from design.jitter_proof import prove_switching, refuted
-from design.members import in_each, worst
-from design.positive_real import find_storage, too_large
+from design import margin
+from design.box.members import in_each, worst
+from design.condition.delayed import theorem4_delayed
+from design.jitter.proof import prove_switching, refuted
 from design.promises import switching_promise
-from design.rational import Matrix, SingularMatrix, definiteness, rational
+from design.proof import exact
+from design.proof.delayed import coupling_block, environment_block
+from design.proof.exact import Exact
+from design.proof.positive_real import find_storage, too_large
+from design.proof.rational import Matrix, SingularMatrix, definiteness, rational
+from design.proof.stored_matrix import refuted_rows, rows_of
 from design.store import Certificate, Condition, CouplingData, Loop, Stored, SwitchingProof, digest, sealed
-from design.stored_matrix import refuted_rows, rows_of
 
 CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
 
@@ -176,7 +177,7 @@ def no_compliance(coupling: controller_coupling.Coupling) -> str:
 def _promise(loop: Loop, condition: Condition) -> Literal["any passive environment", "a set", "this environment"]:
     if condition == "theorem4":
         return "this environment" if any(loop.psi) else "any passive environment"
-    # proved at every vertex; whether it is kept between them is searched by design.set_check and design.check
+    # proved at every vertex; whether it is kept between them is searched by design.box.check and design.check
     return "a set" if loop.box else "this environment"
 
 

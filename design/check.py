@@ -7,11 +7,11 @@ from typing import Any
 
 from rich.table import Table
 
+from design.box.check import search_box, search_part, search_words, violated_between
+from design.box.worst_member import Searched
 from design.certificate import Verdict, verify
 from design.promises import HERE, SET, switching_promise
-from design.set_check import search_box, search_part, search_words, violated_between
 from design.store import Stored, SwitchingProof
-from design.worst_member import Searched
 from sim.command import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute, progress_bar
 from sim.files import write_json
 from sim.scenario import InputError

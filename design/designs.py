@@ -34,7 +34,8 @@ def design_coupling(
     **options: Any,
 ) -> Design:
     """Design and verify a coupling; `options` are those of the design's own function: order, method, diagonal for ccl,
-    the fields of design.wish.Wish for optimal. `progress` hears what takes long: (what, steps done, of how many).
+    the fields of design.parameter.wish.Wish for optimal. `progress` hears what takes long: (what, steps done, of how
+    many).
 
     Raises ValueError for a kind or condition that does not exist, Infeasible or DesignFailed (design.failure) where
     there is nothing to return.
@@ -45,7 +46,7 @@ def design_coupling(
     if condition not in KINDS[kind]:
         raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(KINDS[kind])}")
     from design import ccl, optimal, spring_damper  # cvxpy takes a second to import
-    from design.wish import Wish
+    from design.parameter.wish import Wish
 
     if kind == "ccl":
         return ccl.design(spec, **options)

@@ -1,6 +1,6 @@
 """The paper's matrix inequalities, one function per equation, with a remedy where the printed strict form is empty.
 
-Units: T = 1 and Delta_D = I (design.coordinates). Every function returns a symmetric matrix that must be
+Units: T = 1 and Delta_D = I (design.semidefinite.coordinates). Every function returns a symmetric matrix that must be
 positive (semi)definite; its arguments are numbers or cvxpy expressions.
 
 Two transfer matrices of the paper can never satisfy the strict inequalities printed for them:

@@ -6,7 +6,7 @@ theorem4: Lemma 4 of the paper for Psi = I and any passive environment under bac
     He[(z-1) V/(Tz)] >= diag((1 - cos n_i w) / (2 delta_i)),   n_i = theta_i + 1.
 
 The required damping is s Delta_D with the least s for which s Delta_D satisfies the condition: the supremum
-of design.demand over frequency.
+of design.condition.demand over frequency.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from controller.lti import Lti
-from design.demand import closed_loop_demand, theorem4_demand
-from design.sweep import frequencies, supremum
+from design.condition.demand import closed_loop_demand, theorem4_demand
+from design.frequency.sweep import frequencies, supremum
 
-C = TypeVar("C", bound=str)  # the name of a condition: design.store.Condition, or that of design.jitter
+C = TypeVar("C", bound=str)  # the name of a condition: design.store.Condition, or that of design.jitter.condition
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """The best linear coupling under the closed-loop condition: one convex problem in Q, in one environment or in a set.
 
 F = Theta (Psi E - Psi E Q Psi E) is affine in Q, so the mismatch and He[F/(z-1)] > -Delta_D/T are convex in its
-coefficients, and cutting planes (design.cutting_planes) find the global optimum over a basis. What is returned passes
+coefficients, and cutting planes (design.parameter) find the global optimum over a basis. What is returned passes
 the refined sweep of design.margin, whatever a solver said.
 
 Q stays and E is the current environment, so F is affine in Q at every vertex of a box, too: the same problem, with each
@@ -22,19 +22,19 @@ from controller.coupling import InternalModel
 from controller.environment import environment
 from controller.lti import Lti
 from controller.process import force_map
-from design.cutting_planes import SLACK, asked, cut, sketch
+from design.box.advice import Progress, set_advice
+from design.box.worst_member import Found, search
 from design.failure import DesignFailed, Infeasible
-from design.free_parameter import FreeParameter
-from design.inequalities import CLOSED_LOOP, SWITCHING, World
-from design.jitter_multiplier import jitter_proof
+from design.jitter.multiplier import jitter_proof
 from design.margin import closed_loop
-from design.pole_descent import descend
+from design.parameter.cutting_planes import SLACK, asked, cut, sketch
+from design.parameter.free_parameter import FreeParameter
+from design.parameter.inequalities import CLOSED_LOOP, SWITCHING, World
+from design.parameter.pole_descent import descend
+from design.parameter.wish import MARGIN, Wish
 from design.result import Design
-from design.set_advice import Progress, set_advice
 from design.specification import Specification
 from design.transparency import transparency
-from design.wish import MARGIN, Wish
-from design.worst_member import Found, search
 
 USUAL = Wish()
 ADDED, MOST_ADDITIONS = 3, 8  # points of a box that become environments at a time, and how often at most

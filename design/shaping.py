@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from controller.delay import delay
 from controller.lti import Array, Lti
+from design.frequency.sweep import frequencies, on_circle, supremum
 from design.specification import Specification
-from design.sweep import frequencies, on_circle, supremum
 
 Complex = NDArray[np.complex128]
 

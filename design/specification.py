@@ -10,8 +10,8 @@ import numpy as np
 from controller.box import Region
 from controller.delay import delay
 from controller.lti import Array, Lti
+from design.frequency.sweep import frequencies, hermitian, on_circle, supremum
 from design.margin import dampings
-from design.sweep import frequencies, hermitian, on_circle, supremum
 
 #: Designs ask for (1 - RESERVE) of the damping that there is, so that they are certified as stored.
 RESERVE = 1e-4

@@ -1,6 +1,6 @@
 """Spring-damper couplings (26): the best under either condition, and the stiffest under Theorem 4.
 
-Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT/d, b = B/d (design.gain_set).
+Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT/d, b = B/d (design.gains.gain_set).
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ import numpy as np
 from controller.coupling import SpringDamper
 from controller.lti import Array
 from controller.process import force_map
-from design.convex_concave import step
-from design.delayed import theorem4_delayed
+from design.condition.delayed import theorem4_delayed
 from design.failure import DesignFailed, Infeasible
-from design.frozen_environment import least_rms
-from design.gain_set import solve_within
+from design.gains.convex_concave import step
+from design.gains.frozen_environment import least_rms
+from design.gains.gain_set import solve_within
+from design.gains.switching_search import least_rms_switching
 from design.margin import Requirement, closed_loop, theorem4
-from design.multiplier import shortage
 from design.result import Design
+from design.semidefinite.multiplier import shortage
 from design.shaping import Shaping
 from design.solve import solved
 from design.specification import RESERVE, Specification
-from design.switching_search import least_rms_switching
 
 #: The sequence stops when a step improves the norm by less than this, relatively.
 SETTLED = 1e-6

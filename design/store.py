@@ -179,7 +179,7 @@ CouplingData = NoCoupling | SpringDamper | Compliance | InternalModel
 
 
 class SwitchingProof(Strict, frozen=True):
-    """What proves that the delays may switch within the loop's range (design.jitter_proof)."""
+    """What proves that the delays may switch within the loop's range (design.jitter.proof)."""
 
     required: tuple[float, ...]  # (m,) [N s/m] with this multiplier, from a refined sweep
     margin: float  # available / required

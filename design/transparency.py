@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from controller.delay import delay
 from controller.lti import Array, Lti
-from design.quadrature import integral
-from design.sweep import frequencies, on_circle, supremum
+from design.frequency.quadrature import integral
+from design.frequency.sweep import frequencies, on_circle, supremum
 
 BAND_HZ = (0.5, 80.0)
 

@@ -11,7 +11,7 @@ from design.margin import Requirement
 from design.promises import promise_of
 from design.result import Design
 from hw.desk import session_for
-from hw.emulator_core import Emulator
+from hw.emulator.core import Emulator
 from hw.plan import Ages, Rung, ladder, link_delay
 from hw.rehearsal import Rehearsal
 from hw.safety import Fault

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from controller.lti import Array
-from hw.emulator_core import Emulator
+from hw.emulator.core import Emulator
+from hw.emulator.upset import Line, Upset
 from hw.message import Phase
 from hw.plan import Ages, Program
 from hw.safety import ENDED, Fault, Stage
 from hw.session import Session
 from hw.steering import Steering
-from hw.upset import Line, Upset
 
 POLL_US = 1000
 GRACE_US = 20_000  # after the end

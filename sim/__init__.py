@@ -24,10 +24,10 @@ from sim.interrupt import while_starting
 
 if TYPE_CHECKING:
     from sim.api import simulate, validate
-    from sim.examine import Findings
     from sim.plot import plot_run
     from sim.result import Result
     from sim.scenario import InputError, Scenario, load, parse
+    from sim.validate.examine import Findings
 
 while_starting()
 
@@ -36,7 +36,7 @@ __all__ = ["Findings", "InputError", "Result", "Scenario", "load", "parse", "plo
 _HOMES = {
     "simulate": "sim.api",
     "validate": "sim.api",
-    "Findings": "sim.examine",
+    "Findings": "sim.validate.examine",
     "plot_run": "sim.plot",
     "Result": "sim.result",
 }

@@ -7,17 +7,17 @@ from design.argument import COUPLING, bare, number, of_kind, one_of, whole
 from design.result import Design
 from sim import report
 from sim.command import require_linear
-from sim.drawn import switching
-from sim.examine import ENGINES, Findings, Question
 from sim.loop import Progress
 from sim.mujoco_engine import INTEGRATORS, LEAPFROG
 from sim.result import Result
 from sim.scenario import InputError, Scenario
-from sim.shards import validate as examine_all
 from sim.simulate import ENGINES as ALONE
 from sim.simulate import assemble
 from sim.simulate import simulate as close_loop
 from sim.substeps import LEAST, MOST, check_substeps, default_substeps
+from sim.switching.drawn import switching
+from sim.validate.examine import ENGINES, Findings, Question
+from sim.validate.shards import validate as examine_all
 
 MOST_HUMANS = 1_000_000
 SCENARIO = 'a Scenario, as load("omega-pair") gives it'

@@ -14,11 +14,11 @@ from matplotlib.patches import Patch
 
 from controller.lti import Array
 from sim.files import write
-from sim.gain_map import Map
-from sim.gain_simulation import UNDECIDED
 from sim.plot import STYLES
 from sim.stability import MARGINAL
-from sim.surroundings import MODEL_KEPT
+from sim.zwidth.map import Map
+from sim.zwidth.simulation import UNDECIDED
+from sim.zwidth.surroundings import MODEL_KEPT
 
 STABLE, UNSTABLE = "#DDEBF4", "#F6D9C6"
 #: the broken line lies on the other, so that both are seen where they are the same

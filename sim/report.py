@@ -9,9 +9,9 @@ from rich.console import Console
 from rich.table import Table
 
 from controller.lti import Array
+from design.box.check import set_rows
 from design.listed import listed
 from design.promises import ANY, CAVEATS, finite
-from design.set_check import set_rows
 from sim.loop import Record
 from sim.one_period import frozen_modes, worst_mode
 from sim.simulate import Assembly

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from design.assess import CONDITIONS, assess
+from design.box.check import SetCheck, check_set, set_part
 from design.promises import certificate_part, promise_of
-from design.set_check import SetCheck, check_set, set_part
 from design.summary import coupling_part, transparency_part
 from design.transparency import transparency
-from sim import jitter_report, report, reproducibility
+from sim import report, reproducibility
 from sim.command import (
     DONE,
     INTERRUPTED,
@@ -31,11 +31,9 @@ from sim.command import (
     seed_from,
 )
 from sim.couplings import NAMES, Chosen, choose
-from sim.drawn import switching
 from sim.files import write, write_json
 from sim.human_file import load_humans
 from sim.ideal import Likeness, likeness
-from sim.jitter_options import add_jitter_options, with_jitter
 from sim.loop import Record
 from sim.mujoco_engine import INTEGRATORS, LEAPFROG
 from sim.result import Result
@@ -43,7 +41,10 @@ from sim.scenario import InputError, Scenario
 from sim.simulate import ENGINES, Assembly, assemble, simulate
 from sim.stability import before_clipping
 from sim.substeps import LEAST, MOST, check_substeps, default_substeps
-from sim.worst_switching import Period
+from sim.switching import report as jitter_report
+from sim.switching.drawn import switching
+from sim.switching.options import add_jitter_options, with_jitter
+from sim.switching.worst import Period
 
 
 def main(argv: list[str]) -> int:

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from sim import yardstick
-from sim.accuracy import main
+from sim.accuracy import yardstick
+from sim.accuracy.__main__ import main
+from sim.accuracy.yardstick import mark_front
 from sim.scenario import InputError
-from sim.yardstick import mark_front
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from sim.scenario import InputError, load
 from sim.simulate import assemble
 from sim.stability import close, dominant_mode
 from sim.tightness import main as tightness
-from sim.validate import main
+from sim.validate.__main__ import main
 
 SCENARIO = load()
 DESIGNED = SpringDamper([878.7, 551.8], [0.3864, 0.5219])

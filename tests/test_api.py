@@ -21,7 +21,7 @@ from models.device import RigidDevice
 from sim import InputError, Result, Scenario, load, parse, simulate, validate
 from sim.run import main as run_command
 from sim.scenario import SCENARIOS
-from sim.validate import main as validate_command
+from sim.validate.__main__ import main as validate_command
 
 SHORT = load().replace(duration=0.3)
 GAINS = SpringDamper([878.7, 551.8], [0.3864, 0.5219])
@@ -64,7 +64,7 @@ def test_help_and_completion_show_what_is_for_scripts(package):
 def test_the_options_are_those_that_the_designs_take():
     """One table, the types of the arguments, and the designs' own signatures say the same."""
     from design import ccl, spring_damper
-    from design.wish import Wish
+    from design.parameter.wish import Wish
 
     assert set(OPTIONS) == set(KINDS)
     assert set(OPTIONS["ccl"]) < set(signature(ccl.design).parameters)

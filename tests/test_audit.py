@@ -12,14 +12,14 @@ from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring
 from controller.lti import Lti
 from design import store
-from design.audit import main
-from design.audit_figures import MOST_EXTRA_SAMPLES, edge, stiffest, tolerance
-from design.audit_remedies import remedies
-from design.audit_report import report
+from design.audit.__main__ import main
+from design.audit.figures import MOST_EXTRA_SAMPLES, edge, stiffest, tolerance
+from design.audit.remedies import remedies
+from design.audit.report import report
+from design.audit.subject import Subject
 from design.presets import PRESETS
 from design.promises import CAVEATS, promise
 from design.published import CASE_I
-from design.subject import Subject
 from sim.command import execute
 
 CONDITIONS = ("closed-loop", "theorem4")

@@ -15,18 +15,18 @@ from controller.process import force_map
 from design import optimal
 from design.__main__ import main as design_main
 from design.assess import specification
-from design.audit import main as audit_main
+from design.audit.__main__ import main as audit_main
+from design.box.check import check_set, set_part
 from design.certificate import NotProved, prove, verify
 from design.check import main as check_main
 from design.failure import Infeasible
-from design.set_check import check_set, set_part
+from design.parameter.wish import Wish
 from design.store import Loop, Stored, data_of, digest, load, sealed
 from design.store import SpringDamper as StoredSpringDamper
 from design.transparency import transparency
-from design.wish import Wish
 from sim.run import main as run_main
 from sim.scenario import SCENARIOS, InputError, parse
-from sim.validate import main as validate_main
+from sim.validate.__main__ import main as validate_main
 
 T, THETA = 1.2e-3, (1, 2)
 #: the first spring softer or stiffer or lost: three vertices beside the environment

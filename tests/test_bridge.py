@@ -12,9 +12,10 @@ from design.assess import assess
 from design.store import Stored, data_of
 from design.store import save as save_coupling
 from hw import replay, session_report
-from hw.emulator_core import Emulator
-from hw.fault_cases import CASES
-from hw.faults import lively, rehearse
+from hw.emulator.core import Emulator
+from hw.emulator.upset import Upset
+from hw.faults.__main__ import lively, rehearse
+from hw.faults.cases import CASES
 from hw.frame import Decoder, Force, State, Stop, encode
 from hw.handshake import Units
 from hw.law import Law, fill
@@ -24,7 +25,6 @@ from hw.rehearsal import Rehearsal
 from hw.safety import Fault, Limits, Stage
 from hw.session import Session, Settings
 from hw.trace import Recorder, digest, load, result_of, save_npz, steady_ticks
-from hw.upset import Upset
 from models.scene import plant
 from sim import trace as trace_command
 from sim.couplings import choose
@@ -67,7 +67,7 @@ def rehearsal_of(scenario, rungs, *faults, recorder=None, **options):
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_every_fault_ends_where_it_must(case, scenario, rungs):
-    """Stage, cause, time to zero force, counters, no force above the cap, no second arming: hw/faults.py says which."""
+    """Stage, cause, time to zero force, counters, no force above the cap, no second arming: hw.faults says which."""
     assert rehearse(case, lively(scenario), rungs).wrong == ()
 
 

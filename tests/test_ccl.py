@@ -9,12 +9,12 @@ from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
 from design import ccl, spring_damper
-from design.affine import affine, symmetric_from
-from design.fixed_order import FixedOrder
-from design.fixed_poles import FixedPoles
-from design.inner_convex import descend
+from design.fixed_order.fixed_poles import FixedPoles
+from design.fixed_order.inner_convex import descend
+from design.fixed_order.realisation import FixedOrder
 from design.lmi import v_hat_regular
 from design.margin import closed_loop, theorem4
+from design.semidefinite.affine import affine, symmetric_from
 from design.shaping import Shaping
 from design.specification import RESERVE, Specification
 

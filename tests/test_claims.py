@@ -15,10 +15,10 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
-from design.convex_concave import step
+from design.gains.convex_concave import step
 from design.margin import closed_loop, theorem4
-from design.multiplier import least_multiplier
 from design.published import CASE_I, CASE_II, PRINTED_TAU_DB
+from design.semidefinite.multiplier import least_multiplier
 from design.shaping import Shaping
 from design.solve import Infeasible
 from design.specification import Specification

@@ -15,11 +15,11 @@ import pytest
 distributed = pytest.importorskip("distributed", reason="Dask is not installed (extra `dask`)")
 
 from design.published import CASE_I  # noqa: E402
-from sim.cluster import validate_on_cluster  # noqa: E402
-from sim.examine import BATCH, Findings, Question  # noqa: E402
 from sim.population import MIXED  # noqa: E402
 from sim.scenario import InputError, load  # noqa: E402
-from sim.shards import validate  # noqa: E402
+from sim.validate.cluster import validate_on_cluster  # noqa: E402
+from sim.validate.examine import BATCH, Findings, Question  # noqa: E402
+from sim.validate.shards import validate  # noqa: E402
 
 ROOT = Path(__file__).parent.parent
 QUESTION = Question(load(), CASE_I, 0, 4 * BATCH, MIXED, "both", 0.25)  # 0.25 s: just enough for growth rates

@@ -9,11 +9,12 @@ from hw import session_report
 from hw.clock import BLOCK, Clock, Pace
 from hw.conduct import PATIENCE, Told, check_state
 from hw.device import Device
-from hw.emulated_plant import nobody
-from hw.emulator_core import Emulator, info_of
-from hw.excitation import chirp
-from hw.faults import lively
+from hw.emulator.core import Emulator, info_of
+from hw.emulator.plant import nobody
+from hw.emulator.upset import Upset
+from hw.faults.__main__ import lively
 from hw.frame import Ack, Config, Force, State, Stop, config_crc, encode
+from hw.identify.excitation import chirp
 from hw.measurement import Measurement
 from hw.message import NO_MARGIN, Command, Phase, Reason
 from hw.plan import Ages, ladder
@@ -21,7 +22,6 @@ from hw.rehearsal import Rehearsal
 from hw.safety import Fault, Limits, Stage
 from hw.session import Session, Settings
 from hw.trace import Recorder, result_of
-from hw.upset import Upset
 from sim.growth import growths
 from sim.scenario import load as scenario_of
 

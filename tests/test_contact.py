@@ -13,25 +13,25 @@ from controller.environment import FIGURE_4, GROUND, Network, Wall, environment
 from controller.lti import SingularLoop
 from controller.process import Process, Tape, force_map
 from design.assess import assess
-from design.audit_report import report
+from design.audit.report import report
+from design.audit.subject import Subject
 from design.certificate import NotProved, prove
 from design.margin import closed_loop
 from design.promises import FROZEN
 from design.store import data_of
-from design.subject import Subject
 from models.crowd import variants
 from models.device import CompliantDevice
 from models.human import Population
-from sim.accuracy import main as accuracy
+from sim.accuracy.__main__ import main as accuracy
 from sim.batch_engine import ExactBatchEngine
-from sim.bounce import bounce
 from sim.exact_engine import hold
+from sim.hunt.bounce import bounce
 from sim.mujoco_engine import MujocoBatchEngine
 from sim.population import crowds
 from sim.run import main
 from sim.scenario import SCENARIOS, InputError, load, parse
 from sim.simulate import assemble, simulate
-from sim.validate import main as validate
+from sim.validate.__main__ import main as validate
 
 T = 1e-3
 SOFT = SpringDamper([878.0, 551.0], [0.386, 0.521])  # within theorem4's set for theta = (1, 2), T = 1.2 ms

@@ -7,9 +7,9 @@ import pytest
 
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring
-from design.curves import curves, grid, ideal, judge
 from design.failure import DesignFailed
-from design.plot import main
+from design.plot.__main__ import main
+from design.plot.curves import curves, grid, ideal, judge
 from design.published import CASE_I
 from design.store import Loop
 from sim.scenario import InputError

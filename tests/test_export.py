@@ -15,8 +15,8 @@ from controller.environment import FIGURE_4, GROUND, Network, Spring, environmen
 from controller.lti import Lti
 from controller.process import Process, Tape, force_map
 from design.certificate import prove
-from design.export import main
-from design.exported import process_block, sequential, trial
+from design.export.__main__ import main
+from design.export.block import process_block, sequential, trial
 from design.store import Compliance, Loop, NoCoupling, SpringDamper, Stored, save
 from sim.scenario import InputError
 

@@ -11,6 +11,7 @@ from design.assess import assess
 from design.published import CASE_I
 from models.device import CompliantDevice
 from models.human import Human, Link
+from sim.accuracy.yardstick import limit_cycle
 from sim.engine import outside_forces
 from sim.exact_engine import ExactEngine
 from sim.hard import cases, devices, measure, nominal
@@ -19,7 +20,6 @@ from sim.one_period import exact_growth, simulated_growth
 from sim.scenario import InputError, load
 from sim.simulate import assemble, make_engine, simulate
 from sim.substeps import default_substeps
-from sim.yardstick import limit_cycle
 
 CLOSED_LOOP = SpringDamper(np.array([7806.0, 3137.0]), np.array([0.105, 1.68]))
 

@@ -9,11 +9,11 @@ from controller.coupling import Compliance, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
-from design import audit
-from design.human_structure import closed_loop_of_separate_humans, reciprocal, shared_weights, weighted
+from design.audit import __main__ as audit
+from design.condition.human_structure import closed_loop_of_separate_humans, reciprocal, shared_weights, weighted
+from design.frequency.sweep import on_circle
 from design.margin import closed_loop
 from design.store import Stored, data_of, save
-from design.sweep import on_circle
 from models.device import RigidDevice
 from models.human import Cross, Human, Link, Person
 from sim.one_period import exact_growth

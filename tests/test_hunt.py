@@ -11,10 +11,10 @@ from controller.coupling import NoCoupling
 from controller.environment import environment
 from controller.process import force_map
 from design.margin import closed_loop, theorem4_per_channel
-from sim.bounce import bounce
-from sim.contact_search import attack, draw
 from sim.exact_engine import ExactEngine
-from sim.hunt import main
+from sim.hunt.__main__ import main
+from sim.hunt.bounce import bounce
+from sim.hunt.search import attack, draw
 from sim.scenario import InputError, load
 from sim.simulate import assemble
 

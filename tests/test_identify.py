@@ -6,18 +6,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from hw.emulated_plant import nobody
-from hw.emulator_core import Emulator
-from hw.excitation import chirp
-from hw.fit import identify
-from hw.identify import capped, estimate, held
-from hw.identify import main as identify_command
+from hw.emulator.core import Emulator
+from hw.emulator.plant import nobody
+from hw.emulator.upset import Upset
+from hw.identify.__main__ import capped, estimate, held
+from hw.identify.__main__ import main as identify_command
+from hw.identify.excitation import chirp
+from hw.identify.fit import identify
+from hw.identify.standstill import worth
 from hw.rehearsal import Rehearsal
 from hw.safety import Limits, Stage
 from hw.session import Session, Settings
-from hw.standstill import worth
 from hw.trace import Recorder
-from hw.upset import Upset
 from models.device import RigidDevice
 from sim.result import Result
 from sim.scenario import InputError, load

@@ -10,13 +10,13 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
-from design.audit import main
-from design.jitter import blocks, half_widths, nominal_over_step
-from design.jitter_multiplier import jitter_proof
-from design.jitter_part import switching_part, switching_requirement
-from design.jitter_proof import prove_switching, storage
+from design.audit.__main__ import main
+from design.jitter.condition import blocks, half_widths, nominal_over_step
+from design.jitter.multiplier import jitter_proof
+from design.jitter.part import switching_part, switching_requirement
+from design.jitter.proof import prove_switching, storage
 from design.margin import closed_loop
-from design.rational import Matrix
+from design.proof.rational import Matrix
 from design.solve import solve
 from design.store import DelayRange, Loop
 from sim.scenario import InputError

@@ -16,8 +16,10 @@ MAY_IMPORT = {
     "sim": {"models", "controller", "design"},
     "hw": {"models", "controller", "design", "sim"},
 }
-#: commands of design may also read scenarios, share the command line, and draw
-DESIGN_COMMANDS = {"__main__.py", "audit.py", "check.py", "plot.py", "limits.py", "export.py"}
+#: commands of design, a file or a folder each, may also read scenarios, share the command line, and draw
+DESIGN_COMMANDS = {f"design/{name}__main__.py" for name in ("", "audit/", "export/", "limits/", "plot/")} | {
+    "design/check.py"
+}
 COMMANDS_MAY_IMPORT = {
     "sim.scenario",
     "sim.command",
@@ -42,7 +44,7 @@ HOMES = {
         "sim/view/offscreen.py",
     },
     "cvxpy": {"design/"},
-    "distributed": {"sim/cluster.py"},
+    "distributed": {"sim/validate/cluster.py"},
     "serial": {"hw/port.py"},
     "matplotlib": {"sim/plot"},
     "PIL": {"sim/view/flat.py", "sim/view/film.py"},
@@ -70,9 +72,10 @@ def test_arrows_point_one_way(path):
         if package not in WORLDS or package == world or package in MAY_IMPORT[world]:
             continue
         shared = name in COMMANDS_MAY_IMPORT or name.startswith("sim.plot_")
-        allowed = world == "design" and path.name in DESIGN_COMMANDS and shared
-        starts = (path.relative_to(ROOT).as_posix(), name) == STARTS_COMMANDS
-        assert allowed or starts, f"{path.relative_to(ROOT)} imports {name}"
+        place = path.relative_to(ROOT).as_posix()
+        allowed = place in DESIGN_COMMANDS and shared
+        starts = (place, name) == STARTS_COMMANDS
+        assert allowed or starts, f"{place} imports {name}"
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: p.relative_to(ROOT).as_posix())

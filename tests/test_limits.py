@@ -7,13 +7,15 @@ import pytest
 
 from controller.environment import environment
 from controller.process import force_map
-from design import limit_curve, limits, limits_report
-from design.ladder import LADDERS, SHORT, rung
-from design.limit_curve import AXES, Setting, measured, optimum, remembered, settings
-from design.limits import main
+from design.limits import __main__ as limits
+from design.limits import curve as limit_curve
+from design.limits import report as limits_report
+from design.limits.__main__ import main
+from design.limits.curve import AXES, Setting, measured, optimum, remembered, settings
+from design.limits.ladder import LADDERS, SHORT, rung
 from design.margin import closed_loop
+from design.parameter.wish import Wish
 from design.published import CASE_I
-from design.wish import Wish
 from sim.plot_limits import plot_limits
 from sim.scenario import InputError, load
 

@@ -20,9 +20,10 @@ from types import SimpleNamespace
 import pytest
 
 from controller.jitter import Jitter
-from hw import bridge, identify, replay
-from hw import emulator as emulator_command
+from hw import bridge, replay
 from hw.desk import add_link_options, check_link
+from hw.emulator import __main__ as emulator_command
+from hw.identify import __main__ as identify
 from hw.live import Live
 from hw.plan import ladder, rung
 from hw.port import Port
@@ -233,7 +234,7 @@ def test_an_exception_stops_the_device_first(emulator, scenario):
 def test_an_emulator_ends_with_the_bridge_that_started_it():
     """However that ended: here by SIGKILL, which nobody can catch. An orphan would keep its terminal for minutes."""
     code = (
-        "import argparse, os, time; from hw.emulate import spawned\n"
+        "import argparse, os, time; from hw.emulator.child import spawned\n"
         "args = argparse.Namespace(case='I', scenario=None, theta=None, psi=None, lam=None, delta=None, T=None)\n"
         "args.fault, args.pace = [], '0.2'\n"
         "with spawned(args, 0, 60.0) as path: print(path, flush=True); time.sleep(600)"

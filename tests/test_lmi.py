@@ -8,8 +8,7 @@ from controller.coupling import SpringDamper
 from controller.delay import delay
 from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.lti import Lti
-from design.analysis import analysis
-from design.coordinates import balanced, unit_coupling, unit_environment
+from design.frequency.sweep import frequencies, hermitian, on_circle
 from design.lmi import (
     Ports,
     e_hat_regular,
@@ -20,8 +19,9 @@ from design.lmi import (
     v_hat_regular,
 )
 from design.margin import theorem4
+from design.semidefinite.analysis import analysis
+from design.semidefinite.coordinates import balanced, unit_coupling, unit_environment
 from design.solve import solve
-from design.sweep import frequencies, hermitian, on_circle
 
 T = 1.2e-3
 DELTA = (1.37, 1.37)

@@ -13,19 +13,19 @@ from controller.environment import Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
 from design.assess import specification
-from design.cone_program import Block, ConeProgram, vectors
-from design.cone_solver import solve_cones
-from design.cutting_planes import HIGH_HZ, PASSIVE_SHARE, SLACK, Problem, sketch, square_mismatch
 from design.failure import Infeasible
-from design.free_parameter import FreeParameter, GivenParameter
-from design.inequalities import passivity
+from design.frequency.sweep import on_circle
 from design.margin import closed_loop
 from design.optimal import advice, binding, changes, design, parameter, world, worlds
+from design.parameter.cone_program import Block, ConeProgram, vectors
+from design.parameter.cone_solver import solve_cones
+from design.parameter.cutting_planes import HIGH_HZ, PASSIVE_SHARE, SLACK, Problem, sketch, square_mismatch
+from design.parameter.free_parameter import FreeParameter, GivenParameter
+from design.parameter.inequalities import passivity
+from design.parameter.wish import Wish
 from design.result import Design
 from design.specification import Specification
-from design.sweep import on_circle
 from design.transparency import decibels, transparency
-from design.wish import Wish
 from sim.scenario import load
 
 SPEC = {case: specification(load().loop(case)) for case in ("I", "II")}
@@ -237,7 +237,7 @@ def test_no_perturbation_that_keeps_the_constraints_is_better(name):
 
 
 def test_cvxpy_finds_the_same_optimum():
-    """The sampled problem written from the paper's formulas, without design.inequalities, and solved by cvxpy.
+    """The sampled problem written from the paper's formulas, without design.parameter, and solved by cvxpy.
 
     With all constraints on a grid that is denser than the first round's the optimum lies between that round's and the
     final one, which agree to 1e-3.

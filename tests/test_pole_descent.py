@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from design.assess import specification
-from design.cutting_planes import Problem, cut_problem
 from design.failure import Infeasible
-from design.free_parameter import FreeParameter
 from design.optimal import design, world
-from design.pole_descent import FARTHEST, Places, descend, gradient, log_mismatch
-from design.wish import Wish
+from design.parameter.cutting_planes import Problem, cut_problem
+from design.parameter.free_parameter import FreeParameter
+from design.parameter.pole_descent import FARTHEST, Places, descend, gradient, log_mismatch
+from design.parameter.wish import Wish
 from sim.scenario import load
 
 SPEC = {case: specification(load().loop(case)) for case in ("I", "II")}

@@ -9,11 +9,11 @@ from controller.delay import delay
 from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
-from design.analysis import analysis
-from design.delayed import theorem4_delayed
+from design.condition.delayed import theorem4_delayed
 from design.failure import DesignFailed, Infeasible
-from design.gain_set import gain_set, solve_within
+from design.gains.gain_set import gain_set, solve_within
 from design.margin import closed_loop, theorem4
+from design.semidefinite.analysis import analysis
 from design.shaping import Shaping
 from design.solve import CROSS_CHECK, solve
 from design.specification import RESERVE, Specification

@@ -2,14 +2,14 @@
 
 import pytest
 
-from hw.emulator_core import Emulator
-from hw.faults import lively
+from hw.emulator.core import Emulator
+from hw.emulator.upset import Upset
+from hw.faults.__main__ import lively
 from hw.plan import ladder
 from hw.rehearsal import Rehearsal
 from hw.safety import Limits, Stage
 from hw.session import Session, Settings
 from hw.steering import Steering
-from hw.upset import Upset
 from sim.scenario import load as scenario_of
 
 

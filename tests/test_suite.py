@@ -1,15 +1,16 @@
 """The suite runs commands as a user would, and its report says what each found and how to repeat it."""
 
-import importlib
 import json
 import re
 import shlex
 
 import pytest
 
-from sim import hard, suite, suite_report
+from sim import hard
 from sim.scenario import InputError
-from sim.suite import CHECKS, Check, main
+from sim.suite import __main__ as suite
+from sim.suite import report as suite_report
+from sim.suite.__main__ import CHECKS, Check, entry, main
 
 QUICK = "sim.validate --case none --humans {humans} --links mixed --duration 0.3 --engine exact --seed {seed}"
 
@@ -25,7 +26,7 @@ def quick(monkeypatch):
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
 def test_every_check_is_a_command_with_its_options(check):
     module, *options = shlex.split(check.command.format(humans=3, seed=1))
-    args = importlib.import_module(module)._parser().parse_args([*options, "--out", "x"])
+    args = entry(module)._parser().parse_args([*options, "--out", "x"])
     assert args.out == "x"
 
 

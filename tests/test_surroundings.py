@@ -7,17 +7,17 @@ import pytest
 
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring
-from design.environment_map import Environments
-from design.sweep import on_circle
+from design.condition.environment_map import Environments
+from design.frequency.sweep import on_circle
 from models.crowd import variants
-from sim import zwidth
 from sim.command import BAD_INPUT, DONE, execute
 from sim.couplings import choose
-from sim.gain_population import holders
 from sim.population import crowds
 from sim.scenario import load
-from sim.surroundings import MODEL_KEPT, Surroundings
 from sim.verdicts import dominant_modes, exact_loops
+from sim.zwidth import __main__ as zwidth
+from sim.zwidth.population import holders
+from sim.zwidth.surroundings import MODEL_KEPT, Surroundings
 
 PAIR, STAR = load("omega-pair"), load("three-rigid")
 WALL = Network(("tip",), (Spring(("tip", GROUND), 2000.0, 0.2),))

@@ -15,16 +15,16 @@ from design import store
 from models.crowd import Crowd, variants
 from models.scene import plant
 from sim.batch_engine import ExactBatchEngine
-from sim.drawn import adversary, switching
 from sim.exact_engine import ExactEngine, HeldPlant
 from sim.population import draw
 from sim.run import main
 from sim.scenario import SCENARIOS, InputError, load, parse
 from sim.simulate import assemble, simulate
-from sim.switched import knocked, mode_matrix, unlimited, with_delays, without_theta
-from sim.switching_crowd import switched_crowd
-from sim.validate import main as validate
-from sim.worst_switching import greedy_ages
+from sim.switching.crowd import switched_crowd
+from sim.switching.drawn import adversary, switching
+from sim.switching.switched import knocked, mode_matrix, unlimited, with_delays, without_theta
+from sim.switching.worst import greedy_ages
+from sim.validate.__main__ import main as validate
 
 STIFF = SpringDamper([7806, 3137], [0.105, 1.68])  # certified for the constants (1, 2) in the default environment
 ASSEMBLY = assemble(load(), STIFF)

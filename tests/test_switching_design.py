@@ -11,15 +11,15 @@ from controller.process import force_map
 from design.__main__ import main
 from design.assess import specification
 from design.failure import DesignFailed
-from design.jitter_multiplier import jitter_proof
+from design.jitter.multiplier import jitter_proof
 from design.optimal import design as optimal_design
+from design.parameter.wish import Wish
 from design.spring_damper import design
 from design.store import load as load_stored
-from design.wish import Wish
 from models.crowd import Crowd, variants
 from sim.scenario import InputError, load
 from sim.simulate import assemble
-from sim.switching_crowd import switched_crowd
+from sim.switching.crowd import switched_crowd
 
 RANGE = ((1, 1), (2, 2))
 

@@ -13,21 +13,22 @@ from controller.delay import LOST, ages
 from controller.environment import FIGURE_4, environment
 from controller.jitter import Jitter
 from controller.process import force_map
-from design import certify, positive_real
+from design import certify
 from design.__main__ import main as design_main
-from design.audit import main as audit_main
+from design.audit.__main__ import main as audit_main
 from design.certificate import NotProved, prove, verify
 from design.check import main as check_main
-from design.jitter import blocks
-from design.jitter_multiplier import jitter_proof
-from design.jitter_proof import condition_block, refuted
+from design.jitter.condition import blocks
+from design.jitter.multiplier import jitter_proof
+from design.jitter.proof import condition_block, refuted
 from design.margin import closed_loop
-from design.rational import Matrix
+from design.proof import positive_real
+from design.proof.rational import Matrix
 from design.store import BadFile, Certificate, DelayRange, Loop, SpringDamper, Stored, digest, load, save, sealed
 from hw.plan import ladder
 from sim.run import main as run_main
 from sim.scenario import load as scenario_of
-from sim.validate import main as validate_main
+from sim.validate.__main__ import main as validate_main
 
 T, DELTA = 1.2e-3, (1.37, 1.37)
 RANGE = DelayRange((1, 1), (2, 2))

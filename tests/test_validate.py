@@ -17,21 +17,22 @@ from models.crowd import Crowd, variants
 from models.device import RigidDevice
 from models.human import Person
 from models.scene import build, plant
-from sim import examine as examine_module
 from sim import run as run_command
-from sim import shards, verdict_report
 from sim.batch_engine import ExactBatchEngine
 from sim.couplings import choose
 from sim.exact_engine import ExactEngine, hold
-from sim.examine import BATCH, Findings, Question
 from sim.knock import knock_forces
 from sim.loop import run
 from sim.population import MIXED, crowds, crowds_of, draw
 from sim.scenario import InputError, load
-from sim.shards import validate
 from sim.simulate import assemble, simulate
 from sim.stability import close, dominant_mode
-from sim.validate import main
+from sim.validate import examine as examine_module
+from sim.validate import report as verdict_report
+from sim.validate import shards
+from sim.validate.__main__ import main
+from sim.validate.examine import BATCH, Findings, Question
+from sim.validate.shards import validate
 from sim.verdicts import disagree, dominant_modes, exact_loops, mujoco_loops, unstable
 
 SCENARIO = load()

@@ -14,14 +14,14 @@ from design import optimal
 from design.__main__ import _store
 from design.api import certify
 from design.assess import specification
+from design.box.check import check_set, set_part, set_rows
+from design.box.worst_member import search
 from design.certificate import prove, verify
 from design.check import main as check_main
 from design.failure import DesignFailed
+from design.parameter.wish import Wish
 from design.result import Design
-from design.set_check import check_set, set_part, set_rows
 from design.store import Stored, data_of, load, save
-from design.wish import Wish
-from design.worst_member import search
 from sim import scenario
 from sim.scenario import SCENARIOS
 

@@ -12,27 +12,28 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, Wall, environment
 from controller.gains import Gains, force_maps
 from controller.process import Process, Tape, force_map
-from design.gain_map import closed_loop_ratios, theorem4_ratios
-from design.suprema import suprema
-from design.sweep import on_circle
+from design.frequency.suprema import suprema
+from design.frequency.sweep import on_circle
+from design.gains.gain_map import closed_loop_ratios, theorem4_ratios
 from models.crowd import variants
 from models.device import CompliantDevice, RigidDevice
 from models.human import Human, Link
 from models.scene import build
-from sim import gain_map, zwidth
-from sim.cells import in_slices
 from sim.command import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
-from sim.gain_grid import Grid, make_grid
-from sim.gain_ground import Ground, one_sided
-from sim.gain_map import draw_map
-from sim.gain_population import holders
-from sim.gain_simulation import Effects, Plan
-from sim.many_processes import ManyProcesses
 from sim.mujoco_engine import discretised
 from sim.oscillation import oscillation, slowest_seen
 from sim.population import crowds
 from sim.scenario import InputError, load
 from sim.verdicts import dominant_modes, exact_loops
+from sim.zwidth import __main__ as zwidth
+from sim.zwidth import map as gain_map
+from sim.zwidth.cells import in_slices
+from sim.zwidth.grid import Grid, make_grid
+from sim.zwidth.ground import Ground, one_sided
+from sim.zwidth.many_processes import ManyProcesses
+from sim.zwidth.map import draw_map
+from sim.zwidth.population import holders
+from sim.zwidth.simulation import Effects, Plan
 
 DELTA, T = 1.37, 1e-3
 PAIR, STAR = load("omega-pair"), load("three-rigid")

@@ -11,13 +11,13 @@ from controller.environment import environment
 from controller.process import force_map
 from design import ccl, optimal, spring_damper
 from design.assess import assess, specification
-from design.audit_report import report
+from design.audit.report import report
+from design.audit.subject import Subject
 from design.certificate import prove, verify
+from design.parameter.wish import Wish
 from design.published import CASE_I
 from design.store import Stored, data_of
-from design.subject import Subject
 from design.transparency import decibels, transparency
-from design.wish import Wish
 from sim.scenario import load
 
 pytestmark = pytest.mark.benchmark(group="design")

@@ -1,0 +1,1 @@
+"""python -m design.audit: are these gains safe, with what margin, and where does it bind?"""

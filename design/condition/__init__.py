@@ -1,0 +1,1 @@
+"""What a condition asks of the devices at each frequency. design.margin has the supremum, the required damping."""

@@ -1,0 +1,1 @@
+"""python -m design.export: couplings for use elsewhere."""

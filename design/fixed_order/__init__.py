@@ -1,0 +1,1 @@
+"""State-space couplings of fixed order, by several searches. design.ccl is their front."""

@@ -1,0 +1,1 @@
+"""What happens over frequency: sweeps that know the poles, suprema, integrals."""

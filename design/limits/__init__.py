@@ -1,0 +1,1 @@
+"""python -m design.limits: how good could a coupling be, with another device, delay, period or order?"""

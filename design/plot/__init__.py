@@ -1,0 +1,1 @@
+"""python -m design.plot: couplings side by side over frequency."""

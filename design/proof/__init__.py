@@ -1,0 +1,1 @@
+"""Conditions proved in exact arithmetic from stored coefficients. design.certificate is their front."""

@@ -1,0 +1,1 @@
+"""Problems over matrix inequalities: units, affine functions, samples; feasibility problems that are not designs."""

@@ -1,0 +1,1 @@
+"""python -m hw.emulator: a device that is not there."""

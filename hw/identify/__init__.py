@@ -1,0 +1,1 @@
+"""python -m hw.identify: how much damping does a device guarantee?"""

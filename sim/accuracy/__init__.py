@@ -1,0 +1,1 @@
+"""python -m sim.accuracy: what each engine costs and how wrong it is."""

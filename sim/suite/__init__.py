@@ -1,0 +1,1 @@
+"""python -m sim.suite: every check that a verdict rests on, in one report."""

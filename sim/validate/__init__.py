@@ -1,0 +1,1 @@
+"""python -m sim.validate: does a verdict hold for everyone?"""

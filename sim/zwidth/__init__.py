@@ -1,0 +1,1 @@
+"""python -m sim.zwidth: the K-B map."""
