@@ -19,16 +19,20 @@ class SingularLoop(ValueError):
 
 def frozen(value: ArrayLike, ndim: int, name: str = "") -> Array:
     """A read-only float64 copy of `value`, which must have `ndim` axes. Raises ValueError beginning with `name`."""
-    expected = "a list of numbers" if ndim == 1 else f"an array of numbers with {ndim} axes"
-    came = f"{name} is {value!r}, " if name else ""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{came}expected {expected}") from None
+        raise _unlike(name, value, ndim) from None
     if array.ndim != ndim:
-        raise ValueError(f"{came}expected {expected}, got shape {array.shape}")
+        raise _unlike(name, value, ndim, f", got shape {array.shape}")
     array.setflags(write=False)
     return array
+
+
+def _unlike(name: str, value: ArrayLike, ndim: int, got: str = "") -> ValueError:
+    """The error of `frozen`, apart: to write a matrix as text costs far more than to copy it."""
+    expected = "a list of numbers" if ndim == 1 else f"an array of numbers with {ndim} axes"
+    return ValueError(f"{name} is {value!r}, expected {expected}{got}" if name else f"expected {expected}{got}")
 
 
 @dataclass(frozen=True, eq=False)

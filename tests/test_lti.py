@@ -85,3 +85,15 @@ def test_blocks_prove_their_shapes():
         Lti.constant([[1.0]], 1e-3) @ Lti.constant([[1.0]], 2e-3)
     with pytest.raises(ValueError, match="read-only"):
         Lti.constant([[1.0]], 1e-3).D[0, 0] = 2.0
+
+
+def test_a_block_is_built_without_writing_its_matrices_as_text():
+    """Thousands are built in a search, and the text of one costs more than its arithmetic."""
+
+    class Unwritable(np.ndarray):
+        def __repr__(self):
+            raise AssertionError("written as text")
+
+    matrix = np.eye(2).view(Unwritable)
+    block = Lti(matrix, matrix, matrix, matrix, 1e-3)
+    assert (block.A == np.eye(2)).all()
