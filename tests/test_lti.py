@@ -96,4 +96,4 @@ def test_a_block_is_built_without_writing_its_matrices_as_text():
 
     matrix = np.eye(2).view(Unwritable)
     block = Lti(matrix, matrix, matrix, matrix, 1e-3)
-    assert (block.A == np.eye(2)).all()
+    assert (np.eye(2) == block.A).all()
