@@ -12,7 +12,7 @@ environment alone would gain it 0.2 dB and cost the worst vertex 0.3 to 0.5), th
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -39,6 +39,7 @@ from design.transparency import transparency
 USUAL = Wish()
 ADDED, MOST_ADDITIONS = 3, 8  # points of a box that become environments at a time, and how often at most
 NO_LIMIT = "no limit above 100 Hz"
+MOST = 24  # functions that are tried to say whether more of them would help
 EASIER = (1.5, 2, 3, 5, 10, 20, 50)  # times the damping, tried to say how far a request is from having a solution
 
 
@@ -146,10 +147,7 @@ def advice(spec: Specification, wish: Wish, progress: Progress = lambda what, do
     if spec.others and feasible(alone, wish):
         return set_advice(spec, wish, changes(wish), feasible, solvable, binding, progress)
     spec = alone
-    helpful = []
-    for k, (words, other) in enumerate(changes(wish).items()):
-        progress("no coupling: looking for the reason", k, len(changes(wish)))
-        helpful += [words] if feasible(spec, other) else []
+    helpful = _helpful(spec, changes(wish), progress) or _helpful(spec, last_resorts(wish), progress)
     kind = "diagonal" if wish.diagonal else "full"
     delays = f"theta = {list(spec.theta)}, psi = {list(spec.psi)}"
     if wish.switching:
@@ -158,9 +156,9 @@ def advice(spec: Specification, wish: Wish, progress: Progress = lambda what, do
     request = f"no {kind} Q of {wish.functions} functions is certified with {delays}, delta = {list(spec.delta)}"
     request += f": {binding(spec, wish)}"
     if helpful:
-        return f"{request} in this basis; there seem to be some with {', or '.join(helpful)}"
+        return f"{request} in this basis; there is one with {', or with '.join(helpful)}"
     damped = ((f, replace(spec, delta=tuple(f * d for d in spec.delta))) for f in EASIER)
-    factor = next((f for f, easier in damped if feasible(easier, wish)), None)
+    factor = next((f for f, easier in damped if feasible(easier, wish) and solvable(easier, wish)), None)
     remedy = f"{factor:g} times the damping, or less delay, would do" if factor else "only less delay can help"
     return f"{request}; {remedy}"
 
@@ -182,7 +180,7 @@ def binding(spec: Specification, wish: Wish) -> str:
 
 def changes(wish: Wish) -> dict[str, Wish]:
     """What else could be asked, in words."""
-    more = min(max(2 * wish.functions, 16), 24)
+    more = min(max(2 * wish.functions, 16), MOST)
     other = {
         f"{more} functions": replace(wish, functions=more),
         "a mixed basis": replace(wish, filter="mixed"),
@@ -192,6 +190,23 @@ def changes(wish: Wish) -> dict[str, Wish]:
         f"--margin {MARGIN:g}": replace(wish, margin=min(wish.margin, MARGIN)),
     }
     return {words: changed for words, changed in other.items() if changed != wish}
+
+
+def last_resorts(wish: Wish) -> dict[str, Wish]:
+    """What could be asked where none of `changes` helps."""
+    richest, words = replace(wish, functions=MOST, diagonal=False, filter="mixed"), f"a full Q of {MOST} functions"
+    return {
+        f"{words} in a mixed basis": richest,
+        f"{words} in a mixed basis and {NO_LIMIT}": replace(richest, high_gain=None),
+    }
+
+
+def _helpful(spec: Specification, others: Mapping[str, Wish], progress: Progress) -> list[str]:
+    found = []
+    for k, (words, other) in enumerate(others.items()):
+        progress("no coupling: looking for the reason", k, len(others))
+        found += [words] if feasible(spec, other) and solvable(spec, other) else []
+    return found
 
 
 def solvable(spec: Specification, wish: Wish) -> bool:

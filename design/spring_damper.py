@@ -26,7 +26,7 @@ from design.result import Design
 from design.semidefinite.multiplier import shortage
 from design.shaping import Shaping
 from design.solve import solved
-from design.specification import RESERVE, Specification
+from design.specification import Specification
 
 #: The sequence stops when a step improves the norm by less than this, relatively.
 SETTLED = 1e-6
@@ -122,26 +122,6 @@ def stiffest(spec: Specification) -> Design:
     requirement = verified(spec, coupling, phi)
     total = float(coupling.K.sum())
     return Design(coupling, "theorem4", "stiffness", total, requirement, sdps, time.perf_counter() - started, phi)
-
-
-def stiffest_at(B: float, theta: int, delta: float, T: float) -> float:
-    """The largest stiffness [N/m] that Theorem 4 certifies beside the damping B [N s/m], psi = 0, one channel.
-
-    Raises Infeasible where B alone asks for more damping than delta.
-    """
-    usable = (1 - RESERVE) * delta
-    k = cp.Variable(nonneg=True)
-    gains, what = cp.hstack([k, B / usable]), f"the largest stiffness beside B = {B:g} N s/m"
-    try:
-        problem = solve_within(cp.Maximize(k), gains, (theta,), np.array([np.inf]), what)
-    except Infeasible as error:
-        line = f"B = {B:g} N s/m leaves no stiffness with delta = {delta:g} N s/m and theta = {theta}: use less B"
-        raise Infeasible(error.problem, error.results, line) from error
-    K = float(solved(k)) * usable / T
-    requirement = theorem4(SpringDamper([K], [B]).compliance(T), [theta], [delta])
-    if not requirement.certified:
-        raise DesignFailed(problem, (), f"K = {K:g} N/m beside B = {B:g} needs {requirement.required[0]:g} N s/m")
-    return K
 
 
 def verified(spec: Specification, coupling: SpringDamper, phi: Array | None) -> Requirement:

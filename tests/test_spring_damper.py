@@ -3,6 +3,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
@@ -17,7 +18,7 @@ from design.semidefinite.analysis import analysis
 from design.shaping import Shaping
 from design.solve import CROSS_CHECK, solve
 from design.specification import RESERVE, Specification
-from design.spring_damper import design, stiffest, stiffest_at
+from design.spring_damper import design, stiffest
 
 T = 1.2e-3
 DELTA = (1.37, 1.37)
@@ -94,20 +95,18 @@ def test_a_handful_of_convex_problems_suffices():
     assert design(specification()).sdps <= 4
 
 
+def stiffest_at(B, theta, delta, T):
+    """The largest K that theorem4's own sweep accepts beside B, by bisection, with the reserve of a design."""
+    usable = (1 - RESERVE) * delta
+    return brentq(lambda K: theorem4(SpringDamper([K], [B]).compliance(T), [theta], [usable]).ratio - 1, 1.0, 1e5)
+
+
 @pytest.mark.parametrize(("theta", "K"), list(enumerate([2283.0, 878.86, 551.94, 405.1, 320.8])))
 def test_the_largest_stiffness_by_delay(theta, K):
     found = stiffest(specification((0,), WALL, (theta,), (0,), (1.37,)))
     assert found.objective == pytest.approx(K * (1 - RESERVE), rel=2e-4)
-    # beside the same B the other function finds the same stiffness
+    # and beside the same B a bisection of the condition itself
     assert stiffest_at(float(found.coupling.B[0]), theta, 1.37, T) == pytest.approx(found.objective, rel=1e-5)
-
-
-@pytest.mark.parametrize("B", [0.0, 0.2, 0.9])
-def test_the_stiffest_gains_beside_a_damping_are_on_the_boundary(B):
-    K = stiffest_at(B, 1, 1.37, T)
-    ratio = theorem4(SpringDamper([K], [B]).compliance(T), [1], [1.37]).ratio
-    assert ratio == pytest.approx(1 - RESERVE, abs=1e-6)
-    assert not theorem4(SpringDamper([1.001 * K], [B]).compliance(T), [1], [1.37]).certified
 
 
 def test_the_stiffness_scales_with_damping_and_rate():
@@ -238,11 +237,6 @@ def test_an_active_environment_is_refused():
 def test_an_unknown_condition_is_refused():
     with pytest.raises(ValueError, match="condition is 'both', expected 'theorem4' or 'closed-loop'"):
         design(specification(), "both")
-
-
-def test_too_much_damping_leaves_no_stiffness():
-    with pytest.raises(Infeasible, match=r"B = 3 N s/m leaves no stiffness with delta = 1\.37"):
-        stiffest_at(3.0, 1, 1.37, T)
 
 
 def largest_sum(theta, sigma, largest_gram):

@@ -52,7 +52,8 @@ def solve_cones(program: ConeProgram, what: str) -> tuple[Array, Array]:
         if status in NO_SOLUTION:
             raise Infeasible(program, attempts, f"{what} has no solution ({name}: {status})")
     statuses = ", ".join(f"{a.settings}: {a.status}" for a in attempts)
-    raise DesignFailed(program, attempts, f"{what} could not be solved ({statuses})")
+    fewer = f"ask for fewer functions or a diagonal Q: {program.A.shape[1]} unknowns"
+    raise DesignFailed(program, attempts, f"{what} could not be solved ({statuses}); {fewer} are too many here")
 
 
 def _doubt(program: ConeProgram, status: str, x: Array) -> str | None:
