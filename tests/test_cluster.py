@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 
@@ -55,10 +56,12 @@ class Cluster:
             )
 
     def _wait_for_address(self) -> str:
-        while not self._file.exists():
+        """From the scheduler's file, which is there before all of it is written."""
+        while True:
+            with suppress(FileNotFoundError, json.JSONDecodeError):
+                return json.loads(self._file.read_text())["address"]
             assert self.scheduler.poll() is None, (self._folder / "log.txt").read_text()
             time.sleep(0.05)
-        return json.loads(self._file.read_text())["address"]
 
 
 @pytest.fixture

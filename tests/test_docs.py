@@ -22,6 +22,10 @@ IN_ORDER = list(dict.fromkeys(s.text for page in PAGES for s in regenerate.steps
 SNIPPETS = {p: [s.text for s in regenerate.steps(TEXTS[p]) if s.kind == "python"] for p in PAGES}
 SHOWN = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.SHOWN.finditer(TEXTS[page])]
 MEASURED = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.MEASURED.finditer(TEXTS[page])]
+#: within a sentence; those of other modules need a port, a display or minutes
+IN_TEXT = sorted(
+    {c for text in TEXTS.values() for c in re.findall(r"`(python -m design -[^`]*)`", text) if "FILE" not in c}
+)
 NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]\d+)?(?![\w])")
 
 
@@ -72,6 +76,12 @@ def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown,
     assert shown.splitlines()
     assert len(fresh) == len(shown.splitlines()), f"{page.name}: {output}"
     assert [a for a, b in zip(shown.splitlines(), fresh, strict=True) if not same_line(a, b)] == []
+
+
+@pytest.mark.parametrize("command", IN_TEXT)
+def test_a_design_that_a_sentence_names_can_be_had(command, place):
+    done = regenerate.run(command, place)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(("page", "command", "pattern", "shown"), MEASURED, ids=[block[1] for block in MEASURED])
