@@ -100,6 +100,8 @@ def _table(result: dict[str, Any]) -> Table:
     rows = {key: value for key, value in result.items() if key not in ("proved", "switching")}
     rows["between"] = result["between"] and search_words(result["between"])
     rows |= {f"switching, {key}": value for key, value in switching.items() if key not in ("lo", "hi")}
+    claims = () if result["proved"] else ("required_damping", "margin")  # what a file says that was refused
+    rows = {f"{key}, claimed" if key in claims else key: value for key, value in rows.items()}
     for key, value in rows.items():
         if value is not None:
             shown = ", ".join(f"{v:.6g}" for v in value) if isinstance(value, tuple) else value

@@ -12,7 +12,6 @@ environment alone would gain it 0.2 dB and cost the worst vertex 0.3 to 0.5), th
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,27 +19,22 @@ import numpy as np
 from controller.box import Member
 from controller.coupling import InternalModel
 from controller.environment import environment
-from controller.lti import Lti
 from controller.process import force_map
-from design.box.advice import Progress, set_advice
 from design.box.worst_member import Found, search
 from design.failure import DesignFailed, Infeasible
 from design.jitter.multiplier import jitter_proof
 from design.margin import closed_loop
-from design.parameter.cutting_planes import SLACK, asked, cut, sketch
-from design.parameter.free_parameter import FreeParameter
-from design.parameter.inequalities import CLOSED_LOOP, SWITCHING, World
+from design.parameter.advice import Progress, advice
+from design.parameter.cutting_planes import SLACK, cut
 from design.parameter.pole_descent import descend
-from design.parameter.wish import MARGIN, Wish
+from design.parameter.wish import Wish
+from design.parameter.worlds import environments, parameter, worlds
 from design.result import Design
 from design.specification import Specification
 from design.transparency import transparency
 
 USUAL = Wish()
 ADDED, MOST_ADDITIONS = 3, 8  # points of a box that become environments at a time, and how often at most
-NO_LIMIT = "no limit above 100 Hz"
-MOST = 24  # functions that are tried to say whether more of them would help
-EASIER = (1.5, 2, 3, 5, 10, 20, 50)  # times the damping, tried to say how far a request is from having a solution
 
 
 def design(spec: Specification, wish: Wish = USUAL, progress: Progress = lambda what, done, total: None) -> Design:
@@ -119,112 +113,3 @@ def _still_violated(found: Found) -> str:
         f"between the vertices: {found.ratio:.4f} of the damping is needed at {found.member.name}; "
         "give narrower ranges, or ask for more functions"
     )
-
-
-def parameter(spec: Specification, wish: Wish) -> FreeParameter:
-    """The unknown Q."""
-    return FreeParameter(wish.poles(spec), spec.channels, wish.diagonal)
-
-
-def environments(spec: Specification) -> list[Lti]:
-    """The environment, and what else it may be."""
-    return [spec.environment, *spec.others.values()]
-
-
-def worlds(spec: Specification) -> list[World]:
-    """The environments with the delays around them; one that no device feels asks nothing and is left out."""
-    return [world(spec, E) for E in environments(spec) if E.D.any()]
-
-
-def world(spec: Specification, E: Lti | None = None) -> World:
-    """An environment, by default the specified one, with the delays around it."""
-    return World(E or spec.environment, spec.theta, spec.psi, spec.lam)
-
-
-def advice(spec: Specification, wish: Wish, progress: Progress = lambda what, done, total: None) -> str:
-    """Why nothing was found, and which change of the request, one at a time, leaves a solution."""
-    alone = replace(spec, others={}, shrunk=None)
-    if spec.others and feasible(alone, wish):
-        return set_advice(spec, wish, changes(wish), feasible, solvable, binding, progress)
-    spec = alone
-    helpful = _helpful(spec, changes(wish), progress) or _helpful(spec, last_resorts(wish), progress)
-    kind = "diagonal" if wish.diagonal else "full"
-    delays = f"theta = {list(spec.theta)}, psi = {list(spec.psi)}"
-    if wish.switching:
-        lo, hi = wish.switching
-        delays += f", delays switching from {list(lo)} to {list(hi)}"
-    request = f"no {kind} Q of {wish.functions} functions is certified with {delays}, delta = {list(spec.delta)}"
-    request += f": {binding(spec, wish)}"
-    if helpful:
-        return f"{request} in this basis; there is one with {', or with '.join(helpful)}"
-    damped = ((f, replace(spec, delta=tuple(f * d for d in spec.delta))) for f in EASIER)
-    factor = next((f for f, easier in damped if feasible(easier, wish) and solvable(easier, wish)), None)
-    remedy = f"{factor:g} times the damping, or less delay, would do" if factor else "only less delay can help"
-    return f"{request}; {remedy}"
-
-
-def binding(spec: Specification, wish: Wish) -> str:
-    """Which inequality is in the way: one without which the others have a solution.
-
-    The condition for switching delays contains the closed-loop one, so it is left out with it.
-    """
-    names = list(dict.fromkeys(one.name for one in asked(wish, world(spec), np.asarray(spec.delta))))
-    sets = {name: (name,) for name in names}
-    if wish.switching:
-        sets = {name: (name,) if name != SWITCHING else (name, CLOSED_LOOP) for name in names if name != CLOSED_LOOP}
-    free = [name for name, left_out in sets.items() if feasible(spec, wish, left_out)]
-    if not free:
-        return "more than one condition binds: none of them alone is in the way"
-    return f"{free[0]} binds" if len(free) == 1 else f"{' and '.join(free)} contradict each other"
-
-
-def changes(wish: Wish) -> dict[str, Wish]:
-    """What else could be asked, in words."""
-    more = min(max(2 * wish.functions, 16), MOST)
-    other = {
-        f"{more} functions": replace(wish, functions=more),
-        "a mixed basis": replace(wish, filter="mixed"),
-        "a full Q": replace(wish, diagonal=False),
-        f"a full Q of {more} functions in a mixed basis": replace(wish, functions=more, diagonal=False, filter="mixed"),
-        NO_LIMIT: replace(wish, high_gain=None),
-        f"--margin {MARGIN:g}": replace(wish, margin=min(wish.margin, MARGIN)),
-    }
-    return {words: changed for words, changed in other.items() if changed != wish}
-
-
-def last_resorts(wish: Wish) -> dict[str, Wish]:
-    """What could be asked where none of `changes` helps."""
-    richest, words = replace(wish, functions=MOST, diagonal=False, filter="mixed"), f"a full Q of {MOST} functions"
-    return {
-        f"{words} in a mixed basis": richest,
-        f"{words} in a mixed basis and {NO_LIMIT}": replace(richest, high_gain=None),
-    }
-
-
-def _helpful(spec: Specification, others: Mapping[str, Wish], progress: Progress) -> list[str]:
-    found = []
-    for k, (words, other) in enumerate(others.items()):
-        progress("no coupling: looking for the reason", k, len(others))
-        found += [words] if feasible(spec, other) and solvable(spec, other) else []
-    return found
-
-
-def solvable(spec: Specification, wish: Wish) -> bool:
-    """Whether there is a Q: the whole search."""
-    try:
-        cut(parameter(spec, wish), wish, worlds(spec), np.asarray(spec.delta))
-    except DesignFailed:
-        return False
-    return True
-
-
-def feasible(spec: Specification, wish: Wish, without: Sequence[str] = ()) -> bool:
-    """Whether some Q meets what is asked at the frequencies where it is imposed first: a necessary condition.
-
-    `without` names inequalities that are not asked.
-    """
-    try:
-        sketch(parameter(spec, wish), wish, worlds(spec), np.asarray(spec.delta), without)
-    except DesignFailed:
-        return False
-    return True

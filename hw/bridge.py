@@ -60,13 +60,14 @@ def main(argv: list[str]) -> int:
 
     live = hold_session(args, session, plan, seconds, seed)
     outcome = session_report.outcome(args.case, session, recorder, live.dropped, float(args.pace))
-    outcome["files"] = [str(p) for p in session_report.save(out, session, recorder, outcome, not args.no_plot)]
-    try:
+    try:  # first, for a disk may be full
         session_report.print_session(outcome, console(args))
     except OSError:
         if signal.SIGHUP not in live.signals:
             raise
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - the terminal is gone, and with it whoever would read this
+    outcome["files"] = [str(p) for p in session_report.save(out, session, recorder, outcome, not args.no_plot)]
+    console(args).print("files: " + ", ".join(outcome["files"]), soft_wrap=True)
     if args.json:
         write_json(args.json, outcome)
     if live.signals:

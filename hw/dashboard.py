@@ -12,12 +12,13 @@ import sys
 from contextlib import suppress
 from typing import Any
 
-from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
 from hw.session import Session
+from sim.screen import Screen
 
+WIDTH = 72  # columns
 BAR = 30  # characters of a bar
 COUNTED = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale")
 
@@ -40,13 +41,13 @@ def snapshot(session: Session) -> dict[str, Any]:
     }
 
 
-def view(data: dict[str, Any]) -> Table:
-    """One snapshot as a table."""
-    table = Table(title=f"{data['stage']}: {data['cause']}", width=72, show_header=False)
-    table.add_column("what", width=16)
+def view(data: dict[str, Any], width: int = WIDTH) -> Table:
+    """One snapshot as a table, in a terminal of `width` columns."""
+    table = Table(title=f"{data['stage']}: {data['cause']}", width=min(width, WIDTH), show_header=False)
+    table.add_column("what", width=16 if width >= WIDTH else 7)
     table.add_column("now")
     for i, (x, f, cap) in enumerate(zip(data["x_mm"], data["f"], data["cap"], strict=False), start=1):
-        table.add_row(f"axis {i}", f"{x:+8.3f} mm  {f:+7.3f} N  {_bar(f / cap)}")
+        table.add_row(f"axis {i}", f"{x:+8.3f} mm  {f:+7.3f} N  {_bar(f / cap) if width >= WIDTH else ''}")
     margin = "-" if data["margin_us"] is None else f"at least {data['margin_us']} us in the last ticks"
     table.add_row("margin", f"{margin}; theta = {data['theta']}, gain {data['gain']:.2f}")
     table.add_row("counted", ", ".join(f"{name} {n}" for name, n in data["counters"].items()))
@@ -88,10 +89,10 @@ class Dashboard:
 
 def main() -> None:
     """Draw what comes in until nothing comes any more."""
-    with Live(console=Console(stderr=True), auto_refresh=False) as live:
+    with Live(console=Screen(stderr=True), auto_refresh=False) as live:
         for line in sys.stdin:
             with suppress(ValueError):
-                live.update(view(json.loads(line)), refresh=True)
+                live.update(view(json.loads(line), live.console.width), refresh=True)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from hw.conduct import Told
 from hw.frame import Config, State
 from hw.handshake import Units
 from hw.law import Controller, fill
-from hw.safety import Gain, Limits, check_jump, check_range, shape
+from hw.safety import Gain, Limits, check_jolt, check_jump, check_range, shape
 from hw.watch import Counters
 
 
@@ -45,6 +45,7 @@ class Drive:
         self.gain = Gain(limits, law.T)
         self.force = (0.0,) * config.axes  # [N] the last one sent
         self.x: tuple[float, ...] | None = None  # [m] of the last STATE
+        self._before: tuple[float, ...] | None = None  # [m] of the STATE before that, where none is missing
         self._counters, self._record, self._arming = counters, record, arming
         self._told, self._clock = Told(config), Clock(limits, law.T)
 
@@ -63,6 +64,8 @@ class Drive:
             positions = [x]
         else:
             check_jump(x, self.x, ticks, self.limits)
+            if ticks == 1 and self._before is not None:
+                check_jolt(x, self.x, self._before, self.limits)
             positions = fill(self.x, x, ticks)
         self._counters.unlike += self._told.unlike(state, ticks)
         self._miss(state, positions[:-1])
@@ -70,7 +73,7 @@ class Drive:
         if direction:
             (self.gain.rise if direction > 0 else self.gain.fall)(ticks)
         shaped = shape(asked.tolist(), self.force, self.gain.value, self.limits, self.T)
-        self.x, self.force = x, shaped.force
+        self._before, self.x, self.force = self.x if ticks == 1 else None, x, shaped.force
         self._counters.clipped += shaped.clipped
         self._counters.slowed += shaped.slowed
         steps = self.units.steps(shaped.force, self.config.cap)

@@ -12,6 +12,8 @@ from hw.safety import Limits
 from sim.scenario import Scenario
 
 BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
+FEWEST_STEPS = 16  # of force up to the cap: coarser, and the certificate's linear loop is another one
+COARSEST = 0.1  # of the largest displacement in a tick that is taken for a hand's: one count of an encoder
 LARGEST_MARGIN_US = 30_000  # an age is read from a margin, which is an i16 in microseconds
 HOLD, RAMP_US = 4, 5000  # what the device does without answers: ticks held, then microseconds to zero
 
@@ -72,13 +74,39 @@ def objections(info: Info, scenario: Scenario, limits: Limits, baud: int | None)
                 f"one STATE and one FORCE take {arithmetic}, more than T = {1e6 * scenario.T:g} us ({instead})"
             )
     for i in range(m):
+        if wrong := _impossible(i, info):
+            return [wrong]
         damping, strongest = 1e-6 * info.osp_damping[i], 1e-6 * info.hard_limit[i] * info.force_step[i]
         if damping < scenario.delta[i] * (1 - 1e-6):
             reasons.append(
                 f"axis {i + 1} guarantees {damping:g} N s/m, the certificate needs delta = {scenario.delta[i]:g}"
             )
+        reasons += _coarse(i, info, limits, scenario.T)
         if strongest < limits.cap[i] * (1 - 1e-3):
             reasons.append(f"axis {i + 1} can do {strongest:g} N, the force limit is {limits.cap[i]:g} N")
+    return reasons
+
+
+def _impossible(i: int, info: Info) -> str | None:
+    """What axis i says of itself that docs/protocol.md does not allow."""
+    allowed = {"encoder_step": 0xFFFFFFFF, "force_step": 0xFFFFFFFF, "hard_limit": 0x7FFF, "range": 0x7FFFFFFF}
+    for name, most in allowed.items():
+        if not 1 <= (value := getattr(info, name)[i]) <= most:
+            return f"{name.replace('_', ' ')} of axis {i + 1} is {value}, allowed are 1 to {most}"
+    return None
+
+
+def _coarse(i: int, info: Info, limits: Limits, T: float) -> list[str]:
+    """What is too coarse on axis i for limits on forces and displacements to mean anything."""
+    reasons, force, count = [], 1e-6 * info.force_step[i], 1e-12 * info.encoder_step[i]
+    finest = min(limits.cap[i] / FEWEST_STEPS, limits.slew * T)
+    if force > finest:
+        reasons.append(f"one force step of axis {i + 1} is {force:g} N, at most {finest:g} N is allowed")
+    if count > COARSEST * limits.jump:
+        finest = COARSEST * limits.jump
+        reasons.append(
+            f"one encoder count of axis {i + 1} is {1e3 * count:g} mm, at most {1e3 * finest:g} mm is allowed"
+        )
     return reasons
 
 

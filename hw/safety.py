@@ -102,6 +102,17 @@ def check_jump(x: Sequence[float], previous: Sequence[float], ticks: int, limits
             raise Fault(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
 
 
+def check_jolt(x: Sequence[float], previous: Sequence[float], before: Sequence[float], limits: Limits) -> None:
+    """Raise Fault where an encoder's speed changed within a tick by more than `limits.jump` per tick, as no mass can.
+
+    x, previous, before: (m,) [m], of three ticks in a row.
+    """
+    for i, (now, last, first) in enumerate(zip(x, previous, before, strict=True), start=1):
+        if not (change := abs(now - 2 * last + first)) <= limits.jump:
+            most = f"{1e3 * limits.jump:g} mm in a tick"
+            raise Fault(f"encoder {i} shakes: its speed changed by {1e3 * change:.3g} mm in a tick, allowed are {most}")
+
+
 def check_range(x: Sequence[float], reach: Sequence[float]) -> None:
     """Raise Fault where a displacement x (m,) [m] is outside of what the device can reach: +-reach (m,) [m]."""
     for i, (now, most) in enumerate(zip(x, reach, strict=True), start=1):

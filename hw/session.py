@@ -24,6 +24,7 @@ from hw.stream import USUAL, Settings, Stream, answer
 from sim.scenario import Scenario
 
 STOPPING_US = 50_000  # in which a device that was stopped must say so
+OBEYING_US = 30_000  # in which one that was told to stop must rest: the longest hold and ramp, and half as long again
 ARMING_US = 500_000  # in which a device must follow ARM
 
 
@@ -54,7 +55,7 @@ class Session:
         self.armings: list[tuple[Program, Config]] = []  # what forces came from, arming by arming
         self.record: Callable[[Row], None] = lambda row: None
         self.now = self.entered = 0
-        self._reason = Reason.DONE
+        self._reason, self._obeys, self._rests, self._stopped = Reason.DONE, True, False, 0
         self._after: Stage | None = Stage.FINISHED  # what a ramp-out ends in; None: with a softer coupling, disarmed
 
     @property
@@ -166,7 +167,7 @@ class Session:
         """Look at the time."""
         self.now = now
         if self.stage in ENDED:
-            return b""
+            return self._stop_again()
         if self.stage in (Stage.CONNECTING, Stage.CONFIGURING):
             try:
                 return self.dialogue.again(now)
@@ -195,7 +196,8 @@ class Session:
             self.dialogue.meet(info)
         except Fault as fault:
             return self._end(Stage.REFUSED, str(fault))
-        return self._configure(self.probe, f"{info.firmware or 'device'} {info.serial}, to be measured")
+        name = "".join(c if c.isprintable() else "?" for c in info.firmware) or "device"
+        return self._configure(self.probe, f"{name} {info.serial}, to be measured")
 
     def _configure(self, theta: int, cause: str) -> bytes:
         self._enter(Stage.CONFIGURING, cause)
@@ -228,13 +230,14 @@ class Session:
             self.counters.unexpected += 1
             return b""
         if self.stage in ENDED:
-            unlatched = self.stage == Stage.ESTOP and state.phase != Phase.ESTOP
-            return encode(Stop(self._reason)) if _drives(state) or unlatched else b""
+            self._check_obedience(state)
+            self._rests = not _drives(state) and (self.stage != Stage.ESTOP or state.phase == Phase.ESTOP)
+            return b"" if self._rests else encode(Stop(self._reason))
         if self.stage == Stage.CONFIGURING:
             if not _drives(state):
                 return b""
             if self.now - self.entered > STOPPING_US:
-                raise Fault("the device is armed, and nobody asked it to")
+                raise Fault("the device drives, and nobody asked it to")
             return encode(Stop(Reason.DONE))
         ticks = self.stream.news(state, self.now)
         if not ticks:
@@ -289,6 +292,27 @@ class Session:
         assert self.rung is not None
         return encode(Stop(Reason.DONE)) + self._take(self.rungs.index(self.rung) + 1, f"softer, since {self.cause}")
 
+    def _check_obedience(self, state: State) -> None:
+        """A session whose device goes on driving after STOP has not finished, whatever it was to end in."""
+        if self._obeys and self.now - self.entered > OBEYING_US and _drives(state):
+            self._obeys = False
+            cause = f"told to stop, the device still drives after {OBEYING_US // 1000} ms: cut its power"
+            if self.stage == Stage.FINISHED:
+                self._enter(Stage.STOPPED, cause)
+            else:
+                self._log(cause)
+
+    def _stop_again(self) -> bytes:
+        """STOP, where no STATE has said for a tick that it was heard: the one before may be lost, and STATEs too.
+
+        Only where forces have acted, or the emergency stop was asked for.
+        """
+        due = self.now - self._stopped >= 1e6 * self.scenario.T and self.now - self.entered < STOPPING_US
+        if self._rests or not due or not (self.armings or self.stage == Stage.ESTOP):
+            return b""
+        self._stopped = self.now
+        return encode(Stop(self._reason))
+
     # stages
 
     def _enter(self, stage: Stage, cause: str) -> None:
@@ -299,10 +323,11 @@ class Session:
         self.log.append(Event(self.now, self.stage, cause))
 
     def _end(self, stage: Stage, cause: str, reason: Reason = Reason.FAULT) -> bytes:
-        self._reason, self.stream.drive = reason, None
+        self._reason, self.stream.drive, self._rests, self._stopped = reason, None, False, self.now
         self._enter(stage, cause)
         return encode(Stop(reason))
 
 
 def _drives(state: State) -> bool:
-    return state.phase in (Phase.ARMED, Phase.HOLDING)
+    """Whether it moves its motors as nobody may who was told to stop; a ramp is on its way to zero."""
+    return state.phase in (Phase.ARMED, Phase.HOLDING) or (state.phase != Phase.RAMP and any(state.applied))

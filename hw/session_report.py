@@ -128,7 +128,6 @@ def print_session(report: dict[str, Any], console: Console) -> None:
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link["counters"].items() if n)
     console.print(f"counted: {counted or 'nothing'}")
     console.print(f"[dim]·[/] {CAVEATS}")
-    console.print("files: " + ", ".join(report["files"]), soft_wrap=True)
 
 
 def save(out: Path, session: Session, recorder: Recorder, report: dict[str, Any], plot: bool) -> list[Path]:

@@ -6,6 +6,7 @@ folder of a file that the user names (--json, --video, --out FILE) must exist, f
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import sys
@@ -23,8 +24,13 @@ def check_file(option: str, path: Path, expected: str = "a file") -> Path:
         raise InputError(f"{option} {path}: is a folder, expected {expected}")
     if not path.parent.is_dir():
         raise InputError(f"{option} {path}: the folder {path.parent} does not exist")
+    place = Path(os.path.realpath(path))
     try:
-        with tempfile.TemporaryFile(dir=path.parent):
+        if place.exists() and not place.is_file():
+            if not os.access(place, os.W_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+            return path
+        with tempfile.TemporaryFile(dir=place.parent):
             pass
     except OSError as error:
         raise InputError(f"{option} {path}: cannot write to {path.parent}: {error.strerror}") from None
@@ -48,26 +54,35 @@ def folder(path: Path) -> Path:
 
 
 def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path:
-    """Write a file under a temporary name and rename it into place."""
+    """Write a file under a temporary name and rename it into place; what is no file, a device or a pipe, as it is.
+
+    A link stays a link: the file that it points to is written. Raises InputError where that cannot be.
+    """
+    place = Path(os.path.realpath(path))
     try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from None
-    try:
-        with os.fdopen(handle, "wb") as file:
-            if callable(content):
-                content(file)
-            else:
-                file.write(content.encode() if isinstance(content, str) else content)
-        os.chmod(name, 0o644)
+        if place.exists() and not place.is_file():
+            with place.open("wb") as device:
+                _fill(device, content)
+            return path
+        handle, name = tempfile.mkstemp(dir=place.parent, prefix=f".{place.name}.")
         try:
-            os.replace(name, path)
-        except OSError as error:
-            raise InputError(f"cannot write {path}: {error.strerror}") from None
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+            with os.fdopen(handle, "wb") as file:
+                _fill(file, content)
+            os.chmod(name, 0o644)
+            os.replace(name, place)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from None
     return path
+
+
+def _fill(file: BinaryIO, content: Callable[[BinaryIO], None] | bytes | str) -> None:
+    if callable(content):
+        content(file)
+    else:
+        file.write(content.encode() if isinstance(content, str) else content)
 
 
 def write_json(destination: str | Path, data: dict[str, Any]) -> None:

@@ -14,6 +14,8 @@ from sim.result import Result
 
 mpl.use("Agg")
 
+SAME = 1e-6  # [%] what rounding leaves between two forces that are one
+
 #: Okabe and Ito's palette, with a line style each
 STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#0072B2", "linestyle": "-"},
@@ -69,7 +71,9 @@ def plot_run(
 def _draw_ideal(axes: Array, result: Result, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
     """The ideal forces, broad and pale in each device's colour; cut where they are more than three times as large."""
     forces, percent = ideal
-    label = "pale: ideal environment" + ("" if percent is None else f" (force error {percent:.2g} %)")
+    label = "pale: ideal environment"
+    if percent is not None:  # of the force before the motors' limit, as in the report
+        label += ", asked of the motors too" if percent < SAME else f"; force asked of the motors {percent:.2g} % off"
     for axis, part in zip(axes, parts, strict=True):
         most = 3 * max(map(abs, axis.get_ylim()))
         for i, force in enumerate(forces[part].T):

@@ -51,7 +51,7 @@ class Assembly:
     @property
     def felt(self) -> Lti:
         """What the devices feel of E: F with every wall touching."""
-        return list(self.process.frozen().values())[-1]
+        return list(self.process.frozen().values())[-1] if self.process.contact else self.F
 
 
 def assemble(scenario: Scenario, coupling: Coupling) -> Assembly:

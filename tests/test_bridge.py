@@ -15,7 +15,7 @@ from hw import replay, session_report
 from hw.emulator.core import Emulator
 from hw.emulator.upset import Upset
 from hw.faults.__main__ import lively, rehearse
-from hw.faults.cases import CASES
+from hw.faults.cases import CASES, Case, at, person
 from hw.frame import Decoder, Force, State, Stop, encode
 from hw.handshake import Units
 from hw.law import Law, fill
@@ -63,6 +63,18 @@ def rehearsal_of(scenario, rungs, *faults, recorder=None, **options):
 
 
 # faults
+
+
+def test_a_session_whose_device_is_deaf_to_stop_has_not_finished(scenario, rungs):
+    """Nothing at this end of the line can take the force away; it can be said, and the exit code not be 0."""
+    planned = rehearse(Case("planned", Stage.FINISHED, upsets=at("stuck"), action=person("stop")), scenario, rungs)
+    session = planned.rehearsal.session
+    assert session.stage == Stage.STOPPED
+    assert session.cause.endswith("cut its power")
+    assert [event.stage for event in session.log[-2:]] == [Stage.FINISHED, Stage.STOPPED]
+    fault = rehearse(Case("fault", Stage.STOPPED, upsets=at("stuck jump=5")), scenario, rungs).rehearsal.session
+    assert fault.stage == Stage.STOPPED
+    assert [event.cause[:7] for event in fault.log[-2:]] == ["encoder", "told to"]
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)

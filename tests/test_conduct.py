@@ -219,7 +219,7 @@ def test_a_device_that_drives_before_anybody_asked_is_told_to_stop(scenario, con
     assert session.stage == (Stage.CONFIGURING if configuring else Stage.CONNECTING)
     session.receive(encode(driving._replace(tick=70)), 70_000)
     if configuring:
-        assert (session.stage, session.cause) == (Stage.STOPPED, "the device is armed, and nobody asked it to")
+        assert (session.stage, session.cause) == (Stage.STOPPED, "the device drives, and nobody asked it to")
 
 
 def test_a_clock_that_is_made_of_ticks_is_found_by_the_host(scenario, rungs):
@@ -309,3 +309,26 @@ def test_an_identification_closes_no_loop_that_could_grow(scenario):
     assert len(recorder) > 400
     assert report["growth"] == report["run"]["steady_ticks"] == []
     assert growths(result_of(recorder, session.units, scenario.T, report)) == []
+
+
+def test_an_estop_is_repeated_where_nobody_says_that_it_was_heard(scenario):
+    """The first STOP may be lost, and the STATEs that would show it too."""
+    session = Session(scenario, Limits((12.0, 12.0)))
+    session.start(0)
+    stop = encode(Stop(Reason.ESTOP))
+    assert session.estop("pressed", 1000) == stop
+    sent = [session.poll(1000 + t) for t in range(0, 60_000, 100)]
+    assert sent.count(stop) == pytest.approx(50_000 / 1200, abs=1)
+    session.receive(encode(info_of(scenario)), 70_000)
+    assert session.poll(80_000) == b""
+
+
+def test_a_force_that_a_resting_device_applies_is_told_to_stop(scenario):
+    """Its status says disarmed, its motors do not."""
+    session = Session(scenario, Limits((12.0, 12.0)))
+    session.start(0)
+    session.receive(encode(info_of(scenario)), 0)
+    pushing = State(Phase.DISARMED, 5, 0, 100, 0, 0, 0, (0, 0), (12_000, 0))
+    assert encode(Stop(Reason.DONE)) in session.receive(encode(pushing), 1000)
+    session.receive(encode(pushing._replace(tick=70)), 70_000)
+    assert session.stage == Stage.STOPPED

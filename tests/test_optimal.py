@@ -16,13 +16,15 @@ from design.assess import specification
 from design.failure import Infeasible
 from design.frequency.sweep import on_circle
 from design.margin import closed_loop
-from design.optimal import advice, binding, changes, design, parameter, world, worlds
+from design.optimal import design
+from design.parameter.advice import advice, binding, changes
 from design.parameter.cone_program import Block, ConeProgram, vectors
 from design.parameter.cone_solver import solve_cones
 from design.parameter.cutting_planes import HIGH_HZ, PASSIVE_SHARE, SLACK, Problem, sketch, square_mismatch
 from design.parameter.free_parameter import FreeParameter, GivenParameter
 from design.parameter.inequalities import passivity
 from design.parameter.wish import Wish
+from design.parameter.worlds import parameter, world, worlds
 from design.result import Design
 from design.specification import Specification
 from design.transparency import decibels, transparency
@@ -337,7 +339,7 @@ def test_an_infeasible_request_says_what_would_do():
         design(replace(SPEC["I"], theta=(4, 4), lam=(4, 4)), Wish(functions=4))
     message = str(caught.value)
     assert "no diagonal Q of 4 functions is certified with theta = [4, 4]" in message
-    assert "there is one with a full Q of 16 functions in a mixed basis" in message
+    assert "there is one with --full --functions 16 --filter mixed" in message
     spec = replace(SPEC["I"], theta=(4, 4), lam=(4, 4))
     assert design(spec, Wish(functions=16, diagonal=False, filter="mixed", high_gain=None)).requirement.certified
 
@@ -421,6 +423,7 @@ def test_a_margin_that_costs_the_solution_is_named():
 
 def test_the_search_for_a_reason_says_how_far_it_is():
     seen = []
-    advice(replace(SPEC["I"], theta=(4, 4), lam=(4, 4)), Wish(functions=1), lambda *at: seen.append(at[1:]))
-    assert seen == [(k, len(changes(Wish(functions=1)))) for k in range(len(seen))]
+    spec = replace(SPEC["I"], theta=(4, 4), lam=(4, 4))
+    advice(spec, Wish(functions=1), lambda *at: seen.append(at[1:]))
+    assert seen == [(k, len(changes(spec, Wish(functions=1)))) for k in range(len(seen))]
     assert len(seen) > 3

@@ -5,11 +5,12 @@ import pytest
 
 from design.assess import specification
 from design.failure import Infeasible
-from design.optimal import design, world
+from design.optimal import design
 from design.parameter.cutting_planes import Problem, cut_problem
 from design.parameter.free_parameter import FreeParameter
 from design.parameter.pole_descent import FARTHEST, Places, descend, gradient, log_mismatch
 from design.parameter.wish import Wish
+from design.parameter.worlds import world
 from sim.scenario import load
 
 SPEC = {case: specification(load().loop(case)) for case in ("I", "II")}

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hw.frame import Force, Info, State, encode
 from hw.handshake import Units, configuration, objections, probe_delay, wire_time
 from hw.message import MAX_RELEASE_NS
-from hw.safety import DRIVING, ENDED, Fault, Gain, Limits, Stage, check_jump, check_range, shape
+from hw.safety import DRIVING, ENDED, Fault, Gain, Limits, Stage, check_jolt, check_jump, check_range, shape
 from sim.scenario import load
 
 LIMITS = Limits((12.0, 6.0))
@@ -163,3 +163,39 @@ def test_the_probe_is_the_longest_delay_whose_margin_can_be_told():
     assert probe_delay(5e-3) == 6
     with pytest.raises(ValueError, match=r"T is 0\.05 s"):
         probe_delay(0.05)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"encoder_step": (0, 1_000_000)}, "encoder step of axis 1 is 0, allowed are 1 to 4294967295"),
+        ({"force_step": (400, 0)}, "force step of axis 2 is 0"),
+        ({"hard_limit": (65535, 30000)}, "hard limit of axis 1 is 65535, allowed are 1 to 32767"),
+        ({"range": (-100, 100_000)}, "range of axis 1 is -100"),
+        ({"force_step": (11_999_999, 400)}, "one force step of axis 1 is 12 N, at most 0.75 N is allowed"),
+        (
+            {"encoder_step": (1_000_000, 400_000_000)},
+            "one encoder count of axis 2 is 0.4 mm, at most 0.3 mm",
+        ),
+    ],
+)
+def test_a_device_too_coarse_or_impossible_is_refused(change, reason):
+    assert any(reason in one for one in objections(INFO._replace(**change), load(), Limits((12.0, 12.0)), None))
+
+
+def test_a_force_step_is_never_more_than_the_slew_limit():
+    """Else one step, the least that can be sent, would be the jump that the limit is there against."""
+    slow = Limits((12.0, 12.0), slew=100.0)  # 0.12 N in a tick
+    assert objections(INFO._replace(force_step=(100_000, 100_000), hard_limit=(120, 120)), load(), slow, None) == []
+    (reason,) = objections(INFO._replace(force_step=(130_000, 100_000), hard_limit=(120, 120)), load(), slow, None)
+    assert "0.13 N, at most 0.12 N" in reason
+
+
+def test_an_encoder_that_shakes_is_found_though_no_step_is_too_large():
+    limits = Limits((12.0,))
+    check_jolt((2e-3,), (0.0,), (0.0,), limits)  # a jump that the other check allows, too
+    check_jolt((4e-3,), (2e-3,), (0.0,), limits)  # at constant speed
+    with pytest.raises(Fault, match=r"encoder 1 shakes: its speed changed by 5\.8 mm in a tick, allowed are 3 mm"):
+        check_jolt((2.9e-3,), (0.0,), (2.9e-3,), limits)
+    with pytest.raises(Fault, match="shakes"):
+        check_jolt((float("nan"),), (0.0,), (0.0,), limits)

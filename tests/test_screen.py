@@ -41,10 +41,31 @@ def test_a_table_that_fits_is_as_it_was():
 
 
 def test_every_report_is_printed_on_a_screen():
-    """A bare rich Console cuts: only the progress bar and the bridge's dashboard (of a fixed width) may use one."""
+    """A bare rich Console cuts: only the progress bar may use one."""
     bare = set()
     for path in (file for world in ("design", "sim", "hw") for file in (ROOT / world).rglob("*.py")):
         calls = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
         if any(isinstance(call.func, ast.Name) and call.func.id == "Console" for call in calls):
             bare.add(path.name)
-    assert bare == {"command.py", "dashboard.py"}
+    assert bare == {"command.py"}
+
+
+@pytest.mark.parametrize("name", ["[/]", "[/red]", "[b]out[/b]", "a[0", "[red", ":x:", "[K]", "[m/s]"])
+def test_a_name_is_no_markup(name):
+    """Names of files, scenarios and devices come from outside."""
+    table = Table("what", title=name)
+    table.add_row(f"cell {name} end")
+    lines = printed(table, 60).splitlines()
+    assert lines[0].strip() == name
+    assert f"cell {name} end" in "".join(lines)
+    text = io.StringIO()
+    Screen(file=text, width=60).print(f"files: {name}", soft_wrap=True)
+    assert text.getvalue() == f"files: {name}\n"
+
+
+def test_our_own_tags_are_colours():
+    text = io.StringIO()
+    Screen(file=text, width=60, force_terminal=True, color_system="standard", highlight=False).print(
+        "[red]not promised[/]: [m]"
+    )
+    assert text.getvalue() == "\x1b[31mnot promised\x1b[0m: [m]\n"

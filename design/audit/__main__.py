@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import argparse
 import time
+from pathlib import Path
 
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from design.audit.report import print_report, report
 from design.audit.subject import LONGEST_DELAY, Subject
 from design.box.check import check_set
+from design.designs import KINDS
 from design.presets import PRESETS
 from design.store import DelayRange
 from sim.command import (
@@ -146,6 +148,11 @@ def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Co
     if args.coupling:
         if gains:
             raise InputError(f"{given[0]} with --coupling: give one of them")
+        if args.coupling in KINDS and not Path(args.coupling).exists():
+            raise InputError(
+                f"--coupling {args.coupling}: an audit takes the file of a coupling; make it with "
+                f"`python -m design --coupling {args.coupling} --out {args.coupling}.json`"
+            )
         return fitted(read_coupling(args.coupling), args.coupling, channels, scenario.T)
     if len(gains) == 1:
         missing = "B" if gains == ["K"] else "K"

@@ -57,5 +57,5 @@ def set_advice(
         f"there is one for ranges of {share:.0%} of their width around the nominal values" if share else "",
         f"worth a try: {', or '.join(hopeful)}" if hopeful else "",
     ]
-    remedy = "; ".join(filter(None, remedies)) or "leave out a contact that may be absent, or have less delay"
+    remedy = "; ".join(filter(None, remedies)) or f"nothing helped of narrower ranges, {', '.join(changes)}"
     return f"{request}: {why}; {limit}; {remedy}"

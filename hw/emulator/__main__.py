@@ -156,6 +156,8 @@ def main(argv: list[str]) -> int:
     if not 0 <= coulomb <= 10:
         raise InputError(f"--coulomb is {coulomb:g}, allowed are 0 to 10 N")
     pace, parent = pace_from(args), numbers("--parent", args.parent, int, 1)[0]
+    if parent not in (0, os.getppid()):
+        raise InputError(f"--parent is {parent}, but this process is a child of {os.getppid()}")
     try:
         emulator = Emulator(nobody(scenario) if args.nobody else scenario, upsets, coulomb=coulomb)
     except ValueError as error:

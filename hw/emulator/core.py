@@ -104,6 +104,8 @@ class Emulator:
                     self.device.k = (self.device.k + round(upset.value)) & 0xFFFF
                 case "own":
                     self.device = wilful(self.device, round(upset.value / self.force_step[0]))
+                case "stuck":
+                    self.device.halt = lambda cause: None
                 case "period":
                     self.stretch = upset.value
                 case "estop":

@@ -42,6 +42,7 @@ DEVICE = {
     "jump": ("millimetres by which encoder 1 jumps", -1000.0, 1000.0, 5.0),
     "leap": ("ticks by which its tick number leaps", 1.0, 32000.0, 300.0),
     "own": ("newtons that its motors have while armed, whatever they are told", -12.0, 12.0, 2.0),
+    "stuck": ("no value: it holds its force, without a watchdog and whatever STOP says", 0.0, 0.0, 0.0),
     "period": ("length of a tick in T", 0.5, 4.0, 2.0),
     "estop": ("no value: the emergency stop at the device", 0.0, 0.0, 0.0),
     "trip": ("no value: a fault that the firmware found", 0.0, 0.0, 0.0),
@@ -76,7 +77,9 @@ class Upset:
             lasts = FOREVER if duration is None else float(duration)
             require(f"{kind} ({what})", given, low, high, "")
             require("START", begins or 0.0, 0.0, FOREVER, "s")
-            require("DURATION", lasts, 0.0, FOREVER, "s")
+            require("DURATION", lasts, 1e-6, FOREVER, "s")
+            if kind == "leap" and given != int(given):
+                raise ValueError(f"VALUE is {given:g}, expected a whole number of ticks")
         except ValueError as error:
             raise InputError(f"--fault {text}: {str(error).strip()}") from None
         return cls(kind, given, where or "both", begins, lasts)

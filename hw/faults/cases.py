@@ -157,6 +157,18 @@ CASES = (
     Case("another period", G.REFUSED, "every 1000000 ns", info=lambda i: i._replace(period_ns=1_000_000)),
     Case("a weak motor", G.REFUSED, "can do 6 N", info=lambda i: i._replace(hard_limit=(30000, 15000))),
     Case("little damping", G.REFUSED, "guarantees 1 N s/m", info=lambda i: i._replace(osp_damping=(10**6, 10**6))),
+    Case(
+        "coarse motors",
+        G.REFUSED,
+        "force step of axis 1 is 3 N, at most 0.75 N",
+        info=lambda i: i._replace(force_step=(3_000_000,) * 2, hard_limit=(4, 4)),
+    ),
+    Case(
+        "coarse encoders",
+        G.REFUSED,
+        "count of axis 1 is 0.5 mm, at most 0.3 mm",
+        info=lambda i: i._replace(encoder_step=(500_000_000,) * 2, range=(200, 200)),
+    ),
     Case("115200 baud", G.REFUSED, "4167 us, more than T = 1200 us", baud=115200),
     Case("921600 baud", A, baud=921600),
     Case("nobody there", G.LOST, "no answer to HELLO", ("up:drop=1",)),

@@ -18,6 +18,9 @@
 #ifndef HL_MAX_AXES
 #define HL_MAX_AXES 8
 #endif
+#if HL_MAX_AXES < 1 || HL_MAX_AXES > 8
+#error "HL_MAX_AXES: 1 to 8"
+#endif
 #define HL_PROTOCOL 1
 #define HL_MAX_THETA 15
 #define HL_SLOTS 16                 /* forces that wait for their tick: a power of two above HL_MAX_THETA */

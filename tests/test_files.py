@@ -1,0 +1,50 @@
+"""Files are whole or not there; what is no file is written as it is; a full disk is one line."""
+
+import errno
+import os
+import stat
+import threading
+from pathlib import Path
+
+import pytest
+
+from sim.files import check_file, write
+from sim.scenario import InputError
+
+
+def test_a_link_stays_a_link(tmp_path):
+    target, link = tmp_path / "real" / "data.json", tmp_path / "link.json"
+    target.parent.mkdir()
+    target.write_text("old")
+    link.symlink_to(target)
+    check_file("--json", link)
+    assert write(link, "new") == link
+    assert link.is_symlink()
+    assert target.read_text() == "new"
+
+
+def test_what_is_no_file_is_not_replaced(tmp_path):
+    pipe, got = tmp_path / "pipe", []
+    os.mkfifo(pipe)
+    reader = threading.Thread(target=lambda: got.append(pipe.read_text()))
+    reader.start()
+    write(pipe, "through")
+    reader.join(timeout=30)
+    assert got == ["through"]
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    assert sorted(tmp_path.iterdir()) == [pipe]
+    check_file("--json", Path("/dev/null"))
+
+
+def test_a_full_disk_leaves_the_old_file_and_no_other(tmp_path):
+    path = tmp_path / "report.json"
+    path.write_text("old")
+
+    def content(file):
+        file.write(b"half of")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(InputError, match=r"cannot write .*report\.json: No space left on device"):
+        write(path, content)
+    assert path.read_text() == "old"
+    assert sorted(tmp_path.iterdir()) == [path]
