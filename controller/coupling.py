@@ -153,3 +153,13 @@ def _spring_damper(k: float, b: float, T: float) -> Lti:
         return Lti.constant([[gain]], T)
     memory = gain * b / T
     return Lti([[memory]], [[gain]], [[memory]], [[gain]], T)
+
+
+def compliance(coupling: Coupling, T: float) -> Lti | None:
+    """V(z), where the coupling is one in feedback around the environment."""
+    match coupling:
+        case SpringDamper():
+            return coupling.compliance(T)
+        case Compliance(V=V):
+            return V
+    return None

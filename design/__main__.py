@@ -16,12 +16,13 @@ from design.audit.subject import LONGEST_DELAY
 from design.box.check import SAMPLES, SetCheck, check_set, set_part, set_rows
 from design.box.price import cost_part, price
 from design.certificate import NotProved, prove
-from design.designs import FILTERS, KINDS, METHODS, OBJECTIVES, compare_methods, design_coupling
+from design.designs import KINDS, METHODS, compare_methods, design_coupling
 from design.failure import DesignFailed
 from design.gains.frozen_environment import STIFFEST
 from design.jitter.part import switching_part, switching_requirement
 from design.jitter.proof import sent
 from design.listed import listed
+from design.parameter.wish import FILTERS, OBJECTIVES
 from design.promises import ANY, HERE, certificate_part, promise_of, switching_promise
 from design.result import Design
 from design.store import Certificate, DelayRange, Loop, Stored, data_of, save

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Literal, TypedDict, Unpack
 
@@ -15,9 +15,10 @@ from design.box.check import check_set
 from design.jitter.part import switching_requirement
 from design.margin import Requirement
 from design.result import Design
-from design.store import Loop, Stored, data_of
+from design.store import Condition, Loop, Stored, data_of
 from design.transparency import Transparency, transparency
 
+Kind = Literal["spring-damper", "ccl", "optimal"]
 LOOP = 'a Loop, as scenario.loop("I") gives it'
 
 
@@ -39,7 +40,7 @@ class Options(TypedDict, total=False):
 
 
 def design_coupling(
-    loop: Loop, kind: str = "spring-damper", condition: str | None = None, **options: Unpack[Options]
+    loop: Loop, kind: Kind = "spring-damper", condition: Condition | None = None, **options: Unpack[Options]
 ) -> Design:
     """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
 
@@ -59,7 +60,7 @@ def design_coupling(
     return designs.design_coupling(specification(loop), kind, condition, **options)
 
 
-def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement]:
+def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[str]]:
     """What both conditions, "theorem4" and "closed-loop", ask of a coupling in its loop.
 
     With a box around the loop's environment closed-loop is about the environment and every vertex: the figure is that
@@ -77,7 +78,7 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement]:
     of_kind("loop", loop, Loop, LOOP)
     phi = coupling.phi if isinstance(coupling, Design) else None
     alone = _fitting(loop, coupling)
-    requirements: dict[str, Requirement] = dict(assess(loop, alone, phi))
+    requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, phi))
     if whole := check_set(loop, alone, samples=0):
         _, worst = whole.worst if whole.proved else whole.worst_found
         requirements["closed-loop"] = replace(worst, proof="rational" if whole.proved else "sampled")
@@ -86,14 +87,16 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement]:
     return requirements
 
 
-def promise(loop: Loop, requirements: dict[str, Requirement]) -> str | None:
+def promise(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str | None:
     """For which environments `certify(loop, coupling)` says that a coupling is safe, in words; None where for none.
 
     "any passive environment", "a set" (the loop's environment and its box), "this environment", or each contact state
-    of an environment with walls. Raises TypeError for an argument of another type.
+    of an environment with walls. Raises TypeError for an argument of another type, ValueError for other requirements.
     """
     of_kind("loop", loop, Loop, LOOP)
-    of_kind("requirements", requirements, dict, "what certify returned")
+    of_kind("requirements", requirements, Mapping, "what certify returned")
+    if "closed-loop" not in requirements:
+        raise ValueError(f"requirements has {', '.join(requirements) or 'nothing'}, expected what certify returned")
     held = requirements["closed-loop"]
     whole_set = loop.box is not None and held.certified and held.proof == "rational"
     return promises.promise_of(requirements, loop, whole_set)

@@ -21,10 +21,6 @@ OPTIONS = {
 #: how a state-space coupling of fixed order may be sought
 METHODS = ("complementarity", "inner", "fixed-poles")
 
-#: where the poles of an optimal coupling's basis may lie, and which mismatch it minimises
-FILTERS = ("auto", "fir", "slow", "mixed", "repeated", "adapted")
-OBJECTIVES = ("rms", "sup")
-
 
 def design_coupling(
     spec: Specification,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from design.margin import Requirement
@@ -58,7 +59,7 @@ def switching_promise(span: DelayRange) -> str:
     return f"delays switching within {span}"
 
 
-def promise_of(requirements: dict[str, Requirement], loop: Loop, whole_set: bool = False) -> str | None:
+def promise_of(requirements: Mapping[str, Requirement], loop: Loop, whole_set: bool = False) -> str | None:
     """The promise of a coupling by its requirements; the multiplier that psi >= 1 takes is of one environment."""
     held = {name: requirement.certified for name, requirement in requirements.items()}
     walls = bool(loop.environment.walls)

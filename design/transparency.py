@@ -14,6 +14,7 @@ from design.frequency.quadrature import integral
 from design.frequency.sweep import frequencies, on_circle, supremum
 
 BAND_HZ = (0.5, 80.0)
+ROUNDING = 1e-10  # of the environment: two responses that differ by less are one
 
 
 @dataclass(frozen=True)
@@ -61,10 +62,14 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
     static = np.linalg.svd(environment.dc(), compute_uv=False)
     rounding = 1e-9 * float(np.abs(environment.D).max())  # a stiffness of zero comes out of larger numbers
     least = 0.0 if static[-1] < 1e-9 * static[0] else min(-least, float(static[-1]))
+    worst = supremum(relative, grid)[0]
+    if worst < ROUNDING:
+        worst = peak = 0.0
+    rms = _rms(mismatch, environment, frequencies(F, environment, low=low, high=high, points=60)) if worst > 0 else 0.0
     return Transparency(
         tau=_ratio(peak, least),
-        relative_mismatch=supremum(relative, grid)[0],
-        rms_mismatch=_rms(mismatch, environment, frequencies(F, environment, low=low, high=high, points=60)),
+        relative_mismatch=worst,
+        rms_mismatch=rms,
         dc_ratio=_ratio(float(np.linalg.norm(F.dc(), 2)), float(static[0])) if static[0] > rounding else np.nan,
         high_frequency_gain=_high_frequency_gain(F, environment, 100.0 * per_hz),
         band_hz=band_hz,

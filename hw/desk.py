@@ -12,8 +12,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 from hw.dashboard import Dashboard
-from hw.emulator.__main__ import pace_from
-from hw.emulator.child import spawned
+from hw.emulator.child import pace_from, spawned
 from hw.handshake import require_period
 from hw.live import Live
 from hw.plan import Ages, Program, link_delay

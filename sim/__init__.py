@@ -20,6 +20,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from sim.graphics import set_aside
 from sim.interrupt import while_starting
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from sim.validate.examine import Findings
 
 while_starting()
+set_aside()
 
 __all__ = ["Findings", "InputError", "Result", "Scenario", "load", "parse", "plot_run", "simulate", "validate"]
 

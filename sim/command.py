@@ -218,8 +218,20 @@ def execute(main: Callable[[list[str]], int]) -> NoReturn:
         code = INTERRUPTED
     except SystemExit as end:  # argparse, after --help
         code = end.code
+    except OSError as error:  # a full disk behind standard output, mostly
+        code = _cannot(error)
     try:
         sys.stdout.flush()
     except BrokenPipeError:
         nobody_reads()
+    except OSError as error:
+        code = _cannot(error)
     sys.exit(code)
+
+
+def _cannot(error: OSError) -> int:
+    """One line for what the system refused; what is still to be printed goes nowhere."""
+    place = error.filename or "standard output"
+    print(f"error: {place}: {error.strerror or error}", file=sys.stderr)
+    nobody_reads()
+    return BAD_INPUT

@@ -18,11 +18,17 @@ PACKAGES = ("design", "sim", "hw")
 
 def while_starting() -> None:
     """From now on SIGINT ends the process, if it is one of our commands: those of others keep what they have."""
+    if (
+        starting() and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    ):  # not where a parent has it ignored
+        signal.signal(signal.SIGINT, _leave)
+
+
+def starting() -> bool:
+    """Whether this process is one of our commands that Python is still looking for."""
     words = sys.orig_argv
     module = words[words.index("-m") + 1] if "-m" in words[:-1] else ""
-    ours = sys.argv[:1] == ["-m"] and module.split(".")[0] in PACKAGES  # "-m": Python is still looking for the module
-    if ours and signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not where a parent has it ignored
-        signal.signal(signal.SIGINT, _leave)
+    return sys.argv[:1] == ["-m"] and module.split(".")[0] in PACKAGES
 
 
 def begun() -> None:

@@ -193,6 +193,8 @@ def load(source: str | Path = DEFAULT) -> Scenario:
 
 def parse(text: str, source: str = "scenario") -> Scenario:
     """A scenario from TOML text. Raises InputError, with the path of the field and the value that came."""
+    if not isinstance(text, str):
+        raise TypeError(f"text is of type {type(text).__name__}, expected a str: the scenario itself, in TOML")
     try:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:

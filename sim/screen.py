@@ -19,7 +19,7 @@ OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # what opens 
 
 
 class Screen(Console):
-    """A console whose tables wrap between words only; one that is still too wide runs over the terminal's edge."""
+    """A console whose tables lose nothing: words may break, numbers do not; what is too wide runs over the edge."""
 
     def print(self, *objects: Any, **how: Any) -> None:
         """As rich's, at the least width from the terminal's at which no table loses a character."""

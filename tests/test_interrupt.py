@@ -143,3 +143,22 @@ def test_no_command_makes_the_folder_of_a_file(command, tmp_path, monkeypatch, c
     assert end.value.code == 2
     assert capsys.readouterr().err == "error: --out nix/a.c: the folder nix does not exist\n"
     assert not Path("nix").exists()
+
+
+@pytest.mark.parametrize("asked", ["osmesa", "bogus"])
+def test_a_command_that_draws_nothing_does_not_need_what_mujoco_gl_names(asked, tmp_path):
+    command = [sys.executable, "-m", "sim.run", "--case", "none", "--duration", "0.05", "--no-plot"]
+    environment = ENVIRONMENT | {"MUJOCO_GL": asked}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_full_disk_behind_standard_output_is_one_line(tmp_path):
+    """And not exit code 1, which says that what was asked does not hold."""
+    if not os.path.exists("/dev/full"):
+        pytest.skip("there is no /dev/full here")
+    command = [sys.executable, "-m", "design.audit", "--rigid", "--K", "1000", "--B", "1", "--out", str(tmp_path)]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, env=ENVIRONMENT, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == "error: standard output: No space left on device\n"

@@ -244,3 +244,11 @@ def test_both_engines_see_the_population_grow_alike():
     kept = ~np.isnan(seen.mujoco)
     assert kept.any()
     np.testing.assert_allclose(seen.mujoco[kept], seen.exact[kept], atol=1e-2)
+
+
+def test_the_mismatch_that_a_run_reports_is_that_of_the_constant_delays():
+    """The process of a loop that switches holds G without Theta; what is felt is still F."""
+    moved = with_delays(ASSEMBLY, STIFF, np.ones((5, 2, 1), dtype=int))
+    z = np.exp(1j * np.linspace(0.001, 3, 50))
+    theta = z[:, None, None] ** -np.array(ASSEMBLY.scenario.theta, dtype=float)[:, None]
+    np.testing.assert_allclose(moved.felt.at(z), theta * without_theta(ASSEMBLY, STIFF).at(z), rtol=1e-9)

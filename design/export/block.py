@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from controller.coupling import compliance
 from controller.environment import environment
 from controller.lti import Array, Lti
 from controller.process import force_map
-from design.plot.curves import compliance
 from design.store import Loop, Stored
 
 TICKS = 64  # of a test vector: longer than the delays and the fast modes of a loop

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from design.assess import specification
-from design.designs import FILTERS, OBJECTIVES
 from design.limits.curve import AXES, Designer, Limit, Setting, optimum, remembered, settings, spring_damper
 from design.limits.ladder import LADDERS, climb
 from design.limits.report import Curves, gains, print_curves, print_ladder
-from design.parameter.wish import Wish
+from design.parameter.wish import FILTERS, OBJECTIVES, Wish
 from design.store import Loop
 from sim.command import (
     DOES_NOT_HOLD,

@@ -9,8 +9,11 @@ import numpy as np
 
 from controller.lti import Array
 from design.argument import number, of_kind, one_of, whole
-from design.designs import FILTERS, OBJECTIVES
 from design.specification import Specification
+
+#: where the poles of the basis may lie, and which mismatch is minimised
+FILTERS = ("auto", "fir", "slow", "mixed", "repeated", "adapted")
+OBJECTIVES = ("rms", "sup")
 
 MARGIN = 0.005  # share of the damping that stays unused
 HIGH_GAIN = 1.5  # times the environment that the devices may feel at high frequency

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import Compliance, Coupling, SpringDamper
+from controller.coupling import Coupling, compliance
 from controller.delay import delay
 from controller.environment import environment
 from controller.lti import Array, Lti
@@ -71,16 +71,6 @@ def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Judged:
         else:
             demands["theorem4"] = theorem4_demand(V, loop.theta, loop.delta)
     return Judged(F, requirements, demands)
-
-
-def compliance(coupling: Coupling, T: float) -> Lti | None:
-    """V(z), where the coupling is one in feedback around the environment."""
-    match coupling:
-        case SpringDamper():
-            return coupling.compliance(T)
-        case Compliance(V=V):
-            return V
-    return None
 
 
 def grid(loop: Loop, couplings: Sequence[Judged], low_hz: float = LOWEST_HZ) -> Array:

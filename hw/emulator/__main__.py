@@ -22,6 +22,7 @@ from contextlib import suppress
 from itertools import count
 from typing import Any
 
+from hw.emulator.child import pace_from
 from hw.emulator.core import Emulator
 from hw.emulator.plant import nobody
 from hw.emulator.upset import DEVICE, LINE, Line, Upset
@@ -174,14 +175,6 @@ def main(argv: list[str]) -> int:
     clockwork.run(seconds, lambda: bool(stops) or parent not in (0, os.getppid()))
     print(json.dumps(_summary(clockwork)), file=sys.stderr)
     return INTERRUPTED if signal.SIGINT in stops else DONE
-
-
-def pace_from(args: argparse.Namespace) -> float:
-    """Seconds of the device's clock per second. Raises InputError."""
-    pace = numbers("--pace", args.pace, float, 1)[0]
-    if not 0.01 <= pace <= 1:
-        raise InputError(f"--pace is {pace:g}, allowed are 0.01 to 1")
-    return pace
 
 
 def _summary(clockwork: Clockwork) -> dict[str, Any]:

@@ -10,11 +10,20 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
+from sim.command import numbers
 from sim.scenario import InputError
 
 PATIENCE = 60.0  # [s] for the emulator to load MuJoCo and print its path
 SPARE = 600.0  # [s] beside the run, after which an orphan would end by itself
 PASSED_ON = ("case", "scenario", "theta", "psi", "lam", "delta", "T")
+
+
+def pace_from(args: argparse.Namespace) -> float:
+    """Seconds of the device's clock per second. Raises InputError."""
+    pace = numbers("--pace", args.pace, float, 1)[0]
+    if not 0.01 <= pace <= 1:
+        raise InputError(f"--pace is {pace:g}, allowed are 0.01 to 1")
+    return pace
 
 
 @contextmanager

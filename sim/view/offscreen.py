@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.graphics import asked
 from sim.view.layout import PLOT, SIZE, WORDS
 from sim.view.overlay import columns, overlay
 from sim.view.session import Frame
@@ -31,8 +32,7 @@ def backend() -> str:
 
     Each is tried in a process of its own, because a failed one leaves OpenGL unusable for the next. Raises NoOffscreen.
     """
-    asked = os.environ.get("MUJOCO_GL", "").lower().strip()
-    tried = (asked,) if asked in BACKENDS else BACKENDS
+    tried = (asked(),) if asked() in BACKENDS else BACKENDS
     reasons = []
     for name in tried:
         reason = _failure(name)

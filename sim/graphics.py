@@ -1,0 +1,23 @@
+"""What MUJOCO_GL asks for, set aside until somebody draws.
+
+MuJoCo looks at it when it is imported, and cannot be imported where what it names is not there; few commands draw.
+"""
+
+from __future__ import annotations
+
+import os
+
+from sim.interrupt import starting
+
+OURS = "HAPTIC_LOOP_GL"  # the same, for us and the processes that we start
+
+
+def set_aside() -> None:
+    """In a command of ours, before MuJoCo is imported; a script's own MuJoCo keeps what it was given."""
+    if starting() and "MUJOCO_GL" in os.environ:
+        os.environ[OURS] = os.environ.pop("MUJOCO_GL")
+
+
+def asked() -> str:
+    """What the user has asked for, in lower case; empty where nothing."""
+    return (os.environ.get(OURS) or os.environ.get("MUJOCO_GL") or "").lower().strip()
