@@ -73,7 +73,7 @@ def _draw_ideal(axes: Array, result: Result, ideal: tuple[Array, float | None], 
     forces, percent = ideal
     label = "pale: ideal environment"
     if percent is not None:  # of the force before the motors' limit, as in the report
-        label += ", asked of the motors too" if percent < SAME else f"; force asked of the motors {percent:.2g} % off"
+        label += " (the motors were asked for the same)" if percent < SAME else f" (asked force {percent:.2g} % off)"
     for axis, part in zip(axes, parts, strict=True):
         most = 3 * max(map(abs, axis.get_ylim()))
         for i, force in enumerate(forces[part].T):

@@ -255,7 +255,7 @@ def varying(jitter: dict[str, Any]) -> list[tuple[str, str]]:
 def _force_error(part: dict[str, Any]) -> str:
     if part["error_percent"] is None:
         return f"- ({part['reason']})"
-    return f"{part['error_percent']:.3g} % rms before the motors' limit, against Lambda E for the same motion"
+    return f"{part['error_percent']:.3g} % rms of Lambda E's, before the force limits"
 
 
 def _verdict(word: str | None) -> str:

@@ -26,7 +26,7 @@ def set_advice(
     """Which vertices leave no solution though the environment alone has one, and what would.
 
     `changes` are tried one at a time. feasible: by a quick look, which may err on the hopeful side; solvable: by the
-    whole search.
+    whole search at the vertices.
     """
     others = spec.others.items()
     total, done = len(others) + len(changes) + 1 + len(SMALLER), 0
@@ -47,7 +47,7 @@ def set_advice(
         why = f"beside the nominal environment there is none with {hopeless[0]}{more}"
     else:
         why = "each vertex has one beside the nominal environment, but not all of them together with the points between"
-    hopeful = [words for words, other in changes.items() if step() and feasible(spec, other)]
+    helpful = [w for w, other in changes.items() if step() and feasible(spec, other) and solvable(spec, other)]
     assert spec.shrunk  # a box came with it
     smaller = ((f, replace(spec, others=spec.shrunk(f), regions=())) for f in SMALLER)
     share = next((f for f, less in smaller if step() and solvable(less, wish)), None)
@@ -55,7 +55,7 @@ def set_advice(
     limit = binding(spec, wish)
     remedies = [
         f"there is one for ranges of {share:.0%} of their width around the nominal values" if share else "",
-        f"worth a try: {', or '.join(hopeful)}" if hopeful else "",
+        f"there is one for the whole box with {', or with '.join(helpful)}" if helpful else "",
     ]
     remedy = "; ".join(filter(None, remedies)) or f"nothing helped of narrower ranges, {', '.join(changes)}"
     return f"{request}: {why}; {limit}; {remedy}"
