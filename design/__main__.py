@@ -7,23 +7,20 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
 from controller.coupling import Coupling
 from controller.process import force_map
 from design.assess import CONDITIONS, assess, specification
 from design.audit.subject import LONGEST_DELAY
-from design.box.check import SAMPLES, SetCheck, check_set, set_part, set_rows
+from design.box.check import SAMPLES, SetCheck, check_set, set_part
 from design.box.price import cost_part, price
 from design.certificate import NotProved, prove
 from design.designs import KINDS, METHODS, compare_methods, design_coupling
 from design.failure import DesignFailed
-from design.gains.frozen_environment import STIFFEST
 from design.jitter.part import switching_part, switching_requirement
 from design.jitter.proof import sent
-from design.listed import listed
 from design.parameter.wish import FILTERS, OBJECTIVES
 from design.promises import ANY, HERE, certificate_part, promise_of, switching_promise
+from design.report import tables
 from design.result import Design
 from design.store import Certificate, DelayRange, Loop, Stored, data_of, save
 from design.summary import coupling_part, transparency_part
@@ -93,11 +90,8 @@ def main(argv: list[str]) -> int:
     }
     if args.compare:
         outcome["comparison"] = [asdict(row) for row in compare_methods(spec)]
-    console(args).print(_table(outcome))
-    if outcome["price"]:
-        console(args).print(_costs(outcome["price"]))
-    if args.compare:
-        console(args).print(_comparison(outcome["comparison"]))
+    for table in tables(outcome):
+        console(args).print(table)
     if args.json:
         write_json(args.json, outcome)
     holds = outcome["certificate"]["certified"] and (outcome["promise"] == ANY or not whole or whole.proved)
@@ -257,65 +251,6 @@ def _proved(loop: Loop, design: Design) -> tuple[Certificate | None, str | None]
         return prove(loop, data_of(design.coupling), design.condition, phi), None
     except NotProved as error:
         return None, str(error)
-
-
-def _table(outcome: dict[str, Any]) -> Table:
-    coupling, certificate, transparent = outcome["coupling"], outcome["certificate"], outcome["transparency"]
-    table = Table(title=f"{coupling['kind']}, case {outcome['case']}, {certificate['condition']}", show_header=False)
-    if coupling["K"]:
-        table.add_row("K [N/m]", listed(coupling["K"]))
-        if max(coupling["K"]) > 0.999 * STIFFEST:
-            table.add_row("", f"{STIFFEST:g} N/m is where the search ends, no optimum of its own")
-        table.add_row("B [N s/m]", listed(coupling["B"]))
-    for part in outcome["certificates"].values():
-        word = "certified" if part["certified"] else "not certified"
-        required = listed(part["required_damping"])
-        available = listed(part["available_damping"])
-        table.add_row(f"damping, {part['condition']}", f"needs {required} of {available} N s/m: {word}")
-    if part := outcome["jitter_proof"]:
-        word = "certified" if part["certified"] else "not certified"
-        span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))
-        needs = f"needs {listed(part['required_damping'])}: {word} (proof: {part['proof']})"
-        table.add_row("damping, any switching", f"{span} samples: {needs}")
-    for row in set_rows(outcome["set"]) if outcome["set"] else []:
-        table.add_row(*row)
-    stored = outcome["stored"]
-    table.add_row("promise", outcome["promise"] or "none")
-    if stored["switching"] and stored["switching"]["proof"]:
-        table.add_row("promise, delays", stored["switching"]["promise"])
-    table.add_row(outcome["objective_name"], f"{outcome['objective']:.5g}")
-    rms = transparent["rms_mismatch_db"]
-    table.add_row("mismatch", f"{transparent['relative_mismatch_db']:.2f} dB (rms {rms:.2f} dB)")
-    table.add_row("convex problems", f"{outcome['sdps']} in {outcome['wall_s']:.2f} s")
-    table.add_row("stored", f"{stored['file']} (proof: {stored['proof'] or stored['reason']})")
-    if stored["switching"] and not stored["switching"]["proof"]:
-        table.add_row("", f"for constant delays only: {stored['switching']['reason']}")
-    return table
-
-
-def _comparison(rows: list[dict[str, Any]]) -> Table:
-    table = Table("method", "||W1 L W2||", "SDPs", "seconds", title="one state per channel, diagonal")
-    for row in rows:
-        norm = "-" if row["norm"] is None else f"{row['norm']:.4g}"
-        table.add_row(row["method"], norm, str(row["sdps"]), f"{row['wall_s']:.1f}")
-    return table
-
-
-def _costs(rows: list[dict[str, Any]]) -> Table:
-    """Each figure in the nominal environment, and the worst of the set."""
-    title = "in the nominal environment / at the worst vertex"
-    table = Table(
-        "coupling", "needs of its damping", "vertices violated", "rms mismatch", "relative mismatch", title=title
-    )
-    for row in rows:
-        pairs = [row[name] for name in ("required_over_available", "rms_mismatch_db", "relative_mismatch_db")]
-        needs, rms, sup = (
-            ["-" if v is None else f"{v:.{4 - 2 * (n > 0)}f}" for v in p.values()] for n, p in enumerate(pairs)
-        )
-        table.add_row(
-            row["coupling"], " / ".join(needs), str(row["violated"]), f"{' / '.join(rms)} dB", f"{' / '.join(sup)} dB"
-        )
-    return table
 
 
 if __name__ == "__main__":
