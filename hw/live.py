@@ -106,9 +106,14 @@ class Live:
         """Design while the device rests at zero force; what it says meanwhile is of no use."""
         session = self.session
         try:
-            rungs = self._plan(session.measurement.result)
+            with _interruptible():
+                rungs = self._plan(session.measurement.result)
         except Fault as fault:
             self._write(session.refuse(str(fault), self.now()))
+            return
+        except KeyboardInterrupt:
+            self.signals.append(signal.SIGINT)
+            self._write(session.refuse("SIGINT during the design", self.now()))
             return
         if self._keyboard is not None and select.select([self._keyboard], [], [], 0)[0]:
             self._pressed()  # of now: an `a` from before may not arm what was not there to be armed
@@ -148,6 +153,16 @@ def _signals(received: list[int]) -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGINT is a KeyboardInterrupt: a design may take long, and nothing moves meanwhile."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

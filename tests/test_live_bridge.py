@@ -223,6 +223,18 @@ def test_a_key_typed_during_the_design_does_not_arm(typed, stage):
         os.close(end)
 
 
+def test_ctrl_c_does_not_wait_for_the_end_of_a_design(emulator, scenario):
+    def plan(ages):
+        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(1000):
+            time.sleep(0.01)
+        raise AssertionError("the design went on")
+
+    session, live = run(emulator, scenario, plan)
+    assert (session.stage, session.cause) == (Stage.REFUSED, "SIGINT during the design")
+    assert live.signals == [signal.SIGINT]
+
+
 def test_an_exception_stops_the_device_first(emulator, scenario):
     def plan(ages):
         raise ZeroDivisionError("a mistake of ours")
