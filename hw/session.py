@@ -15,6 +15,7 @@ from typing import NamedTuple
 from hw.conduct import check_state
 from hw.dialogue import Dialogue, Unanswered
 from hw.drive import Drive, Row
+from hw.ending import STOPPING_US, Ending, drives
 from hw.frame import Ack, Config, Decoder, Info, Message, State, Stop, encode
 from hw.handshake import Units, probe_delay
 from hw.message import Command, Phase, Reason
@@ -23,8 +24,6 @@ from hw.safety import DRIVING, ENDED, Fault, Limits, Stage
 from hw.stream import USUAL, Settings, Stream, answer
 from sim.scenario import Scenario
 
-STOPPING_US = 50_000  # in which a device that was stopped must say so
-OBEYING_US = 30_000  # in which one that was told to stop must rest: the longest hold and ramp, and half as long again
 ARMING_US = 500_000  # in which a device must follow ARM
 
 
@@ -55,7 +54,7 @@ class Session:
         self.armings: list[tuple[Program, Config]] = []  # what forces came from, arming by arming
         self.record: Callable[[Row], None] = lambda row: None
         self.now = self.entered = 0
-        self._reason, self._obeys, self._rests, self._stopped = Reason.DONE, True, False, 0
+        self._ending: Ending | None = None
         self._after: Stage | None = Stage.FINISHED  # what a ramp-out ends in; None: with a softer coupling, disarmed
 
     @property
@@ -167,7 +166,7 @@ class Session:
         """Look at the time."""
         self.now = now
         if self.stage in ENDED:
-            return self._stop_again()
+            return self._ending.again(now) if self._ending else b""
         if self.stage in (Stage.CONNECTING, Stage.CONFIGURING):
             try:
                 return self.dialogue.again(now)
@@ -225,16 +224,14 @@ class Session:
 
     def _on_state(self, state: State) -> bytes:
         if self.stage == Stage.CONNECTING:  # another session's device: to zero force first
-            return encode(Stop(Reason.FAULT)) if _drives(state) else b""
+            return encode(Stop(Reason.FAULT)) if drives(state) else b""
         if self.info is None or state.axes != self.info.axes:
             self.counters.unexpected += 1
             return b""
         if self.stage in ENDED:
-            self._check_obedience(state)
-            self._rests = not _drives(state) and (self.stage != Stage.ESTOP or state.phase == Phase.ESTOP)
-            return b"" if self._rests else encode(Stop(self._reason))
+            return self._on_state_after_the_end(state)
         if self.stage == Stage.CONFIGURING:
-            if not _drives(state):
+            if not drives(state):
                 return b""
             if self.now - self.entered > STOPPING_US:
                 raise Fault("the device drives, and nobody asked it to")
@@ -251,6 +248,15 @@ class Session:
         if self.stage == Stage.MEASURING:
             return self._measure(state)
         return answer(self.config, state, Command.IDLE)
+
+    def _on_state_after_the_end(self, state: State) -> bytes:
+        assert self._ending
+        if cause := self._ending.disobeyed(state, self.now):
+            if self.stage == Stage.FINISHED:
+                self._enter(Stage.STOPPED, cause)  # whatever it was to end in, it has not finished
+            else:
+                self._log(cause)
+        return self._ending.heard(state)
 
     def _on_driving(self, state: State, ticks: int) -> bytes:
         assert self.config
@@ -292,27 +298,6 @@ class Session:
         assert self.rung is not None
         return encode(Stop(Reason.DONE)) + self._take(self.rungs.index(self.rung) + 1, f"softer, since {self.cause}")
 
-    def _check_obedience(self, state: State) -> None:
-        """A session whose device goes on driving after STOP has not finished, whatever it was to end in."""
-        if self._obeys and self.now - self.entered > OBEYING_US and _drives(state):
-            self._obeys = False
-            cause = f"told to stop, the device still drives after {OBEYING_US // 1000} ms: cut its power"
-            if self.stage == Stage.FINISHED:
-                self._enter(Stage.STOPPED, cause)
-            else:
-                self._log(cause)
-
-    def _stop_again(self) -> bytes:
-        """STOP, where no STATE has said for a tick that it was heard: the one before may be lost, and STATEs too.
-
-        Only where forces have acted, or the emergency stop was asked for.
-        """
-        due = self.now - self._stopped >= 1e6 * self.scenario.T and self.now - self.entered < STOPPING_US
-        if self._rests or not due or not (self.armings or self.stage == Stage.ESTOP):
-            return b""
-        self._stopped = self.now
-        return encode(Stop(self._reason))
-
     # stages
 
     def _enter(self, stage: Stage, cause: str) -> None:
@@ -323,11 +308,7 @@ class Session:
         self.log.append(Event(self.now, self.stage, cause))
 
     def _end(self, stage: Stage, cause: str, reason: Reason = Reason.FAULT) -> bytes:
-        self._reason, self.stream.drive, self._rests, self._stopped = reason, None, False, self.now
+        self.stream.drive = None
+        self._ending = Ending(reason, bool(self.armings), self.now, self.scenario.T)
         self._enter(stage, cause)
         return encode(Stop(reason))
-
-
-def _drives(state: State) -> bool:
-    """Whether it moves its motors as nobody may who was told to stop; a ramp is on its way to zero."""
-    return state.phase in (Phase.ARMED, Phase.HOLDING) or (state.phase != Phase.RAMP and any(state.applied))
