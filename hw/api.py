@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from cli.options import require_constant_delay, require_linear
 from controller.coupling import Coupling
-from design.argument import COUPLING, bare, number, of_kind, whole
-from design.assess import assess
-from design.margin import Requirement
-from design.promises import promise_of
-from design.result import Design
+from design.certificate import assess, promise_of
+from design.conditions import Requirement
+from design.result import COUPLING, Design, bare, number, of_kind, whole
 from hw.desk import session_for
 from hw.emulator.core import Emulator
 from hw.plan import Ages, Rung, ladder, link_delay
@@ -17,10 +16,9 @@ from hw.rehearsal import Rehearsal
 from hw.safety import Fault
 from hw.session import Session, Settings
 from hw.trace import Recorder, result_of
-from sim.command import require_constant_delay, require_linear
 from sim.couplings import Chosen
-from sim.result import Result
 from sim.scenario import InputError, Scenario
+from sim.trace import Result
 
 MEASURE = 200  # answers that are timed: virtual time does not scatter
 QUANTILE, GUARD_US = 0.99, 100.0  # of the ages that the delay covers, and what is added [us]; as hw.bridge has it

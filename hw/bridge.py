@@ -11,13 +11,7 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from design.assess import CONDITIONS
-from hw import session_report
-from hw.desk import add_link_options, check_link, hold_session, measured_link, number, session_for
-from hw.plan import Ages, Rung, ladder
-from hw.safety import Stage
-from hw.trace import Recorder
-from sim.command import (
+from cli.options import (
     DOES_NOT_HOLD,
     DONE,
     INTERRUPTED,
@@ -32,6 +26,12 @@ from sim.command import (
     scenario_from,
     seed_from,
 )
+from design.certificate import CONDITIONS
+from hw import session_report
+from hw.desk import add_link_options, check_link, hold_session, measured_link, number, session_for
+from hw.plan import Ages, Rung, ladder
+from hw.safety import Stage
+from hw.trace import Recorder
 from sim.couplings import NAMES
 from sim.files import write_json
 from sim.scenario import InputError

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
+from cli.options import numbers
 from hw.dashboard import Dashboard
 from hw.emulator.child import pace_from, spawned
 from hw.handshake import require_period
@@ -19,7 +20,6 @@ from hw.plan import Ages, Program, link_delay
 from hw.port import Port
 from hw.safety import Limits
 from hw.session import Session, Settings
-from sim.command import numbers
 from sim.scenario import InputError, Scenario
 
 STRONGEST = 12.0  # [N] whatever a scenario allows

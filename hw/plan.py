@@ -10,14 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from cli.run import coupling_part
 from controller.environment import environment
 from controller.lti import Lti
 from controller.process import force_map
-from design.assess import assess
-from design.failure import DesignFailed
-from design.margin import Requirement
-from design.promises import certificate_part, promise_of
-from design.summary import coupling_part
+from design.certificate import assess, certificate_part, promise_of
+from design.conditions import Requirement
+from design.result import DesignFailed
 from hw.law import Controller, Law
 from hw.message import MAX_THETA
 from hw.safety import Fault

@@ -12,19 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
+from cli.options import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute
 from controller.environment import environment
 from controller.lti import Array, Lti
 from controller.process import force_map
-from design.store import CouplingData
+from design.certificate import CouplingData
 from hw.handshake import Units
 from hw.law import Law
 from hw.safety import Fault, Limits, shape
 from hw.trace import load
-from models.quantity import require
-from sim.command import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute
+from models.device import require
 from sim.files import write_json
-from sim.result import Result
 from sim.scenario import InputError, Scenario
+from sim.trace import Result
 
 
 class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from models.quantity import require
+from models.device import require
 
 
 class Stage(StrEnum):

@@ -13,8 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from design.promises import CAVEATS
-from design.store import data_of
+from design.certificate import CAVEATS, data_of
 from hw.frame import Config
 from hw.message import NO_MARGIN
 from hw.plan import Ages, Program, Rung
@@ -22,7 +21,7 @@ from hw.safety import Stage
 from hw.session import Session
 from hw.trace import Recorder, result_of, save_npz, steady_ticks
 from sim.files import write_json
-from sim.growth import growths, told
+from sim.trace import growths, told
 
 PERCENTILES = (50, 90, 99, 100)
 
@@ -138,7 +137,7 @@ def save(out: Path, session: Session, recorder: Recorder, report: dict[str, Any]
         result = result_of(recorder, session.units, session.scenario.T, report | {"replay": replay})
         files += [save_npz(out / "trace.npz", result, recorder), result.save_csv(out / "trace.csv")]
         if plot:
-            from sim.plot import plot_run
+            from sim.plots import plot_run
 
             title = f"{report['scenario']}, case {report['case']}: a session that ended {session.stage}"
             files.append(plot_run(result, out / "figure.png", title, 10.0))

@@ -18,8 +18,8 @@ from hw.handshake import Units
 from hw.message import NO_MARGIN
 from hw.trace_check import complaint
 from sim.files import write
-from sim.result import DAMAGED, Result
 from sim.scenario import InputError
+from sim.trace import DAMAGED, Result
 
 #: what the link adds, one entry per tick: name -> axes of the array
 LINK = {"tick": 1, "arming": 1, "received": 1, "asked": 2, "gain": 1, "sent": 2, "margin_us": 1, "status": 1}

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from controller.lti import Array
-from sim.result import Result
+from sim.trace import Result
 
 FLOATS, WHOLE = ("asked", "gain"), ("tick", "arming", "sent", "margin_us", "status")
 #: link array -> least and most that a session writes

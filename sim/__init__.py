@@ -25,10 +25,10 @@ from sim.interrupt import while_starting
 
 if TYPE_CHECKING:
     from sim.api import simulate, validate
-    from sim.plot import plot_run
-    from sim.result import Result
+    from sim.plots import plot_run
     from sim.scenario import InputError, Scenario, load, parse
-    from sim.validate.examine import Findings
+    from sim.trace import Result
+    from sim.validate import Findings
 
 while_starting()
 set_aside()
@@ -38,9 +38,9 @@ __all__ = ["Findings", "InputError", "Result", "Scenario", "load", "parse", "plo
 _HOMES = {
     "simulate": "sim.api",
     "validate": "sim.api",
-    "Findings": "sim.validate.examine",
-    "plot_run": "sim.plot",
-    "Result": "sim.result",
+    "Findings": "sim.validate",
+    "plot_run": "sim.plots",
+    "Result": "sim.trace",
 }
 
 

@@ -24,12 +24,12 @@ from controller.coupling import Coupling
 from controller.environment import environment
 from controller.lti import Array, Lti
 from controller.process import force_map
-from design.margin import closed_loop
-from models.crowd import Crowd, variants
+from design.conditions import closed_loop
 from models.human import Human, Person
-from sim.loop import Progress
+from models.scene import Crowd, variants
+from sim.run import Progress
 from sim.scenario import Scenario
-from sim.verdicts import dominant_modes, exact_loops
+from sim.stability import dominant_modes, exact_loops
 
 MASS, STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
 DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9

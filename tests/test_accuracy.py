@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from sim.accuracy import yardstick
-from sim.accuracy.__main__ import main
-from sim.accuracy.yardstick import mark_front
+from cli.accuracy import main
+from sim import accuracy as yardstick
+from sim.accuracy import mark_front
 from sim.scenario import InputError
 
 

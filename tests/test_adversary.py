@@ -7,20 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cli import run as run_command
+from cli.suite import run_tightness as tightness
+from cli.validate import main
 from controller.coupling import NoCoupling, SpringDamper
-from design.margin import closed_loop as real
-from design.published import CASE_I
+from design.conditions import closed_loop as real
+from design.result import CASE_I
 from models.device import RigidDevice
 from models.scene import build, plant
 from sim import adversary
-from sim import run as run_command
 from sim.adversary import DESTABILISED, attempts, search
-from sim.exact_engine import hold
+from sim.engines import hold
+from sim.run import assemble
 from sim.scenario import InputError, load
-from sim.simulate import assemble
 from sim.stability import close, dominant_mode
-from sim.tightness import main as tightness
-from sim.validate.__main__ import main
 
 SCENARIO = load()
 DESIGNED = SpringDamper([878.7, 551.8], [0.3864, 0.5219])

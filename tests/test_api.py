@@ -13,15 +13,16 @@ import pytest
 import design
 import hw
 import sim
+from cli.run import main as run_command
+from cli.validate import main as validate_command
 from controller.coupling import NoCoupling, SpringDamper
 from design import Options, certify, design_coupling, promise, transparency_of
 from design.designs import KINDS, OPTIONS
 from hw import rehearse
 from models.device import RigidDevice
-from sim import InputError, Result, Scenario, load, parse, simulate, validate
-from sim.run import main as run_command
+from sim import InputError, Result, Scenario, load, parse, validate
+from sim import run as simulate
 from sim.scenario import SCENARIOS
-from sim.validate.__main__ import main as validate_command
 
 SHORT = load().replace(duration=0.3)
 GAINS = SpringDamper([878.7, 551.8], [0.3864, 0.5219])
@@ -63,8 +64,9 @@ def test_help_and_completion_show_what_is_for_scripts(package):
 
 def test_the_options_are_those_that_the_designs_take():
     """One table, the types of the arguments, and the designs' own signatures say the same."""
-    from design import ccl, spring_damper
-    from design.parameter.wish import Wish
+    from design import fixed_order as ccl
+    from design import spring_damper
+    from design.optimal import Wish
 
     assert set(OPTIONS) == set(KINDS)
     assert set(OPTIONS["ccl"]) < set(signature(ccl.design).parameters)
@@ -74,7 +76,7 @@ def test_the_options_are_those_that_the_designs_take():
 
 
 def test_promise_and_transparency_are_those_of_the_commands(tmp_path):
-    from design.__main__ import main as design_command
+    from cli.design import main as design_command
 
     loop = load().loop("I")
     found = design_coupling(loop)

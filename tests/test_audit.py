@@ -8,19 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cli.audit import main
+from cli.options import execute
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring
 from controller.lti import Lti
-from design import store
-from design.audit.__main__ import main
-from design.audit.figures import MOST_EXTRA_SAMPLES, edge, stiffest, tolerance
-from design.audit.remedies import remedies
-from design.audit.report import report
-from design.audit.subject import Subject
-from design.presets import PRESETS
-from design.promises import CAVEATS, promise
-from design.published import CASE_I
-from sim.command import execute
+from design import certificate as store
+from design.audit import MOST_EXTRA_SAMPLES, PRESETS, Subject, edge, remedies, report, stiffest, tolerance
+from design.certificate import CAVEATS, promise
+from design.result import CASE_I
 
 CONDITIONS = ("closed-loop", "theorem4")
 T = 1.2e-3

@@ -8,25 +8,22 @@ import msgspec
 import numpy as np
 import pytest
 
-from controller.box import Box, UncertainSpring, inside, members
+from cli.audit import main as audit_main
+from cli.check import main as check_main
+from cli.design import main as design_main
+from cli.run import main as run_main
+from cli.validate import main as validate_main
 from controller.coupling import SpringDamper
-from controller.environment import FIGURE_4, Network, Spring, environment
+from controller.environment import FIGURE_4, Box, Network, Spring, UncertainSpring, environment, inside, members
 from controller.process import force_map
 from design import optimal
-from design.__main__ import main as design_main
-from design.assess import specification
-from design.audit.__main__ import main as audit_main
-from design.box.check import check_set, set_part
-from design.certificate import NotProved, prove, verify
-from design.check import main as check_main
-from design.failure import Infeasible
-from design.parameter.wish import Wish
-from design.store import Loop, Stored, data_of, digest, load, sealed
-from design.store import SpringDamper as StoredSpringDamper
+from design.certificate import Loop, NotProved, Stored, data_of, digest, load, prove, sealed, specification, verify
+from design.certificate import SpringDamper as StoredSpringDamper
+from design.optimal import Wish
+from design.ranges import check_set, set_part
+from design.result import Infeasible
 from design.transparency import transparency
-from sim.run import main as run_main
 from sim.scenario import SCENARIOS, InputError, parse
-from sim.validate.__main__ import main as validate_main
 
 T, THETA = 1.2e-3, (1, 2)
 #: the first spring softer or stiffer or lost: three vertices beside the environment

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from design.assess import assess
-from design.store import Stored, data_of
-from design.store import save as save_coupling
+from cli import trace as trace_command
+from design.certificate import Stored, assess, data_of
+from design.certificate import save as save_coupling
 from hw import replay, session_report
 from hw.emulator.core import Emulator
 from hw.emulator.upset import Upset
@@ -26,15 +26,13 @@ from hw.safety import Fault, Limits, Stage
 from hw.session import Session, Settings
 from hw.trace import Recorder, digest, load, result_of, save_npz, steady_ticks
 from models.scene import plant
-from sim import trace as trace_command
 from sim.couplings import choose
-from sim.engine import outside_forces
-from sim.exact_engine import hold
-from sim.result import Result
+from sim.engines import hold, outside_forces
+from sim.run import assemble, simulate
 from sim.scenario import InputError
 from sim.scenario import load as scenario_of
-from sim.simulate import assemble, simulate
 from sim.stability import close, dominant_mode
+from sim.trace import Result
 
 FAST = Settings(measure=100)
 

@@ -8,15 +8,11 @@ from controller.coupling import SpringDamper
 from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
-from design import ccl, spring_damper
-from design.fixed_order.fixed_poles import FixedPoles
-from design.fixed_order.inner_convex import descend
-from design.fixed_order.realisation import FixedOrder
-from design.lmi import v_hat_regular
-from design.margin import closed_loop, theorem4
-from design.semidefinite.affine import affine, symmetric_from
-from design.shaping import Shaping
-from design.specification import RESERVE, Specification
+from design import fixed_order as ccl
+from design import spring_damper
+from design.conditions import RESERVE, Specification, closed_loop, theorem4
+from design.fixed_order import FixedOrder, FixedPoles, descend
+from design.lmi import Shaping, affine, symmetric_from, v_hat_regular
 
 T = 1.2e-3
 DELTA = (1.37, 1.37)

@@ -8,23 +8,27 @@ from controller import coupling as controller_coupling
 from controller.environment import FIGURE_4, Network, Spring
 from controller.lti import Lti
 from design import spring_damper
-from design.assess import specification
-from design.certificate import NotProved, Verdict, prove, required_damping, verify
-from design.published import PUBLISHED
-from design.store import (
+from design.certificate import (
     BadFile,
     Compliance,
     InternalModel,
     Loop,
     NoCoupling,
+    NotProved,
     SpringDamper,
     Stored,
+    Verdict,
     data_of,
     digest,
     load,
+    prove,
+    required_damping,
     save,
     sealed,
+    specification,
+    verify,
 )
+from design.result import PUBLISHED
 
 DEFAULT = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
 STIFF = SpringDamper((7806.0, 3137.0), (0.105, 1.68))

@@ -6,11 +6,10 @@ import sys
 
 import pytest
 
+from cli.check import main
+from cli.options import execute
 from controller.environment import FIGURE_4
-from design.certificate import prove
-from design.check import main
-from design.store import Loop, SpringDamper, Stored, save
-from sim.command import execute
+from design.certificate import Loop, SpringDamper, Stored, prove, save
 
 LOOP = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
 GAINS = SpringDamper((878.7, 551.8), (0.3865, 0.5220))

@@ -15,18 +15,14 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
-from design.gains.convex_concave import step
-from design.margin import closed_loop, theorem4
-from design.published import CASE_I, CASE_II, PRINTED_TAU_DB
-from design.semidefinite.multiplier import least_multiplier
-from design.shaping import Shaping
-from design.solve import Infeasible
-from design.specification import Specification
+from design.conditions import Specification, closed_loop, theorem4
+from design.lmi import Infeasible, Shaping, least_multiplier
+from design.result import CASE_I, CASE_II, PRINTED_TAU_DB
+from design.spring_damper import step
 from models.device import RigidDevice
 from models.human import Human, Link, Population
-from sim.loop import run
+from sim.run import assemble, make_engine, run, simulate
 from sim.scenario import load
-from sim.simulate import assemble, make_engine, simulate
 from sim.stability import clipped_ticks, close, dominant_mode
 
 T, THETA, DELTA = 1.2e-3, (1, 2), 1.37

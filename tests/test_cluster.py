@@ -15,12 +15,19 @@ import pytest
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed (extra `dask`)")
 
-from design.published import CASE_I  # noqa: E402
-from sim.population import MIXED  # noqa: E402
-from sim.scenario import InputError, load  # noqa: E402
-from sim.validate.cluster import validate_on_cluster  # noqa: E402
-from sim.validate.examine import BATCH, Findings, Question  # noqa: E402
-from sim.validate.shards import validate  # noqa: E402
+from design.result import CASE_I  # noqa: E402
+from sim.scenario import (
+    InputError,
+    load,
+)
+from sim.validate import (
+    BATCH,
+    MIXED,
+    Findings,
+    Question,
+    validate,
+    validate_on_cluster,
+)
 
 ROOT = Path(__file__).parent.parent
 QUESTION = Question(load(), CASE_I, 0, 4 * BATCH, MIXED, "both", 0.25)  # 0.25 s: just enough for growth rates

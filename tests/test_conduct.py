@@ -22,8 +22,8 @@ from hw.rehearsal import Rehearsal
 from hw.safety import Fault, Limits, Stage
 from hw.session import Session, Settings
 from hw.trace import Recorder, result_of
-from sim.growth import growths
 from sim.scenario import load as scenario_of
+from sim.trace import growths
 
 T_US = 1200
 CONFIG = Config(2, 4, 5, 50, (20000, 20000), (600, 600))

@@ -7,31 +7,24 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from controller.contact import Complementarity, contact, held
+from cli.accuracy import main as accuracy
+from cli.run import main
+from cli.validate import main as validate
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Wall, environment
 from controller.lti import SingularLoop
-from controller.process import Process, Tape, force_map
-from design.assess import assess
-from design.audit.report import report
-from design.audit.subject import Subject
-from design.certificate import NotProved, prove
-from design.margin import closed_loop
-from design.promises import FROZEN
-from design.store import data_of
-from models.crowd import variants
+from controller.process import Complementarity, Process, Tape, contact, force_map, held
+from design.audit import Subject, report
+from design.certificate import FROZEN, NotProved, assess, data_of, prove
+from design.conditions import closed_loop
 from models.device import CompliantDevice
 from models.human import Population
-from sim.accuracy.__main__ import main as accuracy
-from sim.batch_engine import ExactBatchEngine
-from sim.exact_engine import hold
-from sim.hunt.bounce import bounce
-from sim.mujoco_engine import MujocoBatchEngine
-from sim.population import crowds
-from sim.run import main
+from models.scene import variants
+from sim.engines import ExactBatchEngine, MujocoBatchEngine, hold
+from sim.hunt import bounce
+from sim.run import assemble, simulate
 from sim.scenario import SCENARIOS, InputError, load, parse
-from sim.simulate import assemble, simulate
-from sim.validate.__main__ import main as validate
+from sim.validate import crowds
 
 T = 1e-3
 SOFT = SpringDamper([878.0, 551.0], [0.386, 0.521])  # within theorem4's set for theta = (1, 2), T = 1.2 ms

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 
 from controller.coupling import NoCoupling
-from design.published import CASE_I
+from design.result import CASE_I
 from models.scene import plant
-from sim import mujoco_engine
-from sim.engine import outside_forces
-from sim.loop import run
-from sim.mujoco_engine import MujocoBatchEngine, MujocoEngine, profiler_off
+from sim import engines as mujoco_engine
+from sim.engines import MujocoBatchEngine, MujocoEngine, outside_forces, profiler_off
+from sim.run import assemble, run, simulate
 from sim.scenario import load
-from sim.simulate import assemble, simulate
 from sim.stability import close, dominant_mode
 
 SHORT = load().replace(duration=0.6)

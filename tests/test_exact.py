@@ -10,10 +10,16 @@ from controller.delay import delay
 from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
-from design.proof import exact
-from design.proof.positive_definite import strictly_positive
-from design.proof.positive_real import prove_positive_real
-from design.proof.rational import Matrix, SingularMatrix, block_diag, definiteness, rational
+from design import exact
+from design.exact import (
+    Matrix,
+    SingularMatrix,
+    block_diag,
+    definiteness,
+    prove_positive_real,
+    rational,
+    strictly_positive,
+)
 
 T = 1.2e-3
 STAR = Network(

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.linalg import expm
 
-from sim.exponential import expm_each
+from sim.engines import expm_each
 
 
 def longer(matrix):

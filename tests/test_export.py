@@ -10,14 +10,13 @@ import sys
 import numpy as np
 import pytest
 
+from cli.export import main
 from controller.coupling import SpringDamper as Gains
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import Process, Tape, force_map
-from design.certificate import prove
-from design.export.__main__ import main
-from design.export.block import process_block, sequential, trial
-from design.store import Compliance, Loop, NoCoupling, SpringDamper, Stored, save
+from design.certificate import Compliance, Loop, NoCoupling, SpringDamper, Stored, prove, save
+from design.export import process_block, sequential, trial
 from sim.scenario import InputError
 
 T = 1.2e-3

@@ -5,13 +5,12 @@ import json
 import numpy as np
 import pytest
 
+from cli import run, trace
 from controller.coupling import NoCoupling
-from sim import run, trace
-from sim.growth import growth, growths
-from sim.result import Result
+from sim.run import assemble, simulate
 from sim.scenario import InputError, load
-from sim.simulate import assemble, simulate
 from sim.stability import before_clipping, close, dominant_mode
+from sim.trace import Result, growth, growths
 
 T, STEP = 1.2e-3, np.full(2, 1e-6)
 

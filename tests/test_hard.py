@@ -5,21 +5,18 @@ import math
 import numpy as np
 import pytest
 
+from cli.hard import cases, devices, measure, nominal
 from controller.coupling import NoCoupling, SpringDamper
 from controller.process import Tape
-from design.assess import assess
-from design.published import CASE_I
+from design.certificate import assess
+from design.result import CASE_I
 from models.device import CompliantDevice
 from models.human import Human, Link
-from sim.accuracy.yardstick import limit_cycle
-from sim.engine import outside_forces
-from sim.exact_engine import ExactEngine
-from sim.hard import cases, devices, measure, nominal
-from sim.loop import run
-from sim.one_period import exact_growth, simulated_growth
+from sim.accuracy import limit_cycle
+from sim.engines import ExactEngine, outside_forces
+from sim.run import assemble, make_engine, run, simulate
 from sim.scenario import InputError, load
-from sim.simulate import assemble, make_engine, simulate
-from sim.substeps import default_substeps
+from sim.stability import default_substeps, exact_growth, simulated_growth
 
 CLOSED_LOOP = SpringDamper(np.array([7806.0, 3137.0]), np.array([0.105, 1.68]))
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sim.command import Parser
+from cli.options import Parser
 
 ROOT = Path(__file__).parent.parent
 LAUNCH = "execute(main)"  # how a file says that it is a command

@@ -5,20 +5,20 @@ import json
 import numpy as np
 import pytest
 
+from cli import audit
 from controller.coupling import Compliance, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
-from design.audit import __main__ as audit
+from design.certificate import Stored, data_of, save
 from design.condition.human_structure import closed_loop_of_separate_humans, reciprocal, shared_weights, weighted
-from design.frequency.sweep import on_circle
-from design.margin import closed_loop
-from design.store import Stored, data_of, save
+from design.conditions import closed_loop
+from design.frequency import on_circle
 from models.device import RigidDevice
 from models.human import Cross, Human, Link, Person
-from sim.one_period import exact_growth
+from sim.run import assemble
 from sim.scenario import Scenario, load
-from sim.simulate import assemble
+from sim.stability import exact_growth
 
 T, DELTA = 1.2e-3, (1.37, 1.37)
 WALLS = Network(("a", "b"), (Spring(("a", GROUND), 800.0, 1.0), Spring(("b", GROUND), 700.0, 1.0)))

@@ -6,17 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from controller.contact import frozen_states
+from cli.hunt import main
 from controller.coupling import NoCoupling
 from controller.environment import environment
-from controller.process import force_map
-from design.margin import closed_loop, theorem4_per_channel
-from sim.exact_engine import ExactEngine
-from sim.hunt.__main__ import main
-from sim.hunt.bounce import bounce
-from sim.hunt.search import attack, draw
+from controller.process import force_map, frozen_states
+from design.conditions import closed_loop, theorem4_per_channel
+from sim.engines import ExactEngine
+from sim.hunt import attack, bounce, draw
+from sim.run import assemble
 from sim.scenario import InputError, load
-from sim.simulate import assemble
 
 
 @pytest.fixture(scope="module")

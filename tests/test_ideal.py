@@ -5,14 +5,12 @@ import json
 import numpy as np
 import pytest
 
+from cli.run import main
 from controller.coupling import NoCoupling, SpringDamper
-from design.published import CASE_I
-from sim.ideal import Likeness, likeness, response
-from sim.loop import Record
-from sim.result import Result
-from sim.run import main
+from design.result import CASE_I
+from sim.run import Assembly, Record, assemble, simulate
 from sim.scenario import load
-from sim.simulate import Assembly, assemble, simulate
+from sim.trace import Likeness, Result, likeness, response
 
 SCENARIO = load()
 

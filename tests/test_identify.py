@@ -19,8 +19,8 @@ from hw.safety import Limits, Stage
 from hw.session import Session, Settings
 from hw.trace import Recorder
 from models.device import RigidDevice
-from sim.result import Result
 from sim.scenario import InputError, load
+from sim.trace import Result
 
 STEP = 5e-6  # [m] a coarse encoder: half of an Omega's 0.01 mm
 

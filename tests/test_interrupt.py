@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from design.store import SpringDamper, Stored, save
-from sim.command import execute
+from cli.options import execute
+from design.certificate import SpringDamper, Stored, save
 from sim.files import check_file, out_file
 from sim.scenario import InputError, load
 
@@ -132,8 +132,8 @@ def test_the_folder_of_a_file_that_is_named_must_exist(tmp_path):
 
 @pytest.mark.parametrize("command", [["design"], ["design.export", "coupling.json"]])
 def test_no_command_makes_the_folder_of_a_file(command, tmp_path, monkeypatch, capsys):
-    from design.__main__ import main as design
-    from design.export.__main__ import main as export
+    from cli.design import main as design
+    from cli.export import main as export
 
     monkeypatch.chdir(tmp_path)
     save(Stored(load().loop("I"), SpringDamper((878.7, 551.8), (0.3864, 0.5219))), "coupling.json")

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from controller.coupling import SpringDamper
-from controller.delay import LOST, HeldLine, ages, newest, packet_delays, realising
+from controller.delay import LOST, HeldLine, Jitter, ages, newest, packet_delays, realising
 from controller.environment import FIGURE_4, environment
-from controller.jitter import Jitter
 from controller.process import Process, Tape, force_map
 
 T = 1.2e-3

@@ -6,19 +6,15 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
+from cli.audit import main
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
-from design.audit.__main__ import main
-from design.jitter.condition import blocks, half_widths, nominal_over_step
-from design.jitter.multiplier import jitter_proof
-from design.jitter.part import switching_part, switching_requirement
-from design.jitter.proof import prove_switching, storage
-from design.margin import closed_loop
-from design.proof.rational import Matrix
-from design.solve import solve
-from design.store import DelayRange, Loop
+from design.certificate import DelayRange, Loop, prove_switching, storage, switching_part, switching_requirement
+from design.conditions import blocks, closed_loop, half_widths, jitter_proof, nominal_over_step
+from design.exact import Matrix
+from design.lmi import solve
 from sim.scenario import InputError
 
 T, DELTA = 1.2e-3, (1.37, 1.37)

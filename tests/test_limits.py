@@ -5,18 +5,17 @@ import json
 import numpy as np
 import pytest
 
+from cli import compare as limits
+from cli.compare import main
 from controller.environment import environment
 from controller.process import force_map
-from design.limits import __main__ as limits
-from design.limits import curve as limit_curve
-from design.limits import report as limits_report
-from design.limits.__main__ import main
-from design.limits.curve import AXES, Setting, measured, optimum, remembered, settings
-from design.limits.ladder import LADDERS, SHORT, rung
-from design.margin import closed_loop
-from design.parameter.wish import Wish
-from design.published import CASE_I
-from sim.plot_limits import plot_limits
+from design import compare as limit_curve
+from design import compare as limits_report
+from design.compare import AXES, LADDERS, SHORT, Setting, measured, optimum, remembered, rung, settings
+from design.conditions import closed_loop
+from design.optimal import Wish
+from design.result import CASE_I
+from sim.plots import plot_limits
 from sim.scenario import InputError, load
 
 LOOP = load().loop("I")

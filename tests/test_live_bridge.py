@@ -19,7 +19,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from controller.jitter import Jitter
+from cli.options import Parser
+from controller.delay import Jitter
 from hw import bridge, replay
 from hw.desk import add_link_options, check_link
 from hw.emulator import __main__ as emulator_command
@@ -29,7 +30,6 @@ from hw.plan import ladder, rung
 from hw.port import Port
 from hw.safety import ENDED, Limits, Stage
 from hw.session import Session, Settings
-from sim.command import Parser
 from sim.scenario import InputError
 from sim.scenario import load as scenario_of
 

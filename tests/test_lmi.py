@@ -3,25 +3,27 @@
 import cvxpy as cp
 import numpy as np
 import pytest
+from design.semidefinite.analysis import analysis
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
 from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.lti import Lti
-from design.frequency.sweep import frequencies, hermitian, on_circle
+from design.conditions import theorem4
+from design.frequency import frequencies, hermitian, on_circle
 from design.lmi import (
     Ports,
+    balanced,
     e_hat_regular,
     lemma1,
     lemma2,
     lemma3,
+    solve,
     theta_hat,
+    unit_coupling,
+    unit_environment,
     v_hat_regular,
 )
-from design.margin import theorem4
-from design.semidefinite.analysis import analysis
-from design.semidefinite.coordinates import balanced, unit_coupling, unit_environment
-from design.solve import solve
 
 T = 1.2e-3
 DELTA = (1.37, 1.37)

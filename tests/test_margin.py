@@ -8,9 +8,9 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
-from design.frequency.sweep import frequencies, supremum
-from design.margin import closed_loop, theorem4, theorem4_per_channel
-from design.published import CASE_I, CASE_II
+from design.conditions import closed_loop, theorem4, theorem4_per_channel
+from design.frequency import frequencies, supremum
+from design.result import CASE_I, CASE_II
 
 T, THETA, DELTA = 1.2e-3, (1, 2), (1.37, 1.37)
 E = environment(FIGURE_4, T)

@@ -12,21 +12,33 @@ from controller.coupling import InternalModel, basis
 from controller.environment import Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
-from design.assess import specification
-from design.failure import Infeasible
-from design.frequency.sweep import on_circle
-from design.margin import closed_loop
-from design.optimal import design
-from design.parameter.advice import advice, binding, changes
-from design.parameter.cone_program import Block, ConeProgram, vectors
-from design.parameter.cone_solver import solve_cones
-from design.parameter.cutting_planes import HIGH_HZ, PASSIVE_SHARE, SLACK, Problem, sketch, square_mismatch
-from design.parameter.free_parameter import FreeParameter, GivenParameter
-from design.parameter.inequalities import passivity
-from design.parameter.wish import Wish
-from design.parameter.worlds import parameter, world, worlds
-from design.result import Design
-from design.specification import Specification
+from design.certificate import specification
+from design.conditions import Specification, closed_loop
+from design.frequency import on_circle
+from design.optimal import (
+    HIGH_HZ,
+    PASSIVE_SHARE,
+    SLACK,
+    Block,
+    ConeProgram,
+    FreeParameter,
+    GivenParameter,
+    Problem,
+    Wish,
+    advice,
+    binding,
+    changes,
+    design,
+    parameter,
+    passivity,
+    sketch,
+    solve_cones,
+    square_mismatch,
+    vectors,
+    world,
+    worlds,
+)
+from design.result import Design, Infeasible
 from design.transparency import decibels, transparency
 from sim.scenario import load
 

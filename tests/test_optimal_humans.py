@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from controller.coupling import Coupling, NoCoupling
-from models.crowd import Crowd, Variants, variants
+from models.scene import Crowd, Variants, variants
 from sim.adversary import DESTABILISED, search
 from sim.couplings import choose
-from sim.population import draw
+from sim.run import assemble
 from sim.scenario import load
-from sim.simulate import assemble
-from sim.verdicts import disagree, dominant_modes, exact_loops, mujoco_loops, unstable
+from sim.stability import disagree, dominant_modes, exact_loops, mujoco_loops, unstable
+from sim.validate import draw
 
 DEVICES = ("omega-pair", "omega-pair-rigid")
 HUMANS = 1000

@@ -3,14 +3,21 @@
 import numpy as np
 import pytest
 
-from design.assess import specification
-from design.failure import Infeasible
-from design.optimal import design
-from design.parameter.cutting_planes import Problem, cut_problem
-from design.parameter.free_parameter import FreeParameter
-from design.parameter.pole_descent import FARTHEST, Places, descend, gradient, log_mismatch
-from design.parameter.wish import Wish
-from design.parameter.worlds import world
+from design.certificate import specification
+from design.optimal import (
+    FARTHEST,
+    FreeParameter,
+    Places,
+    Problem,
+    Wish,
+    cut_problem,
+    descend,
+    design,
+    gradient,
+    log_mismatch,
+    world,
+)
+from design.result import Infeasible
 from sim.scenario import load
 
 SPEC = {case: specification(load().loop(case)) for case in ("I", "II")}

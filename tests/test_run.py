@@ -9,12 +9,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from design.certificate import prove
-from design.store import SpringDamper, Stored, save
-from sim import loop
-from sim.result import Result
-from sim.run import main
+from cli.run import main
+from design.certificate import SpringDamper, Stored, prove, save
+from sim import run as loop
 from sim.scenario import InputError, load
+from sim.trace import Result
 
 SECTIONS = {"case", "scenario", "coupling", "certificate", "certificates", "promise", "transparency", "stability"}
 SECTIONS |= {"run", "error", "files"}

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.table import Table
 
-from sim.screen import Screen
+from cli.options import Screen
 
 ROOT = Path(__file__).parent.parent
 NUMBERS = ["7.8429", "18.895", "-11.19", "0.71449", "1.3699"]

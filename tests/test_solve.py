@@ -8,9 +8,9 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from design import solve as module
-from design.failure import DesignFailed, Infeasible
-from design.solve import CROSS_CHECK, LADDER, solve
+from design import lmi as module
+from design.lmi import CROSS_CHECK, LADDER, solve
+from design.result import DesignFailed, Infeasible
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
+from design.semidefinite.analysis import analysis
 from scipy.optimize import brentq
 
 from controller.coupling import SpringDamper
@@ -10,15 +11,10 @@ from controller.delay import delay
 from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
-from design.condition.delayed import theorem4_delayed
-from design.failure import DesignFailed, Infeasible
-from design.gains.gain_set import gain_set, solve_within
-from design.margin import closed_loop, theorem4
-from design.semidefinite.analysis import analysis
-from design.shaping import Shaping
-from design.solve import CROSS_CHECK, solve
-from design.specification import RESERVE, Specification
-from design.spring_damper import design, stiffest
+from design.conditions import RESERVE, Specification, closed_loop, theorem4, theorem4_delayed
+from design.lmi import CROSS_CHECK, Shaping, solve
+from design.result import DesignFailed, Infeasible
+from design.spring_damper import design, gain_set, solve_within, stiffest
 
 T = 1.2e-3
 DELTA = (1.37, 1.37)

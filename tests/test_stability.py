@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from controller.coupling import NoCoupling
-from design.published import CASE_I, CASE_II
-from sim.loop import run
+from design.result import CASE_I, CASE_II
+from sim.run import assemble, make_engine, run, simulate
 from sim.scenario import load
-from sim.simulate import assemble, make_engine, simulate
 from sim.stability import close, dominant_mode, growth_rate, measured_growth, verdict
 
 

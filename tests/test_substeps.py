@@ -5,17 +5,25 @@ import json
 import numpy as np
 import pytest
 
+from cli.run import main
 from controller.coupling import NoCoupling
-from design.published import CASE_I
+from design.result import CASE_I
 from models.device import CompliantDevice
 from models.human import Human, Link
 from models.scene import plant
-from sim.mujoco_engine import INTEGRATORS, LEAPFROG
-from sim.one_period import exact_growth, measured_hold, simulated_growth
-from sim.run import main
+from sim.engines import INTEGRATORS, LEAPFROG
+from sim.run import assemble, simulate
 from sim.scenario import SCENARIOS, InputError, load
-from sim.simulate import assemble, simulate
-from sim.substeps import Pace, check_substeps, default_substeps, pace, step_radius
+from sim.stability import (
+    Pace,
+    check_substeps,
+    default_substeps,
+    exact_growth,
+    measured_hold,
+    pace,
+    simulated_growth,
+    step_radius,
+)
 
 SCENARIO = load()
 STIFF = SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=1e6),) * 2)

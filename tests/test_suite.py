@@ -6,11 +6,10 @@ import shlex
 
 import pytest
 
-from sim import hard
+from cli import hard, suite
+from cli import suite as suite_report
+from cli.suite import CHECKS, Check, entry, main
 from sim.scenario import InputError
-from sim.suite import __main__ as suite
-from sim.suite import report as suite_report
-from sim.suite.__main__ import CHECKS, Check, entry, main
 
 QUICK = "sim.validate --case none --humans {humans} --links mixed --duration 0.3 --engine exact --seed {seed}"
 

@@ -5,19 +5,18 @@ import json
 import numpy as np
 import pytest
 
+from cli import zwidth
+from cli.options import BAD_INPUT, DONE, execute
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring
-from design.condition.environment_map import Environments
-from design.frequency.sweep import on_circle
-from models.crowd import variants
-from sim.command import BAD_INPUT, DONE, execute
+from design.conditions import Environments
+from design.frequency import on_circle
+from models.scene import variants
 from sim.couplings import choose
-from sim.population import crowds
 from sim.scenario import load
-from sim.verdicts import dominant_modes, exact_loops
-from sim.zwidth import __main__ as zwidth
-from sim.zwidth.population import holders
-from sim.zwidth.surroundings import MODEL_KEPT, Surroundings
+from sim.stability import dominant_modes, exact_loops
+from sim.validate import crowds
+from sim.zwidth import MODEL_KEPT, Surroundings, holders
 
 PAIR, STAR = load("omega-pair"), load("three-rigid")
 WALL = Network(("tip",), (Spring(("tip", GROUND), 2000.0, 0.2),))

@@ -7,24 +7,28 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from cli.run import main
+from cli.validate import main as validate
 from controller.coupling import SpringDamper
-from controller.delay import ages, realising
-from controller.jitter import Jitter
+from controller.delay import Jitter, ages, realising
 from controller.process import Tape
-from design import store
-from models.crowd import Crowd, variants
-from models.scene import plant
-from sim.batch_engine import ExactBatchEngine
-from sim.exact_engine import ExactEngine, HeldPlant
-from sim.population import draw
-from sim.run import main
+from design import certificate as store
+from models.scene import Crowd, plant, variants
+from sim.engines import ExactBatchEngine, ExactEngine, HeldPlant
+from sim.run import assemble, simulate
 from sim.scenario import SCENARIOS, InputError, load, parse
-from sim.simulate import assemble, simulate
-from sim.switching.crowd import switched_crowd
-from sim.switching.drawn import adversary, switching
-from sim.switching.switched import knocked, mode_matrix, unlimited, with_delays, without_theta
-from sim.switching.worst import greedy_ages
-from sim.validate.__main__ import main as validate
+from sim.switching import (
+    adversary,
+    greedy_ages,
+    knocked,
+    mode_matrix,
+    switched_crowd,
+    switching,
+    unlimited,
+    with_delays,
+    without_theta,
+)
+from sim.validate import draw
 
 STIFF = SpringDamper([7806, 3137], [0.105, 1.68])  # certified for the constants (1, 2) in the default environment
 ASSEMBLY = assemble(load(), STIFF)

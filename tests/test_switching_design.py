@@ -5,21 +5,21 @@ import json
 import numpy as np
 import pytest
 
+from cli.design import main
 from controller.coupling import SpringDamper
-from controller.jitter import Jitter
+from controller.delay import Jitter
 from controller.process import force_map
-from design.__main__ import main
-from design.assess import specification
-from design.failure import DesignFailed
-from design.jitter.multiplier import jitter_proof
+from design.certificate import load as load_stored
+from design.certificate import specification
+from design.conditions import jitter_proof
+from design.optimal import Wish
 from design.optimal import design as optimal_design
-from design.parameter.wish import Wish
+from design.result import DesignFailed
 from design.spring_damper import design
-from design.store import load as load_stored
-from models.crowd import Crowd, variants
+from models.scene import Crowd, variants
+from sim.run import assemble
 from sim.scenario import InputError, load
-from sim.simulate import assemble
-from sim.switching.crowd import switched_crowd
+from sim.switching import switched_crowd
 
 RANGE = ((1, 1), (2, 2))
 

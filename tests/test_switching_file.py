@@ -7,28 +7,38 @@ import msgspec
 import numpy as np
 import pytest
 
+from cli.audit import main as audit_main
+from cli.check import main as check_main
+from cli.design import main as design_main
+from cli.run import main as run_main
+from cli.validate import main as validate_main
 from controller import coupling as built
-from controller.box import Box, UncertainSpring
-from controller.delay import LOST, ages
-from controller.environment import FIGURE_4, environment
-from controller.jitter import Jitter
+from controller.delay import LOST, Jitter, ages
+from controller.environment import FIGURE_4, Box, UncertainSpring, environment
 from controller.process import force_map
 from design import certify
-from design.__main__ import main as design_main
-from design.audit.__main__ import main as audit_main
-from design.certificate import NotProved, prove, verify
-from design.check import main as check_main
-from design.jitter.condition import blocks
-from design.jitter.multiplier import jitter_proof
-from design.jitter.proof import condition_block, refuted
-from design.margin import closed_loop
-from design.proof import positive_real
-from design.proof.rational import Matrix
-from design.store import BadFile, Certificate, DelayRange, Loop, SpringDamper, Stored, digest, load, save, sealed
+from design import exact as positive_real
+from design.certificate import (
+    BadFile,
+    Certificate,
+    DelayRange,
+    Loop,
+    NotProved,
+    SpringDamper,
+    Stored,
+    condition_block,
+    digest,
+    load,
+    prove,
+    refuted,
+    save,
+    sealed,
+    verify,
+)
+from design.conditions import blocks, closed_loop, jitter_proof
+from design.exact import Matrix
 from hw.plan import ladder
-from sim.run import main as run_main
 from sim.scenario import load as scenario_of
-from sim.validate.__main__ import main as validate_main
 
 T, DELTA = 1.2e-3, (1.37, 1.37)
 RANGE = DelayRange((1, 1), (2, 2))

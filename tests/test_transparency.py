@@ -8,8 +8,8 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.lti import Lti
 from controller.process import force_map
-from design.frequency.quadrature import integral
-from design.published import CASE_I
+from design.frequency import integral
+from design.result import CASE_I
 from design.transparency import decibels, transparency
 
 T, THETA = 1.2e-3, (1, 2)

@@ -11,29 +11,31 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from cli import run as run_command
+from cli import validate as verdict_report
+from cli.validate import main
 from controller.coupling import NoCoupling, SpringDamper
-from design.published import CASE_I
-from models.crowd import Crowd, variants
+from design.result import CASE_I
 from models.device import RigidDevice
 from models.human import Person
-from models.scene import build, plant
-from sim import run as run_command
-from sim.batch_engine import ExactBatchEngine
+from models.scene import Crowd, build, plant, variants
+from sim import validate as examine_module
+from sim import validate as shards
 from sim.couplings import choose
-from sim.exact_engine import ExactEngine, hold
-from sim.knock import knock_forces
-from sim.loop import run
-from sim.population import MIXED, crowds, crowds_of, draw
+from sim.engines import ExactBatchEngine, ExactEngine, hold
+from sim.run import assemble, run, simulate
 from sim.scenario import InputError, load
-from sim.simulate import assemble, simulate
-from sim.stability import close, dominant_mode
-from sim.validate import examine as examine_module
-from sim.validate import report as verdict_report
-from sim.validate import shards
-from sim.validate.__main__ import main
-from sim.validate.examine import BATCH, Findings, Question
-from sim.validate.shards import validate
-from sim.verdicts import disagree, dominant_modes, exact_loops, mujoco_loops, unstable
+from sim.stability import (
+    close,
+    disagree,
+    dominant_mode,
+    dominant_modes,
+    exact_loops,
+    knock_forces,
+    mujoco_loops,
+    unstable,
+)
+from sim.validate import BATCH, MIXED, Findings, Question, crowds, crowds_of, draw, validate
 
 SCENARIO = load()
 TWO = "[[human]]\nlinks = [{mass = 1.0, damping = 0, stiffness = 0}]\n" * 2

@@ -14,15 +14,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from cli import view as command
 from controller.coupling import SpringDamper
 from models.human import Human, Link
 from models.scene import build, plant
 from sim.couplings import Chosen
-from sim.exact_engine import hold
+from sim.engines import hold
+from sim.run import simulate
 from sim.scenario import InputError, load
-from sim.simulate import simulate
 from sim.stability import close, dominant_mode
-from sim.view import __main__ as command
 from sim.view import film, offscreen
 from sim.view.events import GIVEN, KEYS, Delay, Push, Restart, parse_script, words
 from sim.view.flat import Flat

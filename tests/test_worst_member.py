@@ -7,21 +7,16 @@ import msgspec
 import numpy as np
 import pytest
 
-from controller.box import Box, Member, Region, UncertainSpring, members, regions
+from cli.check import main as check_main
+from cli.design import _store
 from controller.coupling import InternalModel
-from controller.environment import FIGURE_4, Network, Spring
+from controller.environment import FIGURE_4, Box, Member, Network, Region, Spring, UncertainSpring, members, regions
 from design import optimal
-from design.__main__ import _store
-from design.api import certify
-from design.assess import specification
-from design.box.check import check_set, set_part, set_rows
-from design.box.worst_member import search
-from design.certificate import prove, verify
-from design.check import main as check_main
-from design.failure import DesignFailed
-from design.parameter.wish import Wish
-from design.result import Design
-from design.store import Stored, data_of, load, save
+from design.certificate import Stored, data_of, load, prove, save, specification, verify
+from design.designs import certify
+from design.optimal import Wish
+from design.ranges import check_set, search, set_part, set_rows
+from design.result import Design, DesignFailed
 from sim import scenario
 from sim.scenario import SCENARIOS
 

@@ -7,33 +7,23 @@ import mujoco
 import numpy as np
 import pytest
 
-from controller.contact import contact
+from cli import zwidth
+from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, Wall, environment
 from controller.gains import Gains, force_maps
-from controller.process import Process, Tape, force_map
-from design.frequency.suprema import suprema
-from design.frequency.sweep import on_circle
-from design.gains.gain_map import closed_loop_ratios, theorem4_ratios
-from models.crowd import variants
+from controller.process import Process, Tape, contact, force_map
+from design.conditions import closed_loop_ratios, theorem4_ratios
+from design.frequency import on_circle, suprema
 from models.device import CompliantDevice, RigidDevice
 from models.human import Human, Link
-from models.scene import build
-from sim.command import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
-from sim.mujoco_engine import discretised
-from sim.oscillation import oscillation, slowest_seen
-from sim.population import crowds
+from models.scene import build, variants
+from sim import zwidth as gain_map
+from sim.engines import discretised
 from sim.scenario import InputError, load
-from sim.verdicts import dominant_modes, exact_loops
-from sim.zwidth import __main__ as zwidth
-from sim.zwidth import map as gain_map
-from sim.zwidth.cells import in_slices
-from sim.zwidth.grid import Grid, make_grid
-from sim.zwidth.ground import Ground, one_sided
-from sim.zwidth.many_processes import ManyProcesses
-from sim.zwidth.map import draw_map
-from sim.zwidth.population import holders
-from sim.zwidth.simulation import Effects, Plan
+from sim.stability import dominant_modes, exact_loops, oscillation, slowest_seen
+from sim.validate import crowds
+from sim.zwidth import Effects, Grid, Ground, ManyProcesses, Plan, draw_map, holders, in_slices, make_grid, one_sided
 
 DELTA, T = 1.37, 1e-3
 PAIR, STAR = load("omega-pair"), load("three-rigid")

@@ -23,13 +23,11 @@ from scipy.optimize import minimize
 from controller.coupling import Coupling
 from controller.environment import Network
 from controller.lti import Array, Lti
-from design.frequency.sweep import on_circle
-from design.margin import Requirement, closed_loop
-from design.promises import certificate_part
-from design.proof import exact
-from design.proof.exact import Exact
-from design.proof.positive_real import find_storage, too_large
-from design.proof.rational import Matrix, SingularMatrix, definiteness, rational
+from design import exact
+from design.certificate import certificate_part
+from design.conditions import Requirement, closed_loop
+from design.exact import Exact, Matrix, SingularMatrix, definiteness, find_storage, rational, too_large
+from design.frequency import on_circle
 
 RECIPROCAL = 1e-6  # relative difference of |F_ij| and |F_ji| that is taken for rounding
 LARGEST_RATIO = 1e4  # between two weights

@@ -22,11 +22,7 @@ from contextlib import suppress
 from itertools import count
 from typing import Any
 
-from hw.emulator.child import pace_from
-from hw.emulator.core import Emulator
-from hw.emulator.plant import nobody
-from hw.emulator.upset import DEVICE, LINE, Line, Upset
-from sim.command import (
+from cli.options import (
     DONE,
     INTERRUPTED,
     Parser,
@@ -38,6 +34,10 @@ from sim.command import (
     scenario_from,
     seed_from,
 )
+from hw.emulator.child import pace_from
+from hw.emulator.core import Emulator
+from hw.emulator.plant import nobody
+from hw.emulator.upset import DEVICE, LINE, Line, Upset
 from sim.scenario import InputError
 
 LINGER_US = 50_000  # after the cable was pulled: the device comes to rest by itself

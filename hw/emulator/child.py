@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
-from sim.command import numbers
+from cli.options import numbers
 from sim.scenario import InputError
 
 PATIENCE = 60.0  # [s] for the emulator to load MuJoCo and print its path

@@ -7,8 +7,7 @@ import numpy as np
 from controller.lti import Array
 from models.human import Human, Link
 from models.scene import build, plant
-from sim.engine import outside_forces
-from sim.exact_engine import hold
+from sim.engines import hold, outside_forces
 from sim.scenario import Scenario
 
 STRETCH = 1000  # ticks of outside forces that are computed at once

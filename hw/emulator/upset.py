@@ -18,7 +18,7 @@ from typing import Self
 
 import numpy as np
 
-from models.quantity import require
+from models.device import require
 from sim.scenario import InputError
 
 FOREVER = 1e9  # [s]

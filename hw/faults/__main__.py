@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from rich.table import Table
 
+from cli.options import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute
 from hw.emulator.core import Emulator, info_of
 from hw.emulator.upset import Upset
 from hw.faults.cases import CASES, WHEN, Case
@@ -22,7 +23,6 @@ from hw.plan import Ages, Rung, ladder, link_delay
 from hw.rehearsal import Plan, Rehearsal
 from hw.safety import ENDED, Limits, Stage
 from hw.session import Session, Settings
-from sim.command import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute
 from sim.files import write_json
 from sim.scenario import Scenario, load
 

@@ -16,16 +16,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from hw import session_report
-from hw.desk import add_link_options, check_link, hold_session, measured_link, number, session_for
-from hw.identify.excitation import Excitation, chirp
-from hw.identify.fit import Estimate, identify
-from hw.plan import Ages
-from hw.safety import Stage
-from hw.session import Session
-from hw.trace import Recorder, result_of
-from models.device import RigidDevice
-from sim.command import (
+from cli.options import (
     DOES_NOT_HOLD,
     DONE,
     INTERRUPTED,
@@ -42,6 +33,15 @@ from sim.command import (
     scenario_from,
     seed_from,
 )
+from hw import session_report
+from hw.desk import add_link_options, check_link, hold_session, measured_link, number, session_for
+from hw.identify.excitation import Excitation, chirp
+from hw.identify.fit import Estimate, identify
+from hw.plan import Ages
+from hw.safety import Stage
+from hw.session import Session
+from hw.trace import Recorder, result_of
+from models.device import RigidDevice
 from sim.files import write, write_json
 from sim.scenario import InputError, Scenario
 

@@ -9,14 +9,12 @@ import pytest
 
 from controller.environment import environment
 from controller.process import force_map
-from design import ccl, optimal, spring_damper
-from design.assess import assess, specification
-from design.audit.report import report
-from design.audit.subject import Subject
-from design.certificate import prove, verify
-from design.parameter.wish import Wish
-from design.published import CASE_I
-from design.store import Stored, data_of
+from design import fixed_order as ccl
+from design import optimal, spring_damper
+from design.audit import Subject, report
+from design.certificate import Stored, assess, data_of, prove, specification, verify
+from design.optimal import Wish
+from design.result import CASE_I
 from design.transparency import decibels, transparency
 from sim.scenario import load
 

@@ -10,18 +10,15 @@ import pytest
 
 from controller.coupling import NoCoupling
 from controller.process import Tape
-from design.margin import closed_loop
-from design.published import CASE_I
-from models.crowd import variants
+from design.conditions import closed_loop
+from design.result import CASE_I
+from models.scene import variants
 from sim.adversary import attempts
-from sim.batch_engine import ExactBatchEngine
-from sim.exact_engine import hold
-from sim.loop import stretch
-from sim.mujoco_engine import MujocoBatchEngine, profiler_off
-from sim.population import crowds
+from sim.engines import ExactBatchEngine, MujocoBatchEngine, hold, profiler_off
+from sim.run import assemble, stretch
 from sim.scenario import load
-from sim.simulate import assemble
-from sim.verdicts import disagree, dominant_modes, exact_loops, mujoco_loops, unstable
+from sim.stability import disagree, dominant_modes, exact_loops, mujoco_loops, unstable
+from sim.validate import crowds
 
 pytestmark = pytest.mark.benchmark(group="validation")
 HUMANS = 1000

@@ -1,0 +1,1 @@
+"""The command line: options, tables, one file per command."""
