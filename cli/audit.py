@@ -60,7 +60,7 @@ def main(argv: list[str]) -> int:
         "case": args.case,
         "scenario": None if args.rigid else scenario.name,
         "preset": args.preset and {"name": args.preset, "source": PRESETS[args.preset].source},
-        **report(subject, switching, whole, None if args.rigid else scenario.holders),
+        **report(subject, switching, whole),
         "notes": _notes(args, scenario, switching),
         "wall_s": time.perf_counter() - begin,
     }

@@ -23,7 +23,6 @@ from controller.lti import SingularLoop
 from design.result import DesignFailed
 from models.device import MOST_DAMPING
 from sim.files import check_file, folder, nobody_reads
-from sim.interrupt import INTERRUPTED, begun
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
 
 # ----------------------------------------------------------------------------------------------------
@@ -76,7 +75,7 @@ class Screen(Console):
 # What every command shares: its options, its exit codes, one line for bad input.
 
 
-DONE, DOES_NOT_HOLD, BAD_INPUT = 0, 1, 2  # and INTERRUPTED, which sim.interrupt has
+DONE, DOES_NOT_HOLD, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 Number = TypeVar("Number", int, float)
 
@@ -258,7 +257,6 @@ def execute(main: Callable[[list[str]], int]) -> NoReturn:
     code: str | int | None
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of processes that this one starts
     try:
-        begun()
         # the matrices here are small: more BLAS threads only wait for each other, and the last digits depend on them
         with threadpool_limits(1, user_api="blas"):
             code = main(sys.argv[1:])

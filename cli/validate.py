@@ -40,12 +40,12 @@ from design.ranges import SetCheck, check_set, set_part
 from models.human import Human, Person
 from sim.adversary import Worst, search
 from sim.couplings import NAMES, Chosen, choose
+from sim.crowds import ENGINES, MIXED, Findings, Question, crowd_of, validate, validate_on_cluster
 from sim.files import write_json
 from sim.run import assemble
 from sim.scenario import InputError, Scenario, save_humans
 from sim.stability import unstable
 from sim.switching import certified_part
-from sim.validate import ENGINES, MIXED, Findings, Question, crowd_of, validate, validate_on_cluster
 
 # ----------------------------------------------------------------------------------------------------
 # What a validation found: one dictionary for machines, and the same as a table for people.

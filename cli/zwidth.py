@@ -195,7 +195,7 @@ def _share(count: int, cells: int) -> str:
 NOT_REACHED = "not reached before the interruption"
 
 
-def outcome(ground: MapLoop, drawn: Map, plan: Plan, population: dict[str, Any]) -> dict[str, Any]:
+def summary(ground: MapLoop, drawn: Map, plan: Plan, population: dict[str, Any]) -> dict[str, Any]:
     """The whole map. Rows are stiffnesses; null is infinite, or not reached before an interruption."""
     known = np.isfinite(drawn.growth)
     unsafe = known & (drawn.growth > MARGINAL)
@@ -373,7 +373,7 @@ def main(argv: list[str]) -> int:
             plan,
             lambda stage, k, of: moved(k, of) or bar.update(bar.task_ids[0], description=stage),
         )
-    outcome = outcome(ground, drawn, plan, {"humans": humans, "seed": seed})
+    outcome = summary(ground, drawn, plan, {"humans": humans, "seed": seed})
     outcome |= {"scenario": None if args.rigid else scenario.name, "scenario_digest": scenario.digest}
     outcome |= _coupling(args, scenario, chosen, seed) if chosen else {"axes": "coupling", "coupling": None}
     if not drawn.interrupted:

@@ -14,7 +14,6 @@ what it does not need.
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -24,9 +23,6 @@ if TYPE_CHECKING:
     from design.designs import Options, certify, design_coupling, promise, transparency_of
     from design.result import Design, DesignFailed
     from design.transparency import Transparency
-
-if sys.argv[:1] == ["-m"]:  # a command starts, and may be interrupted; scripts do not need sim for a design
-    import sim  # noqa: F401
 
 __all__ = [
     "Design",

@@ -32,7 +32,6 @@ from design.certificate import (
     switching_requirement,
     theorem4_of,
 )
-from design.condition.human_structure import separate_humans_part
 from design.conditions import JitterProof, Requirement, closed_loop, jitter_proof, jitter_refusal, refusal, theorem4
 from design.ranges import SetCheck, set_part, set_rows
 from design.result import listed
@@ -377,12 +376,11 @@ def report(
     subject: Subject,
     switching: DelayRange | None = None,
     whole: SetCheck | None = None,
-    holders: Sequence[int] | None = None,
 ) -> dict[str, Any]:
     """Both conditions with what surrounds them; SI units, null with a "reason" where a figure does not exist.
 
     With a range of delays also the damping that any switching within it asks; `whole` is the same coupling over the
-    box around the environment, if there is one, `holders` who holds each device.
+    box around the environment, if there is one.
     """
     requirements = {condition: subject.requirement(condition) for condition in reversed(get_args(Condition))}
     closed_loop, theorem4 = requirements["closed-loop"].certified, requirements["theorem4"].certified
@@ -405,7 +403,6 @@ def report(
         },
         **{condition: _condition_part(subject, requirement) for condition, requirement in requirements.items()},
         "jitter-proof": _switching_part(subject, switching) if switching else None,
-        "separate-humans": _separate_part(subject, holders) if holders else None,
         "set": whole and set_part(whole),
         "certified": closed_loop and (whole is None or proved or promised == ANY),
         "promise": promised,
@@ -419,18 +416,6 @@ def _condition_part(subject: Subject, requirement: Requirement) -> dict[str, Any
         "stiffest": _stiffest_part(stiffest(subject, requirement.condition)),
         "sensitivity": _sensitivity_part(subject, requirement, tolerance(subject, requirement)),
     }
-
-
-def _separate_part(subject: Subject, holders: Sequence[int]) -> dict[str, Any] | None:
-    """What the closed-loop condition asks if these humans are separate; None where there is no single loop."""
-    if subject.network is None or subject.network.walls:
-        return None
-    try:
-        F = subject.F
-    except SingularLoop:
-        return None
-    delays = (subject.theta, subject.psi)
-    return separate_humans_part(F, subject.delta, holders, subject.coupling, subject.network, delays)
 
 
 def _switching_part(subject: Subject, span: DelayRange) -> dict[str, Any]:
@@ -560,10 +545,6 @@ def _remarks(report: dict[str, Any]) -> list[str]:
         lines.append(f"What helps: {helping['change']} ({need}).")
     if (part := report["jitter-proof"]) is not None:
         lines += _switching_remarks(part)
-    if (part := report["separate-humans"]) is not None and len(set(part["weights"])) > 1:
-        proof = ", proved exactly" if part["proof"] == "rational" else ""
-        weights = f"weights {listed(part['weights'])}"
-        lines.append(f"As each human holds devices of his own ({weights}) it needs {_needs(part)}{proof}.")
     return [*lines, report["not_covered"]]
 
 

@@ -644,10 +644,3 @@ def _rungs(case: str, rows: Sequence[dict[str, Any]], scenario: str) -> Table:
             need, figures = "-", ["-", "-"]
         table.add_row(row["design"], need, *figures, row["proof"] or "-", f"{row['wall_s']:.2f}")
     return table
-
-
-if __name__ == "__main__":
-    from cli.compare import main
-    from cli.options import execute
-
-    execute(main)

@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from design import design_coupling
-from sim import Result, load, plot_run
-from sim import run as simulate
+from sim import Result, load, plot_run, simulate
 
 SECONDS = 8.0
 

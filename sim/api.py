@@ -6,6 +6,8 @@ from cli import run as report
 from cli.options import require_linear
 from controller.coupling import Coupling, NoCoupling
 from design.result import COUPLING, Design, bare, number, of_kind, one_of, whole
+from sim.crowds import ENGINES, Findings, Question
+from sim.crowds import validate as examine_all
 from sim.engines import INTEGRATORS, LEAPFROG
 from sim.run import ENGINES as ALONE
 from sim.run import Progress, assemble
@@ -14,8 +16,6 @@ from sim.scenario import InputError, Scenario
 from sim.stability import LEAST, MOST, check_substeps, default_substeps
 from sim.switching import switching
 from sim.trace import Result
-from sim.validate import ENGINES, Findings, Question
-from sim.validate import validate as examine_all
 
 MOST_HUMANS = 1_000_000
 SCENARIO = 'a Scenario, as load("omega-pair") gives it'

@@ -105,12 +105,6 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return len(self.environment.contacts)
 
     @property
-    def holders(self) -> tuple[int, ...]:
-        """Who holds each device, (m,): a number per human, one for all devices of the same person."""
-        owner = {channel: p for p, person in enumerate(self.person) for channel in person.holds}
-        return tuple(owner.get(i, len(self.person) + i) for i in range(1, self.channels + 1))
-
-    @property
     def switches(self) -> bool:
         """Whether the delay of the forces is anything but the constant theta."""
         return self.jitter is not None and not self.jitter.steady

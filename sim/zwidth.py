@@ -39,11 +39,11 @@ from design.result import DesignFailed
 from models.device import Device, passivity_level
 from models.human import Population
 from models.scene import Crowd, Scene, variants
+from sim.crowds import crowds
 from sim.engines import HeldPlant, MujocoBatchEngine, hold, profiler_off, quiet_warnings
 from sim.run import stretch
 from sim.scenario import InputError
 from sim.stability import MARGINAL, RUNAWAY, Oscillation, close, oscillation, pace, slowest_seen
-from sim.validate import crowds
 
 # ----------------------------------------------------------------------------------------------------
 # What a K-B map asks of the loop it is about, whatever K and B are gains of.

@@ -14,11 +14,11 @@ from design.conditions import closed_loop
 from design.result import CASE_I
 from models.scene import variants
 from sim.adversary import attempts
+from sim.crowds import crowds
 from sim.engines import ExactBatchEngine, MujocoBatchEngine, hold, profiler_off
 from sim.run import assemble, stretch
 from sim.scenario import load
 from sim.stability import disagree, dominant_modes, exact_loops, mujoco_loops, unstable
-from sim.validate import crowds
 
 pytestmark = pytest.mark.benchmark(group="validation")
 HUMANS = 1000

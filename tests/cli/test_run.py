@@ -144,7 +144,7 @@ def test_bad_options(options, message, tmp_path, monkeypatch):
 
 
 def command(*options, **kwargs):
-    environment = {"PYTHONPATH": str(Path(__file__).parent.parent), "PATH": "/usr/bin:/bin"}
+    environment = {"PYTHONPATH": str(Path(__file__).parents[2]), "PATH": "/usr/bin:/bin"}
     return subprocess.Popen(
         [sys.executable, "-m", "sim.run", *options],
         stdout=subprocess.PIPE,

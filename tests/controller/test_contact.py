@@ -20,11 +20,11 @@ from design.conditions import closed_loop
 from models.device import CompliantDevice
 from models.human import Population
 from models.scene import variants
+from sim.crowds import crowds
 from sim.engines import ExactBatchEngine, MujocoBatchEngine, hold
 from sim.hunt import bounce
 from sim.run import assemble, simulate
 from sim.scenario import SCENARIOS, InputError, load, parse
-from sim.validate import crowds
 
 T = 1e-3
 SOFT = SpringDamper([878.0, 551.0], [0.386, 0.521])  # within theorem4's set for theta = (1, 2), T = 1.2 ms

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 MENTION = re.compile(r"tests/(test_\w+\.py)::(\w+)")
 DOCS = ("theory.md", "reproducibility.md")
 #: Sections that introduce words and claim nothing

@@ -3,7 +3,7 @@
 import cvxpy as cp
 import numpy as np
 import pytest
-from design.semidefinite.analysis import analysis
+from analysis import analysis
 from scipy.optimize import brentq
 
 from controller.coupling import SpringDamper

@@ -20,8 +20,7 @@ from design import Options, certify, design_coupling, promise, transparency_of
 from design.designs import KINDS, OPTIONS
 from hw import rehearse
 from models.device import RigidDevice
-from sim import InputError, Result, Scenario, load, parse, validate
-from sim import run as simulate
+from sim import InputError, Result, Scenario, load, parse, simulate, validate
 from sim.scenario import SCENARIOS
 
 SHORT = load().replace(duration=0.3)
@@ -39,7 +38,7 @@ def test_a_file_of_the_same_name_does_not_take_the_functions_place():
     """In whatever order: this file has imported sim.validate already, a fresh process does so first."""
     assert callable(validate)
     assert callable(simulate)
-    code = "import sim.validate, sim.simulate; from sim import simulate, validate; print(simulate.__module__)"
+    code = "import sim.crowds; from sim import simulate, validate; print(simulate.__module__)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "sim.api"
 

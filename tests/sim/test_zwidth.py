@@ -19,10 +19,10 @@ from models.device import CompliantDevice, RigidDevice
 from models.human import Human, Link
 from models.scene import build, variants
 from sim import zwidth as gain_map
+from sim.crowds import crowds
 from sim.engines import discretised
 from sim.scenario import InputError, load
 from sim.stability import dominant_modes, exact_loops, oscillation, slowest_seen
-from sim.validate import crowds
 from sim.zwidth import Effects, Grid, Ground, ManyProcesses, Plan, draw_map, holders, in_slices, make_grid, one_sided
 
 DELTA, T = 1.37, 1e-3

@@ -13,9 +13,9 @@ from design.conditions import Environments
 from design.frequency import on_circle
 from models.scene import variants
 from sim.couplings import choose
+from sim.crowds import crowds
 from sim.scenario import load
 from sim.stability import dominant_modes, exact_loops
-from sim.validate import crowds
 from sim.zwidth import MODEL_KEPT, Surroundings, holders
 
 PAIR, STAR = load("omega-pair"), load("three-rigid")

@@ -14,6 +14,7 @@ from controller.delay import Jitter, ages, realising
 from controller.process import Tape
 from design import certificate as store
 from models.scene import Crowd, plant, variants
+from sim.crowds import draw
 from sim.engines import ExactBatchEngine, ExactEngine, HeldPlant
 from sim.run import assemble, simulate
 from sim.scenario import SCENARIOS, InputError, load, parse
@@ -28,7 +29,6 @@ from sim.switching import (
     with_delays,
     without_theta,
 )
-from sim.validate import draw
 
 STIFF = SpringDamper([7806, 3137], [0.105, 1.68])  # certified for the constants (1, 2) in the default environment
 ASSEMBLY = assemble(load(), STIFF)

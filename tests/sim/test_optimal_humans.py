@@ -9,10 +9,10 @@ from controller.coupling import Coupling, NoCoupling
 from models.scene import Crowd, Variants, variants
 from sim.adversary import DESTABILISED, search
 from sim.couplings import choose
+from sim.crowds import draw
 from sim.run import assemble
 from sim.scenario import load
 from sim.stability import disagree, dominant_modes, exact_loops, mujoco_loops, unstable
-from sim.validate import draw
 
 DEVICES = ("omega-pair", "omega-pair-rigid")
 HUMANS = 1000

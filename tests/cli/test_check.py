@@ -69,7 +69,7 @@ def test_help_has_an_example(capsys):
 
 
 def test_checking_imports_no_solver(path):
-    code = f"import sys, design.check as c; r = c.main([{str(path)!r}]); sys.exit(r or ('cvxpy' in sys.modules))"
+    code = f"import sys, cli.check as c; r = c.main([{str(path)!r}]); sys.exit(r or ('cvxpy' in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
 
 
@@ -77,5 +77,5 @@ def test_an_interruption_exits_with_130(path, monkeypatch):
     def interrupted(stored):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("design.check.verify", interrupted)
+    monkeypatch.setattr("cli.check.verify", interrupted)
     assert leave(monkeypatch, str(path)) == 130

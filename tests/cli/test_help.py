@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -11,8 +12,8 @@ import pytest
 
 from cli.options import Parser
 
-ROOT = Path(__file__).parent.parent
-LAUNCH = "execute(main)"  # how a file says that it is a command
+ROOT = Path(__file__).parents[2]
+LAUNCH = re.compile(r"    execute\((\w+)\)")  # how a file says that it is a command
 
 
 class Parsed(Exception):
@@ -22,13 +23,17 @@ class Parsed(Exception):
 def modules():
     """Every command as python -m names it."""
     files = [path for folder in ("design", "sim", "hw") for path in sorted((ROOT / folder).rglob("*.py"))]
-    found = [path.relative_to(ROOT).with_suffix("").parts for path in files if LAUNCH in path.read_text()]
+    found = [path.relative_to(ROOT).with_suffix("").parts for path in files if LAUNCH.search(path.read_text())]
     return [".".join(parts).removesuffix(".__main__") for parts in found]
 
 
 def main_of(module):
-    package = (ROOT / module.replace(".", "/")).is_dir()
-    return importlib.import_module(f"{module}.__main__" if package else module).main
+    path = ROOT / module.replace(".", "/")
+    text = (path / "__main__.py" if path.is_dir() else path.with_suffix(".py")).read_text()
+    name = LAUNCH.search(text).group(1)
+    door = re.search(rf"from (cli\.\w+) import {name}\b", text)
+    package = f"{module}.__main__" if path.is_dir() else module
+    return getattr(importlib.import_module(door.group(1) if door else package), name)
 
 
 def help_of(module, capsys):

@@ -16,11 +16,7 @@ import pytest
 distributed = pytest.importorskip("distributed", reason="Dask is not installed (extra `dask`)")
 
 from design.result import CASE_I  # noqa: E402
-from sim.scenario import (
-    InputError,
-    load,
-)
-from sim.validate import (
+from sim.crowds import (  # noqa: E402
     BATCH,
     MIXED,
     Findings,
@@ -28,8 +24,12 @@ from sim.validate import (
     validate,
     validate_on_cluster,
 )
+from sim.scenario import (  # noqa: E402
+    InputError,
+    load,
+)
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 QUESTION = Question(load(), CASE_I, 0, 4 * BATCH, MIXED, "both", 0.25)  # 0.25 s: just enough for growth rates
 
 

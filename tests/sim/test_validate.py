@@ -19,9 +19,10 @@ from design.result import CASE_I
 from models.device import RigidDevice
 from models.human import Person
 from models.scene import Crowd, build, plant, variants
-from sim import validate as examine_module
-from sim import validate as shards
+from sim import crowds as examine_module
+from sim import crowds as shards
 from sim.couplings import choose
+from sim.crowds import BATCH, MIXED, Findings, Question, crowds, crowds_of, draw, validate
 from sim.engines import ExactBatchEngine, ExactEngine, hold
 from sim.run import assemble, run, simulate
 from sim.scenario import InputError, load
@@ -35,7 +36,6 @@ from sim.stability import (
     mujoco_loops,
     unstable,
 )
-from sim.validate import BATCH, MIXED, Findings, Question, crowds, crowds_of, draw, validate
 
 SCENARIO = load()
 TWO = "[[human]]\nlinks = [{mass = 1.0, damping = 0, stiffness = 0}]\n" * 2
@@ -243,13 +243,13 @@ def test_a_wrong_engine_is_found_out(tmp_path, monkeypatch):
 
 
 def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
-    calls = []
+    calls, real = [], examine_module.examine
 
     def interrupted(question, batch, ticked):
         calls.append(batch)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return examine_module.examine(question, batch, ticked)
+        return real(question, batch, ticked)
 
     monkeypatch.setattr(shards, "examine", interrupted)
     options = ["--humans", "300", "--engine", "exact", "--duration", "0", "--no-plot"]
