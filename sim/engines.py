@@ -1,0 +1,433 @@
+"""Engines: what moves the plant between two samples, for one simulation or for many at once.
+
+    exact         s+ = A s + B [w; f], the matrix exponential of the plant under held inputs (no Coulomb friction)
+    exponential   s+ = s + h phi1(h J) [v; qacc], exponential Rosenbrock-Euler: accelerations by one mj_forward a step,
+                  J from the compiled model's matrices; exact on a linear scene, whatever its stiffness and the step
+    RK4, ..       steps of MuJoCo's own integrators, whose number per period sim.stepping decides
+
+All of them read their inputs from the rows of a tape and write the next row, with no copy in between. The exponential
+engine shares J with the exact one, so it checks forces and assembly, not the stepping in time: for that there is RK4.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import glob
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from copy import copy
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Protocol
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+from numpy.typing import NDArray
+from scipy.linalg import expm
+from scipy.sparse.csgraph import connected_components
+
+from controller.lti import Array
+from controller.process import Tape
+from models.crowd import Variants
+from models.scene import Plant, Scene, plant
+
+if TYPE_CHECKING:
+    from sim.simulate import Assembly
+
+ENGINES = ("mujoco", "exact")
+
+#: the integrator of ours, which reads MuJoCo's accelerations
+EXPONENTIAL = "exponential"
+
+#: name -> what MuJoCo's model is set to, for the exponential one, where it decides nothing, to RK4
+INTEGRATORS = {
+    EXPONENTIAL: mujoco.mjtIntegrator.mjINT_RK4,
+    "RK4": mujoco.mjtIntegrator.mjINT_RK4,
+    "Euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
+}
+
+LEAST = 4  # steps per period of MuJoCo's own integrators
+
+
+class Engine(Protocol):
+    """Advances the plant by one period at a time, reading and writing a tape."""
+
+    def start(self, tape: Tape) -> None:
+        """Take the plant state of row 0 as the state at the first tick."""
+        ...
+
+    def advance(self, k: int, /) -> None:
+        """Hold the plant input of row k for T, then write the plant state of row k + 1."""
+        ...
+
+    def troubled(self) -> bool:
+        """Whether the engine itself has reported numbers that it cannot go on with."""
+        ...
+
+
+def make_engine(
+    assembly: Assembly, engine: str, integrator: str | None = None, substeps: int | None = None, T: float | None = None
+) -> Engine:
+    """The engine of that name for one simulation, which MuJoCo advances by T seconds (default: the scenario's).
+
+    Without an integrator it is the scene's default, without substeps they are 1 of the exponential one and 4 of others.
+    Raises ValueError for a name that is none.
+    """
+    if engine == "exact":
+        if assembly.friction:
+            raise ValueError("the devices have Coulomb friction, which the exact engine, being linear, does not model")
+        return ExactEngine(assembly.plant, assembly.process.force_limit)
+    if engine == "mujoco":
+        integrator = integrator or default_integrator(assembly.scene)
+        count = substeps if substeps is not None else 1 if integrator == EXPONENTIAL else LEAST
+        return MujocoEngine(assembly.scene, assembly.scenario.T if T is None else T, integrator, count)
+    raise ValueError(f"engine is {engine!r}, allowed are {', '.join(ENGINES)}")
+
+
+def default_integrator(scene: Scene) -> str:
+    """exponential where the scene is smooth; RK4 where something rubs, which is nearer there at equal cost."""
+    rubs = scene.model.dof_frictionloss.any() or scene.model.tendon_frictionloss.any()
+    return "RK4" if rubs else EXPONENTIAL
+
+
+# ---- the exact engine
+
+
+@dataclass(frozen=True, eq=False)
+class HeldPlant:
+    """s[k+1] = A s[k] + B [w; f][k], x[k] = C s[k]: the plant under a zero-order hold of T seconds.
+
+    Many plants at once have a leading axis in A and B.
+    """
+
+    A: Array  # (..., 2n, 2n)
+    B: Array  # (..., 2n, outside + m)
+    C: Array  # (m, 2n)
+    T: float  # [s]
+
+
+def hold(plant: Plant, T: float) -> HeldPlant:
+    """Sample a continuous plant, or many of them, with the input held for T."""
+    *many, n, inputs = plant.B.shape
+    generator = np.zeros((*many, n + inputs, n + inputs))
+    generator[..., :n, :n], generator[..., :n, n:] = plant.A, plant.B
+    step = expm_each(generator * T) if many else expm(generator * T)
+    return HeldPlant(step[..., :n, :n], step[..., :n, n:], plant.C, T)
+
+
+class ExactEngine:
+    """One matrix product per period, after the actuators' limits."""
+
+    def __init__(self, plant: HeldPlant, force_limit: Array) -> None:
+        self._product = np.ascontiguousarray(np.hstack([plant.A, plant.B])).dot
+        self._high = force_limit[:, None]
+        self._low = -self._high
+
+    def start(self, tape: Tape) -> None:
+        self._rows, self._states, self._forces = tape.plant_row, tape.plant_state, tape.force
+
+    def advance(self, k: int, /) -> None:
+        force = self._forces[k]
+        np.minimum(force, self._high, out=force)
+        np.maximum(force, self._low, out=force)
+        self._product(self._rows[k], self._states[k + 1])
+
+    def troubled(self) -> bool:
+        return False
+
+
+class ExactBatchEngine:
+    """Simulation j of the tape moves by A[j], B[j] of the plants, after the actuators' limits."""
+
+    def __init__(self, plants: HeldPlant, force_limit: Array) -> None:
+        self._product = _each_by_its_own(np.concatenate([plants.A, plants.B], axis=2))
+        self._high = force_limit[:, None]
+        self._low = -self._high
+
+    def start(self, tape: Tape) -> None:
+        self._slabs, self._states, self._forces = tape.plant_row, tape.plant_state, tape.force
+
+    def advance(self, k: int, /) -> None:
+        force = self._forces[k]
+        np.minimum(force, self._high, out=force)
+        np.maximum(force, self._low, out=force)
+        self._product(self._slabs[k], self._states[k + 1])
+
+    def troubled(self) -> bool:
+        return False
+
+
+def expm_each(matrices: Array) -> Array:
+    """exp of each of (nsim, n, n) matrices, by scaling and squaring; a result depends on its own matrix only.
+
+    scipy.linalg.expm hands every matrix to a BLAS that wakes all its threads for it: on busy cores that made verdicts
+    about many humans several times slower than their arithmetic.
+    """
+    norm = np.abs(matrices).sum(axis=1).max(axis=1)
+    halvings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, _LARGEST) / _LARGEST))).astype(int)
+    a, b = matrices * (0.5**halvings)[:, None, None], _PADE
+    one = np.eye(matrices.shape[1])
+    a2 = a @ a
+    a4 = a2 @ a2
+    a6 = a4 @ a2
+    odd = a @ (a6 @ (b[13] * a6 + b[11] * a4 + b[9] * a2) + b[7] * a6 + b[5] * a4 + b[3] * a2 + b[1] * one)
+    even = a6 @ (b[12] * a6 + b[10] * a4 + b[8] * a2) + b[6] * a6 + b[4] * a4 + b[2] * a2 + b[0] * one
+    result = np.linalg.solve(even - odd, even + odd)
+    for done in range(halvings.max(initial=0)):
+        unfinished = halvings > done
+        result[unfinished] = result[unfinished] @ result[unfinished]
+    return result
+
+
+_ORDER = 13  # of the diagonal Padé approximant, Higham (2005), table 2.3
+_LARGEST = 5.37  # 1-norm up to which that order has the accuracy of double precision
+_PADE = [math.comb(_ORDER, k) * math.factorial(2 * _ORDER - k) / math.factorial(2 * _ORDER) for k in range(_ORDER + 1)]
+
+_Product = Callable[[Array, Array], object]  # (columns, nsim), (rows, nsim): writes the second
+_Which = NDArray[np.intp]
+
+
+def _each_by_its_own(matrices: Array) -> _Product:
+    """The product of (nsim, rows, columns) matrices with a slab, the simulation last and contiguous in it.
+
+    What devices and humans do not share splits a plant into separate blocks (one device with its human each), found
+    from the zeros of the matrices; only they are multiplied.
+    """
+    rows, columns = _blocks(np.any(matrices != 0, axis=0))
+    valid = (rows >= 0)[:, :, None] & (columns >= 0)[:, None, :]
+    parts = matrices[:, rows[:, :, None], columns[:, None, :]] * valid
+    blocks = np.ascontiguousarray(np.moveaxis(parts, 0, -1))  # (blocks, rows, columns, nsim)
+    moved = np.empty((*rows.shape, matrices.shape[0]))
+    kept, index = rows >= 0, ...
+    if not kept.all():
+        index, rows = kept, rows[kept]
+
+    def multiply(slab: Array, out: Array) -> None:
+        np.einsum("crkn,ckn->crn", blocks, slab.take(columns, axis=0), out=moved)
+        out[rows] = moved[index]
+
+    return multiply
+
+
+def _blocks(pattern: NDArray[np.bool_]) -> tuple[_Which, _Which]:
+    """Rows and columns of the independent blocks of a (2n, 2n + inputs) pattern of nonzeros.
+
+    Shapes (blocks, rows) and (blocks, columns); smaller blocks are filled up with -1.
+    """
+    n, width = pattern.shape
+    graph = np.zeros((width, width), dtype=bool)
+    graph[:n] = pattern
+    count, label = connected_components(graph, directed=False)
+    rows = [np.flatnonzero(label[:n] == c) for c in range(count)]
+    columns = [np.flatnonzero(label == c) for c in range(count)]
+    # an input that moves nothing is a block without rows
+    pairs = [(r, c) for r, c in zip(rows, columns, strict=True) if r.size]
+    return _filled([r for r, _ in pairs]), _filled([c for _, c in pairs])
+
+
+def _filled(lists: list[_Which]) -> _Which:
+    table = np.full((len(lists), max(part.size for part in lists)), -1)
+    for row, part in zip(table, lists, strict=True):
+        row[: part.size] = part
+    return table
+
+
+# ---- MuJoCo's engines
+
+#: fields of a model that its mass, damping and stiffness matrices are made of
+_MECHANICAL = ("body_mass", "jnt_stiffness", "dof_damping", "tendon_stiffness", "tendon_damping")
+
+
+class MujocoEngine:
+    """One simulation in one MjData, which a viewer can show; inputs are held by MuJoCo's ctrl."""
+
+    def __init__(self, scene: Scene, T: float, integrator: str = "RK4", substeps: int = 4) -> None:
+        self.model = discretised(scene, T, integrator, substeps)
+        self.data = mujoco.MjData(self.model)
+        self.substeps = substeps
+        self._forward = partial(mujoco.mj_forward, self.model, self.data)
+        self._step = partial(mujoco.mj_step, self.model, self.data, substeps)
+        self._sight = np.zeros(self.model.nq + 2 * self.model.nv)  # [q; v; qacc]
+        self.advance: Callable[[int], None] = self._by_steps
+        if integrator == EXPONENTIAL:
+            (move,) = _rosenbrock(_rates(scene, None), T / substeps)
+            self._move, self.advance = move.dot, self._by_exponentials
+
+    def start(self, tape: Tape) -> None:
+        n, nv = self.model.nq, self.model.nq + self.model.nv
+        self._s = [row[:, 0] for row in tape.plant_state]
+        self._q, self._v = ([row[part] for row in self._s] for part in (slice(n), slice(n, nv)))
+        self._inputs = [row[:, 0] for row in tape.plant_input]
+        self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
+        self._qpos[...], self._qvel[...] = self._q[0], self._v[0]
+        self._qacc, self._qacc_seen, self._seen = self.data.qacc, self._sight[nv:], self._sight[:nv]
+        self._seen[...] = self._s[0]
+
+    def _by_steps(self, k: int, /) -> None:
+        self._ctrl[...] = self._inputs[k]
+        self._step()
+        self._q[k + 1][...] = self._qpos
+        self._v[k + 1][...] = self._qvel
+
+    def _by_exponentials(self, k: int, /) -> None:
+        self._ctrl[...] = self._inputs[k]
+        after = self._s[k + 1]
+        for _ in range(self.substeps):
+            self._forward()
+            self._qacc_seen[...] = self._qacc
+            self._move(self._sight, after)
+            self._seen[...] = after
+            self._qpos[...], self._qvel[...] = self._q[k + 1], self._v[k + 1]
+
+    def troubled(self) -> bool:
+        return any(warning.number for warning in self.data.warning)
+
+
+class MujocoBatchEngine:
+    """All simulations of a tape in one mujoco.batch.Batch.
+
+    Steps are those of MujocoEngine for each one, bit for bit; the exponential integrator's products are summed in
+    another order, so they differ by rounding.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        T: float,
+        integrator: str = "RK4",
+        substeps: int = 4,
+        nsim: int = 1,
+        nthread: int = 0,
+        fields: Mapping[str, Array] | None = None,
+    ) -> None:
+        """`fields` gives fields of the model a row per simulation, such as masses: (nsim, ...)."""
+        model = discretised(scene, T, integrator, substeps)
+        self.batch = Batch(model, nsim, nthread)
+        for name, rows in (fields or {}).items():
+            self.batch.expand(name)[...] = rows
+        if fields:
+            self.batch.set_const()
+        self.substeps = substeps
+        time, motion = (mujoco.mj_stateSize(model, part) for part in (_TIME, _TIME | _MOTION))
+        # position and velocity lie side by side in a state row, so one copy reads both
+        self._state = self.batch.state[:, time:motion].T
+        self._ctrl = self.batch.bind("ctrl").T
+        self._sight = np.zeros((len(self._state) + model.nv, nsim))  # [q; v; qacc]
+        self._seen, self._qacc_seen = self._sight[: len(self._state)], self._sight[len(self._state) :]
+        self.advance: Callable[[int], None] = self._by_steps
+        if integrator == EXPONENTIAL:
+            moves = _rosenbrock(_rates(scene, fields), T / substeps)
+            self._move: _Product = _each_by_its_own(moves) if fields else moves[0].dot
+            self._qacc, self.advance = self.batch.bind("qacc").T, self._by_exponentials
+
+    def start(self, tape: Tape) -> None:
+        self._state[...] = self._seen[...] = tape.s[0]
+        self._inputs, self._states = tape.plant_input, tape.plant_state
+
+    def _by_steps(self, k: int, /) -> None:
+        self._ctrl[...] = self._inputs[k]
+        self.batch.step(nstep=self.substeps)
+        self._states[k + 1][...] = self._state
+
+    def _by_exponentials(self, k: int, /) -> None:
+        self._ctrl[...] = self._inputs[k]
+        after = self._states[k + 1]
+        for _ in range(self.substeps):
+            self.batch.forward()
+            self._qacc_seen[...] = self._qacc
+            self._move(self._sight, after)
+            self._seen[...] = after
+            self._state[...] = after
+
+    def troubled(self) -> bool:
+        return bool(np.any(self.batch.warning))
+
+
+def _rates(scene: Scene, fields: Mapping[str, Array] | None) -> Array:
+    """J of s' = J s + .., (nsim or 1, 2n, 2n), from the matrices of the compiled model, or of every variant of it."""
+    if not fields:
+        return plant(scene.model).A[None]
+    nsim = len(next(iter(fields.values())))
+    same = {name: np.tile(getattr(scene.model, name).astype(float), (nsim, 1)) for name in _MECHANICAL}
+    return Variants(scene, {**same, **fields}).plants().A
+
+
+def _rosenbrock(J: Array, h: float) -> Array:
+    """What makes s + h phi1(h J) [v; a] of [q; v; a], (nsim, 2n, 3n), for J (nsim, 2n, 2n) and a step of h seconds.
+
+    phi1(X) = X^-1 (e^X - I) is the upper right block of exp [[X, I], [0, 0]]. Velocities are measured in units of a
+    rate near the fastest mode's, a power of two, so that a stiff J has no larger norm than its modes' frequencies.
+    """
+    nsim, states, _ = J.shape
+    n = states // 2
+    fastest = np.sqrt(np.abs(J[:, n:, :n]).max(axis=(1, 2)))
+    rate = 2.0 ** np.ceil(np.log2(np.maximum(fastest, 1 / h)))
+    unit = np.ones((nsim, states))
+    unit[:, n:] = rate[:, None]
+    generator = np.zeros((nsim, 2 * states, 2 * states))
+    generator[:, :states, :states] = h * J * unit[:, None, :] / unit[:, :, None]
+    generator[:, :states, states:] = np.eye(states)
+    phi = h * expm_each(generator)[:, :states, states:] * unit[:, :, None] / unit[:, None, :]
+    return np.concatenate([np.broadcast_to(np.eye(states, n), (nsim, states, n)), phi + np.eye(states, k=-n)], axis=2)
+
+
+def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
+    """A copy of the scene's model that makes `substeps` steps of `integrator` in a period T."""
+    if integrator not in INTEGRATORS:
+        raise ValueError(f"integrator is {integrator!r}, allowed are {', '.join(INTEGRATORS)}")
+    if substeps < 1:
+        raise ValueError(f"substeps is {substeps}, allowed are whole numbers from 1")
+    model = copy(scene.model)
+    model.opt.timestep = T / substeps
+    model.opt.integrator = INTEGRATORS[integrator]
+    return model
+
+
+_TIME = int(mujoco.mjtState.mjSTATE_TIME)
+_MOTION = int(mujoco.mjtState.mjSTATE_QPOS) | int(mujoco.mjtState.mjSTATE_QVEL)
+
+
+@contextmanager
+def profiler_off() -> Iterator[bool]:
+    """Run without the clock that MuJoCo's Python binding reads several times per step.
+
+    The clock is the function pointer `mjcb_time` of the library; clearing it changes no result. Yields whether
+    the pointer was found; where it is not, everything just runs with the clock. It is put back at the end.
+    """
+    pointer = _profiler_clock()
+    if pointer is None:
+        yield False
+        return
+    saved = pointer.value
+    pointer.value = None
+    try:
+        yield True
+    finally:
+        pointer.value = saved
+
+
+@contextmanager
+def quiet_warnings() -> Iterator[None]:
+    """Keep MuJoCo from printing and logging its warnings: the engine counts and reports them."""
+    previous = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda message: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(previous)
+
+
+def _profiler_clock() -> ctypes.c_void_p | None:
+    folder = os.path.dirname(mujoco.__file__)
+    for library in glob.glob(os.path.join(folder, "libmujoco*")):
+        try:
+            return ctypes.c_void_p.in_dll(ctypes.CDLL(library), "mjcb_time")
+        except (OSError, ValueError):
+            continue
+    return None
