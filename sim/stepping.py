@@ -62,12 +62,11 @@ def pace(A: Array) -> Pace:
     return Pace(float(np.abs(values[weak]).max(initial=0.0)), float(-values.real.min(initial=0.0)))
 
 
-def default_substeps(assembly: Assembly, integrator: str | None = None) -> int:
+def default_substeps(assembly: Assembly, integrator: str = "RK4") -> int:
     """1 of the exponential integrator on a smooth scene, else 4 at least and more where the rule or the verdict asks.
 
-    Without an integrator it is about the scene's default. Raises InputError where no number up to 10000 does.
+    Raises InputError where no number up to 10000 does.
     """
-    integrator = integrator or default_integrator(assembly.scene)
     if integrator == EXPONENTIAL and default_integrator(assembly.scene) == EXPONENTIAL:
         return 1
     if integrator == "discrete":  # it remembers more than position and velocity, so no map of those can vouch for it

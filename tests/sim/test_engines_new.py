@@ -221,10 +221,10 @@ def test_many_hands_are_each_their_own_scene(substeps):
 
 def test_the_default_follows_from_the_scene(assembly):
     rubbing = assemble(RUBBING, CASE_I)
-    assert (default_integrator(assembly.scene), default_substeps(assembly)) == (EXPONENTIAL, 1)
-    assert (default_integrator(rubbing.scene), default_substeps(rubbing)) == ("RK4", 4)
+    assert (default_integrator(assembly.scene), default_substeps(assembly, EXPONENTIAL)) == (EXPONENTIAL, 1)
+    assert (default_integrator(rubbing.scene), default_substeps(rubbing, "RK4")) == ("RK4", 4)
     # no rule asks for more on a stiff linear scene, where Runge-Kutta takes 32
-    assert default_substeps(stiff(1.45e6)) == 1
+    assert default_substeps(stiff(1.45e6), EXPONENTIAL) == 1
     assert default_substeps(stiff(1.45e6), "RK4") == 32
     assert check_substeps(stiff(1.45e6), EXPONENTIAL, 1) == []
     assert check_substeps(rubbing, EXPONENTIAL, 8) == [
