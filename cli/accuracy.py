@@ -27,10 +27,11 @@ from controller.coupling import NoCoupling
 from design.certificate import CONDITIONS
 from sim.accuracy import SETTINGS, Row, mark_front, measure, reference
 from sim.couplings import NAMES, choose
+from sim.engines import EXPONENTIAL
 from sim.files import write_json
-from sim.run import Assembly, assemble
+from sim.run import Simulation, assemble
 from sim.scenario import InputError
-from sim.stability import NEUTRAL, default_substeps, step_radius
+from sim.stepping import NEUTRAL, default_substeps, step_radius
 
 
 def main(argv: list[str]) -> int:
@@ -43,7 +44,7 @@ def main(argv: list[str]) -> int:
     seed, out = seed_from(args), out_folder(args, "accuracy")
     chosen = choose(scenario, args.case, args.coupling, args.condition)
     coupled, uncoupled = assemble(scenario, chosen.coupling), assemble(scenario, NoCoupling())
-    default = max(default_substeps(coupled), default_substeps(uncoupled))
+    default = max(default_substeps(loop, "RK4") for loop in (coupled, uncoupled))
 
     rows, skipped, interrupted = _rows(coupled, uncoupled, default)
     mark_front(rows)
@@ -55,7 +56,8 @@ def main(argv: list[str]) -> int:
         write_json(args.json, outcome)
     if interrupted:
         return INTERRUPTED
-    right = all(r["verdict_correct"] for r in rows if r["integrator"] == "RK4" and r["substeps"] == default)
+    defaults = ((EXPONENTIAL, 1), ("RK4", default))
+    right = all(r["verdict_correct"] for r in rows if (r["integrator"], r["substeps"]) in defaults)
     return DONE if right else DOES_NOT_HOLD
 
 
@@ -70,7 +72,7 @@ def _parser() -> Parser:
     return parser
 
 
-def _rows(coupled: Assembly, uncoupled: Assembly, default: int) -> tuple[list[Row], list[str], bool]:
+def _rows(coupled: Simulation, uncoupled: Simulation, default: int) -> tuple[list[Row], list[str], bool]:
     """Rows of every setting that is stable on this plant and the reasons of those that are not."""
     rows: list[Row] = []
     skipped: list[str] = []

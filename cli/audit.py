@@ -30,7 +30,7 @@ from design.audit import LONGEST_DELAY, PRESETS, Subject, print_report, report
 from design.certificate import DelayRange
 from design.designs import KINDS
 from design.ranges import check_set
-from sim.couplings import fitted, read_coupling, standing
+from sim.couplings import check_stored, fitted, read_coupling
 from sim.files import write_json
 from sim.scenario import InputError, Scenario
 
@@ -117,7 +117,7 @@ def _notes(args: argparse.Namespace, scenario: Scenario, switching: DelayRange |
     if args.coupling is None:
         return []
     loop = scenario.loop(args.case)
-    return list(standing(read_coupling(args.coupling), loop.switching(switching)).notes)
+    return list(check_stored(read_coupling(args.coupling), loop.switching(switching)).notes)
 
 
 def _range(args: argparse.Namespace, scenario: Scenario, subject: Subject) -> DelayRange | None:

@@ -24,6 +24,8 @@ from design.result import DesignFailed
 from models.device import MOST_DAMPING
 from sim.files import check_file, folder, nobody_reads
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
+from sim.scenario import require_constant_delay as require_constant_delay
+from sim.scenario import require_linear as require_linear
 
 # ----------------------------------------------------------------------------------------------------
 # The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
@@ -147,23 +149,6 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
         if not 0 <= value <= MOST_DAMPING:
             raise InputError(f"--delta is {value:g}, allowed are 0 to {MOST_DAMPING:g} N s/m")
     return scenario.replace(delta, **changes) if changes or delta else scenario
-
-
-def require_linear(scenario: Scenario, what: str) -> None:
-    """Raises InputError where a loop has walls or Coulomb friction, for a command whose verdicts are of linear ones."""
-    for i, device in enumerate(scenario.device):
-        if device.friction:
-            instead = "sim.run and sim.zwidth simulate it"
-            raise InputError(f"device[{i}].friction is {device.friction:g} N: {what} decides linear loops; {instead}")
-    if scenario.environment.walls:
-        raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
-
-
-def require_constant_delay(scenario: Scenario, what: str) -> None:
-    """Raises InputError where a scenario's delays vary, for a command that would not make them vary."""
-    if scenario.jitter is not None:
-        instead = "sim.run simulates it"
-        raise InputError(f"jitter: {what} takes the delays that its link has; take the table out, {instead}")
 
 
 def numbers(option: str, text: str, kind: Callable[[str], Number], count: int) -> tuple[Number, ...]:

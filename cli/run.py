@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,33 +33,27 @@ from cli.options import (
 )
 from controller.coupling import Compliance, Coupling, InternalModel, SpringDamper
 from controller.delay import LOST, Jitter, Ticks, ages
-from controller.lti import Array
 from design.certificate import ANY, CAVEATS, CONDITIONS, assess, certificate_part, finite, promise_of
 from design.ranges import SetCheck, check_set, set_part, set_rows
 from design.result import PRINTED_TAU_DB, PUBLISHED, listed
 from design.transparency import Transparency, decibels, transparency
+from sim.accuracy import ForceError, force_error, position_error
 from sim.couplings import NAMES, Chosen, choose
-from sim.engines import INTEGRATORS, LEAPFROG, ExactBatchEngine, HeldPlant
+from sim.engines import INTEGRATORS, ExactBatchEngine, HeldPlant, default_integrator
 from sim.files import write, write_json
-from sim.run import ENGINES, Assembly, Record, assemble, simulate
+from sim.run import ENGINES, Simulation, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, load, load_humans
 from sim.stability import (
-    LEAST,
-    MOST,
-    Mode,
-    before_clipping,
-    check_substeps,
-    clipped_ticks,
     close,
-    default_substeps,
     dominant_mode,
-    frozen_modes,
-    measured_growth,
-    verdict,
-    worst_mode,
+    eigenvalue_part,
+    impulse_growth,
+    stability_part,
+    unlimited,
 )
-from sim.switching import Period, certified_part, knocked, switching, unlimited
-from sim.trace import Likeness, Result, likeness
+from sim.stepping import MOST, check_substeps, default_substeps
+from sim.switching import Period, certified_part, switching
+from sim.trace import Trace
 
 # ----------------------------------------------------------------------------------------------------
 # Couplings and transparency as plain data: what the commands print and write as JSON.
@@ -98,86 +93,6 @@ def transparency_part(figures: Transparency) -> dict[str, Any]:
 # What a run was worth: one dictionary for machines, and the same as tables for people.
 
 
-def stability_part(assembly: Assembly, record: Record) -> dict[str, Any]:
-    """Measured on the trace, and from the eigenvalues of the exact loop; of walls, in the worst contact state."""
-    mode = worst_mode(assembly)
-    limit = assembly.process.force_limit
-    contact = contact_part(assembly, record) if assembly.process.contact else {}
-    if contact.get("ticks"):
-        growth, reason = None, f"contact was made {contact['made']} times, and a growth rate is of one linear loop"
-    elif assembly.friction:
-        growth, reason = None, "with Coulomb friction there is no growth rate; the eigenvalues are those without it"
-    else:
-        loop = close(assembly.plant, assembly.F)
-        growth, reason = measured_growth(loop, dominant_mode(loop), record, limit)
-    if record.diverged:
-        reason = "the simulation left the range of finite numbers: reported as unstable"
-    part: dict[str, Any] = {
-        "verdict": "unstable" if record.diverged else None if growth is None else verdict(growth),
-        "clipped_ticks": int(clipped_ticks(record, limit).sum()),
-        "growth_rate_per_s": growth,
-        "frequency_hz": dominant_frequency(record, assembly.scenario.T),
-        **eigenvalue_part(mode),
-    }
-    part |= {"contact": contact} if contact else {}
-    return part | ({"reason": reason} if reason else {})
-
-
-def eigenvalue_part(mode: Mode) -> dict[str, Any]:
-    """What the eigenvalues of the exact loop say."""
-    return {
-        "exact_verdict": mode.verdict,
-        "exact_growth_rate_per_s": finite(mode.growth),
-        "exact_frequency_hz": mode.frequency_hz,
-        "spectral_radius": mode.spectral_radius,
-    }
-
-
-def contact_part(assembly: Assembly, record: Record) -> dict[str, Any]:
-    """How often the walls were touched in a run, and the linear loops that they switch between."""
-    walls = assembly.process.contact
-    assert walls is not None
-    touching = walls.depths(record.z[:, :, 0]) > 0
-    states = [
-        {
-            "touching": [i + 1 for i, on in enumerate(state) if on],
-            "exact_growth_rate_per_s": finite(mode.growth),
-            "exact_frequency_hz": mode.frequency_hz,
-            "exact_verdict": mode.verdict,
-        }
-        for state, mode in frozen_modes(assembly).items()
-    ]
-    return {
-        "made": int((touching[1:] & ~touching[:-1]).sum() + touching[:1].sum()),
-        "ticks": int(touching.any(axis=1).sum()),
-        "frozen": states,
-    }
-
-
-def error_part(
-    record: Record, exact: Record | None, assembly: Assembly, unstable: bool | None = None
-) -> dict[str, Any]:
-    """Device positions against the exact engine's closed loop, where there is one.
-
-    `unstable` where its eigenvalues do not say it.
-    """
-    if exact is None:
-        reason = "the exact engine is linear and has no Coulomb friction to compare with"
-        return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
-    limit, m = assembly.process.force_limit, assembly.process.channels
-    n = min(record.s.shape[0], exact.s.shape[0])
-    clipped = clipped_ticks(exact, limit)[:n] | clipped_ticks(record, limit)[:n]
-    if unstable is None:
-        unstable = worst_mode(assembly).verdict == "unstable"
-    linear = int(np.argmax(clipped)) if unstable and clipped.any() else n
-    relative, largest = _distance(record.s[:linear, :m], exact.s[:linear, :m])
-    if linear == n:
-        return {"position_relative_rms": relative, "position_max_m": largest}
-    until = f"the unstable run first clips at t = {linear * assembly.scenario.T:.3f} s"
-    reason = f"{until}; up to there the relative rms is {relative:.1e}, and its growth multiplies any difference"
-    return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
-
-
 def remarks(outcome: dict[str, Any]) -> list[str]:
     """What a reader must know to read the figures rightly."""
     lines = []
@@ -201,25 +116,6 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
     if outcome.get("jitter"):
         lines.append(f"Delays that vary: {outcome['jitter']['covers']}.")
     return [*lines, CAVEATS]
-
-
-def _distance(a: Array, b: Array) -> tuple[float | None, float | None]:
-    size = float(np.sqrt(np.mean(b**2))) if b.size else 0.0
-    if size == 0:
-        return None, None
-    return float(np.sqrt(np.mean((a - b) ** 2))) / size, float(np.abs(a - b).max())
-
-
-def dominant_frequency(record: Record, T: float) -> float | None:
-    """The strongest line above 10 Hz in the last quarter of the forces: what one hears and feels."""
-    tail = record.f[-(record.f.shape[0] // 4) :, :, 0]
-    if tail.shape[0] < 64:
-        return None
-    window = np.hanning(tail.shape[0])[:, None]
-    spectrum = np.abs(np.fft.rfft((tail - tail.mean(axis=0)) * window, axis=0)).sum(axis=1)
-    frequency = np.fft.rfftfreq(tail.shape[0], T)
-    spectrum[frequency < 10.0] = 0.0
-    return float(frequency[np.argmax(spectrum)]) if spectrum.any() else None
 
 
 def print_report(report: dict[str, Any], console: Console) -> None:
@@ -409,13 +305,13 @@ JUDGED = 4.0  # [s] at most of the linear loop from which a growth is read: late
 
 
 def part(
-    assembly: Assembly, chosen: Chosen, period: Period | None, ticks: int, certified: bool
+    simulation: Simulation, chosen: Chosen, period: Period | None, ticks: int, certified: bool
 ) -> dict[str, Any] | None:
     """All that a report says of delays that vary; None where the scenario has no jitter."""
-    scenario = assembly.scenario
+    scenario = simulation.scenario
     if scenario.jitter is None:
         return None
-    met = run_part(assembly, period, ticks) if scenario.switches else {}
+    met = run_part(simulation, period, ticks) if scenario.switches else {}
     return range_part(scenario.jitter) | met | certified_part(scenario, chosen, certified)
 
 
@@ -431,7 +327,7 @@ def range_part(jitter: Jitter) -> dict[str, Any]:
     }
 
 
-def run_part(switched: Assembly, period: Period | None, ticks: int) -> dict[str, Any]:
+def run_part(switched: Simulation, period: Period | None, ticks: int) -> dict[str, Any]:
     """The delays that a run met, and the growth of its linear loop under them."""
     delays = switched.process.delays
     assert delays is not None
@@ -464,36 +360,34 @@ def _age(used: Ticks) -> dict[str, Any] | None:
     return {name: values.tolist() for name, values in figures.items()}
 
 
-def _growth_report(switched: Assembly, ticks: int) -> tuple[float, float]:
-    """(rate [1/s], window [s]) of the exact linear loop after a knock, under the run's first delays."""
+def _growth_report(switched: Simulation, ticks: int) -> tuple[float, float]:
+    """(rate [1/s], window [s]) of the exact linear loop after an impulse, under the run's first delays."""
     T, plant = switched.scenario.T, switched.plant
     judged = max(4, min(ticks, round(JUDGED / T)))
     one = HeldPlant(plant.A[None], plant.B[None], plant.C, T)
     process = unlimited(switched.process)
-    engine = ExactBatchEngine(one, process.force_limit)
-    return float(knocked(process, engine, switched.scene, plant.A.shape[0], judged, 1).rate[0]), judged * T
+    rate, _ = impulse_growth(process, ExactBatchEngine(one, process.force_limit), switched.scene, judged)
+    return float(rate[0]), judged * T
 
 
-def stability_part_report(assembly: Assembly, record: Record, jitter: dict[str, Any]) -> dict[str, Any]:
-    """As report.stability_part, for a loop that switches: it has no eigenvalue of its own but over a period."""
+def switching_stability(simulation: Simulation, trace: Trace, jitter: dict[str, Any]) -> dict[str, Any]:
+    """As sim.stability.stability_part, for a loop that switches: it has no eigenvalue of its own but over a period."""
     worst = jitter["period"] or jitter
-    constant = eigenvalue_part(dominant_mode(close(assembly.plant, assembly.F)))
-    verdict = "unstable" if record.diverged or "unstable" in (worst["verdict"], jitter["verdict"]) else "stable"
+    theta = listed(simulation.scenario.theta)
     return {
-        "verdict": verdict,
-        "clipped_ticks": int(clipped_ticks(record, assembly.process.force_limit).sum()),
+        "verdict": "unstable" if trace.diverged or "unstable" in (worst["verdict"], jitter["verdict"]) else "stable",
+        "clipped_ticks": int(trace.clipped(simulation.process.force_limit).sum()),
         "growth_rate_per_s": worst["growth_rate_per_s"],
-        "frequency_hz": dominant_frequency(record, assembly.scenario.T),
-        **constant,
-        "reason": _how(jitter)
-        + f"; the eigenvalues are those of the constant delay theta = {listed(assembly.scenario.theta)}",
+        "frequency_hz": trace.dominant_frequency_hz(),
+        **eigenvalue_part(dominant_mode(close(simulation.plant, simulation.F))),
+        "reason": f"{_how(jitter)}; the eigenvalues are those of the constant delay theta = {theta}",
     }
 
 
 def _how(jitter: dict[str, Any]) -> str:
     if jitter["period"]:
         return f"growth by the eigenvalues of the product over the {jitter['period']['ticks']} ticks of a period"
-    return f"growth of the linear loop after a knock, over {jitter['judged_s']:.3g} s under the run's delays"
+    return f"growth of the linear loop after an impulse, over {jitter['judged_s']:.3g} s under the run's delays"
 
 
 def main(argv: list[str]) -> int:
@@ -508,36 +402,37 @@ def main(argv: list[str]) -> int:
     asked, seed, out = _substeps(args), seed_from(args), out_folder(args, "run")
     chosen = choose(scenario, args.case, args.coupling, args.condition)
     where, simulated = _environment(args, scenario)
-    assembly, period = assemble(simulated, chosen.coupling), None
-    if args.engine == "exact" and assembly.friction:
+    simulation, period = assemble(simulated, chosen.coupling), None
+    if args.engine == "exact" and simulation.friction:
         raise InputError("--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco")
     if scenario.switches:
-        assembly, period = switching(assembly, chosen.coupling, seed, scenario.samples)
+        simulation, period = switching(simulation, chosen.coupling, seed, scenario.samples)
     with (bar := progress_bar("searching the box"))[0]:
         whole = check_set(scenario.loop(args.case), chosen.coupling, seed, progress=bar[1])
-    substeps, warnings = _settled(args, assembly, asked)
+    substeps, warnings = _settled(args, simulation, asked)
+    engine = make_engine(simulation, args.engine, args.integrator, substeps)
 
     with (bar := progress_bar("simulating"))[0]:
         begin = time.perf_counter()
-        record = simulate(assembly, args.engine, args.integrator, substeps or LEAST, progress=bar[1])
+        trace = run(simulation, engine, progress=bar[1])
         wall = time.perf_counter() - begin
-    exact = record if args.engine == "exact" else _exact(assembly, record)
+    exact = trace if args.engine == "exact" else _exact(simulation, trace)
 
-    alike = likeness(assembly, record, scenario.loop(args.case).lam)
-    outcome = _outcome(args, chosen, assembly, period, record, exact, wall, whole)
+    alike = force_error(simulation, trace, scenario.loop(args.case).lam)
+    outcome = _outcome(args, chosen, simulation, period, trace, exact, wall, whole)
     outcome["ideal_force"] = alike.part()
     outcome["run"] |= {"substeps": substeps, "seed": seed, "environment": where}
     outcome["remarks"] = [*warnings, *outcome["remarks"]]
-    outcome["files"] = [str(p) for p in _save(args, out, assembly, record, alike, outcome)]
+    outcome["files"] = [str(p) for p in _save(args, out, simulation, trace, alike, outcome)]
     print_report(outcome, console(args))
     if args.json:
         write_json(args.json, outcome)
-    return INTERRUPTED if record.interrupted else DONE
+    return INTERRUPTED if trace.interrupted else DONE
 
 
-def _exact(assembly: Assembly, record: Record) -> Record | None:
+def _exact(simulation: Simulation, trace: Trace) -> Trace | None:
     """The exact engine's run; None where friction makes the loop another one than the linear."""
-    return None if assembly.friction else simulate(assembly, "exact", samples=record.s.shape[0])
+    return None if simulation.friction else run(simulation, "exact", ticks=trace.t.size)
 
 
 def _parser() -> Parser:
@@ -550,8 +445,10 @@ def _parser() -> Parser:
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
     parser.add_argument("--engine", choices=ENGINES, default="mujoco", help="MuJoCo, or the exact solution")
-    parser.add_argument("--integrator", choices=(*INTEGRATORS, LEAPFROG), default="RK4", help="of MuJoCo (default RK4)")
-    parser.add_argument("--substeps", metavar="N", help="MuJoCo steps per period (default 4, more where needed)")
+    parser.add_argument(
+        "--integrator", choices=tuple(INTEGRATORS), help="of MuJoCo (default exponential, RK4 where devices rub)"
+    )
+    parser.add_argument("--substeps", metavar="N", help="MuJoCo steps per period (default: what the plant asks)")
     parser.add_argument("--duration", metavar="SECONDS", help="default: the scenario's")
     parser.add_argument("--human", metavar="FILE.toml", help="other humans: [[human]] per channel, [[person]]")
     parser.add_argument(
@@ -582,39 +479,38 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
     return members[vertex].name, scenario.replace(environment=members[vertex].network, box=None)
 
 
-def _settled(args: argparse.Namespace, assembly: Assembly, asked: int | None) -> tuple[int | None, list[str]]:
-    """Substeps of this run (None for the exact engine), with remarks on a number that was asked for."""
+def _settled(args: argparse.Namespace, simulation: Simulation, asked: int | None) -> tuple[int | None, list[str]]:
+    """Substeps of this run (None for the exact engine), with remarks on a number that was asked for.
+
+    Sets args.integrator to the scene's default where none was asked for.
+    """
     if args.engine == "exact":
         return None, []
-    try:
-        if asked is None:
-            return default_substeps(assembly, args.integrator), []
-        return asked, check_substeps(assembly, args.integrator, asked)
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(f"--integrator {args.integrator}: {error}") from None
+    args.integrator = args.integrator or default_integrator(simulation.scene)
+    if asked is None:
+        return default_substeps(simulation, args.integrator), []
+    return asked, check_substeps(simulation, args.integrator, asked)
 
 
 def _outcome(
     args: argparse.Namespace,
     chosen: Chosen,
-    assembly: Assembly,
+    simulation: Simulation,
     period: Period | None,
-    record: Record,
-    exact: Record | None,
+    trace: Trace,
+    exact: Trace | None,
     wall: float,
     whole: SetCheck | None,
 ) -> dict[str, Any]:
-    scenario, samples = assembly.scenario, record.s.shape[0]
+    scenario, samples = simulation.scenario, trace.t.size
     loop = scenario.loop(args.case)
     requirements = assess(loop, chosen.coupling, chosen.phi)
     certificates = {name: certificate_part(requirement) for name, requirement in requirements.items()}
     simulated = samples * scenario.T
     certified = any(requirement.certified for requirement in requirements.values())
-    jitter, stability, unstable = part(assembly, chosen, period, samples, certified), None, None
+    jitter, stability, unstable = part(simulation, chosen, period, samples, certified), None, None
     if jitter and scenario.switches:
-        stability = stability_part_report(assembly, record, jitter)
+        stability = switching_stability(simulation, trace, jitter)
         unstable = stability["verdict"] == "unstable"
     mujoco = args.engine == "mujoco"
     outcome = {
@@ -625,8 +521,8 @@ def _outcome(
         "certificates": certificates,
         "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
         "set": whole and set_part(whole),
-        "transparency": transparency_part(transparency(assembly.felt, assembly.E, loop.lam)),
-        "stability": stability or stability_part(assembly, record),
+        "transparency": transparency_part(transparency(simulation.felt, simulation.E, loop.lam)),
+        "stability": stability or stability_part(simulation, trace),
         "jitter": jitter,
         "run": {
             "engine": args.engine,
@@ -639,12 +535,12 @@ def _outcome(
             "psi": list(scenario.psi),
             "lam": list(loop.lam),
             "T_s": scenario.T,
-            "interrupted": record.interrupted,
+            "interrupted": trace.interrupted,
             "scenario_digest": scenario.digest,
-            "encoder_step_m": assembly.process.encoder_step.tolist(),
-            "steady_ticks": [[0, before_clipping(record, assembly.process.force_limit)]],
+            "encoder_step_m": simulation.process.encoder_step.tolist(),
+            "steady_ticks": [[0, trace.ticks_before_clipping(simulation.process.force_limit)]],
         },
-        "error": error_part(record, exact, assembly, unstable),
+        "error": position_error(trace, exact, simulation, unstable),
     }
     outcome["reproducibility"] = table(scenario, args.case, outcome)
     return outcome | {"remarks": [*chosen.notes, *remarks(outcome)]}
@@ -653,16 +549,16 @@ def _outcome(
 def _save(
     args: argparse.Namespace,
     out: Path,
-    assembly: Assembly,
-    record: Record,
-    alike: Likeness,
+    simulation: Simulation,
+    trace: Trace,
+    alike: ForceError,
     outcome: dict[str, Any],
 ) -> list[Path]:
-    result = Result.from_record(assembly, record, outcome)
+    result = replace(trace, meta=outcome)
     files = [
         result.save_npz(out / "trace.npz"),
         result.save_csv(out / "trace.csv"),
-        write(out / "scene.xml", assembly.scene.xml),
+        write(out / "scene.xml", simulation.scene.xml),
     ]
     if not args.no_plot and result.t.size:
         from sim.plots import plot_run
@@ -670,7 +566,7 @@ def _save(
         stability = outcome["stability"]
         with_what = "no virtual coupling" if args.case == "none" else f"{outcome['coupling']['kind']} coupling"
         growth = f"growth {stability['exact_growth_rate_per_s']:+.3f} 1/s at {stability['exact_frequency_hz']:.1f} Hz"
-        if assembly.scenario.jitter and assembly.scenario.switches:
+        if simulation.scenario.jitter and simulation.scenario.switches:
             growth = f"{outcome['jitter']['pattern']} delays, {stability['verdict']}"
         title = f"{outcome['scenario']}, case {args.case}, {with_what}: {growth}"
         apart = outcome["ideal_force"]["error_percent"]

@@ -7,7 +7,7 @@ from pathlib import Path
 from cli.options import DONE, Parser, check_json, console
 from sim.files import write_json
 from sim.scenario import InputError
-from sim.trace import Result, growths, told
+from sim.trace import Trace, format_growth, growths
 
 ZOOM_HZ = 10.0  # the picture shows six periods of it where nothing oscillates
 
@@ -24,7 +24,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
     args = parser.parse_args(argv)
     check_json(args)
-    result = Result.load_npz(Path(args.trace))
+    result = Trace.load_npz(Path(args.trace))
     found = growths(result)
     if not result.t.size:
         raise InputError(f"{args.trace}: it has no ticks")
@@ -42,7 +42,7 @@ def main(argv: list[str]) -> int:
     out = console(args)
     T = float(result.t[-1]) / max(1, result.t.size - 1)
     for part in outcome["growth"]:
-        out.print(f"growth, {told(part, T)}", soft_wrap=True)
+        out.print(f"growth, {format_growth(part, T)}", soft_wrap=True)
     if not found:
         out.print("no loop was closed at full gain: there is no growth to tell of")
     if args.json:

@@ -40,7 +40,7 @@ from design.ranges import SetCheck, check_set, set_part
 from models.human import Human, Person
 from sim.adversary import Worst, search
 from sim.couplings import NAMES, Chosen, choose
-from sim.crowds import ENGINES, MIXED, Findings, Question, crowd_of, validate, validate_on_cluster
+from sim.crowds import ENGINES, MIXED, Findings, Validation, validate, validate_on_cluster
 from sim.files import write_json
 from sim.run import assemble
 from sim.scenario import InputError, Scenario, save_humans
@@ -55,7 +55,7 @@ SETTLING = 4  # decay times of the slowest mode in a trace whose hands must be s
 ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
 
 
-def outcome(question: Question, findings: Findings, certified: bool, wall: float) -> dict[str, Any]:
+def outcome(question: Validation, findings: Findings, certified: bool, wall: float) -> dict[str, Any]:
     """The contract of `sim.validate --json`."""
     bad, mujoco = unstable(findings.exact), question.engine != "exact"
     disagreements = int(findings.disagreements.sum())
@@ -131,15 +131,15 @@ def person_part(persons: tuple[Person, ...]) -> list[dict[str, Any]]:
     return [msgspec.to_builtins(person) for person in persons]
 
 
-def _identified(question: Question, index: int) -> dict[str, Any]:
-    crowd = crowd_of(question.scenario, question.seed, index, question.links)
+def _identified(question: Validation, index: int) -> dict[str, Any]:
+    crowd = question.crowd(index)
     who = {"human": human_part(crowd.humans(0)), "person": person_part(crowd.persons(0))}
     member = question.environment(index)
     where = {"environment": member.name, "network": msgspec.to_builtins(member.network)} if member else {}
     return {"seed": question.seed, "index": index} | who | where
 
 
-def _environments(question: Question, findings: Findings, bad: NDArray[np.bool_]) -> dict[str, Any]:
+def _environments(question: Validation, findings: Findings, bad: NDArray[np.bool_]) -> dict[str, Any]:
     """Which environments the loops had, and in which of them a loop was unstable."""
     if not question.environments:
         return {"of": "the nominal environment", "count": 1}
@@ -152,7 +152,7 @@ def _environments(question: Question, findings: Findings, bad: NDArray[np.bool_]
     }
 
 
-def _worst(question: Question, findings: Findings) -> dict[str, Any] | None:
+def _worst(question: Validation, findings: Findings) -> dict[str, Any] | None:
     if not findings.index.size:
         return None
     k = int(np.argmax(findings.radius))
@@ -164,7 +164,7 @@ def _worst(question: Question, findings: Findings) -> dict[str, Any] | None:
     return figures | _identified(question, int(findings.index[k]))
 
 
-def _traces(question: Question, findings: Findings) -> dict[str, Any] | None:
+def _traces(question: Validation, findings: Findings) -> dict[str, Any] | None:
     if not question.ticks or not findings.index.size:
         return None
     measured, stable = np.isfinite(findings.trace), ~unstable(findings.exact)
@@ -307,7 +307,7 @@ def main(argv: list[str]) -> int:
     with (bar := progress_bar("searching the box"))[0]:
         whole = check_set(scenario.loop(args.case), chosen.coupling, seed, progress=bar[1])
     environments = _environments_validate(args, whole)
-    question = Question(
+    question = Validation(
         scenario, chosen.coupling, seed, humans, links, args.engine, duration, environments=environments
     )
     requirements = assess(scenario.loop(args.case), chosen.coupling, chosen.phi)
@@ -431,7 +431,7 @@ def _outcome(
     scenario: Scenario,
     chosen: Chosen,
     requirements: dict[str, Requirement],
-    question: Question,
+    question: Validation,
     findings: Findings,
     certified: bool,
     wall: float,
@@ -449,7 +449,7 @@ def _outcome(
 def _save(
     args: argparse.Namespace,
     out: Path,
-    question: Question,
+    question: Validation,
     findings: Findings,
     adversary: Worst | None,
     outcome: dict[str, Any],
@@ -460,7 +460,7 @@ def _save(
     if findings.index.size:
         named |= {"worst-human.toml": int(findings.index[np.argmax(findings.radius)])}
     for name, i in named.items():
-        crowd = crowd_of(scenario, question.seed, i, question.links)
+        crowd = question.crowd(i)
         remark = f"seed {question.seed}, index {i}"
         files.append(save_humans(out / name, crowd.humans(0), remark, crowd.persons(0)))
     if adversary:

@@ -41,7 +41,8 @@ from design.ranges import check_set, set_part
 from sim.couplings import NAMES, Chosen, choose
 from sim.files import write, write_json
 from sim.scenario import InputError, Scenario
-from sim.stability import MARGINAL, SUSTAINED, slowest_seen
+from sim.stability import MARGINAL
+from sim.trace import SUSTAINED, slowest_seen
 from sim.zwidth import (
     DECIDED,
     MODEL_KEPT,

@@ -1,4 +1,8 @@
-"""Humans as a TOML file, one [[human]] per channel: how a human that was found is kept and replayed."""
+"""What a run is made of, read strictly from TOML: an unknown key or an impossible number never passes.
+
+A scenario holds devices, humans, environment, delays and timing of one loop. Humans may come from a file of their own,
+one [[human]] per channel: how a human that was found is kept and replayed.
+"""
 
 from __future__ import annotations
 
@@ -20,16 +24,12 @@ from models.device import MOST_DAMPING, Device, passivity_level, require, with_d
 from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
 from sim.files import InputError, write
 
-# ----------------------------------------------------------------------------------------------------
-# What a run is made of, read strictly from TOML: an unknown key or an impossible number never passes.
-
-
 CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
 LONGEST_DELAY = 1000  # [samples]; every one is a state
-Delays = tuple[int, ...]
+_Delays = tuple[int, ...]
 
 
 class Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -51,13 +51,13 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str
     T: float  # sampling period [s]
-    theta: Delays  # transmission delays [samples] (4)
-    psi: Delays  # environment delays [samples] (5)
+    theta: _Delays  # transmission delays [samples] (4)
+    psi: _Delays  # environment delays [samples] (5)
     device: tuple[Device, ...]
     human: tuple[Human, ...]
     environment: Network
     box: Box | None = None  # what else the environment may be
-    lam: Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
+    lam: _Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
     person: tuple[Person, ...] = ()  # those who hold several devices
     tap: Tap | None = None
     duration: float = 15.0  # [s]
@@ -202,76 +202,29 @@ def parse(text: str, source: str = "scenario") -> Scenario:
     return scenario
 
 
-class _Damping(msgspec.Struct, frozen=True):
-    delta: tuple[float, ...]  # [N s/m]
-
-    def __post_init__(self) -> None:
-        for i, damping in enumerate(self.delta):
-            require(f"delta[{i}]", damping, 0.0, MOST_DAMPING, "N s/m")
-
-
-def _strictly(fields: dict[str, Any], kind: Any) -> Any:
-    """The fields as `kind`, by the rules of a file. Raises InputError."""
-    raw = {name: _plain(name, value) for name, value in fields.items()}
-    try:
-        return msgspec.convert(raw, kind)
-    except msgspec.ValidationError as error:
-        raise InputError(_located(str(error), raw)) from None
-
-
-def _plain(name: str, value: Any) -> Any:
-    """Structs, tuples, and numpy's numbers and arrays as what a file holds. Raises InputError."""
-
-    def of_numpy(part: Any) -> Any:
-        if isinstance(part, np.ndarray | np.generic):
-            return part.tolist()
-        raise InputError(f"{name} holds {part!r} ({type(part).__name__}), which no scenario can have")
-
-    if isinstance(value, set | frozenset | bytes | bytearray):  # msgspec would take them for lists and text
-        return of_numpy(value)
-    return msgspec.to_builtins(value, enc_hook=of_numpy)
-
-
 def built_in() -> list[str]:
     """Names of the scenarios that come with the program."""
     return sorted(path.stem for path in SCENARIOS.glob("*.toml"))
 
 
-def _located(message: str, raw: dict[str, Any]) -> str:
-    """'Expected `int`, got `float` - at `$.theta[0]`' as 'theta[0] = 1.5: expected `int`, got `float`'."""
-    match = re.fullmatch(r"(.*?)(?: - at `(?:key in )?\$\.?(.*)`)?", message, flags=re.DOTALL)
-    assert match
-    what, path = match[1], match[2] or ""
-    what += _hint(what)
-    value: Any = raw
-    for key, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
-        try:
-            value = value[int(index)] if index else value[key]
-        except (KeyError, IndexError, TypeError):
-            value = None
-            break
-    shown = f" = {value!r}" if isinstance(value, int | float | str) else ""
-    if what[1:2].islower():  # a word of msgspec's, not a symbol of ours
-        what = what[0].lower() + what[1:]
-    return f"{path}{shown}: {what}" if path else what
+def require_linear(scenario: Scenario, what: str) -> None:
+    """Raises InputError where a loop has walls or Coulomb friction, for what decides linear loops only."""
+    for i, device in enumerate(scenario.device):
+        if device.friction:
+            instead = "sim.run and sim.zwidth simulate it"
+            raise InputError(f"device[{i}].friction is {device.friction:g} N: {what} decides linear loops; {instead}")
+    if scenario.environment.walls:
+        raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
 
 
-def _hint(what: str) -> str:
-    """What would have been allowed, where the message does not say it."""
-    unknown = re.search(r"unknown field `(.*)`", what)
-    if unknown:
-        known = {name for struct in _STRUCTS for name in struct.__struct_fields__}
-        close = difflib.get_close_matches(unknown[1], sorted(known), n=1)
-        return f" (did you mean `{close[0]}`?)" if close else ""
-    if what.startswith("Invalid value"):
-        return f", allowed are {' and '.join(repr(d.__struct_config__.tag) for d in get_args(Device))}"
-    return ""
+def require_constant_delay(scenario: Scenario, what: str) -> None:
+    """Raises InputError where a scenario's delays vary, for what would not make them vary."""
+    if scenario.jitter is not None:
+        instead = "sim.run simulates it"
+        raise InputError(f"jitter: {what} takes the delays that its link has; take the table out, {instead}")
 
 
-_STRUCTS = (
-    Scenario, Tap, Jitter, Human, Link, Voluntary, Person, Cross, Population, Network, Spring, Wall, Box,
-    UncertainSpring, *get_args(Device)
-)  # fmt: skip
+# ---- humans in a file of their own
 
 
 class HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -323,3 +276,73 @@ def save_humans(path: Path, humans: tuple[Human, ...], remark: str, persons: tup
         cross = f"cross = {{ damping = {person.cross.damping!r}, stiffness = {person.cross.stiffness!r} }}"
         lines += ["", "[[person]]", f"holds = {list(person.holds)}", *body, cross]
     return write(path, "\n".join(lines) + "\n")
+
+
+# ---- strictness: what a file may hold, and how its errors are worded
+
+
+class _Damping(msgspec.Struct, frozen=True):
+    delta: tuple[float, ...]  # [N s/m]
+
+    def __post_init__(self) -> None:
+        for i, damping in enumerate(self.delta):
+            require(f"delta[{i}]", damping, 0.0, MOST_DAMPING, "N s/m")
+
+
+def _strictly(fields: dict[str, Any], kind: Any) -> Any:
+    """The fields as `kind`, by the rules of a file. Raises InputError."""
+    raw = {name: _plain(name, value) for name, value in fields.items()}
+    try:
+        return msgspec.convert(raw, kind)
+    except msgspec.ValidationError as error:
+        raise InputError(_located(str(error), raw)) from None
+
+
+def _plain(name: str, value: Any) -> Any:
+    """Structs, tuples, and numpy's numbers and arrays as what a file holds. Raises InputError."""
+
+    def of_numpy(part: Any) -> Any:
+        if isinstance(part, np.ndarray | np.generic):
+            return part.tolist()
+        raise InputError(f"{name} holds {part!r} ({type(part).__name__}), which no scenario can have")
+
+    if isinstance(value, set | frozenset | bytes | bytearray):  # msgspec would take them for lists and text
+        return of_numpy(value)
+    return msgspec.to_builtins(value, enc_hook=of_numpy)
+
+
+def _located(message: str, raw: dict[str, Any]) -> str:
+    """'Expected `int`, got `float` - at `$.theta[0]`' as 'theta[0] = 1.5: expected `int`, got `float`'."""
+    match = re.fullmatch(r"(.*?)(?: - at `(?:key in )?\$\.?(.*)`)?", message, flags=re.DOTALL)
+    assert match
+    what, path = match[1], match[2] or ""
+    what += _hint(what)
+    value: Any = raw
+    for key, index in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
+        try:
+            value = value[int(index)] if index else value[key]
+        except (KeyError, IndexError, TypeError):
+            value = None
+            break
+    shown = f" = {value!r}" if isinstance(value, int | float | str) else ""
+    if what[1:2].islower():  # a word of msgspec's, not a symbol of ours
+        what = what[0].lower() + what[1:]
+    return f"{path}{shown}: {what}" if path else what
+
+
+def _hint(what: str) -> str:
+    """What would have been allowed, where the message does not say it."""
+    unknown = re.search(r"unknown field `(.*)`", what)
+    if unknown:
+        known = {name for struct in _STRUCTS for name in struct.__struct_fields__}
+        close = difflib.get_close_matches(unknown[1], sorted(known), n=1)
+        return f" (did you mean `{close[0]}`?)" if close else ""
+    if what.startswith("Invalid value"):
+        return f", allowed are {' and '.join(repr(d.__struct_config__.tag) for d in get_args(Device))}"
+    return ""
+
+
+_STRUCTS = (
+    Scenario, Tap, Jitter, Human, Link, Voluntary, Person, Cross, Population, Network, Spring, Wall, Box,
+    UncertainSpring, *get_args(Device)
+)  # fmt: skip
