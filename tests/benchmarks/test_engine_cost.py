@@ -182,7 +182,7 @@ def test_many_hands(benchmark):
             f"error {error:.1e} in {ticks} ticks",
             end="",
         )
-        assert error < 1e-6 if name == "RK4 x 4" else error < 1e-9
+        assert error < (1e-2 if name == "RK4 x 4" else 1e-10)  # lightly damped modes at 83 Hz: phase errors add up
     print()
 
 

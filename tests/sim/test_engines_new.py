@@ -15,7 +15,8 @@ from design.published import CASE_I
 from models.crowd import Crowd, variants
 from models.device import CompliantDevice
 from models.human import Human, Link
-from models.scene import plant
+from models.scene import Plant, plant
+from sim.engine import outside_forces
 from sim.engines import (
     EXPONENTIAL,
     INTEGRATORS,
@@ -30,9 +31,9 @@ from sim.engines import (
     quiet_warnings,
 )
 from sim.loop import Record, run
-from sim.scenario import load
+from sim.scenario import InputError, load
 from sim.simulate import assemble
-from sim.stepping import check_substeps, default_substeps, exact_growth, measured_hold, pace, simulated_growth
+from sim.stepping import cheapest, check_substeps, default_substeps, exact_growth, measured_hold, pace, simulated_growth
 
 SCENARIO = load()
 RUBBING = SCENARIO.replace(device=(CompliantDevice(friction=0.5),) * 2)
@@ -212,8 +213,17 @@ def test_many_hands_are_each_their_own_scene(substeps):
         alone = knocked(own, make_engine(own, "mujoco", EXPONENTIAL, substeps), 300, start[:, [i]]).s
         np.testing.assert_allclose(together[:, :, [i]], alone, rtol=1e-9, atol=1e-13)
     exact = ExactBatchEngine(hold(held_by.plants(), SCENARIO.T), loop.process.force_limit)
-    # velocities of 0.5 m/s; the exact engine's own exponential is rounded by 1e-14 of its norm of 290 in each tick
-    np.testing.assert_allclose(together, knocked(loop, exact, 300, start).s, atol=1e-9)
+    np.testing.assert_allclose(together, knocked(loop, exact, 300, start).s, rtol=1e-9, atol=1e-13)
+
+
+def test_many_sampled_plants_are_as_exact_as_one():
+    """The stack of exponentials against scipy's of each: both round by 1e-16 of the largest entry."""
+    plants = variants(SCENARIO.device, hands(20)).plants()
+    together = hold(plants, SCENARIO.T)
+    for i in range(20):
+        alone = hold(Plant(plants.A[i], plants.B[i], plants.C), SCENARIO.T)
+        for own, one in ((together.A[i], alone.A), (together.B[i], alone.B)):
+            np.testing.assert_allclose(own, one, rtol=1e-12, atol=1e-14 * np.abs(one).max())
 
 
 # ---- which one, and how many substeps
@@ -269,3 +279,49 @@ def test_a_heavy_hand_on_a_light_handle_needs_no_substeps():
     loop = assemble(SCENARIO.replace(device=(device,) * 2, human=(human,) * 2), CASE_I)
     assert pace(plant(loop.scene.model).A).substeps(SCENARIO.T) >= 24
     assert simulated_growth(loop, EXPONENTIAL, 1) == pytest.approx(exact_growth(loop), abs=1e-9)
+
+
+# ---- which one keeps an error
+
+
+def test_the_cheapest_on_a_smooth_scene_is_one_exponential_step(assembly):
+    found = cheapest(assembly, 1e-9, ticks=500)
+    assert (found.integrator, found.substeps) == (EXPONENTIAL, 1)
+    assert found.error < 1e-11
+    assert found.cpu_s > 0
+
+
+def test_where_devices_rub_the_asked_error_is_kept_with_the_fewest_steps():
+    """The reference knows 64 steps, which the search does not look at."""
+    loop, ticks = assemble(RUBBING, CASE_I), 1500
+
+    def positions(substeps):
+        with profiler_off(), quiet_warnings():
+            return run(loop.process, make_engine(loop, "mujoco", "RK4", substeps), pushes, ticks, rest).s[:, :2]
+
+    def pushes(first, count):
+        return outside_forces(loop.scenario, loop.scene, first, count)
+
+    rest = np.zeros((8, 1))
+    truth = positions(64)
+    for asked in (1e-3, 1e-5):
+        found = cheapest(loop, asked, ticks)
+        assert found.integrator == "RK4"
+        error = np.sqrt(np.mean((positions(found.substeps) - truth) ** 2) / np.mean(truth**2))
+        assert error <= found.error <= asked
+        if found.substeps > 1:
+            fewer = np.sqrt(np.mean((positions(found.substeps // 2) - truth) ** 2) / np.mean(truth**2))
+            assert fewer > asked / 4
+
+
+@pytest.mark.parametrize(
+    ("scenario", "error", "message"),
+    [
+        (SCENARIO, 0.0, "--error is 0, expected a positive relative error"),
+        (SCENARIO, 1e-18, "--error 1e-18: the engine that is exact here is within .*, by rounding"),
+        (RUBBING, 1e-18, "--error 1e-18: RK4 comes within .* with up to 128 substeps"),
+    ],
+)
+def test_errors_that_nothing_keeps(scenario, error, message):
+    with pytest.raises(InputError, match=message):
+        cheapest(assemble(scenario, CASE_I), error, ticks=100)
