@@ -295,23 +295,25 @@ def test_where_devices_rub_the_asked_error_is_kept_with_the_fewest_steps():
     """The reference knows 64 steps, which the search does not look at."""
     loop, ticks = assemble(RUBBING, CASE_I), 1500
 
-    def positions(substeps):
+    def positions(integrator, substeps):
         with profiler_off(), quiet_warnings():
-            return run(loop.process, make_engine(loop, "mujoco", "RK4", substeps), pushes, ticks, rest).s[:, :2]
+            return run(loop.process, make_engine(loop, "mujoco", integrator, substeps), pushes, ticks, rest).s[:, :2]
 
     def pushes(first, count):
         return outside_forces(loop.scenario, loop.scene, first, count)
 
     rest = np.zeros((8, 1))
-    truth = positions(64)
-    for asked in (1e-3, 1e-5):
+
+    def missed(*setting):
+        return np.sqrt(np.mean((positions(*setting) - truth) ** 2) / np.mean(truth**2))
+
+    truth = positions("RK4", 64)
+    for asked, expected in ((1e-2, EXPONENTIAL), (1e-4, "RK4"), (1e-6, "RK4")):
         found = cheapest(loop, asked, ticks)
-        assert found.integrator == "RK4"
-        error = np.sqrt(np.mean((positions(found.substeps) - truth) ** 2) / np.mean(truth**2))
-        assert error <= found.error <= asked
+        assert found.integrator == expected
+        assert missed(found.integrator, found.substeps) <= found.error <= asked
         if found.substeps > 1:
-            fewer = np.sqrt(np.mean((positions(found.substeps // 2) - truth) ** 2) / np.mean(truth**2))
-            assert fewer > asked / 4
+            assert missed("RK4", found.substeps // 2) > asked / 4
 
 
 @pytest.mark.parametrize(
