@@ -125,7 +125,8 @@ def cheapest(assembly: Assembly, error: float, ticks: int | None = None) -> Sett
 
     `ticks` of the scenario are run for it (default: all). A smooth scene is compared with the exact loop. Where
     something rubs there is none: n steps are compared with 2 n, and since the method is of first order at least there,
-    what n steps miss is at most twice the difference; one exponential step is tried too. Raises InputError where neither keeps it.
+    what n steps miss is at most twice the difference; one exponential step is tried too. Raises InputError where
+    neither keeps it.
     """
     if not error > 0:
         raise InputError(f"--error is {error:g}, expected a positive relative error")
