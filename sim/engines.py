@@ -93,7 +93,10 @@ def hold(plant: Plant, T: float) -> HeldPlant:
     *many, n, inputs = plant.B.shape
     generator = np.zeros((*many, n + inputs, n + inputs))
     generator[..., :n, :n], generator[..., :n, n:] = plant.A, plant.B
-    step = expm_each(generator * T) if many else expm(generator * T)
+    if many:
+        step = _expm_in_units(generator * T, np.concatenate([_units(plant.A, T), np.ones((*many, inputs))], axis=1))
+    else:
+        step = expm(generator * T)
     return HeldPlant(step[..., :n, :n], step[..., :n, n:], plant.C, T)
 
 
@@ -159,6 +162,24 @@ def expm_each(matrices: Array) -> Array:
         unfinished = halvings > done
         result[unfinished] = result[unfinished] @ result[unfinished]
     return result
+
+
+def _units(A: Array, h: float) -> Array:
+    """What to measure the states of s' = A s in, (nsim, 2n), where exp(h A) is asked for.
+
+    Velocities in units of a rate near the fastest mode's: then a stiff plant has no larger norm than that mode times h,
+    and its exponential is rounded by 1e-16 instead of 1e-11. Powers of two, which round nothing themselves.
+    """
+    n = A.shape[2] // 2
+    fastest = np.sqrt(np.abs(A[:, n:, :n]).max(axis=(1, 2)))
+    unit = np.ones(A.shape[:2])
+    unit[:, n:] = 2.0 ** np.ceil(np.log2(np.maximum(fastest, 1 / h)))[:, None]
+    return unit
+
+
+def _expm_in_units(matrices: Array, unit: Array) -> Array:
+    """exp of (nsim, n, n) matrices, computed with entry i of what they act on measured in unit[:, i]."""
+    return expm_each(matrices * unit[:, None, :] / unit[:, :, None]) * unit[:, :, None] / unit[:, None, :]
 
 
 _ORDER = 13  # of the diagonal Padé approximant, Higham (2005), table 2.3
@@ -337,19 +358,13 @@ def _rates(scene: Scene, fields: Mapping[str, Array] | None) -> Array:
 def _rosenbrock(J: Array, h: float) -> Array:
     """What makes s + h phi1(h J) [v; a] of [q; v; a], (nsim, 2n, 3n), for J (nsim, 2n, 2n) and a step of h seconds.
 
-    phi1(X) = X^-1 (e^X - I) is the upper right block of exp [[X, I], [0, 0]]. Velocities are measured in units of a
-    rate near the fastest mode's, a power of two, so that a stiff J has no larger norm than its modes' frequencies.
+    phi1(X) = X^-1 (e^X - I) is the upper right block of exp [[X, I], [0, 0]].
     """
     nsim, states, _ = J.shape
-    n = states // 2
-    fastest = np.sqrt(np.abs(J[:, n:, :n]).max(axis=(1, 2)))
-    rate = 2.0 ** np.ceil(np.log2(np.maximum(fastest, 1 / h)))
-    unit = np.ones((nsim, states))
-    unit[:, n:] = rate[:, None]
+    n, unit = states // 2, np.tile(_units(J, h), 2)
     generator = np.zeros((nsim, 2 * states, 2 * states))
-    generator[:, :states, :states] = h * J * unit[:, None, :] / unit[:, :, None]
-    generator[:, :states, states:] = np.eye(states)
-    phi = h * expm_each(generator)[:, :states, states:] * unit[:, :, None] / unit[:, None, :]
+    generator[:, :states, :states], generator[:, :states, states:] = h * J, np.eye(states)
+    phi = h * _expm_in_units(generator, unit)[:, :states, states:]
     return np.concatenate([np.broadcast_to(np.eye(states, n), (nsim, states, n)), phi + np.eye(states, k=-n)], axis=2)
 
 

@@ -18,34 +18,32 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from design.published import CASE_I
 
 from controller.lti import Array
+from design.result import CASE_I
 from models.scene import actuation, tendon_jacobian
-from sim.engines import EXPONENTIAL, profiler_off, quiet_warnings
+from sim.engines import EXPONENTIAL
 from sim.run import Simulation, assemble, make_engine, outside_forces, run
 from sim.scenario import load
 from sim.stability import MARGINAL, close, dominant_mode, measured_growth
 from sim.trace import Trace
 
-Trace = tuple[Array, Array, Array]  # process states (N, order), plant states (N, 2n), forces (N, m)
-Peer = Callable[[Simulation, Array], Trace]  # from rest, under outside forces (N, outside)
+States = tuple[Array, Array, Array]  # process states (N, order), plant states (N, 2n), forces (N, m)
+Peer = Callable[[Simulation, Array], States]  # from rest, under outside forces (N, outside)
 
 
 def ours(engine: str, integrator: str | None = None, substeps: int | None = None) -> Peer:
     """One of this package's engines."""
 
-    def peer(assembly: Simulation, w: Array) -> Trace:
-        with profiler_off(), quiet_warnings():
-            stepped = make_engine(assembly, engine, integrator, substeps)
-            rest = np.zeros((assembly.plant.A.shape[0], 1))
-            record = run(assembly.process, stepped, lambda first, n: w[first : first + n], len(w), rest)
-        return record.z[:, :, 0], record.s[:, :, 0], record.f[:, :, 0]
+    def peer(assembly: Simulation, w: Array) -> States:
+        stepped = make_engine(assembly, engine, integrator, substeps)
+        trace = run(assembly, stepped, lambda first, n: w[first : first + n], len(w))
+        return trace.z, trace.s, trace.f
 
     return peer
 
 
-def numpy_loop(assembly: Simulation, w: Array) -> Trace:
+def numpy_loop(assembly: Simulation, w: Array) -> States:
     """The loop as one would write it down in an hour, with the sampled plant."""
     F, plant, limit = assembly.F, assembly.plant, assembly.process.force_limit
     z, s = np.zeros(F.order), np.zeros(plant.A.shape[0])
@@ -62,7 +60,7 @@ def numpy_loop(assembly: Simulation, w: Array) -> Trace:
     return np.array(zs), np.array(ss), np.array(fs)
 
 
-def scipy_dlsim(assembly: Simulation, w: Array) -> Trace:
+def scipy_dlsim(assembly: Simulation, w: Array) -> States:
     """scipy.signal.dlsim of the closed loop: no force limits."""
     from scipy.signal import dlsim, dlti
 
@@ -74,7 +72,7 @@ def scipy_dlsim(assembly: Simulation, w: Array) -> Trace:
     return z, s, z @ F.C.T + s @ (F.D @ plant.C).T
 
 
-def python_control(assembly: Simulation, w: Array) -> Trace:
+def python_control(assembly: Simulation, w: Array) -> States:
     """control.input_output_response of a nonlinear discrete system."""
     import control
 
@@ -97,7 +95,7 @@ def python_control(assembly: Simulation, w: Array) -> Trace:
 def drake(step: str, substeps: int) -> Peer:
     """pydrake's MultibodyPlant, continuous with fixed Runge-Kutta steps ("RK3") or "discrete"."""
 
-    def peer(assembly: Simulation, w: Array) -> Trace:
+    def peer(assembly: Simulation, w: Array) -> States:
         from pydrake.systems.analysis import ResetIntegratorFromFlags, Simulator
 
         T, model, F = assembly.scenario.T, assembly.scene.model, assembly.F
@@ -191,9 +189,10 @@ def main() -> None:
     print(f"{'tool':<27}{'position error':>16}{'growth error':>14}{'verdict':>9}{'CPU ms':>9}{'ratio':>8}")
     for name in traces:
         z, s, f = traces[name]
-        record = Trace(*(part[:, :, None] for part in (z, s, w, f)), False, False)
+        t, x, unknown = loop.T * np.arange(len(s)), s[:, :m], np.full_like(f, np.nan)
+        trace = Trace(t, x, f, unknown, unknown, w, z=z, s=s)
         error = np.sqrt(np.mean((s[:, :m] - exact[:, :m]) ** 2) / np.mean(exact[:, :m] ** 2))
-        growth, _ = measured_growth(loop, mode, record, assembly.process.force_limit)
+        growth, _ = measured_growth(loop, trace, assembly.process.force_limit)
         right = (growth > MARGINAL) == (mode.growth > MARGINAL)
         cost = np.median(used[name])
         print(

@@ -194,7 +194,7 @@ def test_interrupting_keeps_what_was_simulated(tmp_path, monkeypatch):
     trace = Trace.load_npz(tmp_path / "out" / "trace.npz")
     assert code == 130
     assert report["run"]["interrupted"]
-    assert trace.t.size == report["run"]["samples"] == 2 * loop.STRETCH
+    assert trace.t.size == report["run"]["samples"] == 2 * loop._BLOCK
     assert report["error"]["position_relative_rms"] < 1e-6
 
 

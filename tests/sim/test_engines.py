@@ -157,16 +157,3 @@ def test_without_the_clock_everything_still_runs(monkeypatch, assembly):
     with profiler_off() as found:
         assert not found
     assert run(assembly).s.shape[0] == SHORT.samples
-
-
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda a: make_engine(a, "drake"), "engine is 'drake', allowed are mujoco, exact"),
-        (lambda a: make_engine(a, "mujoco", "RK5"), "integrator is 'RK5', allowed are exponential, RK4"),
-        (lambda a: make_engine(a, "mujoco", "RK4", 0), "substeps is 0"),
-    ],
-)
-def test_unknown_engines_are_named(assembly, call, message):
-    with pytest.raises(ValueError, match=message):
-        call(assembly)
