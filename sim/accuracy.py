@@ -38,7 +38,7 @@ def position_error(
     n = min(trace.t.size, exact.t.size)
     clipped = exact.clipped(limit)[:n] | trace.clipped(limit)[:n]
     if grows is None:
-        grows = bool(unstable(worst_mode(simulation).growth))
+        grows = worst_mode(simulation).verdict == "unstable"
     linear = int(np.argmax(clipped)) if grows and clipped.any() else n
     own, true = trace.s[:linear, :m], exact.s[:linear, :m]
     size, relative, largest = _rms(true), None, None

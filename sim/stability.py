@@ -75,6 +75,11 @@ class Mode:
     def frequency_hz(self) -> Array:
         return np.abs(np.angle(self.eigenvalue)) / (2 * np.pi * self.T)
 
+    @property
+    def verdict(self) -> str:
+        """Of one loop."""
+        return verdict(float(self.growth))
+
 
 def close(plant: HeldPlant, F: Lti) -> ClosedLoop:
     """The plant's held input f and the force map F joined: f = C z + D x, z+ = A z + B x, x = C s."""
@@ -196,7 +201,7 @@ def stability_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
 def eigenvalue_part(mode: Mode) -> dict[str, Any]:
     """What the eigenvalues of the exact loop say."""
     return {
-        "exact_verdict": verdict(float(mode.growth)),
+        "exact_verdict": mode.verdict,
         "exact_growth_rate_per_s": finite(float(mode.growth)),
         "exact_frequency_hz": float(mode.frequency_hz),
         "spectral_radius": float(mode.spectral_radius),

@@ -14,7 +14,7 @@ from design.result import CASE_I
 from models.device import CompliantDevice
 from models.human import Human, Link
 from sim.accuracy import limit_cycle
-from sim.engines import ExactEngine
+from sim.engines import EXPONENTIAL, ExactEngine
 from sim.run import assemble, make_engine, outside_forces, run
 from sim.scenario import InputError, load
 from sim.stability import exact_growth
@@ -31,9 +31,12 @@ def test_a_setting_fails_and_the_rule_holds(hard):
     assert row.holds, row
 
 
-@pytest.mark.parametrize(("side", "wrong"), [(-0.1, ("Euler2", 2)), (0.1, ("Euler", 12)), (0.1, ("RK4", 1))])
+@pytest.mark.parametrize(("side", "wrong"), [(-0.1, None), (0.1, ("Euler", 12)), (0.1, ("RK4", 1))])
 def test_within_a_tenth_of_the_boundary(side, wrong):
-    """Damping tuned by bisection until the exact growth is +-0.1 1/s: the default sees it, cheaper settings do not."""
+    """Damping tuned by bisection until the exact growth is +-0.1 1/s: RK4 by the rule sees it, cheaper settings do not.
+
+    MuJoCo's integrators err towards stable: inside the boundary none of them has the wrong verdict.
+    """
     low, high = 1.0, 2.0
     while high - low > 1e-9:
         middle = (low + high) / 2
@@ -41,10 +44,13 @@ def test_within_a_tenth_of_the_boundary(side, wrong):
         low, high = (middle, high) if growth > side else (low, middle)
     loop = assemble(nominal().replace(delta=(low, low)), NoCoupling())
     assert exact_growth(loop) == pytest.approx(side, abs=1e-6)
-    own, other = simulated_growth(loop, "RK4", default_substeps(loop)), simulated_growth(loop, *wrong)
-    print(f"| growth {side:+g} 1/s | {wrong[0]} x {wrong[1]}: {other:+.4f} | RK4, by the rule: {own:+.4f} |")
+    own = simulated_growth(loop, "RK4", default_substeps(loop, "RK4"))
     assert own == pytest.approx(side, abs=1e-3)
-    assert (other > 0) != (side > 0)
+    assert simulated_growth(loop, EXPONENTIAL, 1) == pytest.approx(side, abs=1e-6)
+    if wrong:
+        other = simulated_growth(loop, *wrong)
+        print(f"| growth {side:+g} 1/s | {wrong[0]} x {wrong[1]}: {other:+.4f} | RK4, by the rule: {own:+.4f} |")
+        assert (other > 0) != (side > 0)
 
 
 def test_the_limit_cycle_of_saturation():
