@@ -39,7 +39,7 @@ from design.result import PRINTED_TAU_DB, PUBLISHED, listed
 from design.transparency import Transparency, decibels, transparency
 from sim.accuracy import ForceError, force_error, position_error
 from sim.couplings import NAMES, Chosen, choose
-from sim.engines import INTEGRATORS, ExactBatchEngine, HeldPlant, default_integrator
+from sim.engines import INTEGRATORS, ExactBatchEngine, HeldPlant
 from sim.files import write, write_json
 from sim.run import ENGINES, Simulation, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, load, load_humans
@@ -51,7 +51,7 @@ from sim.stability import (
     stability_part,
     unlimited,
 )
-from sim.stepping import MOST, check_substeps, default_substeps
+from sim.stepping import MOST, settle
 from sim.switching import Period, certified_part, switching
 from sim.trace import Trace
 
@@ -409,7 +409,7 @@ def main(argv: list[str]) -> int:
         simulation, period = switching(simulation, chosen.coupling, seed, scenario.samples)
     with (bar := progress_bar("searching the box"))[0]:
         whole = check_set(scenario.loop(args.case), chosen.coupling, seed, progress=bar[1])
-    substeps, warnings = _settled(args, simulation, asked)
+    args.integrator, substeps, warnings = settle(simulation, args.engine, args.integrator, asked)
     engine = make_engine(simulation, args.engine, args.integrator, substeps)
 
     with (bar := progress_bar("simulating"))[0]:
@@ -479,19 +479,6 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
     return members[vertex].name, scenario.replace(environment=members[vertex].network, box=None)
 
 
-def _settled(args: argparse.Namespace, simulation: Simulation, asked: int | None) -> tuple[int | None, list[str]]:
-    """Substeps of this run (None for the exact engine), with remarks on a number that was asked for.
-
-    Sets args.integrator to the scene's default where none was asked for.
-    """
-    if args.engine == "exact":
-        return None, []
-    args.integrator = args.integrator or default_integrator(simulation.scene)
-    if asked is None:
-        return default_substeps(simulation, args.integrator), []
-    return asked, check_substeps(simulation, args.integrator, asked)
-
-
 def _outcome(
     args: argparse.Namespace,
     chosen: Chosen,
@@ -512,7 +499,6 @@ def _outcome(
     if jitter and scenario.switches:
         stability = switching_stability(simulation, trace, jitter)
         unstable = stability["verdict"] == "unstable"
-    mujoco = args.engine == "mujoco"
     outcome = {
         "case": args.case,
         "scenario": scenario.name,
@@ -526,7 +512,7 @@ def _outcome(
         "jitter": jitter,
         "run": {
             "engine": args.engine,
-            "integrator": args.integrator if mujoco else None,
+            "integrator": args.integrator,
             "duration_s": simulated,
             "samples": samples,
             "wall_s": wall,

@@ -7,11 +7,11 @@ from dataclasses import replace
 from controller.coupling import Coupling, NoCoupling
 from design.result import COUPLING, Design, bare, number, of_kind, one_of, whole
 from sim import crowds
-from sim.engines import INTEGRATORS, default_integrator
+from sim.engines import INTEGRATORS
 from sim.run import ENGINES, Progress, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, require_linear
 from sim.stability import stability_part
-from sim.stepping import MOST, check_substeps, default_substeps
+from sim.stepping import MOST, settle
 from sim.switching import switching
 from sim.trace import Trace
 
@@ -51,15 +51,7 @@ def simulate(
     simulation = assemble(scenario, alone)
     if scenario.switches:
         simulation, _ = switching(simulation, alone, seed, scenario.samples)
-    warnings: list[str] = []
-    if engine == "exact":
-        integrator = substeps = None
-    else:
-        integrator = integrator or default_integrator(simulation.scene)
-        if substeps is None:
-            substeps = default_substeps(simulation, integrator)
-        else:
-            warnings = check_substeps(simulation, integrator, substeps)
+    integrator, substeps, remarks = settle(simulation, engine, integrator, substeps)
     trace = run(simulation, make_engine(simulation, engine, integrator, substeps))
     meta = {
         "scenario": scenario.name,
@@ -69,7 +61,7 @@ def simulate(
         "substeps": substeps,
         "seed": seed,
         "stability": None if scenario.switches else stability_part(simulation, trace),
-        "remarks": warnings,
+        "remarks": remarks,
     }
     return replace(trace, meta=meta)
 

@@ -174,13 +174,7 @@ def load(source: str | Path = DEFAULT) -> Scenario:
         kind = type(source).__name__
         raise InputError(f"scenario is {source!r} ({kind}), expected a TOML file or one of: {', '.join(built_in())}")
     path = SCENARIOS / f"{source}.toml" if str(source) in built_in() else Path(source)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        names = ", ".join(built_in())
-        raise InputError(f"scenario {source}: {error.strerror}; give a TOML file or one of: {names}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"scenario {source}: not a text file in UTF-8") from None
+    text = _read(path, f"scenario {source}", f"; give a TOML file or one of: {', '.join(built_in())}")
     return parse(text, str(source))
 
 
@@ -188,15 +182,9 @@ def parse(text: str, source: str = "scenario") -> Scenario:
     """A scenario from TOML text. Raises InputError, with the path of the field and the value that came."""
     if not isinstance(text, str):
         raise TypeError(f"text is of type {type(text).__name__}, expected a str: the scenario itself, in TOML")
+    scenario: Scenario = _converted(text, Scenario, source)
     try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{source}: not valid TOML: {error}") from None
-    try:
-        scenario = msgspec.convert(raw, Scenario)
         environment(scenario.environment, scenario.T)
-    except msgspec.ValidationError as error:
-        raise InputError(f"{source}: {_located(str(error), raw)}") from None
     except ValueError as error:
         raise InputError(f"{source}: environment: {error}") from None
     return scenario
@@ -239,16 +227,7 @@ def load_humans(path: str | Path, channels: int) -> HumanFile:
 
     Raises InputError with one line that names the file and the field.
     """
-    try:
-        people = msgspec.convert(tomllib.loads(Path(path).read_text(encoding="utf-8")), HumanFile)
-    except OSError as error:
-        raise InputError(f"--human {path}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"--human {path}: not a text file in UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"--human {path}: not valid TOML: {error}") from None
-    except msgspec.ValidationError as error:
-        raise InputError(f"--human {path}: {error}") from None
+    people: HumanFile = _converted(_read(Path(path), f"--human {path}"), HumanFile, f"--human {path}")
     if len(people.human) != channels:
         raise InputError(
             f"--human {path} has {len(people.human)} [[human]] tables, expected {channels} (one per channel)"
@@ -279,6 +258,30 @@ def save_humans(path: Path, humans: tuple[Human, ...], remark: str, persons: tup
 
 
 # ---- strictness: what a file may hold, and how its errors are worded
+
+
+def _read(path: Path, name: str, hint: str = "") -> str:
+    """The text of a file that the user named. Raises InputError."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{name}: {error.strerror}{hint}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{name}: not a text file in UTF-8") from None
+
+
+def _converted(text: str, kind: Any, source: str) -> Any:
+    """TOML text as `kind`. Raises InputError with the path of the field and the value that came."""
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{source}: not valid TOML: {error}") from None
+    try:
+        return msgspec.convert(raw, kind)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{source}: {_located(str(error), raw)}") from None
+    except ValueError as error:
+        raise InputError(f"{source}: {error}") from None
 
 
 class _Damping(msgspec.Struct, frozen=True):

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from controller.lti import Array, Lti
 from controller.process import Process, State, StepBuffer
@@ -27,17 +27,17 @@ _CLEAR = 1e-3  # [1/s]: slower than this, a loop is too close to the margin for 
 _SHORTEST_TRACE = 200  # ticks below which a growth rate is not read from a trace
 
 
-def unstable(growth: Array) -> NDArray[np.bool_]:
+def unstable(growth: ArrayLike) -> NDArray[np.bool_]:
     """Whether each growth rate [1/s] counts as unstable; what is not a number does."""
     return ~(np.asarray(growth) <= MARGINAL)
 
 
 def verdict(growth: float) -> str:
     """ "stable" or "unstable" for a growth rate [1/s]."""
-    return "unstable" if unstable(np.asarray(growth)) else "stable"
+    return "unstable" if unstable(growth) else "stable"
 
 
-def disagree(exact: Array, other: Array) -> NDArray[np.bool_]:
+def disagree(exact: ArrayLike, other: ArrayLike) -> NDArray[np.bool_]:
     """Where two growth rates [1/s] have opposite signs though the exact one is clearly not zero."""
     return (unstable(exact) != unstable(other)) & (np.abs(exact) > _CLEAR) & np.isfinite(other)
 
@@ -172,7 +172,8 @@ def measured_growth(loop: ClosedLoop, trace: Trace, force_limit: Array) -> tuple
     weight = float(np.vdot(y[:-1], y[:-1]).real)
     if weight == 0:
         return None, "nothing excites the mode"
-    return float(Mode(np.vdot(y[:-1], y[1:] - pushed) / weight, loop.T).growth), None
+    eigenvalue = np.array(np.vdot(y[:-1], y[1:] - pushed) / weight, dtype=np.complex128)
+    return float(Mode(eigenvalue, loop.T).growth), None
 
 
 def stability_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:

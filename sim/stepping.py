@@ -21,12 +21,11 @@ from models.scene import plant
 from sim.engines import EXPONENTIAL, LEAST, HeldPlant, default_integrator, quiet_warnings
 from sim.run import Simulation, make_engine, run
 from sim.scenario import InputError
-from sim.stability import close, dominant_mode, exact_growth
+from sim.stability import close, disagree, dominant_mode, exact_growth
 
 _RESOLVED, _FOLLOWED = 0.2, 1.0  # what a step may advance the fastest mode [rad] and the strongest damping
 MOST = 10_000  # substeps
 _MODE_LOST = "it damps fast modes away"
-_DECIDED = 1e-3  # [1/s] exact growth rates nearer to zero than this are no verdict to get wrong
 _MOST_COMPARED = 256  # substeps, in the search for those that keep an error
 NEUTRAL = 1e-6  # a passive plant's free motion has eigenvalues at 1, which rounding splits by about 1e-8
 #: basis states and inputs are this long: the plant is linear, and no actuator limit is so small
@@ -60,6 +59,21 @@ def pace(A: Array) -> Pace:
     values = np.linalg.eigvals(A)
     weak = np.abs(values.imag) > np.abs(values.real)
     return Pace(float(np.abs(values[weak]).max(initial=0.0)), float(-values.real.min(initial=0.0)))
+
+
+def settle(
+    simulation: Simulation, engine: str, integrator: str | None = None, substeps: int | None = None
+) -> tuple[str | None, int | None, list[str]]:
+    """(integrator, substeps, remarks) of a run for which some were asked; without any for the exact engine.
+
+    Raises InputError where they cannot be had.
+    """
+    if engine == "exact":
+        return None, None, []
+    integrator = integrator or default_integrator(simulation.scene)
+    if substeps is None:
+        return integrator, default_substeps(simulation, integrator), []
+    return integrator, substeps, check_substeps(simulation, integrator, substeps)
 
 
 def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
@@ -106,7 +120,7 @@ def check_substeps(simulation: Simulation, integrator: str, substeps: int) -> li
 
 
 @dataclass(frozen=True)
-class Setting:
+class EngineChoice:
     """What keeps an error that was asked for, and what it costs."""
 
     integrator: str
@@ -115,7 +129,7 @@ class Setting:
     cpu_s: float  # of that run
 
 
-def cheapest(simulation: Simulation, error: float, ticks: int | None = None) -> Setting:
+def cheapest(simulation: Simulation, error: float, ticks: int | None = None) -> EngineChoice:
     """The cheapest of exponential and RK4 that keeps the relative rms error of the positions below `error`.
 
     `ticks` of the scenario are run for it (default: all). A smooth scene is compared with the exact loop. Where
@@ -131,7 +145,7 @@ def cheapest(simulation: Simulation, error: float, ticks: int | None = None) -> 
             _timed(simulation, ticks, "exact"),
             _timed(simulation, ticks, "mujoco", EXPONENTIAL, 1),
         )
-        found = Setting(EXPONENTIAL, 1, _apart(own, exact), cost)
+        found = EngineChoice(EXPONENTIAL, 1, _apart(own, exact), cost)
         if found.error > error:
             raise InputError(
                 f"--error {error:g}: the engine that is exact here is within {found.error:.1g}, by rounding"
@@ -145,7 +159,11 @@ def cheapest(simulation: Simulation, error: float, ticks: int | None = None) -> 
         if missed <= error:
             rough, least = _timed(simulation, ticks, "mujoco", EXPONENTIAL, 1)  # a quarter of the force evaluations
             apart = _apart(rough, finer) + missed
-            return Setting(EXPONENTIAL, 1, apart, least) if apart <= error else Setting("RK4", substeps, missed, cost)
+            return (
+                EngineChoice(EXPONENTIAL, 1, apart, least)
+                if apart <= error
+                else EngineChoice("RK4", substeps, missed, cost)
+            )
         own, cost, substeps = finer, more, 2 * substeps
     raise InputError(f"--error {error:g}: RK4 comes within {best:.1g} with up to {_MOST_COMPARED // 2} substeps")
 
@@ -179,8 +197,7 @@ def step_radius(simulation: Simulation, integrator: str, substeps: int) -> float
 def _agrees(simulation: Simulation, integrator: str, substeps: int) -> bool:
     if step_radius(simulation, integrator, substeps) > 1 + NEUTRAL:
         return False
-    exact = exact_growth(simulation)
-    return abs(exact) <= _DECIDED or (simulated_growth(simulation, integrator, substeps) > 0) == (exact > 0)
+    return not disagree(exact_growth(simulation), simulated_growth(simulation, integrator, substeps))
 
 
 def _instead(simulation: Simulation, integrator: str) -> str:
