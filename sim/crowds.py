@@ -168,7 +168,7 @@ class Findings:
         return disagree(self.exact, self.mujoco) | disagree(self.exact, self.trace) | switching
 
 
-def merge(parts: Sequence[Findings], interrupted: bool = False) -> Findings:
+def _merge(parts: Sequence[Findings], interrupted: bool = False) -> Findings:
     """The findings of several batches as one, whatever their order."""
     arrays = [f.name for f in fields(Findings) if f.name not in ("simulated", "interrupted")]
     order = np.argsort(np.concatenate([p.index for p in parts]) if parts else np.zeros(0), kind="stable")
@@ -193,7 +193,7 @@ def examine(
     if member:
         scenario = scenario.replace(environment=member.network, box=None)
     simulation = assemble(scenario, validation.coupling)
-    return merge([_group(validation, simulation, *group, ticked) for group in validation.crowds(indices)])
+    return _merge([_group(validation, simulation, *group, ticked) for group in validation.crowds(indices)])
 
 
 def _group(
@@ -276,8 +276,8 @@ def _here(validation: Validation, progress: Progress) -> Findings:
             done = n * ticks
             progress(done, ticks * len(batches))
     except KeyboardInterrupt:
-        return merge(parts, interrupted=True)
-    return merge(parts)
+        return _merge(parts, interrupted=True)
+    return _merge(parts)
 
 
 def _in_processes(validation: Validation, shards: int, progress: Progress) -> Findings:
@@ -297,10 +297,10 @@ def _in_processes(validation: Validation, shards: int, progress: Progress) -> Fi
         finished = [f.result() for f in futures if f.done() and not f.cancelled() and not f.exception()]
         for worker in set(multiprocessing.active_children()) - strangers:
             worker.terminate()  # a batch takes half a minute, and keeps nothing before its end
-        return merge(finished, interrupted=True)
+        return _merge(finished, interrupted=True)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-    return merge(parts)
+    return _merge(parts)
 
 
 def _ignore_interrupts() -> None:
@@ -328,8 +328,8 @@ def validate_on_cluster(
                 progress(len(parts), len(batches))
         except KeyboardInterrupt:
             client.cancel(tasks)
-            return merge(parts, interrupted=True)
-    return merge(parts)
+            return _merge(parts, interrupted=True)
+    return _merge(parts)
 
 
 _one_at_a_time = threading.Lock()  # MuJoCo's clock and warning handler are global to a process

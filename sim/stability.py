@@ -139,14 +139,14 @@ def mujoco_loops(
 # ---- one simulation: what its eigenvalues and its trace say
 
 
-def frozen_modes(simulation: Simulation) -> dict[State, Mode]:
+def _frozen_modes(simulation: Simulation) -> dict[State, Mode]:
     """The dominant mode of the exact loop for every set of walls that touch; one entry where there is no wall."""
     return {walls: dominant_mode(close(simulation.plant, F)) for walls, F in simulation.process.frozen().items()}
 
 
 def worst_mode(simulation: Simulation) -> Mode:
     """The dominant mode of the exact loop; where there are walls, of the worst frozen contact state."""
-    return max(frozen_modes(simulation).values(), key=lambda mode: float(mode.spectral_radius))
+    return max(_frozen_modes(simulation).values(), key=lambda mode: float(mode.spectral_radius))
 
 
 def exact_growth(simulation: Simulation) -> float:
@@ -215,7 +215,7 @@ def _contact_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
     assert walls is not None
     touching = walls.depths(trace.z) > 0
     states = []
-    for state, mode in frozen_modes(simulation).items():
+    for state, mode in _frozen_modes(simulation).items():
         part = eigenvalue_part(mode)
         part.pop("spectral_radius")
         states.append({"touching": [i + 1 for i, on in enumerate(state) if on]} | part)

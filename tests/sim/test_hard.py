@@ -5,17 +5,17 @@ from functools import partial
 
 import numpy as np
 import pytest
+from driven import driven
 
 from cli.hard import cases, devices, measure, nominal
 from controller.coupling import NoCoupling, SpringDamper
-from controller.process import StepBuffer
 from design.certificate import assess
 from design.result import CASE_I
 from models.device import CompliantDevice
 from models.human import Human, Link
 from sim.accuracy import limit_cycle
-from sim.engines import EXPONENTIAL, ExactEngine
-from sim.run import assemble, make_engine, outside_forces, run
+from sim.engines import EXPONENTIAL
+from sim.run import assemble, make_engine, outside_forces, run, run_blocks
 from sim.scenario import InputError, load
 from sim.stability import exact_growth
 from sim.stepping import default_substeps, simulated_growth
@@ -68,6 +68,11 @@ def test_the_limit_cycle_of_saturation():
     assert wrong[0] < 0.1 * exact[0]
 
 
+def quiet(loop):
+    """Nobody pushes."""
+    return lambda first, ticks: np.zeros((ticks, loop.scene.outside))
+
+
 def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
     """The share of 200 starts within 0.5 m and 10 m/s that clip after 48 s; how many of `near` in a fifth of that do.
 
@@ -83,18 +88,9 @@ def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
     start = np.concatenate([rng.uniform(-0.5, 0.5, (n // 2, 200)), rng.uniform(-10, 10, (n // 2, 200))])
     start = np.hstack([start, start[:, :near] / 5])
     start[2:4], start[6:8] = start[:2], start[4:6]  # the transmissions start unstretched
-    tape = StepBuffer(loop.process, 1000, n, loop.scene.outside, 200 + near)
-    engine = ExactEngine(loop.plant, loop.process.force_limit)
-    tape.s[0] = start
-    engine.start(tape)
-    for _ in range(40):
-        for k in range(1000):
-            tape.tick(k)
-            engine.advance(k)
-        tape.saturate(1000)
-        last = tape.x[:1000, 1].copy()
-        clipped = (np.abs(tape.f[:1000]) >= loop.process.force_limit[:, None]).any(axis=(0, 1))
-        tape.rewind(1000)
+    late = driven(loop.process, make_engine(loop, "exact"), quiet(loop), 40_000, start)
+    clipped = (np.abs(late.f[-1000:]) >= loop.process.force_limit[:, None]).any(axis=(0, 1))
+    last = late.s[-1000:, 1]
     strongest = last[:, last.std(axis=0).argmax()]
     spectrum = np.abs(np.fft.rfft((strongest - strongest.mean()) * np.hanning(1000), 2**15))
     return (
@@ -134,19 +130,14 @@ def test_one_simulated_hour_does_not_drift():
     """0.6 Hz at 1.2 ms repeats every 12500 ticks exactly: the last period is the one of the first minute."""
     loop = assemble(load().replace(tap=None), CASE_I)
     period, ticks = 12_500, 3_000_000
-    tape = StepBuffer(loop.process, period, loop.plant.A.shape[0], loop.scene.outside)
-    engine = ExactEngine(loop.plant, loop.process.force_limit)
-    engine.start(tape)
-    early = None
-    for first in range(0, ticks, period):
-        tape.w[:period] = outside_forces(loop.scenario, loop.scene, first, period)[:, :, None]
-        for k in range(period):
-            tape.tick(k)
-            engine.advance(k)
-        if first == 4 * period:
-            early = tape.x[:period].copy()
-        late = tape.x[:period].copy()
-        tape.rewind(period)
+    outside, rest, kept = partial(outside_forces, loop.scenario, loop.scene), np.zeros((loop.plant.A.shape[0], 1)), {}
+
+    def look(buffer, first, count):
+        if first in (4 * period, ticks - period):
+            kept[first] = buffer.x[:count].copy()
+
+    run_blocks(loop.process, make_engine(loop, "exact"), outside, ticks, rest, look, period)
+    early, late = kept.values()
     drift = np.abs(late - early).max()
     print(f"one hour: {drift:.1e} m between the first minute and the last")
     assert drift < 1e-12
@@ -169,9 +160,6 @@ def test_the_loop_runs_from_any_state():
     loop = assemble(devices(transmission_stiffness=1e6), CASE_I)
     start = 1e-3 * np.random.default_rng(0).normal(size=(loop.plant.A.shape[0], 1))
 
-    def quiet(first, ticks):
-        return np.zeros((ticks, loop.scene.outside))
-
     engines = (make_engine(loop, "mujoco", "RK4", default_substeps(loop, "RK4")), make_engine(loop, "exact"))
-    a, b = (run(loop, engine, quiet, 300, start) for engine in engines)
+    a, b = (run(loop, engine, quiet(loop), 300, start) for engine in engines)
     assert np.abs(a.s[:, :2] - b.s[:, :2]).max() < 1e-3 * np.abs(b.s[:, :2]).max()
