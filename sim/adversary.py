@@ -73,7 +73,7 @@ def search(
 ) -> Worst:
     """The lossless humans with the largest growth that were found; with `first`, the first that destabilise.
 
-    `progress` hears of every generation.
+    `progress` is called after every generation.
     """
     m, done = scenario.channels, 0
     passes = [p for p in _PASSES if m > 1 or not p.held]
@@ -127,7 +127,7 @@ def attempts(
 ) -> list[Attempt]:
     """Attack every loop at every shortage: devices get (1 - short) times the damping that `closed_loop` requires.
 
-    A negative shortage gives the devices more than required: there the search must fail. `attempted` hears of each.
+    A negative shortage gives the devices more than required: there the search must fail. `attempted` is called with each.
     """
     rows = []
     for name, (scenario, coupling) in loops.items():

@@ -80,8 +80,8 @@ def validate(
 
     They are drawn from `scenario.population`; number i depends on `seed` and i alone. `engine` is "exact", "mujoco" or
     "both"; `duration` [s] of the traces, 0 for none (then growth rates are those of the period maps alone); `shards`
-    local processes (a script that asks for more than 1 needs `if __name__ == "__main__"`); `progress` hears of the
-    parts done and of all.
+    local processes (a script that asks for more than 1 needs `if __name__ == "__main__"`); `progress` is
+    called with the parts done and all of them.
 
     Returns Findings, n = humans: `exact` and `mujoco` (n,) growth rates [1/s], positive where a human makes the loop
     unstable, `radius` (n,) of the exact loop, `frequency` (n,) [Hz], `disagreements` (n,) of the engines, and more.

@@ -187,7 +187,7 @@ def examine(
 ) -> Findings:
     """Decide and simulate the humans of `indices`, who all meet the same environment.
 
-    `ticked` hears of every tick simulated for all of them.
+    `ticked` is called with the number of ticks that were simulated for all of them.
     """
     scenario, member = validation.scenario, validation.environment(indices[0])
     if member:

@@ -1,7 +1,7 @@
 """What a run returns, as files, and what its displacements show: does something oscillate, and does it grow?
 
 Displacements alone are looked at, for where nobody knows the states of the loop: the trace of a bridge, a stored one,
-a loop that is not linear. An oscillation is what is left of a stretch of ticks without its slow part, split into
+a loop that is not linear. An oscillation is what is left of a part of a trace without its slow motion, split into
 octaves. Two questions are asked of it:
 
 oscillation   does it go on in the second half of a trace? The half is cut into two windows; it does if in some octave
@@ -187,7 +187,7 @@ def _octaves(x: Array, T: float, trend: int) -> tuple[Array, Array, Array]:
 
 _WINDOW = 1.0  # [s] at most
 _TREND = 7  # degree of the polynomial that is the slow part: of 15 mm at 0.6 Hz it leaves less than a micrometre
-_WINDOWS = 7  # in the second half of a stretch, each half over the next, at least
+_WINDOWS = 7  # in the second half of such a part, each half over the next, at least
 _NEEDED = 4  # of them, one after the other, that an oscillation is seen in
 _SHORTEST = 200  # ticks
 _FLOOR = 3.0  # times what the encoders' rounding puts into an octave: less is not an oscillation
@@ -197,7 +197,7 @@ _FINEST = 1e-9  # [m] step taken for an ideal encoder: floating-point noise is n
 
 @dataclass(frozen=True)
 class Growth:
-    """The strongest oscillation in a stretch of a trace, or why there is none to tell of."""
+    """The strongest oscillation in a part of a trace, or why no rate can be given."""
 
     first: int  # ticks [first, stop) that were looked at
     stop: int
@@ -240,7 +240,7 @@ def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
 
 
 class _Lines(NamedTuple):
-    """What oscillates in a stretch."""
+    """What oscillates in a part of a trace."""
 
     found: list[tuple[float, float, float, float]]  # rate and its error [1/s], frequency [Hz], amplitude [m], by octave
     brief: bool  # something does, in too few windows
@@ -281,7 +281,7 @@ def _slope(values: Array, spacing: float) -> tuple[float, float]:
 
 
 def growths(trace: Trace) -> list[Growth]:
-    """One entry per stretch of a trace in which the loop was one linear loop: `run.steady_ticks` of its metadata.
+    """One entry per part of a trace in which the loop was one linear loop: `run.steady_ticks` of its metadata.
 
     Where a trace does not name any, all of it is one. Raises InputError where what it names is none of it.
     """
@@ -305,7 +305,7 @@ def growths(trace: Trace) -> list[Growth]:
 
 
 def format_growth(part: dict[str, Any], T: float) -> str:
-    """One stretch in words, from its plain data."""
+    """The growth of one part of a trace in words, from its plain data."""
     where = f"ticks {part['first']} to {part['stop']} ({(part['stop'] - part['first']) * T:.2f} s)"
     above = "" if part["slowest_hz"] is None else f" (from {part['slowest_hz']:.3g} Hz up)"
     if part["reason"]:

@@ -9,7 +9,7 @@ from cli.run import main
 from controller.coupling import NoCoupling
 from design.result import CASE_I
 from models.device import CompliantDevice
-from models.human import Human, Link
+from models.human import Human, Link, Person
 from models.scene import plant
 from sim.engines import INTEGRATORS
 from sim.run import assemble, make_engine, run
@@ -98,6 +98,14 @@ def test_edges_of_the_stable_regions(integrator, edge):
         h = factor * edge / mode
         shorter = assemble(loop.scenario.replace(T=h), CASE_I)
         assert (step_radius(shorter, integrator, 1) <= 1 + 1e-6) == stable
+
+
+def test_the_rule_knows_who_holds_devices_that_rub():
+    """Coulomb friction is taken out of the scene for the rule; a person who holds both devices stays in it."""
+    person, device = Person((1, 2), 20.0, 1.0, 100.0), CompliantDevice(friction=0.5)
+    loop = assemble(SCENARIO.replace(person=(person,), device=(device,) * 2), CASE_I)
+    assert loop.smooth.scene.model.nv == loop.scene.model.nv == 5
+    assert default_substeps(loop, "RK4") == 4
 
 
 def test_run_uses_and_reports_the_rule(tmp_path):
