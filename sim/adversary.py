@@ -127,7 +127,8 @@ def attempts(
 ) -> list[Attempt]:
     """Attack every loop at every shortage: devices get (1 - short) times the damping that `closed_loop` requires.
 
-    A negative shortage gives the devices more than required: there the search must fail. `attempted` is called with each.
+    A negative shortage gives the devices more than required: there the search must fail. `attempted` is called
+    with each.
     """
     rows = []
     for name, (scenario, coupling) in loops.items():
