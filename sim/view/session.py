@@ -1,9 +1,14 @@
-"""The running loop behind the window: a clock, keys and pushes go in, frames come out. It knows no display.
+"""The running loop behind the window: a clock, keys, pushes and the mouse go in, frames come out. It knows no display.
 
 When the coupling or a delay is changed while the loop runs, the plant goes on from where it is, position and velocity.
 The new process begins at rest with the devices held where they are, z = A z + B x: its delay lines hold the
 force F(1) x, and nothing starts with a step in x. The force changes to what the new coupling makes of that
 position; what the environment's masses had of motion is lost.
+
+The mouse is a hand: a spring and a damper between the handle and the point that it drags. It is part of the plant, so
+it is held exactly and is as passive as any other human: a certificate that covers every passive human covers this one.
+Only its end moves with the mouse, as in a voluntary motion. A force computed from one picture to the next would be no
+such hand: it comes too late, and sets a certified loop in motion by itself.
 """
 
 from __future__ import annotations
@@ -11,20 +16,82 @@ from __future__ import annotations
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
+from typing import Any
 
 import numpy as np
 
-from controller.lti import Array, Lti
+from controller.lti import Array, Lti, SingularLoop
 from controller.process import Tape
-from sim.engines import ExactEngine, outside_forces
+from design.certificate import certificate_part, finite
+from design.result import DesignFailed
+from models.scene import Plant, Scene, plant
+from sim.engines import ExactEngine, HeldPlant, hold, outside_forces
 from sim.run import stretch
-from sim.view.events import Couple, Delay, Event, Push, Restart, Script, words
-from sim.view.grip import Grip, gripped
-from sim.view.pace import LONGEST_LAG, Pace
-from sim.view.setting import Setting, attempt, changed
+from sim.scenario import InputError
+from sim.view.events import Couple, Delay, Event, Push, Restart, Script, Setting, changed, words
 
 HISTORY = 4.0  # [s] of forces that are kept for the picture
-STRETCH = 64  # ticks between two looks at what is due
+_STRETCH = 64  # ticks between two looks at what is due
+LONGEST_LAG = 0.1  # [s] what a window may make up in one go; more is dropped and counted
+STIFFNESS, DAMPING = 200.0, 3.0  # [N/m], [N s/m] of the mouse's hand: as firm as the hands of the default scenario
+
+
+@dataclass
+class Pace:
+    """Ticks of T seconds against a clock that is read from outside and began at 0."""
+
+    T: float  # [s]
+    patience: float = LONGEST_LAG  # [s]
+    done: int = 0  # ticks
+    overruns: int = 0  # how often the loop fell behind by more than `patience`
+    lost: float = 0.0  # [s] clock time that no tick was made for
+
+    def due(self, now: float) -> int:
+        """Ticks to be made now, so that the next one lies in the future; they count as done."""
+        ticks = max(0, self._owed(now))
+        most = self.patience / self.T
+        if ticks > most:
+            most = int(most)
+            self.overruns += 1
+            self.lost += (ticks - most) * self.T
+            ticks = most
+        self.done += ticks
+        return ticks
+
+    def factor(self, now: float) -> float:
+        """Simulated over clock time: 1 where nothing was lost."""
+        return self.done * self.T / now if now > self.T else 1.0
+
+    def _owed(self, now: float) -> int:
+        # a clock that is a rounding error short of a tick has reached it
+        return int((now - self.lost) / self.T + 1e-6) - self.done
+
+
+@dataclass(frozen=True)
+class Grip:
+    """Which handle is held, and where it is drawn to."""
+
+    channel: int  # counted from 0
+    target: float  # [m] displacement of the handle
+
+    @property
+    def pull(self) -> float:
+        """Force [N] of the hand on a handle that rests at 0."""
+        return STIFFNESS * self.target
+
+    def force(self, scene: Scene, s: Array) -> float:
+        """Force [N] of the hand on the handle in the plant state s, positions and velocities."""
+        joint, n = scene.handles[self.channel], scene.model.nq
+        return self.pull - STIFFNESS * float(s[joint]) - DAMPING * float(s[n + joint])
+
+
+def gripped(scene: Scene, channel: int, T: float) -> HeldPlant:
+    """The plant with the hand's spring and damper on a handle, its end at rest."""
+    free, joint, n = plant(scene.model), scene.handles[channel], scene.model.nq
+    A, at_handle = free.A.copy(), free.B[:, scene.tapped[channel]]
+    A[:, joint] -= STIFFNESS * at_handle
+    A[:, n + joint] -= DAMPING * at_handle
+    return hold(Plant(A, free.B, free.C), T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +123,7 @@ class Session:
 
         The clock begins at 0; what it runs ahead by more than `patience` [s] is not made up.
 
-        Raises what sim.view.setting.changed raises where an event of the script is impossible.
+        Raises what `changed` raises where an event of the script is impossible.
         """
         self.setting = setting
         self.pace = Pace(setting.scenario.T, patience)
@@ -127,11 +194,12 @@ class Session:
                 self._happen(event)
 
     def _make(self, event: Couple | Delay) -> Setting | str:
-        """Runs in the executor, one after the other: each event changes what the one before has made."""
-        outcome = attempt(self._latest, event)
-        if isinstance(outcome, Setting):
-            self._latest = outcome
-        return outcome
+        """The loop after an event, or why there is none. The executor makes one after the other."""
+        try:
+            self._latest = changed(self._latest, event)
+        except (InputError, DesignFailed, SingularLoop) as error:  # the old loop goes on
+            return " ".join(str(error).split())
+        return self._latest
 
     def _take_finished(self) -> None:
         while self._wanted and self._wanted[0][1].done():
@@ -153,7 +221,7 @@ class Session:
                     self._latest = setting
                     self._switch(event, setting)
             until = min(end, self._script[0][0]) if self._script else end
-            self._advance(min(STRETCH, until - self._tick))
+            self._advance(min(_STRETCH, until - self._tick))
 
     def _advance(self, count: int) -> None:
         tape, scene = self._tape, self.setting.assembly.scene
@@ -192,7 +260,7 @@ class Session:
         """Go on with another process from the plant state s."""
         process = setting.assembly.process
         outside = setting.assembly.plant.B.shape[1] - process.channels
-        tape = Tape(process, STRETCH, s.size, outside)
+        tape = Tape(process, _STRETCH, s.size, outside)
         tape.s[0, :, 0] = s
         tape.z[0, :, 0] = rest(process.F, s[: process.channels])
         self.setting, self._tape = setting, tape
@@ -229,3 +297,25 @@ def _rehearsed(setting: Setting, script: Script) -> list[tuple[int, Event, Setti
             into = setting = changed(setting, event)
         made.append((round(time / setting.scenario.T), event, into))
     return made
+
+
+def happened(session: Session) -> dict[str, Any]:
+    """How long it ran, what was changed when, and what could be said of each loop."""
+    return {
+        "scenario": session.setting.scenario.name,
+        "simulated_s": session.t,
+        "clipped_ticks": session.clipped,
+        "events": [{"t_s": t, "event": what, **_facts(setting)} for t, what, setting in session.log],
+    }
+
+
+def _facts(setting: Setting) -> dict[str, Any]:
+    return {
+        "coupling": setting.label,
+        "theta": list(setting.scenario.theta),
+        "psi": list(setting.scenario.psi),
+        "exact_growth_rate_per_s": finite(setting.mode.growth),
+        "exact_frequency_hz": setting.mode.frequency_hz,
+        "certificates": {name: certificate_part(need) for name, need in setting.requirements.items()},
+        "promise": setting.promise,
+    }

@@ -23,17 +23,12 @@ from sim.engines import hold
 from sim.run import simulate
 from sim.scenario import InputError, load
 from sim.stability import close, dominant_mode
-from sim.view import film, offscreen
-from sim.view.events import GIVEN, KEYS, Delay, Push, Restart, parse_script, words
-from sim.view.flat import Flat
-from sim.view.grip import DAMPING, STIFFNESS, Grip, gripped
-from sim.view.layout import COLUMNS, channels, envelope, places, scale
-from sim.view.live import loop, typed
-from sim.view.overlay import apart, keys_help, overlay
-from sim.view.pace import Pace
-from sim.view.session import Session, rest
-from sim.view.setting import Menu, changed, first_setting
-from sim.view.stage import Stage, dressed
+from sim.view import film
+from sim.view.events import GIVEN, KEYS, Delay, Menu, Push, Restart, changed, first_setting, parse_script, words
+from sim.view.film import Flat
+from sim.view.session import DAMPING, STIFFNESS, Grip, Pace, Session, gripped, rest
+from sim.view.stage import COLUMNS, Stage, apart, channels, dressed, envelope, keys_help, overlay, places, scale
+from sim.view.window import loop, typed
 
 SCENARIO = load()
 
@@ -467,15 +462,15 @@ def test_flat_pictures_show_where_things_are(none):
 @pytest.fixture(scope="module")
 def backend():
     try:
-        return offscreen.backend()
-    except offscreen.NoOffscreen as error:
+        return film.backend()
+    except film.NoOffscreen as error:
         pytest.skip(str(error))
 
 
 def test_pictures_by_opengl(backend, none):
     """The scene above, the forces below; the handles move with the positions."""
     stage = Stage(none.assembly.scene, none.assembly.process.force_limit)
-    painter = offscreen.Offscreen(stage, backend)
+    painter = film.Offscreen(stage, backend)
     try:
         frame = session(none).frame(0.05)
         one, again = painter.picture(frame), painter.picture(frame)
@@ -491,7 +486,7 @@ def test_pictures_by_opengl(backend, none):
 
 
 def test_without_opengl_there_are_flat_pictures_and_a_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(offscreen, "_failure", lambda name: "absent")
+    monkeypatch.setattr(film, "_failure", lambda name: "absent")
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     where = str(tmp_path / "a.gif")
     run("--coupling", "none", "--video", where, "--duration", "0.2")
@@ -502,10 +497,10 @@ def test_without_opengl_there_are_flat_pictures_and_a_line(tmp_path, monkeypatch
 
 
 def test_a_driver_that_fails_says_why(monkeypatch):
-    monkeypatch.setattr(offscreen, "_PROBE", "import sys; sys.exit('no such driver: {}')")
+    monkeypatch.setattr(film, "_PROBE", "import sys; sys.exit('no such driver: {}')")
     monkeypatch.setenv("MUJOCO_GL", "osmesa")  # asked for: nothing else is tried
-    with pytest.raises(offscreen.NoOffscreen, match=r"here \(osmesa: no such driver: osmesa\)"):
-        offscreen.backend()
+    with pytest.raises(film.NoOffscreen, match=r"here \(osmesa: no such driver: osmesa\)"):
+        film.backend()
 
 
 def test_an_interrupted_film_is_as_long_as_it_got(tmp_path, monkeypatch):
