@@ -78,7 +78,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if lam > self.theta[i] + self.psi[i]:
                 total = self.theta[i] + self.psi[i]
                 raise ValueError(f"lam[{i}] is {lam}, allowed are 0 to theta + psi = {total} samples")
-        check_holds(self.person, self.channels)
+        check_holds([person.holds for person in self.person], self.channels)
         if self.jitter:
             self._check_jitter(self.jitter)
         if self.box and self.environment.walls:
@@ -301,7 +301,7 @@ def load_humans(path: str | Path, channels: int) -> HumanFile:
             f"--human {path} has {len(people.human)} [[human]] tables, expected {channels} (one per channel)"
         )
     try:
-        check_holds(people.person, channels)
+        check_holds([person.holds for person in people.person], channels)
     except ValueError as error:
         raise InputError(f"--human {path}: {error}") from None
     return people

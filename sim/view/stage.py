@@ -53,17 +53,22 @@ def colour(channel: int) -> Colour:
 
 
 def channels(scene: Scene) -> tuple[int, ...]:
-    """The channel (from 0) that each joint belongs to."""
+    """The channel (from 0) that each joint belongs to; of a person's body, the first that the person holds."""
     owner = {motor: motor for motor in range(scene.channels)}
-    for i, masses in enumerate(scene.masses):
-        owner |= dict.fromkeys(masses, i)
+    for i, (_, *own) in enumerate(scene.points[: scene.channels]):
+        owner |= dict.fromkeys((scene.handles[i], *own), i)
+    for points in scene.points[scene.channels :]:
+        owner |= {joint: owner[points[0]] for joint in points if joint not in owner}
     return tuple(owner[joint] for joint in range(scene.model.njnt))
 
 
 def places(scene: Scene) -> tuple[int, ...]:
     """How many steps behind its handle each joint's body stands: 0 the handle, -1 a motor, 1.. a human's arm."""
-    owners = channels(scene)
-    return tuple(scene.masses[i].index(j) if j in scene.masses[i] else -1 for j, i in enumerate(owners))
+    place = dict.fromkeys(range(scene.channels), -1)
+    for points in scene.points[: scene.channels]:
+        place |= {joint: step for step, joint in enumerate(points)}
+    behind = 1 + max(place.values())
+    return tuple(place.get(joint, behind) for joint in range(scene.model.njnt))
 
 
 def scale(history: Array) -> float:
