@@ -30,10 +30,10 @@ ROUNDING = 1e-9  # of |Z|: what rounding may take from the real part of a lossle
 
 @dataclass(frozen=True, eq=False)
 class Impedance:
-    """Z(s) = C (s I - A)^-1 B + D [N s/m], from the velocity of a handle to the force against it. Passive, or ValueError.
+    """Z(s) = C (s I - A)^-1 B + D [N s/m], from the velocity of a handle to the force against it; passive.
 
-    For what decays: all eigenvalues of A have negative real parts. A spring (a pole at zero) and a mass are parts of
-    the Port. Many impedances alike have leading axes.
+    Raises ValueError where it is not. For what decays: all eigenvalues of A have negative real parts. A spring (a pole
+    at zero) and a mass are parts of the Port. Many impedances alike have leading axes.
     """
 
     A: Array  # (..., n, n)

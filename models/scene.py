@@ -145,6 +145,62 @@ def _impedances(model: mujoco.MjModel) -> list[_Felt]:
     return felt
 
 
+def from_mjcf(xml: str, handle: str = "handle", pull: str | None = None) -> Port:
+    """The port of a hand that is drawn in MJCF: bodies that slide along x, with springs and dampers between them.
+
+    The body `handle` is the part of the hand that moves with the handle; the world is the base. The voluntary force
+    contracts the joint or tendon named `pull` (default: the last spring-damper). Gravity and shapes are left out.
+    Raises ValueError for what is no network of masses, springs and dampers.
+    """
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    _check_linear(model, data)
+    names = [model.body(b).name for b in model.jnt_bodyid]
+    if handle not in names:
+        raise ValueError(f"MJCF of a hand: no body {handle!r} that slides; there are {', '.join(map(repr, names))}")
+    order = sorted(range(model.njnt), key=lambda j: names[j] != handle)
+    point = {int(model.jnt_bodyid[j]): k for k, j in enumerate(order)} | {0: model.njnt}
+    mass = np.zeros(model.njnt + 1)
+    np.add.at(mass, [point[int(b)] for b in model.body_weldid], model.body_mass)
+    slides = np.zeros((model.njnt, model.njnt + 1))  # by how much each joint slides, over the points and the base
+    for j, b in enumerate(model.jnt_bodyid):
+        slides[j, point[int(b)]] = 1.0
+        slides[j, point[int(model.body_weldid[model.body_parentid[b]])]] = -1.0
+    across = np.vstack([slides, tendon_jacobian(model) @ slides])
+    damping = np.concatenate([model.dof_damping, model.tendon_damping])
+    stiffness = np.concatenate([model.jnt_stiffness, model.tendon_stiffness])
+    labels = [*(model.joint(j).name for j in range(model.njnt)), *(model.tendon(t).name for t in range(model.ntendon))]
+    if pull is not None and pull not in labels:
+        raise ValueError(f"MJCF of a hand: no joint or tendon {pull!r}; there are {', '.join(map(repr, labels))}")
+    there = [i for i, label in enumerate(labels) if damping[i] or stiffness[i] or label == pull]
+    if not there:
+        raise ValueError("MJCF of a hand: it has no spring and no damper")
+    end = -1 if pull is None else there.index(labels.index(pull))
+    return Port(mass[:-1], across[there], damping[there], stiffness[there], pull=end)
+
+
+def _check_linear(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Raise ValueError unless the model is a network of masses, springs and dampers along x, at rest."""
+    slide, fixed = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtWrap.mjWRAP_JOINT
+    rubbing = ("dof_frictionloss", "tendon_frictionloss", "dof_armature", "tendon_armature")
+    curved = ("jnt_stiffnesspoly", "tendon_stiffnesspoly", "dof_dampingpoly", "tendon_dampingpoly")
+    found = {
+        "a joint that does not slide along x": (model.jnt_type != slide).any()
+        or not np.allclose(data.xaxis, [1.0, 0.0, 0.0]),
+        "several joints in one body": len(set(model.jnt_bodyid)) < model.njnt,
+        "a limit": model.jnt_limited.any() or model.tendon_limited.any(),
+        "friction or armature": any(getattr(model, name).any() for name in rubbing),
+        "a nonlinear spring or damper": any(getattr(model, name).any() for name in curved),
+        "an actuator or a constraint": bool(model.nu or model.neq),
+        "a tendon that is not fixed": (model.wrap_type != fixed).any(),
+        "a spring that is not at rest": model.qpos_spring.any() or model.qpos0.any() or model.tendon_lengthspring.any(),
+    }
+    for what, there in found.items():
+        if there:
+            raise ValueError(f"MJCF of a hand: it has {what}, expected masses, springs and dampers along x, at rest")
+
+
 def tendon_jacobian(model: mujoco.MjModel) -> Array:
     """How each tendon lengthens when a joint moves, shape (tendons, n)."""
     rows = np.zeros((model.ntendon, model.nv))

@@ -23,7 +23,7 @@ from scipy.sparse.csgraph import connected_components
 from controller.lti import Array
 from controller.process import Tape
 from models.scene import Plant, Scene, impeded
-from sim.scenario import Scenario
+from sim.scenario import InputError, Scenario
 
 # ----------------------------------------------------------------------------------------------------
 # The matrix exponential of many small matrices at once.
@@ -294,7 +294,7 @@ def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoc
     if substeps < 1:
         raise ValueError(f"substeps is {substeps}, allowed are whole numbers from 1")
     if impeded(scene.model):
-        raise ValueError("a human has an impedance (A, B, C, D), which MuJoCo does not simulate: use the exact engine")
+        raise InputError("a human has an impedance (A, B, C, D), which MuJoCo does not simulate: use the exact engine")
     model = copy(scene.model)
     model.opt.timestep = T / substeps
     model.opt.integrator = INTEGRATORS[integrator][0]
