@@ -66,7 +66,7 @@ def test_what_lags_is_passive_and_what_lags_twice_is_not():
 
 
 def test_a_lossless_impedance_is_no_rounding_victim():
-    """A mass on a spring behind a damper that carries nothing: Re Z is 0 but for rounding, and what drives it decays."""
+    """A resonance of 30 rad/s that hardly decays: Re Z is zero but for rounding at most frequencies."""
     assert Impedance([[-1e-3, -30.0], [30.0, -1e-3]], [[1.0], [0.0]], [[1.0, 0.0]], [[0.0]]).order == 2
 
 
@@ -127,7 +127,7 @@ def test_no_spring_of_the_wrong_kind_is_split_off(parts, message):
 
 
 def hill(elastic=400.0, damping=9.0, tissue=0.004, parallel=150.0, mass=0.25):
-    """A muscle after Hill: a series elastic part, the contractile part's damping, a parallel spring, with its masses."""
+    """A muscle after Hill: a series elastic part, the contractile part's damping, a parallel spring, and masses."""
     across = [[-1, 1, 0], [0, -1, 1], [-1, 0, 1]]
     return Port([mass, tissue], across, [0.0, damping, 0.5], [elastic, 0.0, parallel], pull=1)
 
