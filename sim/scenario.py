@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import re
+import runpy
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -316,10 +317,15 @@ class HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def load_humans(path: str | Path, channels: int) -> HumanFile:
     """The humans of a file, one per channel, and who holds several devices.
 
+    A Python file is run, and says who they are: `humans`, and `persons` if it likes, of any class (models.human.Hand).
     Raises InputError with one line that names the file and the field.
     """
     try:
-        people = msgspec.convert(tomllib.loads(Path(path).read_text(encoding="utf-8")), HumanFile)
+        if Path(path).suffix == ".py":
+            names = runpy.run_path(str(path))
+            people = HumanFile(tuple(names.get("humans", ())), tuple(names.get("persons", ())))
+        else:
+            people = msgspec.convert(tomllib.loads(Path(path).read_text(encoding="utf-8")), HumanFile)
     except OSError as error:
         raise InputError(f"--human {path}: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -328,10 +334,9 @@ def load_humans(path: str | Path, channels: int) -> HumanFile:
         raise InputError(f"--human {path}: not valid TOML: {error}") from None
     except msgspec.ValidationError as error:
         raise InputError(f"--human {path}: {error}") from None
+    what = "`humans`" if Path(path).suffix == ".py" else "[[human]] tables"
     if len(people.human) != channels:
-        raise InputError(
-            f"--human {path} has {len(people.human)} [[human]] tables, expected {channels} (one per channel)"
-        )
+        raise InputError(f"--human {path} has {len(people.human)} {what}, expected {channels} (one per channel)")
     try:
         check_holds([person.holds for person in people.person], channels)
     except ValueError as error:

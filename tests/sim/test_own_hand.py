@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from cli.run import main
 from design.result import CASE_I
 from models.human import Human, Link, Person, Port, state_space
 from sim import load, simulate, validate
@@ -154,3 +155,20 @@ def test_a_scenario_keeps_it_and_says_what_is_none():
         held_by(Muscle(), None)
     with pytest.raises(InputError, match="damping has a negative"):
         held_by(Muscle(), Muscle(damping=-1.0))
+
+
+def test_the_command_takes_hands_from_a_python_file(tmp_path, capsys):
+    hands = tmp_path / "hands.py"
+    hands.write_text(
+        "from models.human import Port\n"
+        "class Soft:\n"
+        "    def port(self): return Port([0.2], [[-1, 1]], [2.0], [90.0])\n"
+        "    def voluntary_force(self, t): return 0 * t\n"
+        "humans = (Soft(), Soft())\n"
+    )
+    words = ("--case", "none", "--duration", "0.2", "--no-plot", "--out", str(tmp_path / "out"))
+    assert main([*words, "--human", str(hands)]) == 0
+    assert "unstable" in capsys.readouterr().out
+    hands.write_text("humans = ()")
+    with pytest.raises(InputError, match="has 0 `humans`, expected 2"):
+        main([*words, "--human", str(hands)])
