@@ -16,7 +16,7 @@ from PIL import Image
 
 from cli import view as command
 from controller.coupling import SpringDamper
-from models.human import Human, Link
+from models.human import Human, Link, Person
 from models.scene import build, plant
 from sim.couplings import Chosen
 from sim.engines import hold
@@ -304,6 +304,14 @@ def test_every_body_has_its_place():
         "handle_2": (1, 0),
         "human_1_2": (0, 1),
     }
+
+
+def test_a_person_s_body_stands_behind_both_arms():
+    arm = Human((Link(0.3, 3, 200), Link(1, 2, 300)))
+    scene = build(SCENARIO.device, [arm, SCENARIO.human[1]], [Person((1, 2), 30.0, 80.0, 900.0)])
+    body = scene.model.joint("body_1").id
+    assert (channels(scene)[body], places(scene)[body]) == (0, 2)
+    assert np.array_equal(plant(dressed(scene)).A, plant(scene.model).A)
 
 
 def test_the_overlay_says_growth_and_certificates(none, published):
