@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -94,7 +94,10 @@ def plant(model: mujoco.MjModel) -> Plant:
     across = tendon_jacobian(model)
     stiffness = np.diag(model.jnt_stiffness.astype(float)) + across.T * model.tendon_stiffness @ across
     damping = np.diag(model.dof_damping) + across.T * model.tendon_damping @ across
-    return _plant(np.linalg.inv(mass), stiffness, damping, actuation(model), _motors(model), _impedances(model))
+    inverse = np.linalg.inv(mass)
+    return _plant(
+        lambda matrix: inverse @ matrix, stiffness, damping, actuation(model), _motors(model), _impedances(model)
+    )
 
 
 def impeded(model: mujoco.MjModel) -> bool:
@@ -109,21 +112,23 @@ class _Felt(NamedTuple):
     Z: Impedance
 
 
-def _plant(inverse: Array, K: Array, D: Array, forces: Array, motors: int, felt: Sequence[_Felt]) -> Plant:
-    """M q'' = -K q - D q' + forces u and the impedances, from the inverse of M; many at once have a leading axis."""
+def _plant(
+    solved: Callable[[Array], Array], K: Array, D: Array, forces: Array, motors: int, felt: Sequence[_Felt]
+) -> Plant:
+    """The plant M q'' = -K q - D q' + forces u and the impedances; `solved` multiplies by M^-1."""
     *many, n, _ = K.shape
     size = 2 * n + sum(z.order for _, z in felt)
     A, B = np.zeros((*many, size, size)), np.zeros((*many, size, forces.shape[-1]))
     A[..., :n, n : 2 * n] = np.eye(n)
-    A[..., n : 2 * n, :n] = -inverse @ K
-    A[..., n : 2 * n, n : 2 * n] = -inverse @ (D + sum(np.outer(row, row) * z.D for row, z in felt))
-    B[..., n : 2 * n, :] = inverse @ forces
+    A[..., n : 2 * n, :n] = -solved(K)
+    A[..., n : 2 * n, n : 2 * n] = -solved(D + sum(np.outer(row, row) * z.D for row, z in felt))
+    B[..., n : 2 * n, :] = solved(forces)
     first = 2 * n
     for row, z in felt:
         mine = slice(first, first + z.order)
         A[..., mine, n : 2 * n] = z.B * row
         A[..., mine, mine] = z.A
-        A[..., n : 2 * n, mine] = -inverse @ (row[:, None] * z.C)
+        A[..., n : 2 * n, mine] = -solved(row[:, None] * z.C)
         first += z.order
     return Plant(A, B, np.eye(motors, size))
 
@@ -507,8 +512,9 @@ class Variants:
             return between + self.fields[joint][:, :, None] * np.eye(model.nv)
 
         K, D = matrix("jnt_stiffness", "tendon_stiffness"), matrix("dof_damping", "tendon_damping")
-        inverse = np.eye(model.nv) / mass[:, None, :]
-        return _plant(inverse, K, D, actuation(model), self.scene.channels, self.impedances)
+        return _plant(
+            lambda matrix: matrix / mass[:, :, None], K, D, actuation(model), self.scene.channels, self.impedances
+        )
 
 
 def variants(devices: Sequence[Device], crowd: Crowd | HumanSets) -> Variants:
