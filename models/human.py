@@ -22,7 +22,7 @@ from models.device import require
 Array = NDArray[np.floating[Any]]
 Range = tuple[float, float]
 
-ROUNDING = 1e-9  # of |Z|: what rounding may take from the real part of a lossless impedance
+_ROUNDING = 1e-9  # of |Z|: what rounding may take from the real part of a lossless impedance
 
 # ----------------------------------------------------------------------------------------------------
 # Ports: what a handle feels.
@@ -66,13 +66,13 @@ def _check_positive_real(A: Array, B: Array, C: Array, D: Array) -> None:
     n = A.shape[0]
     if n and not np.linalg.eigvals(A).real.max() < 0:
         raise ValueError("impedance: A has an eigenvalue on or right of the imaginary axis, expected what decays")
-    zeros = eig(-np.block([[A @ A, B], [C @ A, D]]), np.diag([*[1.0] * n, 0.0]), right=False)
+    zeros = np.asarray(eig(-np.block([[A @ A, B], [C @ A, D]]), np.diag([*[1.0] * n, 0.0]), right=False), dtype=complex)
     zeros = np.sort(zeros[np.isfinite(zeros)])
     real = zeros.real[(zeros.real > 0) & (np.abs(zeros.imag) <= 1e-6 * np.abs(zeros))]
     between = [(a + b) / 2 for a, b in pairwise([0.0, *real])] + [2 * real.max() if real.size else 1.0]
     for w in np.sqrt([0.0, *between]):
         Z = complex((C @ np.linalg.solve(1j * w * np.eye(n) - A, B) + D).item())
-        if not Z.real >= -ROUNDING * abs(Z):
+        if not Z.real >= -_ROUNDING * abs(Z):
             raise ValueError(f"impedance: not passive, Re Z is {Z.real:g} N s/m at {w / (2 * np.pi):.3g} Hz")
 
 
@@ -173,14 +173,14 @@ class Hand(Protocol):
         ...
 
 
-def chain(links: Array) -> Port:
+def chain_port(links: Array) -> Port:
     """A chain from the handle to the base; links (..., n, 3) are mass, damping and stiffness of each."""
     n = links.shape[-2]
     across = np.eye(n, n + 1, 1) - np.eye(n, n + 1)
     return Port(links[..., 0], across, links[..., 1], links[..., 2])
 
 
-def body(hands: int, values: Array) -> Port:
+def body_port(hands: int, values: Array) -> Port:
     """A body on ground, and the hands joined one to the next; values (..., 5) as in Crowd.bodies."""
     mass, damping, stiffness, cross_damping, cross_stiffness = np.moveaxis(values, -1, 0)[..., None]
     across = np.eye(hands, hands + 2, 1) - np.eye(hands, hands + 2)
@@ -265,7 +265,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def port(self) -> Port:
         """The chain as the handle feels it."""
-        return chain(np.array([(link.mass, link.damping, link.stiffness) for link in self.links]))
+        return chain_port(np.array([(link.mass, link.damping, link.stiffness) for link in self.links]))
 
     def voluntary_force(self, t: Array) -> Array:
         """k x_eq + b x_eq' [N] on the last mass, at times t [s]."""
@@ -310,7 +310,7 @@ class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Body and cross springs as the hands feel them; the arms end on the body, the last point."""
         cross = self.cross
         values = (self.mass, self.damping, self.stiffness, cross.damping, cross.stiffness)
-        return body(len(self.holds), np.array(values))
+        return body_port(len(self.holds), np.array(values))
 
 
 def check_holds(held_by: Sequence[tuple[int, ...]], channels: int) -> None:

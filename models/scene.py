@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.device import CompliantDevice, Device
-from models.human import Cross, Hand, Human, Impedance, Link, Person, Port, body, chain, check_holds
+from models.human import Cross, Hand, Human, Impedance, Link, Person, Port, body_port, chain_port, check_holds
 
 # ----------------------------------------------------------------------------------------------------
 # Devices and humans as one MuJoCo model, and the same plant as matrices, read from that model.
@@ -245,7 +245,8 @@ class _Placed(NamedTuple):
     """A port in the scene."""
 
     port: Port
-    joints: tuple[str | None, ...]  # of its points, then of the base, which is None where that is ground
+    joints: tuple[str, ...]  # of its points
+    base: str | None  # joint of the body that it ends on; None for ground
     springs: tuple[str, ...]  # the tendon, or the one joint, that each of its spring-dampers is on
 
 
@@ -266,23 +267,24 @@ def _placed(
         if port.handles > 1:
             raise ValueError(f"human[{i - 1}] has {port.handles} handles, expected one: a person holds several")
         own = (f"human_{i}_{j}" for j in range(2, port.mass.shape[-1] + 1))
-        placed.append(_place(port, (handles[i - 1], *own, body.get(i)), f"link_{i}"))
+        placed.append(_place(port, (handles[i - 1], *own), body.get(i), f"link_{i}"))
     for p, (holds, port) in enumerate(held, start=1):
         extra = port.mass.shape[-1] - len(holds)
         if port.handles != len(holds) or extra < 1:
             raise ValueError(f"person[{p - 1}] has {port.handles} handles and {extra} bodies, expected {len(holds)}, 1")
         own = (f"body_{p}_{j}" for j in range(1, extra))
         hands = (handles[channel - 1] for channel in holds)
-        placed.append(_place(port, (*hands, *own, f"body_{p}", None), f"cross_{p}"))
+        placed.append(_place(port, (*hands, *own, f"body_{p}"), None, f"cross_{p}"))
     return tuple(placed)
 
 
-def _place(port: Port, joints: tuple[str | None, ...], name: str) -> _Placed:
+def _place(port: Port, joints: tuple[str, ...], base: str | None, name: str) -> _Placed:
+    ends = (*joints, base) if base else joints
     springs = []
     for j, row in enumerate(port.across, start=1):
-        between = [joint for joint, c in zip(joints, row, strict=True) if c and joint]
-        springs.append(between[0] if len(between) == 1 else f"{name}_{j}")
-    return _Placed(port, joints, tuple(springs))
+        between = [joint for joint, c in zip(ends, row, strict=False) if c]  # ground is no end
+        springs.append(between[0] if len(between) == 1 and between[0] in joints else f"{name}_{j}")
+    return _Placed(port, joints, base, tuple(springs))
 
 
 class _Amounts(NamedTuple):
@@ -307,8 +309,8 @@ def _amounts(devices: Sequence[Device], placed: Sequence[_Placed]) -> _Amounts:
             mass[f"handle_{i}"] = device.handle_mass
             damping[f"transmission_{i}"] = device.transmission_damping
             stiffness[f"transmission_{i}"] = device.transmission_stiffness
-    for port, joints, springs in placed:
-        for k, joint in enumerate(joints[:-1]):
+    for port, joints, _, springs in placed:
+        for k, joint in enumerate(joints):
             mass[joint] = mass.get(joint, 0.0) + port.mass[..., k]
         for r, name in enumerate(springs):
             lever = float(port.across[r, joints.index(name)]) ** 2 if name in joints else 1.0
@@ -323,7 +325,7 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
     _only_what_the_loop_needs(spec, friction=any(device.friction for device in devices))
     mass, damping, stiffness = _amounts(devices, placed)
     rubbing = {f"motor_{i}": device.friction for i, device in enumerate(devices, start=1)}
-    own = [joint for part in placed for joint in part.joints[part.port.handles : -1]]
+    own = [joint for part in placed for joint in part.joints[part.port.handles :]]
     order = [name for name in mass if name not in own] + own
     for name in order:
         body = spec.worldbody.add_body(
@@ -351,10 +353,10 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
     for i, device in enumerate(devices, start=1):
         _add_motor(spec, f"force_{i}", f"motor_{i}", gear=-1.0, limit=device.force_limit)
     number = {name: j for j, name in enumerate(order)}
-    for i, (port, joints, _) in enumerate(channels, start=1):
+    for i, (port, joints, base, _) in enumerate(channels, start=1):
         if z := port.impedance:
             numbers = np.block([[z.A, z.B], [z.C, z.D]]).ravel()
-            places = [number[joints[0]], number[joints[-1]] if joints[-1] else -1]
+            places = [number[joints[0]], number[base] if base else -1]
             spec.add_numeric(name=f"{_IMPEDANCE}{i}", data=[*places, *numbers], size=len(numbers) + 2)
     model = spec.compile()
     return Scene(
@@ -363,7 +365,7 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
         handles=tuple(model.joint(name).id for name in handles),
         pushed=tuple(reached.index(end) for end in ends),
         tapped=tuple(reached.index((name, 1.0)) for name in handles),
-        points=tuple(tuple(model.joint(name).id for name in part.joints[:-1]) for part in placed),
+        points=tuple(tuple(model.joint(name).id for name in part.joints) for part in placed),
     )
 
 
@@ -379,7 +381,8 @@ def _add_springs(spec: mujoco.MjSpec, part: _Placed, damping: Mapping[str, Any],
     """The spring-dampers of a port that lie between joints, as fixed tendons."""
     for name, row in zip(part.springs, part.port.across, strict=True):
         if name not in part.joints:
-            ends = {joint: float(c) for joint, c in zip(part.joints, row, strict=True) if c and joint}
+            joints = (*part.joints, part.base) if part.base else part.joints
+            ends = {joint: float(c) for joint, c in zip(joints, row, strict=False) if c}
             _add_spring(spec, name, ends, float(stiffness[name]), float(damping[name]))
 
 
@@ -441,12 +444,12 @@ class Crowd:
     @property
     def ports(self) -> tuple[Port, ...]:
         """One per device, each with a leading axis over the sets."""
-        return tuple(chain(self.links[:, i]) for i in range(self.links.shape[1]))
+        return tuple(chain_port(self.links[:, i]) for i in range(self.links.shape[1]))
 
     @property
     def held(self) -> tuple[tuple[tuple[int, ...], Port], ...]:
         """Who holds several devices: which, and the port with a leading axis over the sets."""
-        return tuple((holds, body(len(holds), self.bodies[:, p])) for p, holds in enumerate(self.holds))
+        return tuple((holds, body_port(len(holds), self.bodies[:, p])) for p, holds in enumerate(self.holds))
 
     def humans(self, i: int) -> tuple[Human, ...]:
         """Set i, one human per device."""

@@ -318,7 +318,7 @@ def _over_frequency(title: str, rows: int, columns: int, size: tuple[float, floa
 # How good a coupling could be, against what a laboratory could change.
 
 #: design -> what it is called, and how it is drawn
-_CURVES = {
+_CURVES: dict[str, tuple[str, dict[str, Any]]] = {
     "optimal": ("the optimal coupling", _STYLES[0] | {"marker": "o"}),
     "closed-loop": (f"spring-damper, {_CONDITIONS['closed-loop']}", _STYLES[1] | {"marker": "s"}),
     "theorem4": (f"spring-damper, {_CONDITIONS['theorem4']}", _STYLES[2] | {"marker": "^"}),
