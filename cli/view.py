@@ -26,9 +26,9 @@ from cli.options import (
 from design.certificate import CONDITIONS
 from sim.files import write_json
 from sim.scenario import InputError
-from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, Script, first_setting, parse_script
+from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, Script, first_loop, parse_script
 from sim.view.film import Picture, check_film, painter, save_film
-from sim.view.session import LONGEST_LAG, Session, happened
+from sim.view.session import LONGEST_LAG, Session, session_report
 from sim.view.stage import Stage, keys_help
 
 EXAMPLE = "python -m sim.view --video out.gif --script '0:none 1:theta+1 6:designed'"
@@ -48,14 +48,14 @@ def main(argv: list[str]) -> int:
     label, script = _beginning(args, scenario.channels)
     # --case none begins without a coupling; those that keys bring are for case I
     menu = Menu("I" if args.case == "none" else args.case, args.condition, args.coupling if label == GIVEN else None)
-    setting = first_setting(menu, scenario, label)
+    prepared = first_loop(menu, scenario, label)
     executor = ThreadPoolExecutor(1)
     try:
-        session = Session(setting, executor, script, inf if args.video else LONGEST_LAG)
+        session = Session(prepared, executor, script, inf if args.video else LONGEST_LAG)
         outcome = _film(args, session, wish) if args.video else _window(session, wish)
     finally:
         executor.shutdown(cancel_futures=True)
-    outcome = {"case": args.case, **happened(session), **outcome}
+    outcome = {"case": args.case, **session_report(session), **outcome}
     _print_story(outcome, console(args))
     if args.json:
         write_json(args.json, outcome)
@@ -138,7 +138,7 @@ def _film(args: argparse.Namespace, session: Session, wish: Wish) -> dict[str, A
     """The session against a clock of its own: the same film every time. Interrupted, it is as long as it got."""
     seconds = wish.duration or (session.script_ends + AFTER)
     count, interrupted = round(seconds * wish.fps) + 1, False
-    assembly = session.setting.assembly
+    assembly = session.prepared.assembly
     artist, drawn, remarks = painter(args.draw, assembly.scene, assembly.process.force_limit)
     bar, progress = progress_bar("filming")
 
@@ -165,7 +165,7 @@ def _film(args: argparse.Namespace, session: Session, wish: Wish) -> dict[str, A
 def _window(session: Session, wish: Wish) -> dict[str, Any]:
     from sim.view.window import NoWindow, show
 
-    stage = Stage(session.setting.assembly.scene, session.setting.assembly.process.force_limit)
+    stage = Stage(session.prepared.assembly.scene, session.prepared.assembly.process.force_limit)
     interrupted = False
     try:
         show(session, stage, wish.duration)

@@ -66,9 +66,9 @@ def _check_positive_real(A: Array, B: Array, C: Array, D: Array) -> None:
     n = A.shape[0]
     if n and not np.linalg.eigvals(A).real.max() < 0:
         raise ValueError("impedance: A has an eigenvalue on or right of the imaginary axis, expected what decays")
-    zeros = np.asarray(eig(-np.block([[A @ A, B], [C @ A, D]]), np.diag([*[1.0] * n, 0.0]), right=False), dtype=complex)
+    zeros = eig(-np.block([[A @ A, B], [C @ A, D]]), np.diag([*[1.0] * n, 0.0]), right=False)
     zeros = np.sort(zeros[np.isfinite(zeros)])
-    real = zeros.real[(zeros.real > 0) & (np.abs(zeros.imag) <= 1e-6 * np.abs(zeros))]
+    real = np.real(zeros[(np.real(zeros) > 0) & (np.abs(np.imag(zeros)) <= 1e-6 * np.abs(zeros))])
     between = [(a + b) / 2 for a, b in pairwise([0.0, *real])] + [2 * real.max() if real.size else 1.0]
     for w in np.sqrt([0.0, *between]):
         Z = complex((C @ np.linalg.solve(1j * w * np.eye(n) - A, B) + D).item())

@@ -135,7 +135,7 @@ class Menu:
 
 
 @dataclass(frozen=True, eq=False)
-class Setting:
+class PreparedLoop:
     """A loop, and what can be said of it before it runs."""
 
     menu: Menu
@@ -155,21 +155,21 @@ class Setting:
         return self.chosen.coupling
 
 
-def first_setting(menu: Menu, scenario: Scenario, label: str) -> Setting:
+def first_loop(menu: Menu, scenario: Scenario, label: str) -> PreparedLoop:
     """The loop to begin with. Raises InputError, DesignFailed or SingularLoop."""
-    return _setting(menu, scenario, label, _choose(menu, scenario, label))
+    return _prepare(menu, scenario, label, _choose(menu, scenario, label))
 
 
-def changed(setting: Setting, event: Couple | Delay) -> Setting:
+def changed(prepared: PreparedLoop, event: Couple | Delay) -> PreparedLoop:
     """The loop after an event. Raises InputError, DesignFailed or SingularLoop; the old loop can go on."""
     if isinstance(event, Couple):
-        chosen = _choose(setting.menu, setting.scenario, event.name)
-        return _setting(setting.menu, setting.scenario, event.name, chosen)
-    delays = tuple(n + event.samples for n in getattr(setting.scenario, event.which))
+        chosen = _choose(prepared.menu, prepared.scenario, event.name)
+        return _prepare(prepared.menu, prepared.scenario, event.name, chosen)
+    delays = tuple(n + event.samples for n in getattr(prepared.scenario, event.which))
     if not 0 <= min(delays) <= max(delays) <= LONGEST_DELAY:
         raise InputError(f"{event.which} would be {list(delays)}, allowed are 0 to {LONGEST_DELAY} samples")
-    scenario = setting.scenario.replace(None, **{event.which: delays})
-    return _setting(setting.menu, scenario, setting.label, setting.chosen)
+    scenario = prepared.scenario.replace(None, **{event.which: delays})
+    return _prepare(prepared.menu, scenario, prepared.label, prepared.chosen)
 
 
 def _choose(menu: Menu, scenario: Scenario, label: str) -> Chosen:
@@ -181,7 +181,9 @@ def _choose(menu: Menu, scenario: Scenario, label: str) -> Chosen:
     return choose(scenario, menu.case, name, menu.condition if name in KINDS else None)
 
 
-def _setting(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> Setting:
+def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> PreparedLoop:
     assembly, loop = assemble(scenario, chosen.coupling), scenario.loop(menu.case)
     requirements = assess(loop, chosen.coupling, chosen.phi)
-    return Setting(menu, label, chosen, assembly, worst_mode(assembly), requirements, promise_of(requirements, loop))
+    return PreparedLoop(
+        menu, label, chosen, assembly, worst_mode(assembly), requirements, promise_of(requirements, loop)
+    )

@@ -114,29 +114,16 @@ class Offscreen:
         """(height, width, 3): what is said of the loop, the scene, the forces, from top to bottom."""
         stage, (width, height) = self.stage, SIZE
         stage.show(frame.q)
-        mujoco.mjv_updateScene(
-            stage.model,
-            stage.data,
-            self._option,
-            self._grip,
-            self._camera,
-            mujoco.mjtCatBit.mjCAT_ALL.value,
-            self._scene,
-        )
+        seen = self._option, self._grip, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(stage.model, stage.data, *seen, self._scene)
         stage.draw(self._scene, frame)
         below = round(PLOT * height)
         top = round(WORDS * height)
         mujoco.mjr_render(mujoco.MjrRect(0, below, width, height - below - top), self._scene, self._context)
         above = mujoco.MjrRect(0, height - top, width, top)
         mujoco.mjr_rectangle(above, 0.93, 0.93, 0.93, 1.0)
-        said = columns(overlay(frame, live=False))
-        mujoco.mjr_overlay(
-            mujoco.mjtFont.mjFONT_NORMAL,
-            mujoco.mjtGridPos.mjGRID_TOPLEFT,
-            above,
-            *said,
-            self._context,
-        )
+        font, corner = mujoco.mjtFont.mjFONT_NORMAL, mujoco.mjtGridPos.mjGRID_TOPLEFT
+        mujoco.mjr_overlay(font, corner, above, *columns(overlay(frame, live=False)), self._context)
         for place, figure in stage.figures(frame, mujoco.MjrRect(0, 0, width, height)):
             mujoco.mjr_figure(place, figure, self._context)
         pixels = np.empty((height, width, 3), dtype=np.uint8)
@@ -228,7 +215,7 @@ class Flat:
     def _forces(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
         """One plot per device, side by side."""
         m, most, middle = self.scene.channels, scale(frame.history), (top + bottom) / 2
-        low, high = envelope(frame.history, COLUMNS, round(HISTORY / frame.setting.scenario.T))
+        low, high = envelope(frame.history, COLUMNS, round(HISTORY / frame.prepared.scenario.T))
         width = (SIZE[0] - 20) / m
         for i in range(m):
             left, right = 50 + i * width, (i + 1) * width - 2

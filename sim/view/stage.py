@@ -90,15 +90,15 @@ def envelope(history: Array, columns: int, ticks: int) -> tuple[Array, Array]:
 
 def overlay(frame: Frame, live: bool) -> Lines:
     """Labels and values; `live` adds the clock, which a video has none of."""
-    setting, scenario = frame.setting, frame.setting.scenario
+    prepared, scenario = frame.prepared, frame.prepared.scenario
     delays = f"theta {_list(scenario.theta)}, psi {_list(scenario.psi)} samples of {1e3 * scenario.T:g} ms"
-    mode, here = setting.mode, setting.requirements["closed-loop"]
+    mode, here = prepared.mode, prepared.requirements["closed-loop"]
     lines = [
-        ("coupling", setting.label),
+        ("coupling", prepared.label),
         ("delays", delays),
         ("growth", f"{mode.growth:+.3g} 1/s at {mode.frequency_hz:.1f} Hz: {mode.verdict}"),
         ("this environment", _needs(here)),
-        ("any environment", _needs(setting.requirements["theorem4"])),
+        ("any environment", _needs(prepared.requirements["theorem4"])),
         ("largest force", f"{np.abs(frame.history).max():.2f} N in {HISTORY:g} s, {frame.clipped} ticks at the limit"),
     ]
     if np.any(frame.push):
@@ -187,7 +187,7 @@ class Stage:
         """The forces of the last seconds, side by side at the bottom of a picture."""
         m = self.scene.channels
         width, height = picture.width // m, round(PLOT * picture.height)
-        low, high = envelope(frame.history, COLUMNS, round(HISTORY / frame.setting.scenario.T))
+        low, high = envelope(frame.history, COLUMNS, round(HISTORY / frame.prepared.scenario.T))
         top, drawn = scale(frame.history), []
         for i in range(m):
             place = mujoco.MjrRect(picture.left + i * width, picture.bottom, width, height)

@@ -90,7 +90,7 @@ def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Grip | None:
             window.user_scn.ngeom = 0
             stage.draw(window.user_scn, frame)
     window.sync()
-    (said, refused), keys = apart(overlay(frame, live=True)), keys_help(frame.setting.menu.given is not None)
+    (said, refused), keys = apart(overlay(frame, live=True)), keys_help(frame.prepared.menu.given is not None)
     font, grid = mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos
     places = {grid.mjGRID_TOPLEFT: said, grid.mjGRID_TOPRIGHT: keys, grid.mjGRID_BOTTOMLEFT: refused}
     window.set_texts([(font, place, *columns(lines)) for place, lines in places.items() if lines])
