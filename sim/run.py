@@ -9,9 +9,10 @@ import msgspec
 import numpy as np
 
 from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
-from controller.environment import environment
+from controller.environment import environment, held
+from controller.loop import force_map
 from controller.lti import Array, Lti
-from controller.process import Process, Tape, contact, force_map, held
+from controller.process import Process, Tape, contact
 from models.device import Device
 from models.scene import Scene, build, plant
 from sim.engines import (

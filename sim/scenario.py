@@ -16,7 +16,7 @@ import numpy as np
 
 from controller.delay import Jitter
 from controller.environment import Box, Network, Spring, UncertainSpring, Wall, environment
-from design.certificate import DelayRange, Loop
+from controller.loop import DelayRange, Loop
 from models.device import MOST_DAMPING, Device, passivity_level, require, with_damping
 from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
 from sim.files import InputError, write

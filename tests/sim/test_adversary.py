@@ -11,7 +11,7 @@ from cli import run as run_command
 from cli.suite import run_tightness as tightness
 from cli.validate import main
 from controller.coupling import NoCoupling, SpringDamper
-from design.conditions import closed_loop as real
+from design.conditions import this_environment as real
 from design.result import CASE_I
 from models.device import RigidDevice
 from models.scene import build, plant
