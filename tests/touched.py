@@ -1,7 +1,7 @@
 """The tests of what a change touches: `make check` runs them.
 
-A file of a package is tested by the folder of its name under tests/; tests that are changed are run themselves. What has
-changed is what git sees as different from HEAD, or the last commit where nothing does.
+A file of a package is tested by the file or the folder of its name under tests/; changed tests are run themselves.
+What has changed is what git sees as different from HEAD, or the last commit where nothing does.
 """
 
 import subprocess
