@@ -26,8 +26,8 @@ from cli.options import (
     seed_from,
 )
 from controller.coupling import Coupling, NoCoupling, SpringDamper
+from controller.loop import DelayRange
 from design.audit import LONGEST_DELAY, PRESETS, Subject, print_report, report
-from design.certificate import DelayRange
 from design.designs import KINDS
 from design.ranges import check_set
 from sim.couplings import check_stored, fitted, read_coupling

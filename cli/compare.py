@@ -29,8 +29,9 @@ from cli.options import (
 )
 from cli.run import coupling_part, transparency_part
 from controller.environment import environment
+from controller.loop import Loop
 from controller.lti import Array
-from design.certificate import CONDITIONS, Loop, certificate_part, finite, specification
+from design.certificate import CONDITIONS, certificate_part, finite
 from design.compare import (
     AXES,
     LADDERS,
@@ -86,7 +87,8 @@ def main(argv: list[str]) -> int:
         return _ladder(args, {case: scenario.loop(case) for case in ("I", "II")}, head)
     loop = scenario.loop(args.case)
     try:
-        specification(loop)
+        if min(loop.delta) <= 0:
+            raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
     except ValueError as error:
         raise InputError(str(error)) from None
     plan = _plan(args, loop, wish)

@@ -26,33 +26,28 @@ from cli.options import (
 )
 from cli.run import coupling_part, transparency_part
 from controller.coupling import Coupling
-from controller.process import force_map
+from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY
 from design.certificate import (
     ANY,
     CONDITIONS,
     HERE,
     Certificate,
-    DelayRange,
-    Loop,
     NotProved,
     Stored,
     assess,
     certificate_part,
-    data_of,
     promise_of,
     prove,
     save,
-    sent,
-    specification,
     switching_part,
     switching_promise,
     switching_requirement,
 )
-from design.designs import KINDS, METHODS, compare_methods, design_by_kind
+from design.designs import KINDS, compare_methods, design_by_kind
 from design.optimal import FILTERS, OBJECTIVES
 from design.ranges import SAMPLES, SetCheck, check_set, cost_part, price, set_part, set_rows
-from design.result import Design, DesignFailed, listed
+from design.result import METHODS, Design, DesignFailed, listed
 from design.spring_damper import STIFFEST
 from design.transparency import transparency
 from sim.files import out_file, write_json
@@ -144,16 +139,15 @@ def main(argv: list[str]) -> int:
         raise InputError("environment.walls: an optimal coupling holds a linear model, so it cannot face walls")
     seed, samples = seed_from(args), _samples(args)
     try:
-        spec = specification(loop)
         with (bar := progress_bar("designing"))[0]:
             design = design_by_kind(
-                spec, args.coupling, args.condition, lambda what, done, total: bar[1](done, total, what), **options
+                loop, args.coupling, args.condition, lambda what, done, total: bar[1](done, total, what), **options
             )
     except DesignFailed:
         raise
     except ValueError as error:
         raise InputError(as_option(error, args)) from None
-    F = force_map(spec.environment, design.coupling, loop.theta, loop.psi)
+    F = loop.F(design.coupling)
     requirements = assess(loop, design.coupling, design.phi)
     with (bar := progress_bar("searching the box"))[0]:
         whole = check_set(loop, design.coupling, seed, samples, bar[1])
@@ -166,7 +160,7 @@ def main(argv: list[str]) -> int:
         "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
         "set": whole and set_part(whole),
         "price": _price(args, loop, design, options) if whole else None,
-        "transparency": transparency_part(transparency(F, spec.environment, loop.lam)),
+        "transparency": transparency_part(transparency(F, loop.E(), loop.lam)),
         "objective": design.objective,
         "objective_name": design.figure,
         "sdps": design.sdps,
@@ -175,7 +169,7 @@ def main(argv: list[str]) -> int:
         "jitter_proof": _switching_figures(loop, design.coupling),
     }
     if args.compare:
-        outcome["comparison"] = [asdict(row) for row in compare_methods(spec)]
+        outcome["comparison"] = [asdict(row) for row in compare_methods(loop)]
     for table in tables(outcome):
         console(args).print(table)
     if args.json:
@@ -281,7 +275,7 @@ def _switching_figures(loop: Loop, coupling: Coupling) -> dict[str, Any] | None:
     """What any switching asks of the designed coupling, from the coupling alone."""
     if loop.jitter is None:
         return None
-    return switching_part(switching_requirement(loop, coupling), sent(loop, coupling), loop.jitter)
+    return switching_part(switching_requirement(loop, coupling), loop.sent(coupling), loop.jitter)
 
 
 def _samples(args: argparse.Namespace) -> int:
@@ -297,7 +291,7 @@ def _price(args: argparse.Namespace, loop: Loop, design: Design, options: dict[s
     if args.coupling == "optimal":
         couplings = {"whole set": design.coupling}
         try:
-            alone = design_by_kind(specification(loop.at(loop.environment)), "optimal", None, **options)
+            alone = design_by_kind(loop.at(loop.environment), "optimal", None, **options)
             couplings = {"nominal only": alone.coupling, **couplings}
         except DesignFailed:  # the set is given another basis by default
             pass
@@ -323,7 +317,7 @@ def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path) -> dic
             loop = loop.switching(None)
             certificate, reason = _proved(loop, design)
     try:
-        save(Stored(loop, data_of(design.coupling), certificate), out)
+        save(Stored.of(loop, design.coupling, certificate), out)
     except OSError as error:
         raise InputError(f"--out {out}: {error.strerror}") from None
     proof = certificate.proof if certificate else None
@@ -334,6 +328,6 @@ def _proved(loop: Loop, design: Design) -> tuple[Certificate | None, str | None]
     """The certificate of all that the loop claims, or why there is none."""
     try:
         phi = None if design.phi is None else design.phi.tolist()
-        return prove(loop, data_of(design.coupling), design.condition, phi), None
+        return prove(loop, design.coupling, design.condition, phi), None
     except NotProved as error:
         return None, str(error)

@@ -14,7 +14,8 @@ import numpy as np
 from rich.table import Table
 
 from cli.options import DOES_NOT_HOLD, DONE, Parser, add_output_options, check_json, console, seed_from
-from design.certificate import HERE, SET, SpringDamper, Stored, Verdict, switching_promise, verify
+from controller.coupling import SpringDamperForm
+from design.certificate import HERE, SET, Stored, Verdict, switching_promise, verify
 from design.export import (
     Block,
     NothingToExport,
@@ -102,7 +103,7 @@ def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> Block:
 
 def _gains(stored: Stored) -> str:
     coupling = stored.coupling
-    if isinstance(coupling, SpringDamper):
+    if isinstance(coupling, SpringDamperForm):
         return f"spring-damper, K = {listed(coupling.K)} N/m, B = {listed(coupling.B)} N s/m"
     return f"coupling of kind {coupling.__struct_config__.tag}"
 

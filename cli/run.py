@@ -366,7 +366,9 @@ def _growth_report(switched: Simulation, ticks: int) -> tuple[float, float]:
     judged = max(4, min(ticks, round(JUDGED / T)))
     one = HeldPlant(plant.A[None], plant.B[None], plant.C, T)
     process = unlimited(switched.process)
-    rate, _ = impulse_growth(process, ExactBatchEngine(one, process.force_limit), switched.scene, judged)
+    rate, _ = impulse_growth(
+        process, ExactBatchEngine(one, process.force_limit), switched.scene, plant.A.shape[0], judged
+    )
     return float(rate[0]), judged * T
 
 
@@ -450,7 +452,9 @@ def _parser() -> Parser:
     )
     parser.add_argument("--substeps", metavar="N", help="MuJoCo steps per period (default: what the plant asks)")
     parser.add_argument("--duration", metavar="SECONDS", help="default: the scenario's")
-    parser.add_argument("--human", metavar="FILE.toml", help="other humans: [[human]] per channel, [[person]]")
+    parser.add_argument(
+        "--human", metavar="FILE", help="other humans: [[human]] per channel in a .toml, or `humans` in a .py"
+    )
     parser.add_argument(
         "--vertex", metavar="N", help="simulate at this vertex of the scenario's box (default 0: nominal)"
     )

@@ -43,7 +43,7 @@ from cli.options import (
 from controller.coupling import Coupling, NoCoupling
 from controller.lti import SingularLoop
 from design.certificate import CONDITIONS, finite
-from design.conditions import closed_loop
+from design.conditions import this_environment
 from design.result import DesignFailed
 from sim.adversary import Attempt, attempts
 from sim.couplings import NAMES, choose
@@ -119,7 +119,7 @@ def _loops(args: argparse.Namespace, scenario: Scenario) -> Loops:
         chosen = choose(scenario, args.case, args.coupling, args.condition)
         loops[f"{chosen.kind}, case {args.case}"] = (scenario, chosen.coupling)
     for name, (_, coupling) in loops.items():
-        requirement = closed_loop(assemble(scenario, coupling).F, scenario.delta)
+        requirement = this_environment(assemble(scenario, coupling).F, scenario.delta)
         if not np.isfinite(requirement.ratio):
             raise InputError(f"{name}: no damping is enough ({requirement.reason}), so none can be short of it")
     return loops

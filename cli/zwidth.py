@@ -36,7 +36,7 @@ from cli.options import (
 from cli.run import coupling_part
 from controller.lti import Array
 from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, promise_of
-from design.conditions import contact_springs
+from design.maps import contact_springs
 from design.ranges import check_set, set_part
 from sim.couplings import NAMES, Chosen, choose
 from sim.files import write, write_json

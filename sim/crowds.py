@@ -28,7 +28,7 @@ from controller.coupling import Coupling
 from controller.environment import Member
 from controller.lti import Array
 from models.human import Population
-from models.scene import Crowd, Variants, variants
+from models.scene import Crowd, HumanSets, Variants, variants
 from sim.engines import EXPONENTIAL, ExactBatchEngine, MujocoBatchEngine, hold
 from sim.run import Progress, Simulation, assemble
 from sim.scenario import InputError, Scenario
@@ -87,6 +87,18 @@ def crowds(
         yield np.array(group), Crowd(np.stack([drawn[i] for i in group]), holds, bodies)
 
 
+def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], HumanSets]]:
+    """Humans of a user's own population, grouped by how they are built: (indices of the group, sets)."""
+    drawn, layouts = {}, {}
+    for i in indices:
+        rng = np.random.default_rng(np.random.SeedSequence((seed, i)))
+        drawn[i] = tuple(scenario.population.draw(rng, scenario.channels))
+        layouts[i] = tuple(human.port().layout for human in drawn[i])
+    for layout in dict.fromkeys(layouts.values()):
+        group = [i for i in drawn if layouts[i] == layout]
+        yield np.array(group), HumanSets(tuple(drawn[i] for i in group), scenario.person)
+
+
 def _draw_bodies(population: Population, persons: int, seed: int, index: int) -> Array:
     """Bodies of the persons with this index who hold several devices: (persons, 5) as in Crowd, from the same ranges.
 
@@ -129,12 +141,18 @@ class Validation:
         """What the humans of this index meet, None for the scenario's own environment: each in turn."""
         return self.environments[index % len(self.environments)] if self.environments else None
 
-    def crowds(self, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], Crowd]]:
-        """The humans of these indices, held together as the scenario's persons hold its devices."""
-        holds = tuple(person.holds for person in self.scenario.person)
-        return crowds(self.scenario.population, self.scenario.channels, self.seed, indices, self.links, holds)
+    def crowds(self, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], Crowd | HumanSets]]:
+        """The humans of these indices, held together as the scenario's persons hold its devices.
 
-    def crowd(self, index: int) -> Crowd:
+        A user's own population draws from the same seeds, with the persons as they stand in the scenario.
+        """
+        scenario = self.scenario
+        if not isinstance(scenario.population, Population):
+            return _own_crowds(scenario, self.seed, indices)
+        holds = tuple(person.holds for person in scenario.person)
+        return crowds(scenario.population, scenario.channels, self.seed, indices, self.links, holds)
+
+    def crowd(self, index: int) -> Crowd | HumanSets:
         """The one set of humans with this index."""
         ((_, crowd),) = self.crowds([index])
         return crowd
@@ -200,7 +218,7 @@ def _group(
     validation: Validation,
     simulation: Simulation,
     index: NDArray[np.intp],
-    crowd: Crowd,
+    crowd: Crowd | HumanSets,
     ticked: Callable[[int], None],
 ) -> Findings:
     scenario, nowhere = validation.scenario, np.full(len(crowd), np.nan)
@@ -226,12 +244,18 @@ def _group(
         energy=exact.least_energy if exact else nowhere,
         audited=exact.audited if exact else nowhere,
         settling=exact.settling if exact else nowhere,
-        mass=np.exp(np.log(crowd.links[..., 0].sum(axis=2)).mean(axis=1)),
-        damping=np.exp(np.log(crowd.links[..., 1].min(axis=2)).mean(axis=1)),
+        mass=_geometric_mean(np.stack([port.mass.sum(axis=1) for port in crowd.ports], axis=1)),
+        damping=_geometric_mean(np.stack([port.damping.min(axis=1) for port in crowd.ports], axis=1)),
         switching=switched.exact,
         switching_mujoco=switched.mujoco,
         simulated=sum(test.simulated for test in dict.fromkeys((exact, last)) if test),
     )
+
+
+def _geometric_mean(values: Array) -> Array:
+    """Over the channels, (n, channels) -> (n,); 0 where one of them is."""
+    with np.errstate(divide="ignore"):
+        return np.exp(np.log(values).mean(axis=1))
 
 
 def _tests(

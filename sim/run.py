@@ -16,9 +16,10 @@ import msgspec
 import numpy as np
 
 from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
-from controller.environment import environment
+from controller.environment import environment, held
+from controller.loop import force_map
 from controller.lti import Array, Lti
-from controller.process import Process, StepBuffer, contact, force_map, held
+from controller.process import Process, StepBuffer, contact
 from models.scene import Scene, build, plant
 from sim.engines import (
     EXPONENTIAL,
@@ -103,8 +104,8 @@ def run(
     """Close the loop and return what every tick saw.
 
     `engine` is an engine or the name of one, with its default step; `outside`, `ticks` and the plant state `start`,
-    (2n, 1), are those of the scenario and rest where they are not given. The trace ends early where numbers stop being
-    finite, the engine reports trouble, or somebody interrupts from the keyboard.
+    (states, 1), are those of the scenario and rest where they are not given. The trace ends early where numbers stop
+    being finite, the engine reports trouble, or the keyboard interrupts.
     """
     process, scenario = simulation.process, simulation.scenario
     engine = make_engine(simulation, engine) if isinstance(engine, str) else engine
@@ -128,8 +129,8 @@ def run(
         run_blocks(process, engine, outside, ticks, start, keep, _BLOCK)
     except KeyboardInterrupt:  # what was finished is kept
         interrupted = True
-    n, m, handles = len(start) // 2, process.channels, list(simulation.scene.handles)
-    nothing = [np.empty((0, width)) for width in (process.F.order, 2 * n, simulation.scene.outside, m)]
+    n, m, handles = simulation.scene.model.nq, process.channels, list(simulation.scene.handles)
+    nothing = [np.empty((0, width)) for width in (process.F.order, len(start), simulation.scene.outside, m)]
     z, s, w, f = (np.concatenate(rows) for rows in zip(nothing, *blocks, strict=True))
     return Trace(
         t=np.arange(len(s)) * scenario.T,
@@ -148,7 +149,7 @@ def run(
 def run_blocks(
     process: Process, engine: Engine, outside: Outside, ticks: int, start: Array, look: Look, block: int = 32
 ) -> None:
-    """Close the loop for `ticks` periods from the plant states `start`, (2n, nsim), and look at it block by block.
+    """Close the loop for `ticks` periods from the plant states `start`, (states, nsim), and look at it block by block.
 
     Row 0 of the buffer is the block's first tick. So few ticks in a block that it stays in the processor's cache.
     """

@@ -278,9 +278,11 @@ def impulse_test(
 
 
 def impulse_growth(
-    process: Process, engine: Engine, scene: Scene, ticks: int, nsim: int = 1
+    process: Process, engine: Engine, scene: Scene, states: int, ticks: int, nsim: int = 1
 ) -> tuple[Array, NDArray[np.bool_]]:
     """(growth, clipped) after an impulse on every handle, (nsim,) each, of loops that may vary in time.
+
+    `states` is the order of the plant.
 
     The growth [1/s] is that of the handles' speeds from the second quarter to the last: inf where numbers overflow,
     -inf at exact rest. Of an `unlimited` process it does not depend on the size of the impulse.
@@ -292,8 +294,7 @@ def impulse_growth(
         clipped[...] |= (np.abs(buffer.f[:count]) >= limit).any(axis=(0, 1))
         speeds.see(buffer, first, count)
 
-    rest = np.zeros((2 * scene.model.nv, nsim))
-    run_blocks(process, engine, partial(impulse_forces, scene, T), ticks, rest, look)
+    run_blocks(process, engine, partial(impulse_forces, scene, T), ticks, np.zeros((states, nsim)), look)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         rate = np.log(speeds.late / speeds.early) / 2 / ((ticks - 2 * quarter) * T)
     return np.where(speeds.late == 0, -np.inf, np.where(np.isnan(rate), np.inf, rate)), clipped

@@ -24,9 +24,10 @@ from numpy.typing import NDArray
 
 from controller.coupling import Coupling
 from controller.delay import LOST, Jitter, Ticks, realising
+from controller.loop import DelayRange, force_map
 from controller.lti import Array, Lti
-from controller.process import Process, StepBuffer, force_map
-from design.certificate import DelayRange, sent, switching_part, switching_promise, switching_requirement
+from controller.process import Process, StepBuffer
+from design.certificate import switching_part, switching_promise, switching_requirement
 from design.conditions import Requirement
 from models.scene import Scene, Variants
 from sim.couplings import Chosen
@@ -217,16 +218,17 @@ def switched_crowd(
     """The impulse test for every set of humans, under the delays of its index: of (seed, index) and the loop only."""
     scenario, nsim, scene = simulation.scenario, len(held_by), held_by.scene
     plants = hold(held_by.plants(), scenario.T)
+    states = plants.A.shape[1]
     free = replace(simulation.process, F=without_theta(simulation, coupling))
 
     def judged(ticks: int) -> Switched:
         process = replace(free, delays=_crowd_delays(scenario, free, scene, plants, index, seed, ticks))
         endless = unlimited(process)
-        exact, _ = impulse_growth(endless, ExactBatchEngine(plants, endless.force_limit), scene, ticks, nsim)
+        exact, _ = impulse_growth(endless, ExactBatchEngine(plants, endless.force_limit), scene, states, ticks, nsim)
         if not mujoco:
             return Switched(exact, np.full(nsim, np.nan))
         engine = MujocoBatchEngine(scene, scenario.T, nsim=nsim, nthread=threads, fields=held_by.fields)
-        own, clipped = impulse_growth(process, engine, scene, ticks, nsim)
+        own, clipped = impulse_growth(process, engine, scene, states, ticks, nsim)
         return Switched(exact, np.where(clipped, np.nan, own))
 
     ticks = round(max(duration, _SHORTEST_CROWD) / scenario.T)
@@ -269,7 +271,7 @@ def certified_part(scenario: Scenario, chosen: Chosen, certified: bool) -> dict[
     loop = scenario.loop("I").switching(span)  # the case does not matter to stability
     found = switching_requirement(loop, chosen.coupling)
     on_file = chosen.switching if chosen.switching and chosen.switching.contains(span) else None
-    figures = switching_part(found, sent(loop, chosen.coupling), span)
+    figures = switching_part(found, loop.sent(chosen.coupling), span)
     proof = _how_proved(found.requirement, on_file)
     parts = {"jitter_proof": figures, "on_file": on_file and msgspec.to_builtins(on_file)}
     return parts | _coverage(scenario.jitter, certified, proof, figures["playout"]["certified"])

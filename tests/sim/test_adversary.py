@@ -11,7 +11,7 @@ from cli import run as run_command
 from cli.suite import run_tightness as tightness
 from cli.validate import main
 from controller.coupling import NoCoupling, SpringDamper
-from design.conditions import closed_loop as real
+from design.conditions import this_environment as real
 from design.result import CASE_I
 from models.device import RigidDevice
 from models.scene import build, plant
@@ -139,7 +139,7 @@ def test_the_tightness_command_reports_the_rate_by_shortage(tmp_path):
 
 def test_somebody_who_destabilises_a_loop_with_enough_damping_fails_the_command(tmp_path, monkeypatch):
     """Were the condition wrong, the command would say so: here it is told that a third of the damping is enough."""
-    monkeypatch.setattr("sim.adversary.closed_loop", lambda F, delta: replace(real(F, delta), required=(0.5, 0.5)))
+    monkeypatch.setattr("sim.adversary.this_environment", lambda F, delta: replace(real(F, delta), required=(0.5, 0.5)))
     assert tightness(["--case", "none", "--short", "0", "--generations", "5", "--out", str(tmp_path)]) == 1
 
 

@@ -114,7 +114,7 @@ def test_greedy_ages_repeat_the_trajectory_that_chose_them():
     for each in (delays, drawn):
         free = replace(unlimited(process), delays=each)
         engine = ExactBatchEngine(held, free.force_limit)
-        rates.append(impulse_growth(free, engine, ASSEMBLY.scene, ticks)[0][0])
+        rates.append(impulse_growth(free, engine, ASSEMBLY.scene, held.A.shape[1], ticks)[0][0])
     assert rates[0] > 0 > rates[1]
 
 
@@ -145,7 +145,7 @@ def test_both_engines_meet_the_same_delays(tmp_path):
 
 
 def test_the_adversarial_pattern_shows_growth(tmp_path):
-    store.save(store.Stored(load().loop("I"), store.data_of(STIFF)), tmp_path / "stiff.json")
+    store.save(store.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
     options = ["--coupling", str(tmp_path / "stiff.json"), "--jitter", "1,2", "--pattern", "adversarial"]
     report = run(tmp_path, *options, "--duration", "1", "--engine", "exact")
     assert report["stability"]["verdict"] == "unstable"
@@ -213,7 +213,7 @@ def validated(tmp_path, *options):
 
 def test_random_humans_under_the_worst_switching(tmp_path):
     """The constants' design fails for most humans, the jitter-proof one for none; 0 and 1 are what is claimed."""
-    store.save(store.Stored(load().loop("I"), store.data_of(STIFF)), tmp_path / "stiff.json")
+    store.save(store.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
     code, stiff = validated(tmp_path, "--pattern", "adversarial", "--coupling", str(tmp_path / "stiff.json"))
     assert stiff["unstable"]["exact"] >= 10
     assert not stiff["covered"]
