@@ -166,7 +166,7 @@ def test_null_cells_say_why_and_what_pushes_outwards_runs_away(tmp_path):
         (["--coupling", "optimal", "--rigid"], "--rigid with --coupling optimal: it is about a map of spring-dampers"),
         (["--coupling", "none", "--velocity-filter", "50"], "--velocity-filter with --coupling none"),
         (["--coupling", "optimal", "--condition", "theorem4"], "for optimal allowed are closed-loop"),
-        (["--condition", "theorem4"], "--condition theorem4: without --coupling nothing is designed"),
+        (["--condition", "theorem4"], "--condition any-environment: without --coupling nothing is designed"),
         (["--coupling", "optimal", "--scenario", "one-wall"], "an optimal coupling holds a linear model"),
         (["--coupling", "published", "--scenario", "one-wall"], "the paper prints gains for 2 channels"),
     ],
