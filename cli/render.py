@@ -217,11 +217,12 @@ def needs(part: Mapping[str, Any], digits: int = 6) -> str:
     return f"{required} of {available} N s/m"
 
 
-def certificate_rows(certificates: Mapping[str, Any], digits: int = 6) -> Rows:
-    """What each condition needs."""
+def certificate_rows(certificates: Mapping[str, dict[str, Any]], digits: int = 6, proof: bool = True) -> Rows:
+    """What each condition needs, and whether that is proved exactly, where no other row says it."""
     for name, part in certificates.items():
         if name in CONDITION_NAMES:
-            yield f"damping, {CONDITION_NAMES[name]}", f"needs {needs(part, digits)}: {certified(part)}"
+            word = certified(part) if proof else certified(part | {"proof": None})
+            yield f"damping, {CONDITION_NAMES[name]}", f"needs {needs(part, digits)}: {word}"
 
 
 def optional(value: float | None, form: str, absent: str = "-") -> str:

@@ -89,7 +89,7 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
     """Which environment is simulated, and the scenario with that one, known exactly. Raises InputError."""
     members = scenario.loop(args.case).members()
     if not 0 <= args.vertex < len(members):
-        why = f"allowed are 0 to {len(members) - 1}" if scenario.box else "but the scenario has no ranges"
+        why = f"allowed are 0 to {len(members) - 1}" if scenario.box else "but the scenario has no ranges ([box])"
         raise InputError(f"--vertex is {args.vertex}, {why}")
     return members[args.vertex].name, scenario.replace(environment=members[args.vertex].network, box=None)
 

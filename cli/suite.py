@@ -215,7 +215,7 @@ def hard(report: dict[str, Any]) -> list[Part]:
         (
             row["name"],
             f"{row['exact']:+.4f}",
-            f"{' x '.join(map(str, row['fails']))}: {row['fault']}" if row["fails"] else "none tried",
+            _failing(row),
             f"RK4 x {row['substeps']}",
             f"{row['error']:+.1e}",
         )
@@ -224,6 +224,14 @@ def hard(report: dict[str, Any]) -> list[Part]:
     good = sum(row["holds"] for row in report["rows"])
     columns = ("loop", "exact growth [1/s]", "fails", "holds", "growth error [1/s]")
     return [Part("", columns, rows, f"{good} of {len(rows)} verdicts right under the substep rule")]
+
+
+def _failing(row: Row) -> str:
+    """The setting that fails, how and by how much."""
+    if not row["fails"]:
+        return "none tried"
+    off = "" if row["off"] is None else f" {row['off']:+.1e}"
+    return f"{' x '.join(map(str, row['fails']))}: {row['fault'] or '-'}{off}"
 
 
 def fault_table(report: dict[str, Any]) -> list[Part]:

@@ -119,7 +119,7 @@ def _environments(args: argparse.Namespace, whole: SetCheck | None) -> tuple[Mem
     if args.environments == "nominal":
         return ()
     if whole is None:
-        raise InputError(f"--environments {args.environments}: the scenario has no ranges (docs/scenario.md: [box])")
+        raise InputError(f"--environments {args.environments}: the scenario has no ranges (docs/scenario.md, [box])")
     others = (whole.searched.worst[0].member, *whole.samples)
     return (*whole.members, *others[: len(whole.members)])
 
