@@ -35,7 +35,7 @@ class _Checked:
 
     proved: bool
     reason: str | None = render.figure("reason")
-    condition: str | None = render.figure("condition", lambda name: CONDITION_NAMES.get(name, name))
+    condition: str | None = render.figure("condition", CONDITION_NAMES.__getitem__)
     promise: str | None = render.figure("guarantee")
     proof: str | None = render.figure("proof")
     vertices: int | None = render.figure("vertices")

@@ -128,7 +128,8 @@ def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
 def _names(args: argparse.Namespace) -> list[str]:
     """The couplings that were asked for. Raises InputError."""
     usual = "none" if args.case == "none" else "none,spring-damper"
-    names = (usual if args.coupling is None else args.coupling).split(",")
+    asked: str = usual if args.coupling is None else args.coupling
+    names = asked.split(",")
     if "" in names:
         raise InputError(f"--coupling is {args.coupling!r}, expected names separated by commas")
     if len(set(names)) < len(names):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import sys
 from importlib import import_module
+from types import ModuleType
 from typing import NoReturn
 
-from cli.options import InputError, execute
+from cli.options import execute
+from sim.scenario import InputError
 
 #: command -> what python -m calls it, and what it is for; it lives in the file of its name in this folder
 COMMANDS = {
@@ -46,7 +48,7 @@ def main() -> NoReturn:
     execute(lambda argv: _command(argv[0]).main(argv[1:]))
 
 
-def _command(name: str):
+def _command(name: str) -> ModuleType:
     if name not in COMMANDS:
         raise InputError(f"unknown command {name!r}, allowed are {', '.join(COMMANDS)}")
     return import_module(f"cli.{name}")

@@ -192,7 +192,7 @@ def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: s
     add_condition_option(parser)
 
 
-def add_condition_option(parser: argparse.ArgumentParser, what: str = "that the certificate is about") -> None:
+def add_condition_option(parser: argparse._ActionsContainer, what: str = "that the certificate is about") -> None:
     """--condition."""
     names = ",".join(CONDITION_NAMES.values())
     help_ = f"{what}: {' or '.join(CONDITION_NAMES.values())} (default: the coupling's own)"
