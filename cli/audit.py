@@ -18,7 +18,7 @@ from design.certificate import DelayRange
 from design.designs import KINDS
 from design.ranges import check_set, set_rows
 from design.result import CONDITION_NAMES, listed
-from sim.couplings import fitted, read_coupling, standing
+from sim.couplings import check_stored, fitted, read_coupling
 from sim.scenario import InputError, Scenario
 
 EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
@@ -143,7 +143,7 @@ def _notes(args: argparse.Namespace, scenario: Scenario, switching: DelayRange |
     if args.coupling is None:
         return []
     loop = scenario.loop(args.case)
-    return list(standing(read_coupling(args.coupling), loop.switching(switching)).notes)
+    return list(check_stored(read_coupling(args.coupling), loop.switching(switching)).notes)
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -173,17 +173,16 @@ def tightness(report: dict[str, Any]) -> list[Part]:
 
 def accuracy(report: dict[str, Any]) -> list[Part]:
     """Of sim.accuracy."""
-    default = report["default_substeps"]
-    rows = []
+    default, rows = ("exponential", 1), []
     for row in report["rows"]:
         name = f"{row['integrator']} x {row['substeps']}" if row["integrator"] else "exact"
-        mark = " (default)" if (row["integrator"], row["substeps"]) == ("RK4", default) else ""
+        mark = " (default)" if (row["integrator"], row["substeps"]) == default else ""
         growth, speed = f"{row['growth_rate_error']:+.1e}", f"{1 / row['wall_s_per_simulated_s']:.0f}"
         position = row["position_relative_rms"]
         right = "right" if row["verdict_correct"] else "wrong"
         rows.append((name + mark, "-" if position is None else f"{position:.1e}", growth, right, speed))
-    ours = next((r for r in report["rows"] if (r["integrator"], r["substeps"]) == ("RK4", default)), None)
-    gist = f"default RK4 x {default}: growth off by {ours['growth_rate_error']:+.0e} 1/s" if ours else ""
+    ours = next((r for r in report["rows"] if (r["integrator"], r["substeps"]) == default), None)
+    gist = f"default exponential x 1: growth off by {ours['growth_rate_error']:+.0e} 1/s" if ours else ""
     columns = ("setting", "position error, relative rms", "growth error [1/s]", "verdict", "times real time")
     return [Part("", columns, tuple(rows), gist)]
 

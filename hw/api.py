@@ -17,7 +17,7 @@ from hw.session import Session, Settings
 from hw.trace import Recorder, result_of
 from sim.couplings import Chosen
 from sim.scenario import InputError, Scenario, require_constant_delay, require_linear
-from sim.trace import Result
+from sim.trace import Trace
 
 MEASURE = 200  # answers that are timed: virtual time does not scatter
 QUANTILE, GUARD_US = 0.99, 100.0  # of the ages that the delay covers, and what is added [us]; as hw.bridge has it
@@ -34,7 +34,7 @@ class Rehearsed:
     coupling: Coupling | None  # that the device was armed with, or would have been
     requirements: dict[str, Requirement]  # of that coupling by both conditions, as `certify` gives them
     promise: str | None  # for which environments they hold
-    result: Result | None  # t, x and f of every tick, as `simulate` gives them; handles are not measured
+    result: Trace | None  # t, x and f of every tick, as `simulate` gives them; handles are not measured
     zero_after: float | None  # from the wish to stop until no motor does anything [s]; None where it never ran
 
 

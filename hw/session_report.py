@@ -21,7 +21,7 @@ from hw.safety import Stage
 from hw.session import Session
 from hw.trace import Recorder, result_of, save_npz, steady_ticks
 from sim.files import write_json
-from sim.trace import growths, told
+from sim.trace import format_growth, growths
 
 PERCENTILES = (50, 90, 99, 100)
 
@@ -123,7 +123,7 @@ def print_session(report: dict[str, Any], console: Console) -> None:
             f"link: {link['rate_hz']:.0f} answers a second, {link['missed_percent']:.2f} % missed; age {ages}"
         )
     for i, part in enumerate(report["growth"], start=1):
-        console.print(f"growth at full gain, arming {i}, {told(part, report['run']['T_s'])}")
+        console.print(f"growth at full gain, arming {i}, {format_growth(part, report['run']['T_s'])}")
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link["counters"].items() if n)
     console.print(f"counted: {counted or 'nothing'}")
     console.print(f"[dim]·[/] {CAVEATS}")

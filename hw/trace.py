@@ -19,7 +19,7 @@ from hw.message import NO_MARGIN
 from hw.trace_check import complaint
 from sim.files import write
 from sim.scenario import InputError
-from sim.trace import DAMAGED, Result
+from sim.trace import DAMAGED, Trace
 
 #: what the link adds, one entry per tick: name -> axes of the array
 LINK = {"tick": 1, "arming": 1, "received": 1, "asked": 2, "gain": 1, "sent": 2, "margin_us": 1, "status": 1}
@@ -82,7 +82,7 @@ def steady_ticks(recorder: Recorder, force_step: Sequence[float]) -> list[list[i
     return stretches
 
 
-def result_of(recorder: Recorder, units: Units, T: float, meta: dict[str, Any]) -> Result:
+def result_of(recorder: Recorder, units: Units, T: float, meta: dict[str, Any]) -> Trace:
     """The trace in the terms of sim.run. Handles and outside forces are not measured: nan, and no column."""
     link = recorder.link()
     n, m = len(recorder), recorder.channels
@@ -90,10 +90,10 @@ def result_of(recorder: Recorder, units: Units, T: float, meta: dict[str, Any]) 
     f = -link["applied"][last] * np.array(units.force_step)
     unknown = np.full((n, m), np.nan)
     t = np.arange(n, dtype=float) * T
-    return Result(t, link["x"], f, unknown, unknown, np.zeros((n, 0)), meta)
+    return Trace(t, link["x"], f, unknown, unknown, np.zeros((n, 0)), meta)
 
 
-def save_npz(path: Path, result: Result, recorder: Recorder) -> Path:
+def save_npz(path: Path, result: Trace, recorder: Recorder) -> Path:
     """An npz that sim.result reads, with the arrays of LINK beside its own."""
     link = {f"link_{name}": recorder.link()[name] for name in LINK}
     own = {name: getattr(result, name) for name in ("t", "x", "f", "x_handle", "v_handle", "w")}
@@ -113,9 +113,9 @@ def digest(arrays: Mapping[str, Array]) -> str:
     return whole.hexdigest()
 
 
-def load(path: Path) -> tuple[Result, dict[str, Array]]:
+def load(path: Path) -> tuple[Trace, dict[str, Array]]:
     """A trace with its link arrays. Raises InputError where the file holds no session of a bridge."""
-    result = Result.load_npz(path)
+    result = Trace.load_npz(path)
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}

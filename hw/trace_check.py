@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from controller.lti import Array
-from sim.trace import Result
+from sim.trace import Trace
 
 FLOATS, WHOLE = ("asked", "gain"), ("tick", "arming", "sent", "margin_us", "status")
 #: link array -> least and most that a session writes
 RANGES = {"gain": (0.0, 1.0), "tick": (0, 0xFFFF), "sent": (-0x7FFF, 0x7FFF), "margin_us": (-0x8000, 0x7FFF)}
 
 
-def complaint(result: Result, link: dict[str, Array]) -> str | None:
+def complaint(result: Trace, link: dict[str, Array]) -> str | None:
     """What is wrong with a trace whose shapes are right; None where nothing is."""
     if not isinstance(result.meta, dict):
         return f"its metadata is a {type(result.meta).__name__}, expected an object"

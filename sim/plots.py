@@ -18,7 +18,7 @@ from matplotlib.patches import Patch
 from controller.lti import Array
 from sim.files import write
 from sim.stability import MARGINAL
-from sim.trace import Result
+from sim.trace import Trace
 from sim.zwidth import MODEL_KEPT, UNDECIDED, Map
 
 # ----------------------------------------------------------------------------------------------------
@@ -41,7 +41,7 @@ STYLES: tuple[dict[str, Any], ...] = (
 
 
 def plot_run(
-    result: Result, path: Path, title: str, frequency_hz: float, ideal: tuple[Array, float | None] | None = None
+    result: Trace, path: Path, title: str, frequency_hz: float, ideal: tuple[Array, float | None] | None = None
 ) -> Path:
     """Displacements and forces over the whole run, and about six periods of `frequency_hz` where forces turn sharply.
 
@@ -81,7 +81,7 @@ def plot_run(
         plt.close(figure)
 
 
-def _draw_ideal(axes: Array, result: Result, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
+def _draw_ideal(axes: Array, result: Trace, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
     """The ideal forces, broad and pale in each device's colour; cut where they are more than three times as large."""
     forces, percent = ideal
     label = "pale: ideal environment"
@@ -130,7 +130,7 @@ def _calmest_last(values: Array) -> list[int]:
     return list(np.argsort(-np.square(np.diff(values, axis=0)).sum(axis=0)))
 
 
-def _zoom(result: Result, frequency_hz: float) -> slice:
+def _zoom(result: Trace, frequency_hz: float) -> slice:
     """Six periods where the forces turn most sharply; more where they turn less than six times in them."""
     n = result.t.size
     T = result.t[1] - result.t[0] if n > 1 else 1.0

@@ -27,12 +27,12 @@ from hw.session import Session, Settings
 from hw.trace import Recorder, digest, load, result_of, save_npz, steady_ticks
 from models.scene import plant
 from sim.couplings import choose
-from sim.engines import hold, outside_forces
-from sim.run import assemble, simulate
+from sim.engines import hold
+from sim.run import assemble, outside_forces, run
 from sim.scenario import InputError
 from sim.scenario import load as scenario_of
 from sim.stability import close, dominant_mode
-from sim.trace import Result
+from sim.trace import Trace
 
 FAST = Settings(measure=100)
 
@@ -197,14 +197,14 @@ def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
     assert link["received"].all()
     assert (link["gain"][first:] == 1.0).all()
     n = len(recorder) - first
-    exact = simulate(assemble(scenario, rungs[0].chosen.coupling), "exact", samples=n)
+    exact = run(assemble(scenario, rungs[0].chosen.coupling), "exact", ticks=n)
     step, coupling = 1e-6, rungs[0].chosen.coupling
     assert n > 1800
-    assert np.abs(exact.s[:, :2, 0]).max() > 5e-3  # the people do move
-    assert np.abs(link["x"][first:] - exact.s[:, :2, 0]).max() < step
+    assert np.abs(exact.s[:, :2]).max() > 5e-3  # the people do move
+    assert np.abs(link["x"][first:] - exact.s[:, :2]).max() < step
     forces = -link["applied"][first:] * 4e-4
     bound = max(coupling.K) * step + max(coupling.B) * step / scenario.T + 4e-4
-    assert np.abs(forces - exact.f[:, :, 0]).max() < bound
+    assert np.abs(forces - exact.f).max() < bound
 
 
 def test_the_same_to_the_last_bit_but_for_rounded_forces(scenario, rungs):
@@ -359,7 +359,7 @@ def trace(scenario, rungs, tmp_path_factory):
 
 def test_a_trace_is_one_of_sim_run(trace):
     files, recorder = trace
-    result = Result.load_npz(files[0])
+    result = Trace.load_npz(files[0])
     assert result.t.size == len(recorder)
     np.testing.assert_array_equal(np.diff(recorder.link()["tick"]) & 0xFFFF, 1)  # a row for every tick
     assert np.isfinite(result.f).all()
@@ -400,7 +400,7 @@ def test_a_replay_finds_one_changed_bit(trace):
     assert not compared.sent.any()
     x = result.x.copy()
     x[200, 0] += 1e-6
-    moved = Result(result.t, x, result.f, result.x_handle, result.v_handle, result.w, result.meta)
+    moved = Trace(result.t, x, result.f, result.x_handle, result.v_handle, result.w, result.meta)
     assert np.flatnonzero(replay.replay(moved, link).asked)[0] == 200
 
 
@@ -414,7 +414,7 @@ def test_the_replay_command(trace, capsys):
 
 def test_a_trace_of_sim_run_is_no_session(scenario, rungs, tmp_path):
     assembly = assemble(scenario, rungs[0].chosen.coupling)
-    plain = Result.from_record(assembly, simulate(assembly, "exact", samples=10), {})
+    plain = run(assembly, "exact", ticks=10)
     path = plain.save_npz(tmp_path / "trace.npz")
     with pytest.raises(InputError, match="not of a bridge's session"):
         load(path)
@@ -422,7 +422,7 @@ def test_a_trace_of_sim_run_is_no_session(scenario, rungs, tmp_path):
 
 def test_a_trace_whose_recipe_is_broken_is_bad_input(trace, tmp_path):
     result, _ = load(trace[0][0])
-    broken = Result(
+    broken = Trace(
         result.t, result.x, result.f, result.x_handle, result.v_handle, result.w, result.meta | {"replay": {}}
     )
     path = save_npz(tmp_path / "trace.npz", broken, trace[1])

@@ -20,7 +20,7 @@ from hw.session import Session, Settings
 from hw.trace import Recorder
 from models.device import RigidDevice
 from sim.scenario import InputError, load
-from sim.trace import Result
+from sim.trace import Trace
 
 STEP = 5e-6  # [m] a coarse encoder: half of an Omega's 0.01 mm
 
@@ -200,4 +200,4 @@ def test_a_record_that_cannot_tell_the_frictions_apart_gives_no_bound():
 def test_a_trace_whose_forces_have_another_shape_is_refused():
     two, one = np.zeros((3, 2)), np.zeros((3, 1))
     with pytest.raises(ValueError, match="f has 1 channels, x has 2"):
-        Result(np.arange(3.0), x=two, f=one, x_handle=two, v_handle=two, w=two, meta={})
+        Trace(np.arange(3.0), x=two, f=one, x_handle=two, v_handle=two, w=two, meta={})

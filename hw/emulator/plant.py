@@ -7,7 +7,8 @@ import numpy as np
 from controller.lti import Array
 from models.human import Human, Link
 from models.scene import build, plant
-from sim.engines import hold, outside_forces
+from sim.engines import hold
+from sim.run import outside_forces
 from sim.scenario import Scenario
 
 STRETCH = 1000  # ticks of outside forces that are computed at once

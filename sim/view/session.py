@@ -15,9 +15,9 @@ from queue import Empty, SimpleQueue
 import numpy as np
 
 from controller.lti import Array, Lti
-from controller.process import Tape
-from sim.engines import ExactEngine, outside_forces
-from sim.run import stretch
+from controller.process import StepBuffer
+from sim.engines import ExactEngine
+from sim.run import outside_forces, run_block
 from sim.view.events import Couple, Delay, Event, Push, Restart, Script, words
 from sim.view.grip import Grip, gripped
 from sim.view.pace import LONGEST_LAG, Pace
@@ -164,7 +164,7 @@ class Session:
             w[:, scene.tapped[self._grip.channel]] += self._grip.pull
         tape.w[:count] = w[:, :, None]
         with np.errstate(over="ignore", invalid="ignore"):  # a process that runs away is noticed below
-            stretch(tape, self._engine, count)
+            run_block(tape, self._engine, count)
         self._tick += count
         if not (np.isfinite(tape.s[: count + 1]).all() and np.isfinite(tape.z[: count + 1]).all()):
             self._happen(Restart())
@@ -192,7 +192,7 @@ class Session:
         """Go on with another process from the plant state s."""
         process = setting.assembly.process
         outside = setting.assembly.plant.B.shape[1] - process.channels
-        tape = Tape(process, STRETCH, s.size, outside)
+        tape = StepBuffer(process, STRETCH, s.size, outside)
         tape.s[0, :, 0] = s
         tape.z[0, :, 0] = rest(process.F, s[: process.channels])
         self.setting, self._tape = setting, tape

@@ -11,7 +11,7 @@ from design.conditions import Requirement
 from design.designs import KINDS
 from design.result import DesignFailed
 from sim.couplings import Chosen, choose
-from sim.run import Assembly, assemble
+from sim.run import Simulation, assemble
 from sim.scenario import LONGEST_DELAY, InputError, Scenario
 from sim.stability import Mode, worst_mode
 from sim.view.events import COUPLINGS, GIVEN, Couple, Delay
@@ -33,7 +33,7 @@ class Setting:
     menu: Menu
     label: str  # as the user calls the coupling
     chosen: Chosen
-    assembly: Assembly
+    assembly: Simulation
     mode: Mode  # of the exact linear loop; before walls, of the worst contact state
     requirements: dict[str, Requirement]
     promise: str | None

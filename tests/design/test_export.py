@@ -14,7 +14,7 @@ from cli.export import main
 from controller.coupling import SpringDamper as Gains
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.lti import Lti
-from controller.process import Process, Tape, force_map
+from controller.process import Process, StepBuffer, force_map
 from design.certificate import Compliance, Loop, NoCoupling, SpringDamper, Stored, prove, save
 from design.export import process_block, sequential, trial
 from sim.scenario import InputError
@@ -82,7 +82,7 @@ def test_the_process_of_the_simulator_differs_by_rounding_alone(data):
     block = process_block(Stored(LOOP, data))
     test, G = trial(block), block.system
     limits = np.full(2, np.inf)
-    tape = Tape(Process(G, limits, np.zeros(2)), len(test.inputs), plant_states=2)
+    tape = StepBuffer(Process(G, limits, np.zeros(2)), len(test.inputs), plant_states=2)
     for k, x in enumerate(test.inputs):
         tape.x[k, :, 0] = x
         tape.tick(k)
