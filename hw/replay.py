@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from cli.options import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute
+from cli.options import DOES_NOT_HOLD, DONE, Parser, check_json, execute
+from cli.render import console
 from controller.coupling import Form
 from controller.environment import environment
 from controller.loop import force_map
@@ -24,7 +25,7 @@ from hw.trace import load
 from models.device import require
 from sim.files import write_json
 from sim.scenario import InputError, Scenario
-from sim.trace import Trace
+from sim.trace import Result
 
 
 class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -70,7 +71,7 @@ class Comparison:
         return not (self.asked.any() or self.sent.any())
 
 
-def recipes_of(result: Trace) -> list[Recipe]:
+def recipes_of(result: Result) -> list[Recipe]:
     """The recipes in a trace, one for each arming. Raises InputError where there is none."""
     try:
         _require_limits(result.meta.get("replay"))
@@ -89,7 +90,7 @@ def _require_limits(raw: object) -> None:
             raise ValueError(f"limits are {', '.join(sorted(names))}; missing or unknown: {wrong}")
 
 
-def replay(result: Trace, link: dict[str, Array]) -> Comparison:
+def replay(result: Result, link: dict[str, Array]) -> Comparison:
     """Feed the recorded displacements through law, gain, limits and rounding, every arming from rest."""
     recipes, arming = recipes_of(result), link["arming"]
     channels = result.x.shape[1]
@@ -105,7 +106,7 @@ def replay(result: Trace, link: dict[str, Array]) -> Comparison:
 
 
 def _again(
-    recipe: Recipe, ticks: NDArray[np.intp], result: Trace, link: dict[str, Array], into: tuple[Array, Array]
+    recipe: Recipe, ticks: NDArray[np.intp], result: Result, link: dict[str, Array], into: tuple[Array, Array]
 ) -> None:
     """The `ticks` of one arming: forces asked for and steps sent, written to `into`."""
     law, units = _built(recipe), Units((1.0,) * len(recipe.cap), recipe.force_step, (1.0,) * len(recipe.cap))
@@ -163,7 +164,7 @@ def main(argv: list[str]) -> int:
     return DONE if compared.identical else DOES_NOT_HOLD
 
 
-def _first(compared: Comparison, result: Trace) -> float | None:
+def _first(compared: Comparison, result: Result) -> float | None:
     different = compared.asked | compared.sent
     return float(result.t[np.argmax(different)]) if different.any() else None
 

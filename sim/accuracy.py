@@ -212,7 +212,6 @@ def _rms(values: Array) -> float:
 
 
 if __name__ == "__main__":
-    from cli.accuracy import main
-    from cli.options import execute
+    from cli.main import door
 
-    execute(main)
+    door("accuracy")

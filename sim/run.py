@@ -215,7 +215,6 @@ def make_engine(
 
 
 if __name__ == "__main__":
-    from cli.options import execute
-    from cli.run import main
+    from cli.main import door
 
-    execute(main)
+    door("run")

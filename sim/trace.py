@@ -318,7 +318,6 @@ Result = Trace  # its name in earlier versions
 
 
 if __name__ == "__main__":
-    from cli.options import execute
-    from cli.trace import main
+    from cli.main import door
 
-    execute(main)
+    door("trace")
