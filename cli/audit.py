@@ -13,8 +13,8 @@ from rich.table import Table
 
 from cli import options, render
 from controller.coupling import Coupling, NoCoupling, SpringDamper
+from controller.loop import DelayRange
 from design.audit import LONGEST_DELAY, PRESETS, Subject, report
-from design.certificate import DelayRange
 from design.designs import KINDS
 from design.ranges import check_set, set_rows
 from design.result import CONDITION_NAMES, listed
@@ -88,7 +88,7 @@ def _with_preset(args: argparse.Namespace) -> argparse.Namespace:
 def _subject(args: argparse.Namespace, scenario: Scenario) -> Subject:
     """The coupling in its loop. Raises InputError."""
     if args.rigid:
-        loop = {"network": None, "delta": scenario.delta[:1], **options.rigid_loop(args, scenario)}
+        loop: dict[str, Any] = {"network": None, "delta": scenario.delta[:1], **options.rigid_loop(args, scenario)}
     else:
         delays = {"theta": scenario.theta, "psi": scenario.psi}
         loop = {"network": scenario.environment, "delta": scenario.delta, **delays}

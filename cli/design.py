@@ -10,31 +10,26 @@ from typing import Any
 from rich.table import Table
 
 from cli import options, render
-from controller.process import force_map
+from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY
 from design.certificate import (
     ANY,
     HERE,
     Certificate,
-    DelayRange,
-    Loop,
     NotProved,
     Stored,
     assess,
-    data_of,
     promise_of,
     prove,
     save,
-    sent,
-    specification,
     switching_part,
     switching_promise,
     switching_requirement,
 )
-from design.designs import KINDS, METHODS, compare_methods, design_by_kind
+from design.designs import KINDS, compare_methods, design_by_kind
 from design.optimal import FILTERS, OBJECTIVES
 from design.ranges import SAMPLES, SetCheck, check_set, cost_part, price, set_part, set_rows
-from design.result import CONDITION_NAMES, Design, DesignFailed, listed
+from design.result import CONDITION_NAMES, METHODS, Design, DesignFailed, listed
 from design.spring_damper import STIFFEST
 from design.transparency import transparency
 from sim import report
@@ -54,8 +49,6 @@ def main(argv: list[str]) -> int:
     requirements = assess(loop, design.coupling, design.phi)
     with render.progress("searching the ranges") as move:
         whole = check_set(loop, design.coupling, args.seed, args.samples, move)
-    E = specification(loop).environment
-    F = force_map(E, design.coupling, loop.theta, loop.psi)
     certificates = report.certificates_part(requirements)
     outcome = {
         "case": args.case,
@@ -66,7 +59,7 @@ def main(argv: list[str]) -> int:
         "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
         "set": whole and set_part(whole),
         "price": _robustness_loss(args, loop, design) if whole else None,
-        "transparency": report.transparency_part(transparency(F, E, loop.lam)),
+        "transparency": report.transparency_part(transparency(loop.F(design.coupling), loop.E(), loop.lam)),
         "objective": design.objective,
         "objective_name": design.figure,
         "sdps": design.sdps,
@@ -75,7 +68,7 @@ def main(argv: list[str]) -> int:
         "jitter_proof": _switching_figures(loop, design),
     }
     if args.compare:
-        outcome["comparison"] = [asdict(row) for row in compare_methods(specification(loop))]
+        outcome["comparison"] = [asdict(row) for row in compare_methods(loop)]
     render.publish(args, outcome, _tables(outcome))
     holds = outcome["certificate"]["certified"] and (outcome["promise"] == ANY or not whole or whole.proved)
     switching = outcome["jitter_proof"]
@@ -192,9 +185,7 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
         asked["switching"] = (loop.jitter.lo, loop.jitter.hi)
     try:
         with render.progress("designing") as move:
-            return design_by_kind(
-                specification(loop), args.coupling, args.condition, lambda what, n, of: move(n, of, what), **asked
-            )
+            return design_by_kind(loop, args.coupling, args.condition, lambda what, n, of: move(n, of, what), **asked)
     except DesignFailed:
         raise
     except ValueError as error:
@@ -209,7 +200,7 @@ def _switching_figures(loop: Loop, design: Design) -> dict[str, Any] | None:
     """What any switching asks of the designed coupling, from the coupling alone."""
     if loop.jitter is None:
         return None
-    return switching_part(switching_requirement(loop, design.coupling), sent(loop, design.coupling), loop.jitter)
+    return switching_part(switching_requirement(loop, design.coupling), loop.sent(design.coupling), loop.jitter)
 
 
 def _robustness_loss(args: argparse.Namespace, loop: Loop, design: Design) -> list[dict[str, Any]]:
@@ -218,7 +209,7 @@ def _robustness_loss(args: argparse.Namespace, loop: Loop, design: Design) -> li
     if args.coupling == "optimal":
         couplings = {"whole set": design.coupling}
         try:
-            alone = design_by_kind(specification(loop.at(loop.environment)), "optimal", None, **_asked(args))
+            alone = design_by_kind(loop.at(loop.environment), "optimal", None, **_asked(args))
             couplings = {"nominal only": alone.coupling, **couplings}
         except DesignFailed:  # the set is given another basis by default
             pass
@@ -244,7 +235,7 @@ def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path) -> dic
             loop = loop.switching(None)
             certificate, reason = _proved(loop, design)
     try:
-        save(Stored(loop, data_of(design.coupling), certificate), out)
+        save(Stored.of(loop, design.coupling, certificate), out)
     except OSError as error:
         raise InputError(f"--out {out}: {error.strerror}") from None
     proof = certificate.proof if certificate else None
@@ -255,7 +246,7 @@ def _proved(loop: Loop, design: Design) -> tuple[Certificate | None, str | None]
     """The certificate of all that the loop claims, or why there is none."""
     try:
         phi = None if design.phi is None else design.phi.tolist()
-        return prove(loop, data_of(design.coupling), design.condition, phi), None
+        return prove(loop, design.coupling, design.condition, phi), None
     except NotProved as error:
         return None, str(error)
 

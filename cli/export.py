@@ -13,7 +13,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from cli import options, render
-from design.certificate import HERE, SET, SpringDamper, Stored, Verdict, switching_promise, verify
+from controller.coupling import SpringDamperForm
+from design.certificate import HERE, SET, Stored, Verdict, switching_promise, verify
 from design.export import (
     Block,
     NothingToExport,
@@ -99,7 +100,7 @@ def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> Block:
 
 def _gains(stored: Stored) -> str:
     coupling = stored.coupling
-    if isinstance(coupling, SpringDamper):
+    if isinstance(coupling, SpringDamperForm):
         return f"spring-damper, K = {listed(coupling.K)} N/m, B = {listed(coupling.B)} N s/m"
     return f"coupling of kind {coupling.__struct_config__.tag}"
 

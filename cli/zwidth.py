@@ -18,7 +18,7 @@ from rich.table import Table
 from cli import options, render
 from controller.lti import Array
 from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, promise_of
-from design.conditions import contact_springs
+from design.maps import contact_springs
 from design.ranges import check_set, set_part
 from design.result import CONDITION_NAMES
 from sim import report

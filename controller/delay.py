@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controller.lti import Array, Lti
+from controller.lti import Array, Lti, Number, taps
 
 # ----------------------------------------------------------------------------------------------------
 # Delays: constant ones as linear blocks, Theta (4), Psi (5) and Lambda (7); varying ones as a line that holds.
@@ -27,19 +27,17 @@ Ticks = NDArray[np.int64]
 LOST = -1  # as a delay: the packet never arrives
 
 
-def delay(steps: Sequence[int], T: float) -> Lti:
-    """blockdiag(z^-n_1, ..., z^-n_m): a chain of n_i unit delays per channel."""
-    return Lti.diag(*(_chain(n, T) for n in steps))
+def delay(steps: Sequence[int], T: Number) -> Lti:
+    """blockdiag(z^-n_1, ..., z^-n_m) in the arithmetic of T: a chain of n_i unit delays per channel."""
+    for n in steps:
+        if n != int(n) or n < 0:
+            raise ValueError(f"a delay is a whole number of samples, zero or more, got {n}")
+    return Lti.diag(*(taps([0] * int(n) + [1], T) for n in steps))
 
 
-def _chain(n: int, T: float) -> Lti:
-    if n != int(n) or n < 0:
-        raise ValueError(f"a delay is a whole number of samples, zero or more, got {n}")
-    if n == 0:
-        return Lti.constant([[1.0]], T)
-    first, last = np.zeros((n, 1)), np.zeros((1, n))
-    first[0, 0] = last[0, -1] = 1.0
-    return Lti(np.eye(n, k=-1), first, last, [[0.0]], T)
+def moving_sum(steps: Sequence[int], T: Number) -> Lti:
+    """diag(1 + 1/z + ... + z^-n_i)."""
+    return Lti.diag(*(taps([1] * (n + 1), T) for n in steps))
 
 
 def packet_delays(values: ArrayLike) -> Ticks:

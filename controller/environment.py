@@ -7,8 +7,10 @@ to the forces that the devices feel (with a minus sign) is Z_cc - Z_ci Z_ii^-1 Z
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from itertools import product
 from math import prod
 from typing import Annotated, Any
@@ -17,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.lti import Array, Lti
+from controller.lti import Array, Lti, Number, inverse, rational
 
 # ----------------------------------------------------------------------------------------------------
 # Environments that are not known exactly: a box around a network's parameters, its vertices, and points inside.
@@ -370,23 +372,25 @@ FIGURE_4 = Network(
 )
 
 
-def environment(network: Network, T: float) -> Lti:
+def environment(network: Network, T: Number) -> Lti:
     """E(z), contact displacements [m] to forces [N], by backward Euler s -> (z-1)/(Tz); no wall touches.
 
     Internal nodes obey M (v - v-)/T + D v + K q + (coupling to the contacts) = 0 with q = q- + T v, solved
     for v at every tick. The states are q- and v- of the internal nodes, and what the contact dampers and
-    masses need of the past. Raises ValueError if an internal node is held by nothing.
+    masses need of the past. In the arithmetic of T. Raises ValueError if an internal node is held by nothing.
     """
-    return Lti(*realise(_solvable(network, T), len(network.contacts), T, np.linalg.inv), T)
+    return Lti(*realise(_solvable(network, T), len(network.contacts), T), T)
 
 
-def walled_environment(network: Network, T: float) -> Lti:
+def walled_environment(network: Network, T: Number) -> Lti:
     """[x; p] -> [f; y]: as `environment`, wall forces p [N] put in and displacements y [m] across walls out."""
     across = network.across(network.walls)
-    return Lti(*realise(_solvable(network, T), len(network.contacts), T, np.linalg.inv, across), T)
+    return Lti(*realise(_solvable(network, T), len(network.contacts), T, across), T)
 
 
-def _solvable(network: Network, T: float) -> tuple[Array, Array, Array]:
+def _solvable(network: Network, T: Number) -> tuple[Array, Array, Array]:
+    if isinstance(T, Fraction):
+        return network.matrices(rational)
     M, D, K = network.matrices()
     free = network.nodes()[len(network.contacts) :]
     inner = slice(len(network.contacts), None)
@@ -399,14 +403,12 @@ def realise(
     matrices: tuple[Array, Array, Array],
     c: int,
     T: Any,
-    inverse: Callable[[Array], Array],
     across: NDArray[np.int64] | None = None,
 ) -> tuple[Array, Array, Array, Array]:
     """A, B, C, D of the network (M, D, K) whose first `c` nodes are contacts; see `environment`.
 
     With `across` (w, nodes) there are w more inputs, forces that push the displacements `across q` back, and w more
-    outputs, these displacements. The arithmetic is that of the entries: floating point, or exact with object arrays
-    and an exact inverse.
+    outputs, these displacements. The arithmetic is that of the entries.
     """
     M, D, K = matrices
     cc, ci, ic, ii = _quarters(c)
@@ -444,3 +446,17 @@ def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
     for _ in range(used.size):
         used = used | reads[used].any(axis=0)
     return np.flatnonzero(used)
+
+
+def frozen_states(network: Network) -> dict[tuple[bool, ...], Network]:
+    """The linear environments that a walled one is made of, by the walls that touch; one state where there is none."""
+    states = itertools.product((False, True), repeat=len(network.walls))
+    return {touching: held(network, touching) for touching in states}
+
+
+def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
+    """The network with the touching walls (default: all) as springs that also pull, the others as none at all."""
+    touching = [True] * len(network.walls) if touching is None else touching
+    walls = zip(network.walls, touching, strict=True)
+    springs = (Spring(w.between, on * w.stiffness, on * w.damping) for w, on in walls)
+    return msgspec.structs.replace(network, springs=(*network.springs, *springs), walls=())

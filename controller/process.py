@@ -20,12 +20,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-import msgspec
 import numpy as np
 
 from controller.coupling import Coupling
 from controller.delay import HeldLine, Ticks, delay, packet_delays
-from controller.environment import Network, Spring, Wall, walled_environment
+from controller.environment import Network, Wall, walled_environment
 from controller.lti import Array, Lti, SingularLoop, frozen
 
 # ----------------------------------------------------------------------------------------------------
@@ -49,20 +48,6 @@ from controller.lti import Array, Lti, SingularLoop, frozen
 
 
 State = tuple[bool, ...]  # which walls touch
-
-
-def frozen_states(network: Network) -> dict[State, Network]:
-    """The linear environments that a walled one is made of, by the walls that touch; one state where there is none."""
-    states = itertools.product((False, True), repeat=len(network.walls))
-    return {touching: held(network, touching) for touching in states}
-
-
-def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
-    """The network with the touching walls (default: all) as springs that also pull, the others as none at all."""
-    touching = [True] * len(network.walls) if touching is None else touching
-    walls = zip(network.walls, touching, strict=True)
-    springs = (Spring(w.between, on * w.stiffness, on * w.damping) for w, on in walls)
-    return msgspec.structs.replace(network, springs=(*network.springs, *springs), walls=())
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,12 +181,6 @@ class Complementarity:
             inverse[chosen] = np.linalg.inv(part)
             maps.append(inverse)
         return np.concatenate(maps)
-
-
-def force_map(environment: Lti, coupling: Coupling, theta: Sequence[int], psi: Sequence[int]) -> Lti:
-    """F = Theta (I + Psi E V)^-1 Psi E (6): displacements to forces, as the devices see them."""
-    delayed = delay(psi, environment.T) @ environment
-    return delay(theta, environment.T) @ coupling.around(delayed)
 
 
 @dataclass(frozen=True, eq=False)

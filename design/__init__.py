@@ -18,7 +18,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from design.certificate import Loop
+    from controller.loop import Loop
     from design.conditions import Requirement
     from design.designs import Options, certify, design_coupling, promise, transparency_of
     from design.result import Design, DesignFailed

@@ -14,15 +14,12 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 from controller.coupling import Compliance, Coupling, InternalModel, NoCoupling, SpringDamper
-from controller.environment import GROUND, Network, Spring, environment
+from controller.environment import GROUND, Network, Spring, environment, held
+from controller.loop import DelayRange, Loop, force_map
 from controller.lti import Lti, SingularLoop
-from controller.process import force_map, held
 from design.certificate import (
     ANY,
     CAVEATS,
-    Condition,
-    DelayRange,
-    Loop,
     certificate_part,
     closed_loop_of,
     promise,
@@ -30,7 +27,16 @@ from design.certificate import (
     switching_requirement,
     theorem4_of,
 )
-from design.conditions import JitterProof, Requirement, closed_loop, jitter_proof, jitter_refusal, refusal, theorem4
+from design.conditions import (
+    Condition,
+    JitterProof,
+    Requirement,
+    any_environment,
+    jitter_proof,
+    jitter_refusal,
+    refusal,
+    this_environment,
+)
 from design.ranges import SetCheck, set_part
 from design.result import listed
 
@@ -146,15 +152,18 @@ class Subject:
     def _closed_loop(self) -> Requirement:
         try:
             if self.network is None:
-                return closed_loop(self.F, self.delta)
-            return closed_loop_of(self.network, self.T, self.coupling, self.theta, self.psi, self.delta)
+                return this_environment(self.F, self.delta)
+            return closed_loop_of(self._loop(self.network), self.coupling)
         except SingularLoop as error:
             return refusal("closed-loop", self.delta, str(error))
 
     def _theorem4(self) -> Requirement:
         # what is behind a wall's coupling does not matter to Theorem 4
         network = self.network or Network(("contact",), masses={"contact": 1.0})
-        return theorem4_of(network, self.T, self.coupling, self.theta, self.psi, self.delta)
+        return theorem4_of(self._loop(network), self.coupling)
+
+    def _loop(self, network: Network) -> Loop:
+        return Loop(self.T, self.theta, self.psi, self.theta, self.delta, network)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -193,7 +202,7 @@ class Tolerance:
 
 
 def stiffest(subject: Subject, condition: Condition) -> Stiffest:
-    """theorem4: channel by channel; closed-loop: the largest common scale of all K, by steps of 3 down from 1e6 N/m."""
+    """any-environment: channel by channel; this-environment: the largest common scale of all K."""
     unknown = (None,) * subject.channels
     if not isinstance(subject.coupling, SpringDamper):
         return Stiffest(unknown, "only a spring-damper has a K")
@@ -229,7 +238,7 @@ def _stiffest_for_any_environment(subject: Subject, coupling: SpringDamper) -> S
 
         @cache
         def ratio(K: float, B: float = B, theta: int = theta, delta: float = delta) -> float:
-            return theorem4(SpringDamper([K], [B]).compliance(subject.T), [theta], [delta]).ratio
+            return any_environment(SpringDamper([K], [B]).compliance(subject.T), [theta], [delta]).ratio
 
         bound = 2 * (delta - B) / subject.T
         stiffest.append(edge(ratio, 1e-9 * bound, bound))
@@ -381,10 +390,10 @@ def report(
     box around the environment, if there is one.
     """
     requirements = {condition: subject.requirement(condition) for condition in reversed(get_args(Condition))}
-    closed_loop, theorem4 = requirements["closed-loop"].certified, requirements["theorem4"].certified
+    here, anywhere = requirements["closed-loop"].certified, requirements["theorem4"].certified
     proved = bool(whole and whole.proved)
     rigid = subject.network is None
-    promised = promise(closed_loop and theorem4, closed_loop, rigid=rigid, walls=subject.walls, whole_set=proved)
+    promised = promise(anywhere, here, rigid=rigid, walls=subject.walls, whole_set=proved)
     gains = subject.coupling if isinstance(subject.coupling, SpringDamper) else None
     return {
         "coupling": {
@@ -402,9 +411,9 @@ def report(
         **{condition: _condition_part(subject, requirement) for condition, requirement in requirements.items()},
         "jitter-proof": _switching_part(subject, switching) if switching else None,
         "set": whole and set_part(whole),
-        "certified": closed_loop and (whole is None or proved or promised == ANY),
+        "certified": here and (whole is None or proved or promised == ANY),
         "promise": promised,
-        "helps": _helps(subject, requirements["theorem4" if closed_loop else "closed-loop"]),
+        "helps": _helps(subject, requirements["theorem4" if here else "closed-loop"]),
         "not_covered": CAVEATS,
     }
 
@@ -443,7 +452,7 @@ def _because(reason: str | None) -> dict[str, str]:
 
 
 def _helps(subject: Subject, requirement: Requirement) -> list[dict[str, Any]]:
-    """Changes that help the condition that fails first: closed-loop, else theorem4."""
+    """Changes that help the condition that fails first: closed-loop, else any_environment."""
     return [
         {
             "change": remedy.change,

@@ -6,35 +6,27 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import Coupling, NoCoupling, compliance
+from controller.coupling import Coupling, NoCoupling
 from controller.delay import delay
 from controller.environment import environment
+from controller.loop import Loop
 from controller.lti import Array, Lti
-from controller.process import force_map
-from design.certificate import (
-    Condition,
-    Loop,
-    NotProved,
-    data_of,
-    digest,
-    finite,
-    prove,
-    specification,
-    theorem4_requirement,
-)
+from design.certificate import NotProved, digest, finite, prove, theorem4_of
 from design.conditions import (
+    Condition,
     Requirement,
-    Specification,
-    closed_loop,
-    closed_loop_demand,
+    any_environment_demand,
     delayed_demand,
-    theorem4_demand,
+    least_scale,
+    this_environment,
+    this_environment_demand,
 )
 from design.designs import design_by_kind
 from design.frequency import Response, frequencies, on_circle
@@ -79,23 +71,22 @@ class Curves:
 
 def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Judged:
     """Both conditions of a coupling, as figures and over frequency. Raises SingularLoop."""
-    E = environment(loop.environment, loop.T)
-    F = force_map(E, coupling, loop.theta, loop.psi)
-    phi = _multiplier(loop, E, coupling) if phi is None and any(loop.psi) else phi
+    F = loop.F(coupling)
+    phi = _multiplier(loop, coupling) if phi is None and any(loop.psi) else phi
     requirements = {
-        "closed-loop": closed_loop(F, loop.delta),
-        "theorem4": theorem4_requirement(coupling, E, loop.theta, loop.psi, loop.delta, phi),
+        "closed-loop": this_environment(F, loop.delta),
+        "theorem4": theorem4_of(loop, coupling, phi),
     }
     demands: dict[str, Response | None] = dict.fromkeys(requirements)
     if np.isfinite(requirements["closed-loop"].ratio):
-        demands["closed-loop"] = closed_loop_demand(F, loop.delta)
-    V = compliance(coupling, loop.T)
+        demands["closed-loop"] = partial(least_scale, this_environment_demand(F, loop.delta))
+    V = coupling.compliance(loop.T)
     if V is not None and np.isfinite(requirements["theorem4"].ratio):
         if any(loop.psi):
             assert phi is not None  # a finite figure had a multiplier
             demands["theorem4"] = delayed_demand(V, loop.theta, np.asarray(loop.delta), phi)
         else:
-            demands["theorem4"] = theorem4_demand(V, loop.theta, loop.delta)
+            demands["theorem4"] = partial(least_scale, any_environment_demand(V, loop.theta, loop.delta))
     return Judged(F, requirements, demands)
 
 
@@ -137,17 +128,16 @@ def perceived(G: NDArray[np.complex128], hz: Array) -> Perceived:
     return Perceived(own.real, own.imag / (2 * np.pi * hz)[:, None])
 
 
-def _multiplier(loop: Loop, E: Lti, coupling: Coupling) -> Array | None:
+def _multiplier(loop: Loop, coupling: Coupling) -> Array | None:
     """The least multiplier of Theorem 4 for an environment with delay inside, None where there is none."""
-    if compliance(coupling, loop.T) is None:
+    if coupling.compliance(loop.T) is None:
         return None
-    from design.conditions import Specification
-    from design.lmi import shortage  # takes the solver
+    from design.lmi import least_phi  # takes the solver
 
     try:
-        return shortage(Specification(E, loop.theta, loop.psi, loop.lam, loop.delta))
+        return least_phi(loop)
     except ValueError:
-        return None  # theorem4_requirement says why
+        return None  # theorem4_of says why
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -264,18 +254,17 @@ def measured(setting: Setting, kind: str, condition: Condition | None, options: 
     figures: dict[str, Any] = dict.fromkeys(("rms_mismatch_db", "relative_mismatch_db", "required_damping", "dc_ratio"))
     bare: tuple[float | None, ...] = (None,) * len(loop.delta)
     try:
-        spec = specification(loop)
-        bare = _damping(closed_loop(force_map(spec.environment, NoCoupling(), loop.theta, loop.psi), loop.delta))
-        design = design_by_kind(spec, kind, condition, **options)
+        bare = _damping(this_environment(loop.F(NoCoupling()), loop.delta))
+        design = design_by_kind(loop, kind, condition, **options)
     except ValueError as error:  # no such design, or a loop that cannot be
         figures["reason"] = str(error)
     else:
-        F = force_map(spec.environment, design.coupling, loop.theta, loop.psi)
-        transparent = transparency(F, spec.environment, loop.lam)
+        F = loop.F(design.coupling)
+        transparent = transparency(F, loop.E(), loop.lam)
         figures = {
             "rms_mismatch_db": finite(decibels(transparent.rms_mismatch)),
             "relative_mismatch_db": finite(decibels(transparent.relative_mismatch)),
-            "required_damping": _damping(closed_loop(F, loop.delta)),
+            "required_damping": _damping(this_environment(F, loop.delta)),
             "dc_ratio": finite(transparent.dc_ratio),
         } | _proof(loop, design)
     functions = setting.wish.functions if kind == "optimal" else None
@@ -290,7 +279,7 @@ def _proof(loop: Loop, design: Design) -> dict[str, str | None]:
     # what is asked is the environment alone, as the figures are
     alone = loop.at(loop.environment)
     try:
-        certificate = prove(alone, data_of(design.coupling), design.condition, phi)
+        certificate = prove(alone, design.coupling, design.condition, phi)
     except NotProved as error:
         return {"proof": "sampled", "proof_reason": str(error)}
     return {"proof": certificate.proof, "proof_reason": None}
@@ -433,23 +422,23 @@ def compare_designs(
 
 def ladder_row(case: str, loop: Loop, entry: Entry) -> LadderRow:
     """One design with its proof; a request without a solution gives its reason."""
-    spec, begin = specification(loop), time.perf_counter()
+    begin = time.perf_counter()
     try:
-        coupling, design = _made(spec, case, entry)
+        coupling, design = _made(loop, case, entry)
     except DesignFailed as error:
         wall = time.perf_counter() - begin
         return LadderRow(
             _name(entry, case), case, None, False, entry.condition, None, None, None, wall, 0.0, str(error)
         )
     wall = time.perf_counter() - begin
-    F = force_map(spec.environment, coupling, loop.theta, loop.psi)
-    requirement = closed_loop(F, loop.delta)
-    figures = transparency(F, spec.environment, loop.lam)
+    F = loop.F(coupling)
+    requirement = this_environment(F, loop.delta)
+    figures = transparency(F, loop.E(), loop.lam)
     begin, proof, reason = time.perf_counter(), None, requirement.reason
     if design or requirement.certified:
         try:
             phi = None if design is None or design.phi is None else design.phi.tolist()
-            proof = prove(loop, data_of(coupling), entry.condition, phi).proof
+            proof = prove(loop, coupling, entry.condition, phi).proof
         except NotProved as error:
             reason = str(error)
     required = None if requirement.reason else requirement.required
@@ -465,14 +454,14 @@ def _name(entry: Entry, case: str) -> str:
     return f"{entry.name} {PRINTED[case]}" if entry.kind == "published" else entry.name
 
 
-def _made(spec: Specification, case: str, entry: Entry) -> tuple[Coupling, Design | None]:
+def _made(loop: Loop, case: str, entry: Entry) -> tuple[Coupling, Design | None]:
     if entry.kind == "none":
         return NoCoupling(), None
     if entry.kind == "published":
-        if spec.channels != 2:
-            raise DesignFailed(None, (), f"the paper prints gains for 2 channels, not {spec.channels}")
+        if loop.channels != 2:
+            raise DesignFailed(None, (), f"the paper prints gains for 2 channels, not {loop.channels}")
         return PUBLISHED[case], None
-    design = design_by_kind(spec, entry.kind, entry.condition, **entry.options)
+    design = design_by_kind(loop, entry.kind, entry.condition, **entry.options)
     return design.coupling, design
 
 

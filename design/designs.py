@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import Any, Literal, TypedDict, Unpack
 
 from controller.coupling import Coupling
-from controller.process import force_map
+from controller.loop import Loop
 from design import certificate as promises
-from design.certificate import Condition, Loop, Stored, assess, data_of, specification, switching_requirement
-from design.conditions import Requirement, Specification
+from design.certificate import Stored, assess, switching_requirement
+from design.conditions import Condition, Requirement
 from design.ranges import check_set
 from design.result import Design, Row, bare, known, of_kind, one_of
 from design.transparency import Transparency, transparency
@@ -29,12 +29,9 @@ OPTIONS = {
     "optimal": ("functions", "filter", "diagonal", "objective", "high_gain", "margin", "switching"),
 }
 
-#: how a state-space coupling of fixed order may be sought
-METHODS = ("complementarity", "inner", "fixed-poles")
-
 
 def design_by_kind(
-    spec: Specification,
+    loop: Loop,
     kind: str = "spring-damper",
     condition: str | None = None,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
@@ -54,8 +51,10 @@ def design_by_kind(
         raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(KINDS[kind])}")
     from design import fixed_order as ccl  # cvxpy takes a second to import
     from design import optimal, spring_damper
+    from design.lmi import Specification
     from design.optimal import Wish
 
+    spec = Specification.of(loop)
     if kind == "ccl":
         return ccl.design(spec, **options)
     if kind == "optimal":
@@ -63,11 +62,12 @@ def design_by_kind(
     return spring_damper.design(spec, condition, **options)
 
 
-def compare_methods(spec: Specification) -> tuple[Row, ...]:
+def compare_methods(loop: Loop) -> tuple[Row, ...]:
     """Every method on the same specification: norm, convex problems, seconds."""
     from design import fixed_order as ccl
+    from design.lmi import Specification
 
-    return ccl.compare(spec)
+    return ccl.compare(Specification.of(loop))
 
 
 Kind = Literal["spring-damper", "ccl", "optimal"]
@@ -109,7 +109,7 @@ def design_coupling(
     of_kind("loop", loop, Loop, LOOP)
     one_of("kind", kind, KINDS)
     known(options, OPTIONS[kind], f"kind {kind!r}")
-    return design_by_kind(specification(loop), kind, condition, **options)
+    return design_by_kind(loop, kind, condition, **options)
 
 
 def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[str]]:
@@ -164,13 +164,11 @@ def transparency_of(loop: Loop, coupling: Coupling | Design) -> Transparency:
     Raises TypeError and ValueError as `certify` does.
     """
     of_kind("loop", loop, Loop, LOOP)
-    E = specification(loop).environment
-    F = force_map(E, _fitting(loop, coupling), loop.theta, loop.psi)
-    return transparency(F, E, loop.lam)
+    return transparency(loop.F(_fitting(loop, coupling)), loop.E(), loop.lam)
 
 
 def _fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:
     """The coupling alone. Raises ValueError where it is one of another number of channels."""
     alone = bare(coupling)
-    Stored(loop, data_of(alone))
+    Stored.of(loop, alone)
     return alone

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cholesky, solve_discrete_are, solve_triangular
 
-from controller.coupling import Compliance, Coupling, InternalModel, NoCoupling, SpringDamper, parameter
-from controller.environment import Network, realise
-from controller.lti import Array, Lti
+from controller.lti import Array, Lti, rational
 from design.frequency import frequencies, hermitian, on_circle, supremum
 
 # ----------------------------------------------------------------------------------------------------
@@ -26,15 +25,6 @@ from design.frequency import frequencies, hermitian, on_circle, supremum
 Integers = NDArray[np.object_]
 
 
-class SingularMatrix(ValueError):
-    """An exact inverse was asked of a matrix that has none."""
-
-
-def rational(value: float | int | str | Fraction) -> Fraction:
-    """The exact value of a number; a float stands for its shortest decimal."""
-    return Fraction(repr(float(value))) if isinstance(value, float) else Fraction(value)
-
-
 @dataclass(frozen=True, eq=False)
 class Matrix:
     """`num / den` with integer entries and one positive denominator."""
@@ -43,10 +33,10 @@ class Matrix:
     den: int = 1
 
     @classmethod
-    def of(cls, rows: Iterable[Sequence], shape: tuple[int, int] | None = None) -> Matrix:
+    def of(cls, rows: Any, shape: Any = None) -> Matrix:
         """From rows of floats (read as decimals), integers, fractions or strings "p/q"."""
         entries = [[rational(v) for v in row] for row in rows]
-        shape = shape or (len(entries), len(entries[0]) if entries else 0)
+        shape = shape or getattr(rows, "shape", None) or (len(entries), len(entries[0]) if entries else 0)
         den = math.lcm(*(v.denominator for row in entries for v in row))
         num = np.empty(shape, dtype=object)
         for i, row in enumerate(entries):
@@ -109,57 +99,6 @@ class Matrix:
 
     def equals(self, other: Matrix) -> bool:
         return self.shape == other.shape and bool((self.num * other.den == other.num * self.den).all())
-
-    def inverse(self) -> Matrix:
-        """The exact inverse. Raises SingularMatrix."""
-        return self.solve(Matrix.eye(self.shape[0]))
-
-    def solve(self, right: Matrix) -> Matrix:
-        """X with `self @ X` = right, by elimination over the fractions. Raises SingularMatrix.
-
-        The models here are series of small blocks, triangular when read in the right order: the next pivot is in the
-        row with the fewest entries, and there in the column with the fewest (Markowitz), so next to nothing fills in.
-        """
-        n = self.shape[0]
-        rows = [{j: Fraction(int(v), self.den) for j, v in enumerate(row) if v} for row in self.num]
-        values = [list(row) for row in right.fractions()]
-        columns = [{i for i in range(n) if j in rows[i]} for j in range(n)]
-        active, order = set(range(n)), []
-        while active:
-            i = min(active, key=lambda r: len(rows[r]))
-            if not rows[i]:
-                raise SingularMatrix(f"a {n} x {n} matrix is singular")
-            j = min(rows[i], key=lambda c: len(columns[c]))
-            active.remove(i)
-            order.append((i, j))
-            for c in rows[i]:
-                columns[c].discard(i)
-            for r in list(columns[j]):
-                factor = rows[r].pop(j) / rows[i][j]
-                for c, v in rows[i].items():
-                    if c != j:
-                        _subtract(rows[r], columns[c], r, c, factor * v)
-                values[r] = [x - factor * y for x, y in zip(values[r], values[i], strict=True)]
-            columns[j].clear()
-        solution: list[list[Fraction]] = [[] for _ in range(n)]
-        for i, j in reversed(order):
-            total = values[i]
-            for c, v in rows[i].items():
-                if c != j:
-                    total = [x - v * y for x, y in zip(total, solution[c], strict=True)]
-            solution[j] = [x / rows[i][j] for x in total]
-        return Matrix.of(solution, right.shape)
-
-
-def _subtract(row: dict[int, Fraction], column: set[int], r: int, c: int, value: Fraction) -> None:
-    """Take `value` off the entry (r, c) of a sparse matrix that is kept by rows, with the rows of each column."""
-    entry = row.get(c, Fraction(0)) - value
-    if entry:
-        row[c] = entry
-        column.add(r)
-    else:
-        row.pop(c, None)
-        column.discard(r)
 
 
 def block(rows: Sequence[Sequence[Matrix]]) -> Matrix:
@@ -298,134 +237,6 @@ def _whitening(W: Floats) -> Integers | None:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The loop's linear blocks in exact rational arithmetic, built from the stored coefficients.
-#
-# The floating-point state space will not do: rounding makes its F(1) asymmetric at 1e-13, and then the closed-loop
-# condition fails, formally, as the frequency goes to zero.
-
-
-@dataclass(frozen=True, eq=False)
-class Exact:
-    """x+ = A x + B u, y = C x + D u over the rationals. `G @ H` is the series G(z) H(z)."""
-
-    A: Matrix  # (n, n)
-    B: Matrix  # (n, m)
-    C: Matrix  # (p, n)
-    D: Matrix  # (p, m)
-
-    @classmethod
-    def constant(cls, D: Matrix) -> Exact:
-        p, m = D.shape
-        return cls(Matrix.zeros(0, 0), Matrix.zeros(0, m), Matrix.zeros(p, 0), D)
-
-    @classmethod
-    def diag(cls, *blocks: Exact) -> Exact:
-        return cls(*(block_diag(*(getattr(g, name) for g in blocks)) for name in "ABCD"))
-
-    @property
-    def order(self) -> int:
-        return self.A.shape[0]
-
-    def __matmul__(self, other: Exact) -> Exact:
-        A = block([[other.A, Matrix.zeros(other.order, self.order)], [self.B @ other.C, self.A]])
-        B = block([[other.B], [self.B @ other.D]])
-        return Exact(A, B, block([[self.D @ other.C, self.C]]), self.D @ other.D)
-
-    def __sub__(self, other: Exact) -> Exact:
-        B = block([[self.B], [other.B]])
-        return Exact(block_diag(self.A, other.A), B, block([[self.C, -other.C]]), self.D - other.D)
-
-    def feedback(self, other: Exact) -> Exact:
-        """(I + G H)^-1 G. Raises SingularMatrix where I + D_G D_H has no inverse."""
-        S = (Matrix.eye(self.D.shape[0]) + self.D @ other.D).inverse()
-        y_x, y_u = block([[S @ self.C, -(S @ self.D @ other.C)]]), S @ self.D
-        u_x = block([[Matrix.zeros(self.D.shape[1], self.order), -other.C]]) - other.D @ y_x
-        u_u = Matrix.eye(self.D.shape[1]) - other.D @ y_u
-        A = block_diag(self.A, other.A) + block([[self.B @ u_x], [other.B @ y_x]])
-        return Exact(A, block([[self.B @ u_u], [other.B @ y_u]]), y_x, y_u)
-
-    def split_at_one(self) -> tuple[Matrix, Exact]:
-        """G(1), and (G(z) - G(1))/(z - 1) = -C (I - A)^-1 (zI - A)^-1 B, which is regular at z = 1.
-
-        Raises SingularMatrix if A has the eigenvalue one.
-        """
-        C = -(Matrix.eye(self.order) - self.A).T.solve(self.C.T).T
-        p, m = self.D.shape
-        return self.D - C @ self.B, Exact(self.A, self.B, C, Matrix.zeros(p, m))
-
-
-def delay(steps: Sequence[int], gain: Sequence[Fraction] | None = None, moving_sum: bool = False) -> Exact:
-    """diag(g_i z^-n_i), or with `moving_sum` diag(g_i (1 + 1/z + ... + z^-n_i))."""
-    gains = gain or [Fraction(1)] * len(steps)
-    return Exact.diag(*(_chain(n, g, moving_sum) for n, g in zip(steps, gains, strict=True)))
-
-
-def _chain(n: int, gain: Fraction, moving_sum: bool) -> Exact:
-    if n == 0:
-        return Exact.constant(Matrix.of([[gain]]))
-    taps = [gain if moving_sum or i == n - 1 else Fraction(0) for i in range(n)]
-    first = [[int(i == 0)] for i in range(n)]
-    return Exact(
-        Matrix(np.eye(n, k=-1, dtype=object)),
-        Matrix.of(first),
-        Matrix.of([taps]),
-        Matrix.of([[gain if moving_sum else 0]]),
-    )
-
-
-def environment(network: Network, T: Fraction) -> Exact:
-    """E(z) by backward Euler, exactly. Raises SingularMatrix if nothing holds an internal node."""
-    inverse: Callable = lambda values: Matrix.of(values, values.shape).inverse().fractions()  # noqa: E731
-    blocks = realise(network.matrices(rational), len(network.contacts), T, inverse)
-    return Exact(*(Matrix.of(values, values.shape) for values in blocks))
-
-
-def compliance(coupling: Coupling, channels: int, T: Fraction) -> Exact:
-    """V(z) of a coupling; zero where there is none. Raises TypeError for a kind that has no V."""
-    match coupling:
-        case NoCoupling():
-            return Exact.constant(Matrix.zeros(channels, channels))
-        case SpringDamper():
-            return Exact.diag(*(_spring_damper(rational(float(k)), rational(float(b)), T)
-                                for k, b in zip(coupling.K, coupling.B, strict=True)))  # fmt: skip
-        case Compliance():
-            parts = (getattr(coupling.V, name) for name in "ABCD")
-            return Exact(*(Matrix.of(values.tolist(), values.shape) for values in parts))
-    raise TypeError(f"no exact model of a {type(coupling).__name__}")
-
-
-def _spring_damper(k: Fraction, b: Fraction, T: Fraction) -> Exact:
-    """V = [k + b (z-1)/(Tz)]^-1 (26)."""
-    gain = 1 / (k + b / T)
-    if b == 0:
-        return Exact.constant(Matrix.of([[gain]]))
-    memory = gain * b / T
-    return Exact(*(Matrix.of([[value]]) for value in (memory, gain, memory, gain)))
-
-
-def force_map(E: Exact, coupling: Coupling, theta: Sequence[int], psi: Sequence[int], T: Fraction) -> Exact:
-    """F = Theta (I + Psi E V)^-1 Psi E (6), or Theta (Psi E - Psi E Q Psi E)."""
-    delayed = delay(psi) @ E
-    m = len(theta)
-    if not isinstance(coupling, InternalModel):
-        return delay(theta) @ delayed.feedback(compliance(coupling, m, T))
-    return delay(theta) @ delayed @ (Exact.constant(Matrix.eye(m)) - _parameter(coupling) @ delayed)
-
-
-def _parameter(coupling: InternalModel) -> Exact:
-    """Q(z): the poles and coefficients as decimals, the rest follows exactly."""
-    exactly = np.vectorize(lambda value: rational(float(value)), otypes=[object])
-    poles = exactly(coupling.poles) if coupling.poles.size else np.zeros(0, dtype=object)
-    blocks = parameter(poles, exactly(coupling.Q))
-    return Exact(*(Matrix.of(values.tolist(), values.shape) for values in blocks))
-
-
-def shifted_compliance(V: Exact, theta: Sequence[int], delta: Sequence[Fraction], T: Fraction) -> Exact:
-    """H = V - Theta-hat, Theta-hat = diag(T/(2 delta_i) (1 + 1/z + ... + z^-theta_i)) (12)."""
-    return V - delay(theta, [T / (2 * d) for d in delta], moving_sum=True)
-
-
-# ----------------------------------------------------------------------------------------------------
 # Strict positive realness of a block G = (A, B, C, D): found by a Riccati equation, proved in exact arithmetic.
 #
 # Kalman-Yakubovich-Popov: if P > 0 and
@@ -439,21 +250,22 @@ STORED_BITS = 44  # of each entry of P, relative to its diagonal
 UNIT = 2.0**-53  # of double precision
 
 
-def kyp_matrix(G: Exact, P: Matrix) -> Matrix:
+def kyp_matrix(G: Lti, P: Matrix) -> Matrix:
     """The matrix of (KYP), exactly, shape (n + m, n + m)."""
-    PA, PB = P @ G.A, P @ G.B
-    cross = G.C - G.B.T @ PA
-    return block([[P - G.A.T @ PA, cross.T], [cross, G.D + G.D.T - G.B.T @ PB]])
+    A, B, C, D = (Matrix.of(getattr(G, name)) for name in "ABCD")
+    PA, PB = P @ A, P @ B
+    cross = C - B.T @ PA
+    return block([[P - A.T @ PA, cross.T], [cross, D + D.T - B.T @ PB]])
 
 
-def too_large(G: Exact) -> str | None:
+def too_large(states: int) -> str | None:
     """Why no proof is tried for a model of so many states, or None."""
-    if G.order <= LARGEST:
+    if states <= LARGEST:
         return None
-    return f"a proof over {G.order} states takes long: up to {LARGEST} are tried"
+    return f"a proof over {states} states takes long: up to {LARGEST} are tried"
 
 
-def prove_positive_real(G: Exact, P: Matrix) -> str | None:
+def prove_positive_real(G: Lti, P: Matrix) -> str | None:
     """None if P proves that G is strictly positive real, otherwise why it does not.
 
     Floating point with an a-priori error bound may refuse early; only exact arithmetic accepts.
@@ -471,14 +283,15 @@ def prove_positive_real(G: Exact, P: Matrix) -> str | None:
     return None
 
 
-def refuted_in_floating_point(G: Exact, P: Matrix) -> bool:
+def refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
     """Whether some direction makes the KYP matrix negative by more than every rounding error.
 
     The matrix is S - J'PJ with S = [[P, C'], [C, D + D']] and J = [A B], sums of products of three correctly
     rounded numbers: entry by entry the computed one is within gamma (|S| + |J|'|P||J|),
     gamma = (2n + 8) u / (1 - (2n + 8) u).
     """
-    A, B, C, D, p = (m.floats() for m in (G.A, G.B, G.C, G.D, P))
+    F, p = G.floats(), P.floats()
+    A, B, C, D = F.A, F.B, F.C, F.D
     J = np.hstack([A, B])
     direct = np.block([[p, C.T], [C, D + D.T]])
     with np.errstate(all="ignore"):
@@ -496,7 +309,7 @@ def refuted_in_floating_point(G: Exact, P: Matrix) -> bool:
     return bool(x @ M @ x < -2 * bound)
 
 
-def find_storage(G: Exact) -> tuple[Matrix | None, str | None]:
+def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     """(P, None) with a P that proves G strictly positive real, or (None, why there is none).
 
     P solves the discrete algebraic Riccati equation of G pushed half-way into its margin: D is reduced by
@@ -525,12 +338,13 @@ def find_storage(G: Exact) -> tuple[Matrix | None, str | None]:
     return None, reason
 
 
-def _scaled(G: Exact) -> tuple[Lti, Array]:
+def _scaled(G: Lti) -> tuple[Lti, Array]:
     """G in floating point with states and channels of size one, and the factor that undoes the state scaling.
 
     The size of a state is the largest gain from the scaled inputs to it, over frequency.
     """
-    A, B, C, D = (m.floats() for m in (G.A, G.B, G.C, G.D))
+    F = G.floats()
+    A, B, C, D = F.A, F.B, F.C, F.D
     channel = 1 / np.sqrt(np.maximum(np.abs(np.diag(D)), 1e-300))
     B, C, D = B * channel, channel[:, None] * C, channel[:, None] * D * channel
     size = np.linalg.norm(_states(Lti(A, B, C, D, 1.0)), axis=2).max(axis=0)
@@ -582,7 +396,7 @@ def rows_of(M: Matrix) -> Rows:
     return tuple(tuple(str(value) for value in row) for row in M.fractions())
 
 
-def refuted_rows(name: str, block: Exact, rows: Sequence[Sequence[str]]) -> str | None:
+def refuted_rows(name: str, block: Lti, rows: Sequence[Sequence[str]]) -> str | None:
     """Why the matrix of this name does not prove that the block is strictly positive real, or None if it does."""
     n = block.order
     if len(rows) != n or any(len(row) != n for row in rows):

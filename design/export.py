@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from controller.coupling import compliance
 from controller.environment import environment
+from controller.loop import Loop, force_map
 from controller.lti import Array, Lti
-from controller.process import force_map
-from design.certificate import Loop, Stored
+from design.certificate import Stored
 
 # ----------------------------------------------------------------------------------------------------
 # What is exported: one state-space block, the order in which its sums are taken, and a test vector in that order.
@@ -66,7 +65,7 @@ class NothingToExport(ValueError):
 
 def coupling_block(stored: Stored) -> Block:
     """V(z), force to displacement. Raises NothingToExport where the coupling is no V in feedback."""
-    V = compliance(stored.coupling.build(stored.loop.T), stored.loop.T)
+    V = stored.built().compliance(stored.loop.T)
     if V is None:
         raise NothingToExport("this coupling is no V in feedback around the environment; the whole process can be had")
     about = ("d = V f: what the coupling gives way by. In its loop the environment sees u = x - d, and f = Psi E u.",)

@@ -22,12 +22,12 @@ from scipy.optimize import minimize
 from controller.coupling import Compliance, SpringDamper
 from controller.lti import Array, Lti
 from design import spring_damper
-from design.conditions import Requirement, Specification, theorem4, theorem4_delayed
-from design.designs import METHODS
+from design.conditions import Requirement, any_environment, any_environment_delayed
 from design.frequency import on_circle
 from design.lmi import (
     Ports,
     Shaping,
+    Specification,
     affine,
     affine_lmis,
     gain_lmi,
@@ -43,7 +43,7 @@ from design.lmi import (
     symmetric_from,
     theta_hat,
 )
-from design.result import Design, DesignFailed, Row, of_kind, one_of, whole
+from design.result import METHODS, Design, DesignFailed, Row, of_kind, one_of, whole
 
 # ----------------------------------------------------------------------------------------------------
 # State-space couplings of fixed order, in a realisation where both conditions are affine.
@@ -508,8 +508,8 @@ class _Search:
     def requirement(self, V: Lti) -> Requirement:
         spec = self.spec
         if self.phi is None:
-            return theorem4(V, spec.theta, spec.delta)
-        return theorem4_delayed(V, spec.environment, spec.theta, spec.psi, spec.delta, self.phi)
+            return any_environment(V, spec.theta, spec.delta)
+        return any_environment_delayed(V, spec.environment, spec.theta, spec.psi, spec.delta, self.phi)
 
     def run(self, method: str, most_sdps: int) -> Lti:
         """The coupling found, certified."""

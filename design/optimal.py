@@ -26,10 +26,12 @@ from scipy.optimize import minimize
 
 from controller.coupling import InternalModel, basis
 from controller.environment import Member, environment
+from controller.loop import force_map
 from controller.lti import Array, Lti
-from controller.process import force_map
-from design.conditions import Specification, blocks, closed_loop, jitter_proof
+from design.conditions import jitter_proof, this_environment
 from design.frequency import frequencies, hermitian, on_circle, peaks
+from design.lmi import Specification
+from design.maps import blocks
 from design.ranges import Found, search
 from design.result import Attempt, Design, DesignFailed, Infeasible, number, of_kind, one_of, whole
 from design.transparency import BAND_HZ, transparency
@@ -1057,7 +1059,7 @@ def design(spec: Specification, wish: Wish = USUAL, progress: Progress = lambda 
     except Infeasible as error:
         raise Infeasible(error.problem, error.results, advice(spec, wish, progress)) from error
     maps = [force_map(E, coupling, spec.theta, spec.psi) for E in environments(spec)]
-    requirement = max((closed_loop(F, spec.delta) for F in maps), key=lambda r: r.ratio)
+    requirement = max((this_environment(F, spec.delta) for F in maps), key=lambda r: r.ratio)
     if wish.switching:
         free = [force_map(E, coupling, (0,) * spec.channels, spec.psi) for E in environments(spec)]
         requirement = max(
@@ -1109,7 +1111,7 @@ def violators(
 
     def ratio(member: Member) -> float:
         F = force_map(environment(member.network, spec.T), coupling, spec.theta, spec.psi)
-        return closed_loop(F, spec.delta).ratio
+        return this_environment(F, spec.delta).ratio
 
     found = search(spec.regions, ratio, lambda done, total: progress("searching the box", done, total))
     return [one for one in found.worst if one.ratio > most]

@@ -11,10 +11,10 @@ import numpy as np
 
 from controller.coupling import Coupling
 from controller.environment import Member, Region, environment, inside, regions
+from controller.loop import Loop, force_map
 from controller.lti import Array
-from controller.process import force_map
-from design.certificate import Certificate, Loop, NotProved, data_of, finite, in_each, prove, worst
-from design.conditions import Requirement, closed_loop
+from design.certificate import Certificate, NotProved, finite, in_each, prove, worst
+from design.conditions import Requirement, this_environment
 from design.transparency import decibels, transparency
 
 # ----------------------------------------------------------------------------------------------------
@@ -149,7 +149,7 @@ def cost(name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -
     for member in members:
         E = environment(member.network, loop.T)
         F = force_map(E, coupling, loop.theta, loop.psi)
-        ratios.append(closed_loop(F, loop.delta).ratio)
+        ratios.append(this_environment(F, loop.delta).ratio)
         if E.D.any():
             figures[member.name] = transparency(F, E, loop.lam)
     nominal = figures[members[0].name]
@@ -231,7 +231,7 @@ def check_set(
     searched = search_box(loop, coupling, progress)
     members, drawn = loop.members(), inside(loop.environment, loop.box, samples, seed)
     try:
-        certificate, reason = prove(loop, data_of(coupling), "closed-loop"), None
+        certificate, reason = prove(loop, coupling, "closed-loop"), None
     except NotProved as error:
         certificate, reason = None, str(error)
     at_members, at_samples = in_each(loop, coupling, members), in_each(loop, coupling, drawn)

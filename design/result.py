@@ -11,8 +11,7 @@ from typing import Any
 
 from controller.coupling import Coupling, SpringDamper
 from controller.lti import Array
-from design.certificate import Condition
-from design.conditions import Requirement
+from design.conditions import Condition, Requirement
 
 # ----------------------------------------------------------------------------------------------------
 # What a design raises when it has nothing to return.
@@ -158,3 +157,7 @@ def shown(value: Any) -> str:
     if len(text) > 60 or "\n" in text:
         return f"a {type(value).__name__}"
     return text if value is None else f"{text} ({type(value).__name__})"
+
+
+#: how a state-space coupling of fixed order may be sought
+METHODS = ("complementarity", "inner", "fixed-poles")

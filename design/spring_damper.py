@@ -16,21 +16,19 @@ from scipy.optimize import OptimizeResult, minimize
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
+from controller.loop import force_map
 from controller.lti import Array
-from controller.process import force_map
 from design.conditions import (
-    RESERVE,
     Requirement,
-    Specification,
-    closed_loop,
+    any_environment,
+    any_environment_delayed,
     half_widths,
     jitter_proof,
-    nominal_over_step,
-    theorem4,
-    theorem4_delayed,
+    this_environment,
 )
 from design.frequency import frequencies, hermitian, on_circle, peaks
-from design.lmi import Complex, Shaping, affine_lmis, gain_lmi, shortage, solve, solved
+from design.lmi import RESERVE, Complex, Shaping, Specification, affine_lmis, gain_lmi, shortage, solve, solved
+from design.maps import nominal_over_step
 from design.result import Design, DesignFailed, Infeasible
 from design.transparency import BAND_HZ, transparency
 
@@ -314,7 +312,7 @@ def _certified_optimum(spec: Specification, start: SpringDamper) -> tuple[Spring
     for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
         coupling = sampled.coupling(x)
-        requirement = closed_loop(force_map(spec.environment, coupling, spec.theta, spec.psi), spec.delta)
+        requirement = this_environment(force_map(spec.environment, coupling, spec.theta, spec.psi), spec.delta)
         if requirement.ratio <= 1 - RESERVE:
             return coupling, searches
         stuck = sampled.room(x).min() < -STUCK
@@ -419,8 +417,8 @@ def design(
 ) -> Design:
     """The best spring-damper under `condition`; by default the starts are chosen, a start need not be feasible.
 
-    theorem4: minimises ||W1 L W2||_inf (23) over the exact set; the result does not depend on the start (the first
-    one is used). closed-loop: minimises the rms mismatch in this environment from every start, local optima only; with
+    any-environment: minimises ||W1 L W2||_inf (23) over the exact set; the result does not depend on the start.
+    closed-loop: minimises the rms mismatch in this environment from every start, local optima only; with
     `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it (design.jitter).
     Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for closed-loop.
     """
@@ -430,7 +428,7 @@ def design(
         return _for_this_environment(spec, starts, switching)
     if switching:
         raise ValueError("delays that vary are designed for by the closed-loop condition only")
-    raise ValueError(f"condition is {condition!r}, expected 'theorem4' or 'closed-loop'")
+    raise ValueError(f"condition is {condition!r}, expected 'any_environment' or 'closed-loop'")
 
 
 def _for_any_environment(spec: Specification, start: SpringDamper | None) -> Design:
@@ -470,7 +468,7 @@ def _for_this_environment(
         raise DesignFailed(None, (), line)
     coupling = SpringDamper(coupling.K, np.where(NEGLIGIBLE * spec.usable > coupling.B, 0.0, coupling.B))
     F = force_map(spec.environment, coupling, spec.theta, spec.psi)
-    requirement = closed_loop(F, spec.delta)
+    requirement = this_environment(F, spec.delta)
     return Design(coupling, "closed-loop", "rms", rms, requirement, searches, time.perf_counter() - started)
 
 
@@ -504,13 +502,15 @@ def verified(spec: Specification, coupling: SpringDamper, phi: Array | None) -> 
     """Theorem 4's requirement from the coupling alone; raises DesignFailed unless it is certified."""
     V = coupling.compliance(spec.T)
     requirement = (
-        theorem4(V, spec.theta, spec.delta)
+        any_environment(V, spec.theta, spec.delta)
         if phi is None
-        else theorem4_delayed(V, spec.environment, spec.theta, spec.psi, spec.delta, phi)
+        else any_environment_delayed(V, spec.environment, spec.theta, spec.psi, spec.delta, phi)
     )
     if not requirement.certified:
         why = requirement.reason or f"it requires {max(requirement.required):.6g} N s/m"
-        raise DesignFailed(None, (), f"the designed coupling is not certified by theorem4: {why}; try another start")
+        raise DesignFailed(
+            None, (), f"the designed coupling is not certified by any_environment: {why}; try another start"
+        )
     return requirement
 
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from controller.environment import environment
+from controller.loop import force_map
 from controller.lti import Lti
-from controller.process import force_map
 from design.certificate import assess, certificate_part, promise_of
 from design.conditions import Requirement
 from design.result import DesignFailed

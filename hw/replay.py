@@ -14,10 +14,10 @@ from rich.table import Table
 
 from cli.options import DOES_NOT_HOLD, DONE, Parser, check_json, execute
 from cli.render import console
+from controller.coupling import Form
 from controller.environment import environment
+from controller.loop import force_map
 from controller.lti import Array, Lti
-from controller.process import force_map
-from design.certificate import CouplingData
 from hw.handshake import Units
 from hw.law import Law
 from hw.safety import Fault, Limits, shape
@@ -32,7 +32,7 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a trace says of the controller that made it."""
 
     scenario: Scenario
-    coupling: CouplingData
+    coupling: Form
     link_delay: int
     limits: Limits
     force_step: tuple[float, ...]

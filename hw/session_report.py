@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from design.certificate import CAVEATS, data_of
+from design.certificate import CAVEATS
 from hw.frame import Config
 from hw.message import NO_MARGIN
 from hw.plan import Ages, Program, Rung
@@ -151,7 +151,7 @@ def _recipe(session: Session, program: Program, config: Config) -> dict[str, Any
     assert isinstance(program, Rung)
     return {
         "scenario": json.loads(msgspec.json.encode(program.scenario)),
-        "coupling": json.loads(msgspec.json.encode(data_of(program.chosen.coupling))),
+        "coupling": json.loads(msgspec.json.encode(program.chosen.coupling.form())),
         "link_delay": program.link,
         "limits": asdict(session.limits),
         "force_step": list(session.units.force_step),

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from controller.coupling import Compliance, Coupling, InternalModel, NoCoupling
+from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design import certificate as store
-from design.certificate import DelayRange, Loop, Stored, specification, switching_promise, verify
+from design.certificate import Stored, switching_promise, verify
 from design.designs import KINDS, design_by_kind
 from design.result import PUBLISHED, DesignFailed
 from sim.scenario import InputError, Scenario
@@ -103,7 +104,7 @@ def choose(scenario: Scenario, case: str, name: str | None = None, condition: st
         return _published(scenario, case, condition)
     if name in KINDS:
         try:
-            design = design_by_kind(specification(scenario.loop(case)), name, condition)
+            design = design_by_kind(scenario.loop(case), name, condition)
         except DesignFailed:
             raise
         except ValueError as error:

@@ -22,6 +22,7 @@ import numpy as np
 
 from controller.coupling import SpringDamper
 from controller.environment import GROUND, Network, Spring, Wall
+from controller.loop import Loop
 from controller.lti import Array
 from controller.process import Process, Tape
 from design.certificate import closed_loop_of, theorem4_of
@@ -137,8 +138,8 @@ def draw(seed: int, index: int) -> Case | None:
         walls.append(Wall(ends[i], between(100, 1e5), 0.0, gap))
     network = Network(("tip",), (spring,), {"mass": mass}, tuple(walls))
     coupling = SpringDamper(np.array([K]), np.array([B]))
-    loop = (network, T, coupling, (theta,), (0,), (1.0,))
-    frozen, whatever = closed_loop_of(*loop).ratio * (1 + SPARE), theorem4_of(*loop).ratio
+    loop = Loop(T, (theta,), (0,), (theta,), (1.0,), network)
+    frozen, whatever = closed_loop_of(loop, coupling).ratio * (1 + SPARE), theorem4_of(loop, coupling).ratio
     if not 0.01 < frozen < min(whatever, 20.0):
         return None
     device = RigidDevice(mass=between(0.01, 0.25), damping=frozen, force_limit=LIMIT)

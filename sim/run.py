@@ -9,9 +9,10 @@ import msgspec
 import numpy as np
 
 from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
-from controller.environment import environment
+from controller.environment import environment, held
+from controller.loop import force_map
 from controller.lti import Array, Lti
-from controller.process import Process, Tape, contact, force_map, held
+from controller.process import Process, Tape, contact
 from models.device import Device
 from models.scene import Scene, build, plant
 from sim.engines import (
@@ -123,7 +124,7 @@ class Assembly:
             return self
         devices = tuple(msgspec.structs.replace(device, friction=0.0) for device in self.scenario.device)
         scenario = self.scenario.replace(device=devices)
-        return replace(self, scenario=scenario, scene=build(devices, scenario.human))
+        return replace(self, scenario=scenario, scene=build(devices, scenario.human, scenario.person))
 
     @property
     def felt(self) -> Lti:

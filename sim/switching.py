@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from controller.coupling import Coupling
 from controller.delay import LOST, Jitter, Ticks, realising
+from controller.loop import DelayRange, force_map
 from controller.lti import Array, Lti
-from controller.process import Process, Tape, force_map
-from design.certificate import DelayRange, sent, switching_part, switching_promise, switching_requirement
+from controller.process import Process, Tape
+from design.certificate import switching_part, switching_promise, switching_requirement
 from design.conditions import Requirement
 from models.scene import Scene, Variants
 from sim.couplings import Chosen
@@ -332,7 +333,7 @@ def certified_part(scenario: Scenario, chosen: Chosen, certified: bool) -> dict[
     loop = scenario.loop("I").switching(span)  # the case does not matter to stability
     found = switching_requirement(loop, chosen.coupling)
     on_file = chosen.switching if chosen.switching and chosen.switching.contains(span) else None
-    figures = switching_part(found, sent(loop, chosen.coupling), span)
+    figures = switching_part(found, loop.sent(chosen.coupling), span)
     proof = _how_proved(found.requirement, on_file)
     parts = {"jitter_proof": figures, "on_file": on_file and msgspec.to_builtins(on_file)}
     return parts | coverage(scenario.jitter, certified, proof, figures["playout"]["certified"])

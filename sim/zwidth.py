@@ -16,25 +16,30 @@ from numpy.typing import NDArray
 
 from controller.coupling import Compliance, Coupling, InternalModel, SpringDamper
 from controller.delay import delay
-from controller.environment import GROUND, Network, Wall, environment
+from controller.environment import GROUND, Network, Wall, environment, frozen_states
 from controller.gains import Gains, Stack, force_maps
+from controller.loop import Loop, force_map
 from controller.lti import Array, Lti, SingularLoop
-from controller.process import Contact, Process, Tape, contact, force_map, frozen_states
+from controller.process import Contact, Process, Tape, contact
 from design.audit import Subject, edge
-from design.certificate import CONDITIONS, Condition, theorem4_requirement
+from design.certificate import CONDITIONS, theorem4_of
 from design.conditions import (
-    Environments,
+    Condition,
     Requirement,
-    Specification,
-    closed_loop,
+    any_environment,
+    any_environment_delayed,
+    refusal,
+    this_environment,
+)
+from design.lmi import Specification, shortage
+from design.maps import (
+    Environments,
     closed_loop_in_each,
     closed_loop_ratios,
     contact_springs,
-    refusal,
     response,
     theorem4_ratios,
 )
-from design.lmi import shortage
 from design.result import DesignFailed
 from models.device import Device, passivity_level
 from models.human import Population
@@ -530,14 +535,17 @@ class Ground:
             return self._subject.with_gains([K] * self.channels, [B] * self.channels).requirement(asked)
         gains = self.gains(np.array([K]), np.array([B]))
         if condition == "closed-loop":
-            states = [closed_loop(stack[0], self.delta) for stack in self.force_maps(gains)]
+            states = [this_environment(stack[0], self.delta) for stack in self.force_maps(gains)]
             return max(states, key=lambda requirement: requirement.ratio)
         phi, reason = self.multiplier
         if reason:
             return refusal("theorem4", self.delta, reason)
-        E = self.environments[0] or Lti.constant(np.eye(1), self.T)
-        coupling = gains.compliance(0, self.channels)
-        return theorem4_requirement(coupling, E, self.theta, self.psi, self.delta, phi)
+        V = gains.compliance(0, self.channels).V
+        if phi is None:
+            return any_environment(V, self.theta, self.delta)
+        E = self.environments[0]
+        assert E is not None
+        return any_environment_delayed(V, E, self.theta, self.psi, self.delta, phi)
 
     @cached_property
     def multiplier(self) -> tuple[Array | None, str | None]:
@@ -690,7 +698,7 @@ class Surroundings:
         coupling = self._kept if condition == MODEL_KEPT else self.coupling
         try:
             E = self._environments(self.gains(np.array([K]), np.array([B])))[0]
-            return closed_loop(self._force_map(coupling, E), self.delta)
+            return this_environment(self._force_map(coupling, E), self.delta)
         except SingularLoop as error:
             return refusal("closed-loop", self.delta, str(error))
 
@@ -699,8 +707,7 @@ class Surroundings:
         """theorem4's requirement, which no spring of the environment changes."""
         if any(self.psi):
             return refusal("theorem4", self.delta, "not asked")
-        E = environment(self.network, self.T)
-        return theorem4_requirement(self.coupling, E, self.theta, self.psi, self.delta)
+        return theorem4_of(Loop(self.T, self.theta, self.psi, self.theta, self.delta, self.network), self.coupling)
 
     @cached_property
     def _kept(self) -> Coupling:

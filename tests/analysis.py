@@ -9,10 +9,11 @@ import cvxpy as cp
 import numpy as np
 
 from controller.lti import Array, Lti
-from design.conditions import check_passive, dampings
+from design.conditions import dampings
 from design.lmi import (
     Ports,
     balanced,
+    check_passive,
     e_hat_regular,
     lemma1,
     lemma4,

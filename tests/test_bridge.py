@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from cli import trace as trace_command
-from design.certificate import Stored, assess, data_of
+from design.certificate import Stored, assess
 from design.certificate import save as save_coupling
 from hw import replay, session_report
 from hw.emulator.core import Emulator
@@ -309,7 +309,7 @@ def test_an_optimal_coupling_has_a_spring_damper_in_reserve(optimal_rungs, capsy
 
 def test_a_coupling_from_a_file_has_one_too(scenario, optimal_rungs, tmp_path):
     path = tmp_path / "stiff.json"
-    save_coupling(Stored(scenario.loop("I"), data_of(optimal_rungs[0].chosen.coupling)), path)
+    save_coupling(Stored(scenario.loop("I"), optimal_rungs[0].chosen.coupling.form()), path)
     rungs = ladder(scenario, "I", str(path), None, 1)
     assert [r.chosen.kind for r in rungs] == ["stiff.json", "spring-damper", "spring-damper"]
     assert [r.link for r in rungs] == [1, 2, 3]

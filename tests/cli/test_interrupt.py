@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from cli.options import execute
-from design.certificate import SpringDamper, Stored, save
+from controller.coupling import SpringDamper
+from design.certificate import Stored, save
 from sim.files import check_file, out_file
 from sim.scenario import InputError, load
 
@@ -95,7 +96,7 @@ def test_no_command_makes_the_folder_of_a_file(command, tmp_path, monkeypatch, c
     from cli.export import main as export
 
     monkeypatch.chdir(tmp_path)
-    save(Stored(load().loop("I"), SpringDamper((878.7, 551.8), (0.3864, 0.5219))), "coupling.json")
+    save(Stored.of(load().loop("I"), SpringDamper((878.7, 551.8), (0.3864, 0.5219))), "coupling.json")
     monkeypatch.setattr(sys, "argv", ["x", *command[1:], "--out", "nix/a.c"])
     with pytest.raises(SystemExit) as end:
         execute(design if command == ["design"] else export)

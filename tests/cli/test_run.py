@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from cli.run import main
-from design.certificate import SpringDamper, Stored, prove, save
+from controller.coupling import SpringDamper
+from design.certificate import Stored, prove, save
 from sim import run as loop
 from sim.scenario import InputError, load
 from sim.trace import Result
@@ -97,10 +98,10 @@ def test_a_tampered_coupling_is_named(tmp_path):
     """One gain changed by 1 %: judged anew, and the report says that the file's certificate does not hold."""
     scenario = load()
     data = SpringDamper((400.0, 300.0), (0.1, 0.1))
-    stored = Stored(scenario.loop("I"), data, prove(scenario.loop("I"), data, "theorem4"))
+    stored = Stored.of(scenario.loop("I"), data, prove(scenario.loop("I"), data, "theorem4"))
     save(stored, tmp_path / "good.json")
     changed = SpringDamper((404.0, 300.0), (0.1, 0.1))
-    save(msgspec.structs.replace(stored, coupling=changed), tmp_path / "bad.json")
+    save(msgspec.structs.replace(stored, coupling=changed.form()), tmp_path / "bad.json")
     short = ("--no-plot", "--duration", "0.5")
     for name, doubted in (("good.json", False), ("bad.json", True)):
         _, report = run(tmp_path, "--coupling", str(tmp_path / name), *short)

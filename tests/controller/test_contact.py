@@ -11,12 +11,13 @@ from cli.accuracy import main as accuracy
 from cli.run import main
 from cli.validate import main as validate
 from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Network, Wall, environment
+from controller.environment import FIGURE_4, GROUND, Network, Wall, environment, held
+from controller.loop import force_map
 from controller.lti import SingularLoop
-from controller.process import Complementarity, Process, Tape, contact, force_map, held
+from controller.process import Complementarity, Process, Tape, contact
 from design.audit import Subject, report
-from design.certificate import FROZEN, NotProved, assess, data_of, prove
-from design.conditions import closed_loop
+from design.certificate import FROZEN, NotProved, assess, prove
+from design.conditions import this_environment
 from models.device import CompliantDevice
 from models.human import Population
 from models.scene import variants
@@ -233,15 +234,17 @@ def test_closed_loop_is_asked_of_every_frozen_state():
     loop = boxed(load()).loop("I")
     requirement = assess(loop, SOFT)["closed-loop"]
     singles = [
-        closed_loop(force_map(environment(held(loop.environment, state), loop.T), SOFT, (1, 2), (0, 0)), loop.delta)
+        this_environment(
+            force_map(environment(held(loop.environment, state), loop.T), SOFT, (1, 2), (0, 0)), loop.delta
+        )
         for state in [(False, False), (False, True), (True, False), (True, True)]
     ]
     assert requirement.ratio == max(single.ratio for single in singles)
     assert len({single.ratio for single in singles}) == 4
     assert requirement.proof == "sampled"
     with pytest.raises(NotProved, match="of walls only theorem4"):
-        prove(loop, data_of(SOFT), "closed-loop")
-    assert prove(loop, data_of(SOFT), "theorem4").promise == "any passive environment"
+        prove(loop, SOFT, "closed-loop")
+    assert prove(loop, SOFT, "theorem4").promise == "any passive environment"
     late = boxed(load()).replace(psi=(1, 0)).loop("I")
     assert "no walls" in (assess(late, SOFT)["theorem4"].reason or "")
 

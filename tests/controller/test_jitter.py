@@ -6,7 +6,8 @@ import pytest
 from controller.coupling import SpringDamper
 from controller.delay import LOST, HeldLine, Jitter, ages, newest, packet_delays, realising
 from controller.environment import FIGURE_4, environment
-from controller.process import Process, Tape, force_map
+from controller.loop import force_map
+from controller.process import Process, Tape
 
 T = 1.2e-3
 COUPLING = SpringDamper([7806, 3137], [0.105, 1.68])

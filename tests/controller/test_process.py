@@ -5,8 +5,9 @@ import pytest
 
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.loop import force_map
 from controller.lti import Lti
-from controller.process import Process, Tape, force_map
+from controller.process import Process, Tape
 
 T = 1e-3
 NONE = np.zeros(1)

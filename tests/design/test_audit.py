@@ -234,10 +234,10 @@ def test_a_preset_names_its_source(run):
 def files(tmp_path):
     """A spring-damper for the default scenario, the same as a state space, and a file that is none."""
     loop = store.Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
-    store.save(store.Stored(loop, store.data_of(SAFE)), tmp_path / "gains.json")
-    store.save(store.Stored(loop, store.data_of(Compliance(SAFE.compliance(T)))), tmp_path / "space.json")
+    store.save(store.Stored.of(loop, SAFE), tmp_path / "gains.json")
+    store.save(store.Stored(loop, Compliance(SAFE.compliance(T)).form()), tmp_path / "space.json")
     unstable = Compliance(Lti(1.1 * np.eye(2), np.eye(2), np.eye(2), np.eye(2), T))
-    store.save(store.Stored(loop, store.data_of(unstable)), tmp_path / "unstable.json")
+    store.save(store.Stored.of(loop, unstable), tmp_path / "unstable.json")
     (tmp_path / "broken.json").write_text("{")
 
 

@@ -14,11 +14,12 @@ from cli.design import main as design_main
 from cli.run import main as run_main
 from cli.validate import main as validate_main
 from controller.coupling import SpringDamper
+from controller.coupling import SpringDamper as StoredSpringDamper
 from controller.environment import FIGURE_4, Box, Network, Spring, UncertainSpring, environment, inside, members
-from controller.process import force_map
+from controller.loop import Loop, force_map
 from design import optimal
-from design.certificate import Loop, NotProved, Stored, data_of, digest, load, prove, sealed, specification, verify
-from design.certificate import SpringDamper as StoredSpringDamper
+from design.certificate import NotProved, Stored, digest, load, prove, sealed, verify
+from design.lmi import Specification
 from design.optimal import Wish
 from design.ranges import check_set, set_part
 from design.result import Infeasible
@@ -42,18 +43,17 @@ change = msgspec.structs.replace
 @pytest.fixture(scope="module")
 def robust():
     """The optimal coupling for the small box."""
-    return optimal.design(specification(LOOP))
+    return optimal.design(Specification.of(LOOP))
 
 
 @pytest.fixture(scope="module")
 def nominal_only():
-    return optimal.design(specification(LOOP.at(FIGURE_4)))
+    return optimal.design(Specification.of(LOOP.at(FIGURE_4)))
 
 
 @pytest.fixture(scope="module")
 def stored(robust):
-    data = data_of(robust.coupling)
-    return Stored(LOOP, data, prove(LOOP, data, "closed-loop"))
+    return Stored.of(LOOP, robust.coupling, prove(LOOP, robust.coupling, "closed-loop"))
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +219,7 @@ def test_the_mismatch_is_the_mean_square_over_the_set(robust):
 
 def test_environments_of_the_box_that_violate_the_condition_join_the_design():
     """Without its vertices: the search finds the stiff one, and the design with it is certified there."""
-    spec = replace(specification(LOOP), others={})
+    spec = replace(Specification.of(LOOP), others={})
     coupling, grown, _ = optimal.searched(spec, Wish(filter="mixed"))
     assert any("840 N/m" in name for name in grown.others)
     assert optimal.violators(spec, coupling, 1.0) == []
@@ -230,7 +230,7 @@ def test_an_environment_that_no_device_feels_asks_nothing():
     """Both springs lost: the forces are zero, and so is their mismatch."""
     both = Box(tuple(UncertainSpring(s.between, absent=True) for s in FIGURE_4.springs))
     loop = change(LOOP, box=both)
-    found = optimal.design(specification(loop), Wish(functions=6))
+    found = optimal.design(Specification.of(loop), Wish(functions=6))
     check = check_set(loop, found.coupling, samples=4)
     assert check.proved
     nothing = check.at_members[[m.name for m in check.members].index(check.members[-1].name)]
@@ -240,7 +240,7 @@ def test_an_environment_that_no_device_feels_asks_nothing():
 def test_vertices_that_contradict_are_named_with_a_remedy():
     box = Box((UncertainSpring(("contact 1", "mass"), (700.0, 4000.0)),))
     with pytest.raises(Infeasible, match=r"none with vertex 2 \(contact 1-mass 4000 N/m.*binds.*of their width"):
-        optimal.design(specification(change(LOOP, box=box)), Wish(filter="mixed"))
+        optimal.design(Specification.of(change(LOOP, box=box)), Wish(filter="mixed"))
 
 
 # the proof
@@ -274,7 +274,7 @@ def test_a_wider_box_is_another_claim(stored):
 
 def test_a_coupling_for_one_environment_is_not_proved_for_the_set(nominal_only):
     with pytest.raises(NotProved, match=r"^vertex 2 .*needs 1\.39"):
-        prove(LOOP, data_of(nominal_only.coupling), "closed-loop")
+        prove(LOOP, nominal_only.coupling, "closed-loop")
     part = set_part(check_set(LOOP, nominal_only.coupling, samples=8))
     assert not part["certified"]
     assert part["vertices_certified"] == 2
@@ -302,8 +302,8 @@ def test_files_without_a_box_have_the_digest_that_they_always_had():
     """Made before there were boxes, for this loop and coupling."""
     plain = LOOP.at(FIGURE_4)
     expected = "b8cae9c8ced7f5c0abcd4246af3ea609fa292b47b365d074618a2702234f644a"
-    assert digest(plain, StoredSpringDamper((7806.0, 3137.0), (0.105, 1.68))) == expected
-    assert digest(LOOP, StoredSpringDamper((7806.0, 3137.0), (0.105, 1.68))) != expected
+    assert digest(plain, StoredSpringDamper((7806.0, 3137.0), (0.105, 1.68)).form()) == expected
+    assert digest(LOOP, StoredSpringDamper((7806.0, 3137.0), (0.105, 1.68)).form()) != expected
 
 
 # the commands

@@ -5,29 +5,25 @@ import numpy as np
 import pytest
 
 from controller import coupling as controller_coupling
+from controller.coupling import Compliance, ComplianceForm, InternalModelForm, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, Network, Spring
+from controller.loop import Loop
 from controller.lti import Lti
 from design import spring_damper
 from design.certificate import (
     BadFile,
-    Compliance,
-    InternalModel,
-    Loop,
-    NoCoupling,
     NotProved,
-    SpringDamper,
     Stored,
     Verdict,
-    data_of,
     digest,
     load,
     prove,
     required_damping,
     save,
     sealed,
-    specification,
     verify,
 )
+from design.lmi import Specification
 from design.result import PUBLISHED
 
 DEFAULT = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
@@ -53,15 +49,15 @@ SOFT = Network(
 def test_delay_inside_the_environment_is_proved_with_its_multiplier(psi):
     """Theorem 4 with psi >= 1: the design's Phi is stored, and only for this environment is anything promised."""
     loop = change(DEFAULT, psi=psi, environment=SOFT)
-    found = spring_damper.design(specification(loop))
-    stored = Stored(loop, data_of(found.coupling), prove(loop, data_of(found.coupling), "theorem4", found.phi))
+    found = spring_damper.design(Specification.of(loop))
+    stored = Stored.of(loop, found.coupling, prove(loop, found.coupling, "theorem4", found.phi))
     assert stored.certificate.promise == "this environment"
     assert set(stored.certificate.matrices) == {"P", "P_E", "Phi"}
     assert verify(stored) == Verdict(True)
     with pytest.raises(NotProved, match="needs a multiplier Phi"):
-        prove(loop, data_of(found.coupling), "theorem4")
+        prove(loop, found.coupling, "theorem4")
     with pytest.raises(NotProved, match="E-hat \\+ Phi is not passive"):
-        prove(loop, data_of(found.coupling), "theorem4", 0.9 * found.phi)
+        prove(loop, found.coupling, "theorem4", 0.9 * found.phi)
     forged = sealed(change(stored.certificate, matrices=stored.certificate.matrices | {"Phi": (("1/100", "1/100"),)}))
     assert not verify(change(stored, certificate=forged)).proved
 
@@ -80,7 +76,7 @@ def test_a_model_of_a_hundred_states_is_proved():
 
 
 def certified(loop: Loop, coupling, condition: str) -> Stored:
-    return Stored(loop, coupling, prove(loop, coupling, condition))
+    return Stored.of(loop, coupling, prove(loop, coupling, condition))
 
 
 @pytest.mark.parametrize(
@@ -107,8 +103,8 @@ def test_safe_gains_are_proved_and_proved_again_from_the_file(tmp_path, coupling
 @pytest.mark.parametrize(
     ("coupling", "condition"),
     [
-        (data_of(PUBLISHED["I"]), "closed-loop"),
-        (data_of(PUBLISHED["I"]), "theorem4"),
+        (PUBLISHED["I"], "closed-loop"),
+        (PUBLISHED["I"], "theorem4"),
         (NoCoupling(), "closed-loop"),
         (NoCoupling(), "theorem4"),
         (SpringDamper((879, 552), (0.39, 0.52)), "theorem4"),  # the optimal gains, rounded up
@@ -144,14 +140,14 @@ def test_three_channels_with_unequal_delays_and_dampings():
 def test_a_general_compliance_is_proved_under_both_conditions():
     V = controller_coupling.SpringDamper([800.0, 500.0], [0.39, 0.52]).compliance(1.2e-3)
     crossed = Lti(V.A, V.B, V.C, V.D + 1e-5, V.T)  # full, and symmetric at z = 1
-    rounded = Compliance(*(tuple(map(tuple, np.round(getattr(crossed, n), 12).tolist())) for n in "ABCD"))
+    rounded = Compliance(Lti(*(np.round(getattr(crossed, n), 12) for n in "ABCD"), V.T))
     for condition in ("closed-loop", "theorem4"):
         assert verify(certified(DEFAULT, rounded, condition)).proved
 
 
 def test_a_static_asymmetry_is_refused():
     anchored = change(FIGURE_4, springs=(*FIGURE_4.springs, Spring(("mass", "ground"), 50.0)))
-    V = Compliance((), (), ((), ()), ((2e-3, 1e-4), (2e-4, 2e-3)))
+    V = Compliance(Lti.constant([[2e-3, 1e-4], [2e-4, 2e-3]], 1.2e-3))
     for condition in ("closed-loop", "theorem4"):
         with pytest.raises(NotProved, match="symmetric"):
             prove(change(DEFAULT, environment=anchored), V, condition)
@@ -204,7 +200,7 @@ def test_tampering_is_rejected_with_the_reason():
     P[0][0] = "7" + P[0][0]
     wrong = change(good.certificate, matrices={"P": tuple(map(tuple, P))})
     cases = {
-        "scenario digest differs": change(good, coupling=stiffer),
+        "scenario digest differs": change(good, coupling=stiffer.form()),
         "seal differs": change(good, certificate=wrong),
         "P is not symmetric|negative direction|not positive definite": change(good, certificate=sealed(wrong)),
         "no certificate": change(good, certificate=None),
@@ -219,10 +215,10 @@ def test_a_forger_who_repairs_the_digests_still_has_to_prove():
     good = certified(DEFAULT, STIFF, "closed-loop")
     starved = change(DEFAULT, delta=(1.36, 1.36))
     forged = change(prove(change(DEFAULT, delta=(1.38, 1.38)), STIFF, "closed-loop"), available=(1.36, 1.36))
-    honest_digest = digest(starved, STIFF)
+    honest_digest = digest(starved, STIFF.form())
     requirement = required_damping(starved, STIFF, "closed-loop")
     forged = change(forged, scenario=honest_digest, required=requirement.required, margin=1 / requirement.ratio)
-    verdict = verify(Stored(starved, STIFF, sealed(forged)))
+    verdict = verify(Stored.of(starved, STIFF, sealed(forged)))
     assert not verdict.proved
     assert "KYP matrix" in verdict.reason
     claims = {
@@ -277,9 +273,9 @@ def test_a_file_of_something_else_is_one_line(tmp_path, content, said):
 
 def test_coefficients_that_no_coupling_has_are_refused():
     with pytest.raises(ValueError, match=r"Q has an entry 1e\+80, allowed are up to 1e\+12"):
-        InternalModel((), (((1e80, 0.0), (0.0, 1e80)),))
+        InternalModelForm((), (((1e80, 0.0), (0.0, 1e80)),))
     with pytest.raises(ValueError, match=r"D has an entry -1e\+13"):
-        Compliance((), (), ((),), ((-1e13,),))
+        ComplianceForm((), (), ((),), ((-1e13,),))
 
 
 def test_an_entry_of_a_proof_beyond_floating_point_is_no_proof():

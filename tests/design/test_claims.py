@@ -13,10 +13,10 @@ from scipy.signal import dlsim, lfilter
 
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.loop import force_map
 from controller.lti import Lti
-from controller.process import force_map
-from design.conditions import Specification, closed_loop, theorem4
-from design.lmi import Infeasible, Shaping, least_multiplier
+from design.conditions import any_environment, this_environment
+from design.lmi import Infeasible, Shaping, Specification, least_multiplier
 from design.result import CASE_I, CASE_II, PRINTED_TAU_DB
 from design.spring_damper import step
 from models.device import RigidDevice
@@ -114,7 +114,7 @@ def test_a_certified_force_map_never_gives_more_than_the_devices_dissipate():
             assert supplied(F, dx).min() >= -1e-12
     # a map that is not certified: the worst direction at the frequency where the condition binds takes energy out
     F = force_map(E, CASE_I, THETA, (0, 0))
-    hz = closed_loop(F, (DELTA, DELTA)).frequency_hz
+    hz = this_environment(F, (DELTA, DELTA)).frequency_hz
     z = np.exp(2j * np.pi * hz * T)
     H = F.at(z) / (z - 1) + DELTA / T * np.eye(2)
     worst = np.linalg.eigh((H + H.conj().T) / 2)[1][:, 0]
@@ -227,7 +227,7 @@ def test_a_rigid_wall_is_not_the_worst_environment():
     assert line(K, B, theta).max() == pytest.approx(1.5160, abs=5e-5)
     # the project's own figure for the mass, and for a spring alone, whose closed form is (theta + 1/2) K T
     E = environment(Network(("a",), masses={"a": 0.0357}), T)
-    found = closed_loop(force_map(E, SpringDamper([K], [B]), [theta], [0]), [1.0]).required[0]
+    found = this_environment(force_map(E, SpringDamper([K], [B]), [theta], [0]), [1.0]).required[0]
     assert found == pytest.approx(1.3769, abs=5e-5)
     assert needed(0 * RATE, K, 0.0, theta) == pytest.approx((theta + 0.5) * K * T, rel=1e-6)
 
@@ -260,7 +260,7 @@ def test_the_moving_average_attains_the_stiffness_limit(theta):
     spent = (RATE * V.at(Z)[:, 0, 0]).real
     np.testing.assert_allclose(spent, np.sin((theta + 1) * W / 2) ** 2 / DELTA, atol=1e-9)
     softer = V + Lti.constant([[1e-4 * V.dc()[0, 0]]], T)  # strictly inside
-    assert theorem4(softer, [theta], [DELTA]).certified
+    assert any_environment(softer, [theta], [DELTA]).certified
 
 
 def moving_average(theta, delta):
@@ -349,7 +349,7 @@ def test_the_frozen_promise_ends_with_another_stiffness():
     def required(factor, mass):
         springs = tuple(Spring(s.between, factor * s.stiffness, s.damping) for s in FIGURE_4.springs)
         E = environment(Network(FIGURE_4.contacts, springs, {"mass": mass}), T)
-        return max(closed_loop(force_map(E, STIFF, THETA, (0, 0)), (DELTA, DELTA)).required)
+        return max(this_environment(force_map(E, STIFF, THETA, (0, 0)), (DELTA, DELTA)).required)
 
     assert required(1.0, 1.0) == pytest.approx(1.3633, abs=5e-5)
     assert required(1.2, 1.0) == pytest.approx(1.5156, abs=5e-5)

@@ -8,7 +8,7 @@ import pytest
 from cli.compare import main
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring
-from design.certificate import Loop
+from controller.loop import Loop
 from design.compare import curves, grid, ideal, judge
 from design.result import CASE_I, DesignFailed
 from sim.scenario import InputError

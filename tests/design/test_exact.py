@@ -6,20 +6,11 @@ import numpy as np
 import pytest
 
 from controller.coupling import Compliance, NoCoupling, SpringDamper
-from controller.delay import delay
+from controller.delay import delay, moving_sum
 from controller.environment import FIGURE_4, Network, Spring, environment
-from controller.lti import Lti
-from controller.process import force_map
-from design import exact
-from design.exact import (
-    Matrix,
-    SingularMatrix,
-    block_diag,
-    definiteness,
-    prove_positive_real,
-    rational,
-    strictly_positive,
-)
+from controller.loop import force_map
+from controller.lti import Lti, SingularLoop, inverse, numbers, rational
+from design.exact import Matrix, block_diag, definiteness, prove_positive_real, strictly_positive
 
 T = 1.2e-3
 STAR = Network(
@@ -42,8 +33,8 @@ COUPLINGS = [
 ]
 
 
-def at(G: exact.Exact, z: complex) -> np.ndarray:
-    return Lti(*(getattr(G, name).floats() for name in "ABCD"), T).at(z)
+def at(G: Lti, z: complex) -> np.ndarray:
+    return G.floats().at(z)
 
 
 def symmetric_integers(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -122,18 +113,17 @@ def test_definiteness_is_proved_beyond_the_reach_of_double_precision():
 def test_the_exact_inverse_is_an_inverse():
     rng = np.random.default_rng(3)
     for n in range(1, 8):
-        S = Matrix.of(rng.integers(-9, 10, (n, n)).tolist()).scaled(Fraction(1, 7))
-        assert (S @ S.inverse()).equals(Matrix.eye(n))
-    with pytest.raises(SingularMatrix):
-        Matrix.of([[1, 2], [2, 4]]).inverse()
+        S = numbers(rng.integers(-9, 10, (n, n)), Fraction(1)) / 7
+        assert (S @ inverse(S) == np.eye(n, dtype=int)).all()
+    with pytest.raises(SingularLoop):
+        inverse(numbers([[1, 2], [2, 4]], Fraction(1)))
     assert block_diag(Matrix.zeros(0, 0), Matrix.eye(2)).equals(Matrix.eye(2))
 
 
 @pytest.mark.parametrize("coupling", COUPLINGS, ids=lambda c: type(c).__name__)
 @pytest.mark.parametrize(("theta", "psi"), [((1, 2), (0, 0)), ((0, 3), (1, 0))])
 def test_the_exact_force_map_is_the_one_that_runs(coupling, theta, psi):
-    E = exact.environment(FIGURE_4, rational(T))
-    F = exact.force_map(E, coupling, theta, psi, rational(T))
+    F = force_map(environment(FIGURE_4, rational(T)), coupling, theta, psi)
     running = force_map(environment(FIGURE_4, T), coupling, theta, psi)
     rng = np.random.default_rng(4)
     for z in rng.uniform(0.7, 1.5, 5) * np.exp(1j * rng.uniform(0, np.pi, 5)):
@@ -144,32 +134,28 @@ def test_the_exact_force_map_is_the_one_that_runs(coupling, theta, psi):
 def test_the_static_stiffness_is_exactly_symmetric_and_semidefinite():
     T = rational(0.001)
     for coupling in (SpringDamper([901.3, 512.9, 3000.1], [0.3, 0.0, 1.1]), NoCoupling()):
-        F1, _ = exact.force_map(exact.environment(STAR, T), coupling, (0, 3, 1), (0, 0, 0), T).split_at_one()
-        assert F1.equals(F1.T)
-        assert definiteness(F1).definite
-    F1, _ = exact.environment(FIGURE_4, rational(T)).split_at_one()
-    assert F1.fractions()[0, 0] == Fraction(800 * 700, 1500)
-    assert str(definiteness(F1)) == "the leading minor of order 2 is zero"
+        F1, _ = force_map(environment(STAR, T), coupling, (0, 3, 1), (0, 0, 0)).split_at_one()
+        assert (F1 == F1.T).all()
+        assert definiteness(Matrix.of(F1)).definite
+    F1, _ = environment(FIGURE_4, rational(T)).split_at_one()
+    assert F1[0, 0] == Fraction(800 * 700, 1500)
+    assert str(definiteness(Matrix.of(F1))) == "the leading minor of order 2 is zero"
 
 
-def test_the_shifted_compliance_subtracts_the_moving_sum():
-    delta = [1.37, 0.8]
-    H = exact.shifted_compliance(
-        exact.compliance(NoCoupling(), 2, rational(T)), (0, 3), [rational(d) for d in delta], rational(T)
-    )
+def test_exact_delays_and_moving_sums_are_those_that_run():
     z = 1.1 * np.exp(0.4j)
-    window = [sum(z**-k for k in range(n + 1)) * T / (2 * d) for n, d in zip((0, 3), delta, strict=True)]
-    np.testing.assert_allclose(at(H, z), -np.diag(window), rtol=1e-12)
-    np.testing.assert_allclose(at(exact.delay((0, 3)), z), delay((0, 3), T).at(z), rtol=1e-12)
+    window = [sum(z**-k for k in range(n + 1)) for n in (0, 3)]
+    np.testing.assert_allclose(at(moving_sum((0, 3), rational(T)), z), np.diag(window), rtol=1e-12)
+    np.testing.assert_allclose(at(delay((0, 3), rational(T)), z), delay((0, 3), T).at(z), rtol=1e-12)
 
 
 def test_a_wrong_storage_matrix_proves_nothing():
     # G = 1 + 0.5/(z - 0.5): He G >= 2/3 on the circle
-    G = exact.Exact(*(Matrix.of([[v]]) for v in (0.5, 1.0, 0.5, 1.0)))
+    G = Lti(*([[v]] for v in (0.5, 1.0, 0.5, 1.0)), Fraction(1))
     assert prove_positive_real(G, Matrix.of([["1/2"]])) is None
     assert "negative direction" in prove_positive_real(G, Matrix.of([[5]]))
     # unstable: P < 0 may satisfy the second inequality alone, and only P > 0 refuses it
-    unstable = exact.Exact(*(Matrix.of([[v]]) for v in (2, 1, 0, 5)))
+    unstable = Lti(*([[v]] for v in (2, 1, 0, 5)), Fraction(1))
     assert prove_positive_real(unstable, Matrix.of([[-1]])) == (
         "P is not positive definite, or by so little that it is not proved"
     )

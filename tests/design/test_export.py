@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 from cli.export import main
+from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.coupling import SpringDamper as Gains
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.loop import Loop, force_map
 from controller.lti import Lti
-from controller.process import Process, Tape, force_map
-from design.certificate import Compliance, Loop, NoCoupling, SpringDamper, Stored, prove, save
+from controller.process import Process, Tape
+from design.certificate import Stored, prove, save
 from design.export import process_block, sequential, trial
 from sim.scenario import InputError
 
@@ -24,7 +26,7 @@ LOOP = Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
 GAINS = SpringDamper((878.7, 551.8), (0.3865, 0.5220))
 SPRINGS = SpringDamper((300.0, 200.0), (0.0, 0.0))  # no state at all
 FULL = Compliance(
-    ((0.5, 0.1), (-0.2, 0.3)), ((1e-3, 0.0), (2e-4, 1e-3)), ((0.4, 0.0), (0.1, 0.5)), ((1e-3, 1e-4), (1e-4, 2e-3))
+    Lti([[0.5, 0.1], [-0.2, 0.3]], [[1e-3, 0], [2e-4, 1e-3]], [[0.4, 0], [0.1, 0.5]], [[1e-3, 1e-4], [1e-4, 2e-3]], T)
 )
 COUPLINGS = {"gains": GAINS, "springs": SPRINGS, "full": FULL}
 
@@ -39,7 +41,7 @@ def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("export")
     for name, data in COUPLINGS.items():
         certificate = prove(LOOP, GAINS, "theorem4") if name == "gains" else None
-        save(Stored(LOOP, data, certificate), folder / f"{name}.json")
+        save(Stored.of(LOOP, data, certificate), folder / f"{name}.json")
     return folder
 
 
@@ -62,7 +64,7 @@ def run(program):
 
 def test_the_order_of_the_sums_in_plain_python():
     """Floats of Python, one rounding per operation: equal to the last bit."""
-    block = process_block(Stored(LOOP, GAINS))
+    block = process_block(Stored.of(LOOP, GAINS))
     test, G = trial(block), block.system
     z = [0.0] * G.order
     for u, y in zip(test.inputs.tolist(), test.outputs.tolist(), strict=True):
@@ -79,7 +81,7 @@ def test_the_order_of_the_sums_in_plain_python():
 @pytest.mark.parametrize("data", COUPLINGS.values(), ids=COUPLINGS)
 def test_the_process_of_the_simulator_differs_by_rounding_alone(data):
     """It sums by BLAS, in any order: each tick each side is wrong by at most gamma_N |row| |v|, carried on by A."""
-    block = process_block(Stored(LOOP, data))
+    block = process_block(Stored.of(LOOP, data))
     test, G = trial(block), block.system
     limits = np.full(2, np.inf)
     tape = Tape(Process(G, limits, np.zeros(2)), len(test.inputs), plant_states=2)
@@ -200,7 +202,7 @@ def test_the_control_script_builds_the_same_block_and_tests_itself(place):
 
 
 def test_without_theta_the_link_is_the_delay():
-    stored = Stored(LOOP, GAINS)
+    stored = Stored.of(LOOP, GAINS)
     with_it, without = (process_block(stored, flag) for flag in (True, False))
     z = np.exp(0.3j)
     theta = np.diag([1 / z, 1 / z**2])
@@ -229,7 +231,7 @@ def test_a_certificate_that_does_not_hold_is_said_and_exits_with_1(place, tmp_pa
 
 def test_a_hostile_name_stays_inside_the_comments(tmp_path):
     path = tmp_path / "a\nimport os; #.json"
-    save(Stored(LOOP, GAINS), path)
+    save(Stored.of(LOOP, GAINS), path)
     assert main([str(path), "--format", "control", "--out", str(tmp_path / "out.py")]) == 0
     code = [line for line in (tmp_path / "out.py").read_text().splitlines() if not line.startswith("#")]
     assert code[0] == "import sys"
@@ -249,7 +251,7 @@ def test_a_hostile_name_stays_inside_the_comments(tmp_path):
     ],
 )
 def test_bad_input_is_one_line(place, options, message):
-    save(Stored(LOOP, NoCoupling()), place / "none.json")
+    save(Stored.of(LOOP, NoCoupling()), place / "none.json")
     with pytest.raises(InputError, match=message):
         main([option.format(gains=place / "gains.json", place=place) for option in options])
 
@@ -257,7 +259,7 @@ def test_bad_input_is_one_line(place, options, message):
 def test_one_channel(tmp_path):
     """A single device before a wall, as the command would be used for a first device."""
     wall = Network(("tip",), (Spring(("tip", GROUND), 2000.0),))
-    save(Stored(Loop(T, (1,), (0,), (1,), (1.37,), wall), SpringDamper((500.0,), (0.1,))), tmp_path / "one.json")
+    save(Stored.of(Loop(T, (1,), (0,), (1,), (1.37,), wall), SpringDamper((500.0,), (0.1,))), tmp_path / "one.json")
     assert main([str(tmp_path / "one.json"), "--process", "--format", "json", "--out", str(tmp_path / "o.json")]) == 0
     plain = json.loads((tmp_path / "o.json").read_text())
     static = np.array(plain["C"]) @ np.linalg.inv(np.eye(len(plain["A"])) - plain["A"]) @ plain["B"] + plain["D"]

@@ -9,12 +9,13 @@ import pytest
 from cli.audit import main
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.loop import DelayRange, Loop, force_map
 from controller.lti import Lti
-from controller.process import force_map
-from design.certificate import DelayRange, Loop, prove_switching, storage, switching_part, switching_requirement
-from design.conditions import blocks, closed_loop, half_widths, jitter_proof, nominal_over_step
+from design.certificate import prove_switching, storage, switching_part, switching_requirement
+from design.conditions import half_widths, jitter_proof, this_environment
 from design.exact import Matrix
 from design.lmi import solve
+from design.maps import blocks, nominal_over_step
 from sim.scenario import InputError
 
 T, DELTA = 1.2e-3, (1.37, 1.37)
@@ -54,8 +55,8 @@ def test_a_spring_needs_what_its_longest_delay_needs(lo, hi):
 def test_a_range_of_one_delay_is_the_closed_loop_condition(theta):
     F = force_map(environment(FIGURE_4, T), STIFF, theta, (0, 0))
     found = jitter_proof(sent(), theta, theta, DELTA).requirement
-    assert found.required == pytest.approx(closed_loop(F, DELTA).required, rel=1e-12)
-    assert found.frequency_hz == pytest.approx(closed_loop(F, DELTA).frequency_hz, rel=1e-4)
+    assert found.required == pytest.approx(this_environment(F, DELTA).required, rel=1e-12)
+    assert found.frequency_hz == pytest.approx(this_environment(F, DELTA).frequency_hz, rel=1e-4)
 
 
 def test_the_least_factor_is_that_of_a_convex_solver():
@@ -128,7 +129,7 @@ def test_what_is_refused():
     floating = jitter_proof(sent(NoCoupling()), (1, 1), (2, 2), DELTA)
     assert (
         floating.requirement.ratio
-        > closed_loop(force_map(environment(FIGURE_4, T), NoCoupling(), (2, 2), (0, 0)), DELTA).ratio
+        > this_environment(force_map(environment(FIGURE_4, T), NoCoupling(), (2, 2), (0, 0)), DELTA).ratio
     )
     unstable = Lti([[1.1]], [[1.0]], [[1.0]], [[1.0]], T)
     found = jitter_proof(unstable, [1], [2], [1.0])
@@ -169,7 +170,7 @@ def test_a_wall_with_damping():
     wall = Network(("a",), (Spring(("a", GROUND), 2000.0, 1.0),))
     G = environment(wall, T)
     needs = jitter_proof(G, [0], [1], [1.37]).requirement.required[0]
-    constant = [closed_loop(force_map(G, NoCoupling(), [n], [0]), [1.37]).required[0] for n in (0, 1)]
+    constant = [this_environment(force_map(G, NoCoupling(), [n], [0]), [1.37]).required[0] for n in (0, 1)]
     assert constant[0] == pytest.approx(2000 * T / 2 + 1)
     assert needs >= max(constant) * (1 - 1e-6)
 

@@ -8,10 +8,10 @@ import pytest
 from cli import compare as command
 from cli.compare import main
 from controller.environment import environment
-from controller.process import force_map
+from controller.loop import force_map
 from design import compare as limit_curve
 from design.compare import AXES, LADDERS, SHORT, Setting, ladder_row, measured, optimum, remembered, settings
-from design.conditions import closed_loop
+from design.conditions import this_environment
 from design.optimal import Wish
 from design.result import CASE_I
 from sim.plots import plot_limits
@@ -206,7 +206,7 @@ def test_rungs_are_the_designs_that_they_name():
     by_name = {entry.name: entry for entry in SHORT}
     published = ladder_row("I", LOOP, by_name["published"])
     E = environment(LOOP.environment, LOOP.T)
-    expected = closed_loop(force_map(E, CASE_I, LOOP.theta, LOOP.psi), LOOP.delta)
+    expected = this_environment(force_map(E, CASE_I, LOOP.theta, LOOP.psi), LOOP.delta)
     assert published.design == "published (27)"
     assert published.required_damping == expected.required
     assert not published.certified

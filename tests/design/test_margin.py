@@ -6,9 +6,9 @@ from scipy.linalg import eig
 
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.loop import force_map
 from controller.lti import Lti
-from controller.process import force_map
-from design.conditions import closed_loop, theorem4, theorem4_per_channel
+from design.conditions import any_environment, any_environment_per_channel, this_environment
 from design.frequency import frequencies, supremum
 from design.result import CASE_I, CASE_II
 
@@ -32,16 +32,20 @@ def default(coupling) -> Lti:
     ],
 )
 def test_closed_loop_figures(coupling, required):
-    result = closed_loop(default(coupling), DELTA)
+    result = this_environment(default(coupling), DELTA)
     assert result.required == pytest.approx((required, required), rel=3e-5)
     assert result.certified == (required < 1.37)
 
 
 def test_theorem4_figures():
-    assert theorem4_per_channel(CASE_I.channels(T), THETA, DELTA).required == pytest.approx((7.63, 7.84), abs=0.005)
-    assert theorem4_per_channel(CASE_II.channels(T), THETA, DELTA).required == pytest.approx((7.04, 3.89), abs=0.005)
+    assert any_environment_per_channel(CASE_I.channels(T), THETA, DELTA).required == pytest.approx(
+        (7.63, 7.84), abs=0.005
+    )
+    assert any_environment_per_channel(CASE_II.channels(T), THETA, DELTA).required == pytest.approx(
+        (7.04, 3.89), abs=0.005
+    )
     best = SpringDamper([878.86, 551.94], [0.3865, 0.5220])
-    assert theorem4_per_channel(best.channels(T), THETA, DELTA).required == pytest.approx((1.37, 1.37), rel=1e-4)
+    assert any_environment_per_channel(best.channels(T), THETA, DELTA).required == pytest.approx((1.37, 1.37), rel=1e-4)
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -53,7 +57,7 @@ def test_theorem4_of_a_spring_damper_is_the_trigonometric_maximum(seed):
     window = sum(z**-n for n in range(theta + 1))
     expected = np.max(np.abs(K * T * window + B * (1 - z ** -(theta + 1))) ** 2) / (4 * (K * T / 2 + B))
     V = SpringDamper([K], [B]).compliance(T)
-    assert theorem4(V, [theta], [1.0]).required[0] == pytest.approx(expected, rel=1e-9)
+    assert any_environment(V, [theta], [1.0]).required[0] == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize(("K", "B", "theta", "factor"), [(5000, 0, 0, 0.5), (5000, 30, 0, 0.5), (2000, 0, 1, 1.5)])
@@ -61,7 +65,7 @@ def test_rigid_wall_closed_forms(K, B, theta, factor):
     """Colgate's K T/2 + B without delay, and 3 K T/2 for a spring with one sample of it."""
     wall = environment(Network(("a",), (Spring(("a", GROUND), float(K), float(B)),)), 1e-3)
     F = force_map(wall, NoCoupling(), [theta], [0])
-    assert closed_loop(F, [1.0]).required[0] == pytest.approx(factor * K * 1e-3 + B, rel=1e-9)
+    assert this_environment(F, [1.0]).required[0] == pytest.approx(factor * K * 1e-3 + B, rel=1e-9)
 
 
 def crossings(F: Lti, level: float) -> np.ndarray:
@@ -92,9 +96,9 @@ def test_the_sweep_misses_no_peak(seed):
     """Just above the required damping no frequency violates the condition, just below some does: good to 1e-4."""
     F = random_loop(seed)
     if not F.is_stable():
-        assert closed_loop(F, (1.0, 1.0)).required == (np.inf, np.inf)
+        assert this_environment(F, (1.0, 1.0)).required == (np.inf, np.inf)
         return
-    required = closed_loop(F, (1.0, 1.0)).required[0]
+    required = this_environment(F, (1.0, 1.0)).required[0]
     assert crossings(F, required * (1 + 1e-4)).size == 0
     assert crossings(F, required * (1 - 1e-4)).size > 0
 
@@ -102,7 +106,7 @@ def test_the_sweep_misses_no_peak(seed):
 def test_unequal_devices_need_a_common_factor():
     """Scaling delta scales the ratio: required damping is along the direction of what is available."""
     F = default(CASE_I)
-    one, two = closed_loop(F, (1.0, 2.0)), closed_loop(F, (2.0, 4.0))
+    one, two = this_environment(F, (1.0, 2.0)), this_environment(F, (2.0, 4.0))
     assert one.required == pytest.approx(two.required, rel=1e-9)
     assert one.ratio == pytest.approx(2 * two.ratio, rel=1e-9)
 
@@ -112,7 +116,7 @@ def test_a_free_mass_is_not_refused_by_rounding(mass):
     """Its F(1) is exactly 0; a heavy one asks what a rigid wall asks."""
     free = environment(Network(("a",), masses={"a": mass}), T)
     F = force_map(free, SpringDamper([610.0], [0.545]), [2], [0])
-    assert closed_loop(F, [1.37]).required[0] == pytest.approx(1.3659, rel=3e-3)
+    assert this_environment(F, [1.37]).required[0] == pytest.approx(1.3659, rel=3e-3)
 
 
 def test_moving_a_delay_between_force_and_measurement_changes_nothing():
@@ -121,21 +125,23 @@ def test_moving_a_delay_between_force_and_measurement_changes_nothing():
 
     inner = CASE_I.around(E)
     split = delay((1, 0), T) @ inner @ delay((0, 2), T)
-    assert closed_loop(split, DELTA).ratio == pytest.approx(closed_loop(default(CASE_I), DELTA).ratio, rel=1e-9)
+    assert this_environment(split, DELTA).ratio == pytest.approx(
+        this_environment(default(CASE_I), DELTA).ratio, rel=1e-9
+    )
 
 
 def test_refusals_say_why():
     unstable = Lti([[1.01]], [[1.0]], [[1.0]], [[0.0]], T)
-    assert "outside the unit circle" in closed_loop(unstable, [1.0]).reason
+    assert "outside the unit circle" in this_environment(unstable, [1.0]).reason
     twisted = Lti.constant([[1.0, 0.5], [0.0, 1.0]], T)
-    assert "not symmetric" in closed_loop(twisted, (1.0, 1.0)).reason
-    assert "pushes outwards" in closed_loop(Lti.constant([[-1.0]], T), [1.0]).reason
-    assert "no damping" in closed_loop(default(CASE_I), (0.0, 1.0)).reason
-    assert "not passive enough" in theorem4(Lti.constant([[0.0]], T), [0], [1.0]).reason
+    assert "not symmetric" in this_environment(twisted, (1.0, 1.0)).reason
+    assert "pushes outwards" in this_environment(Lti.constant([[-1.0]], T), [1.0]).reason
+    assert "no damping" in this_environment(default(CASE_I), (0.0, 1.0)).reason
+    assert "not passive enough" in any_environment(Lti.constant([[0.0]], T), [0], [1.0]).reason
     with pytest.raises(ValueError, match="delta has 1 entries for 2 channels"):
-        closed_loop(default(CASE_I), [1.0])
+        this_environment(default(CASE_I), [1.0])
     with pytest.raises(ValueError, match="expected dampings >= 0"):
-        closed_loop(default(CASE_I), (-1.0, 1.0))
+        this_environment(default(CASE_I), (-1.0, 1.0))
 
 
 def test_supremum_finds_a_needle():

@@ -10,11 +10,11 @@ import pytest
 
 from controller.coupling import InternalModel, basis
 from controller.environment import Network, Spring, environment
+from controller.loop import force_map
 from controller.lti import Lti
-from controller.process import force_map
-from design.certificate import specification
-from design.conditions import Specification, closed_loop
+from design.conditions import this_environment
 from design.frequency import on_circle
+from design.lmi import Specification
 from design.optimal import (
     HIGH_HZ,
     PASSIVE_SHARE,
@@ -42,7 +42,7 @@ from design.result import Design, Infeasible
 from design.transparency import decibels, transparency
 from sim.scenario import load
 
-SPEC = {case: specification(load().loop(case)) for case in ("I", "II")}
+SPEC = {case: Specification.of(load().loop(case)) for case in ("I", "II")}
 #: the default environment with all that is not default: full Q, slow poles, delay inside, three unequal devices
 STAR = Network(
     contacts=("a", "b", "c"),
@@ -342,7 +342,7 @@ def test_three_unequal_devices():
     assert requirement.certified
     share = np.array(requirement.required) / np.array(THREE.delta)
     np.testing.assert_allclose(share, requirement.ratio, rtol=1e-12)
-    again = closed_loop(force(THREE, q_of(made("three channels"))), THREE.delta)
+    again = this_environment(force(THREE, q_of(made("three channels"))), THREE.delta)
     assert again.ratio == requirement.ratio
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from design.certificate import specification
+from design.lmi import Specification
 from design.optimal import (
     FARTHEST,
     FreeParameter,
@@ -20,7 +20,7 @@ from design.optimal import (
 from design.result import Infeasible
 from sim.scenario import load
 
-SPEC = {case: specification(load().loop(case)) for case in ("I", "II")}
+SPEC = {case: Specification.of(load().loop(case)) for case in ("I", "II")}
 
 
 def problem(case: str, wish: Wish, poles: list[float]) -> Problem:

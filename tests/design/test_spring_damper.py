@@ -9,10 +9,10 @@ from scipy.optimize import brentq
 from controller.coupling import SpringDamper
 from controller.delay import delay
 from controller.environment import FIGURE_4, Network, Spring, environment
+from controller.loop import force_map
 from controller.lti import Lti
-from controller.process import force_map
-from design.conditions import RESERVE, Specification, closed_loop, theorem4, theorem4_delayed
-from design.lmi import CROSS_CHECK, Shaping, solve
+from design.conditions import any_environment, any_environment_delayed, this_environment
+from design.lmi import CROSS_CHECK, RESERVE, Shaping, Specification, solve
 from design.result import DesignFailed, Infeasible
 from design.spring_damper import design, gain_set, solve_within, stiffest
 
@@ -80,7 +80,7 @@ def test_no_certified_gains_do_better(case):
     for _ in range(200):
         gains = SpringDamper(rng.uniform(300, 1200, 2), rng.uniform(0, 1, 2))
         V = gains.compliance(T)
-        if theorem4(V, spec.theta, DELTA).certified:
+        if any_environment(V, spec.theta, DELTA).certified:
             tried += 1
             assert shaping.norm(V)[0] > best.objective
     assert tried > 10
@@ -92,9 +92,11 @@ def test_a_handful_of_convex_problems_suffices():
 
 
 def stiffest_at(B, theta, delta, T):
-    """The largest K that theorem4's own sweep accepts beside B, by bisection, with the reserve of a design."""
+    """The largest K that any_environment's own sweep accepts beside B, by bisection, with the reserve of a design."""
     usable = (1 - RESERVE) * delta
-    return brentq(lambda K: theorem4(SpringDamper([K], [B]).compliance(T), [theta], [usable]).ratio - 1, 1.0, 1e5)
+    return brentq(
+        lambda K: any_environment(SpringDamper([K], [B]).compliance(T), [theta], [usable]).ratio - 1, 1.0, 1e5
+    )
 
 
 @pytest.mark.parametrize(("theta", "K"), list(enumerate([2283.0, 878.86, 551.94, 405.1, 320.8])))
@@ -170,14 +172,14 @@ def test_delay_in_the_environment(psi):
     assert found.phi.max() < 1.37
     # two judges that did not take part: the LMI over every multiplier, and the loop itself
     assert analysis(V, spec.environment, spec.theta, psi, DELTA).feasible
-    assert closed_loop(force_map(spec.environment, found.coupling, spec.theta, psi), DELTA).certified
+    assert this_environment(force_map(spec.environment, found.coupling, spec.theta, psi), DELTA).certified
 
 
 def test_without_a_multiplier_the_delayed_condition_is_the_plain_one():
     for gains in random_starts(10, seed=4):
         V = gains.compliance(T)
-        plain = theorem4(V, (1, 2), DELTA)
-        same = theorem4_delayed(V, environment(FIGURE_4, T), (1, 2), (0, 0), DELTA, np.zeros(2))
+        plain = any_environment(V, (1, 2), DELTA)
+        same = any_environment_delayed(V, environment(FIGURE_4, T), (1, 2), (0, 0), DELTA, np.zeros(2))
         assert same.ratio == pytest.approx(plain.ratio, rel=1e-6)
 
 
@@ -189,7 +191,7 @@ def test_the_closed_loop_design_spends_the_environments_own_damping(case, rms_db
     assert found.requirement.condition == "closed-loop"
     assert found.requirement.ratio <= 1 - RESERVE
     assert found.coupling.K.min() > 2500
-    assert not theorem4(found.coupling.compliance(T), spec.theta, DELTA).certified
+    assert not any_environment(found.coupling.compliance(T), spec.theta, DELTA).certified
 
 
 def test_the_closed_loop_design_keeps_a_delayed_environment_stable():
@@ -231,7 +233,7 @@ def test_an_active_environment_is_refused():
 
 
 def test_an_unknown_condition_is_refused():
-    with pytest.raises(ValueError, match="condition is 'both', expected 'theorem4' or 'closed-loop'"):
+    with pytest.raises(ValueError, match="condition is 'both', expected 'any_environment' or 'closed-loop'"):
         design(specification(), "both")
 
 

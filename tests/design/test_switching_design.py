@@ -8,10 +8,10 @@ import pytest
 from cli.design import main
 from controller.coupling import SpringDamper
 from controller.delay import Jitter
-from controller.process import force_map
+from controller.loop import force_map
 from design.certificate import load as load_stored
-from design.certificate import specification
 from design.conditions import jitter_proof
+from design.lmi import Specification
 from design.optimal import Wish
 from design.optimal import design as optimal_design
 from design.result import DesignFailed
@@ -35,7 +35,7 @@ def made(tmp_path_factory):
 
 def test_the_designed_gains_are_proved_for_any_switching(made):
     report, coupling = made
-    spec = specification(load().loop("I"))
+    spec = Specification.of(load().loop("I"))
     swept = jitter_proof(force_map(spec.environment, coupling, (0, 0), (0, 0)), *RANGE, spec.delta)
     assert swept.requirement.certified
     assert swept.requirement.ratio > 0.999  # all of the damping is spent
@@ -63,7 +63,7 @@ def test_no_lossless_human_grows_under_the_worst_switching(made):
 
 
 def test_a_range_that_is_too_wide_says_so():
-    spec = specification(load().replace(theta=(3, 3), delta=(0.02, 0.02)).loop("I"))
+    spec = Specification.of(load().replace(theta=(3, 3), delta=(0.02, 0.02)).loop("I"))
     starts = [SpringDamper([2e4, 2e4], [0.5, 0.5])]
     with pytest.raises(DesignFailed, match=r"under any switching from \(0, 0\) to \(9, 9\) samples"):
         design(spec, "closed-loop", starts, switching=((0, 0), (9, 9)))
@@ -84,12 +84,12 @@ def test_requests_that_make_no_sense_are_refused(options, tmp_path):
 
 def test_theorem4_is_not_designed_for_delays_that_vary():
     with pytest.raises(ValueError, match="closed-loop condition only"):
-        design(specification(load().loop("I")), "theorem4", switching=RANGE)
+        design(Specification.of(load().loop("I")), "theorem4", switching=RANGE)
 
 
 def test_an_optimal_coupling_for_switching_delays():
     """A full Q of 12 functions: swept, proved, and met by lossless hands under the worst switching."""
-    spec = specification(load().loop("I"))
+    spec = Specification.of(load().loop("I"))
     made = optimal_design(spec, Wish(functions=12, diagonal=False, switching=RANGE))
     swept = jitter_proof(force_map(spec.environment, made.coupling, (0, 0), (0, 0)), *RANGE, spec.delta)
     assert swept.requirement.ratio == pytest.approx(0.995, abs=1e-3)  # the margin that was asked, all else is spent

@@ -13,18 +13,16 @@ from cli.design import main as design_main
 from cli.run import main as run_main
 from cli.validate import main as validate_main
 from controller import coupling as built
+from controller.coupling import SpringDamper
 from controller.delay import LOST, Jitter, ages
 from controller.environment import FIGURE_4, Box, UncertainSpring, environment
-from controller.process import force_map
+from controller.loop import DelayRange, Loop, force_map
 from design import certify
 from design import exact as positive_real
 from design.certificate import (
     BadFile,
     Certificate,
-    DelayRange,
-    Loop,
     NotProved,
-    SpringDamper,
     Stored,
     condition_block,
     digest,
@@ -35,8 +33,9 @@ from design.certificate import (
     sealed,
     verify,
 )
-from design.conditions import blocks, closed_loop, jitter_proof
+from design.conditions import jitter_proof, this_environment
 from design.exact import Matrix
+from design.maps import blocks
 from hw.plan import ladder
 from sim.scenario import load as scenario_of
 
@@ -51,7 +50,7 @@ change = msgspec.structs.replace
 
 @pytest.fixture(scope="module")
 def stored() -> Stored:
-    return Stored(LOOP, SOFT, prove(LOOP, SOFT, "closed-loop"))
+    return Stored.of(LOOP, SOFT, prove(LOOP, SOFT, "closed-loop"))
 
 
 @pytest.fixture
@@ -62,12 +61,12 @@ def file(stored, tmp_path) -> str:
 
 @pytest.fixture
 def constant_file(tmp_path) -> str:
-    save(Stored(CONSTANT, STIFF, prove(CONSTANT, STIFF, "closed-loop")), tmp_path / "constant.json")
+    save(Stored.of(CONSTANT, STIFF, prove(CONSTANT, STIFF, "closed-loop")), tmp_path / "constant.json")
     return str(tmp_path / "constant.json")
 
 
 def sent(coupling: SpringDamper):
-    return force_map(environment(FIGURE_4, T), coupling.build(T), (0, 0), (0, 0))
+    return force_map(environment(FIGURE_4, T), coupling, (0, 0), (0, 0))
 
 
 # the proof
@@ -89,8 +88,9 @@ def test_what_is_on_file_is_a_witness_on_a_dense_sweep(stored):
     proof = stored.certificate.switching
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
     assert np.linalg.eigvalsh(blocks(z, sent(SOFT).at(z), np.array(proof.alpha), (1, 1), (2, 2), DELTA, T)).min() > 0
-    G = condition_block(LOOP, SOFT.build(T), proof.alpha)
-    A, B, C, D, S = (M.floats() for M in (G.A, G.B, G.C, G.D, Matrix.of(proof.P)))
+    G = condition_block(LOOP, SOFT, proof.alpha)
+    F, S = G.floats(), Matrix.of(proof.P).floats()
+    A, B, C, D = F.A, F.B, F.C, F.D
     kyp = np.block([[S - A.T @ S @ A, (C - B.T @ S @ A).T], [C - B.T @ S @ A, D + D.T - B.T @ S @ B]])
     scale = 1 / np.sqrt(np.diag(kyp))
     assert np.linalg.eigvalsh(scale[:, None] * kyp * scale).min() > 0
@@ -100,7 +100,7 @@ def test_what_is_on_file_is_a_witness_on_a_dense_sweep(stored):
 def test_other_ranges_are_proved_too(lo, hi):
     soft = SpringDamper((300.0, 250.0), (0.3, 0.3))
     loop = CONSTANT.switching(DelayRange(lo, hi))
-    made = Stored(loop, soft, prove(loop, soft, "theorem4"))
+    made = Stored.of(loop, soft, prove(loop, soft, "theorem4"))
     assert verify(made).proved
     assert [a > 0 for a in made.certificate.switching.alpha] == [a < b for a, b in zip(lo, hi, strict=True)]
 
@@ -110,8 +110,8 @@ def test_every_constant_delay_of_the_range_asks_no_more(coupling):
     """Why a file that is proved for switching covers constants: by the energy, which knows no z."""
     switching = jitter_proof(sent(coupling), (1, 0), (2, 3), DELTA).requirement.ratio
     for theta in product((1, 2), (0, 1, 2, 3)):
-        F = force_map(environment(FIGURE_4, T), coupling.build(T), theta, (0, 0))
-        assert closed_loop(F, DELTA).ratio <= switching * (1 + 1e-9)
+        F = force_map(environment(FIGURE_4, T), coupling, theta, (0, 0))
+        assert this_environment(F, DELTA).ratio <= switching * (1 + 1e-9)
 
 
 def test_what_is_not_jitter_proof_is_not_certified_as_such():
@@ -123,8 +123,8 @@ def test_what_is_not_jitter_proof_is_not_certified_as_such():
 def test_files_without_a_range_keep_their_digests():
     """Made before there were ranges."""
     expected = "b8cae9c8ced7f5c0abcd4246af3ea609fa292b47b365d074618a2702234f644a"
-    assert digest(CONSTANT, STIFF) == expected
-    assert digest(LOOP, STIFF) != expected
+    assert digest(CONSTANT, STIFF.form()) == expected
+    assert digest(LOOP, STIFF.form()) != expected
     matrices, figures = {"P": (("1/2", "0"), ("0", "3"))}, ((1.25, 1.25), (1.37, 1.37), 1.096)
     old = Certificate("closed-loop", *figures, "this environment", "rational", matrices, "ab" * 32, {"numpy": "2.0.0"})
     assert sealed(old).seal == "5a8b5bd2efbe574d18642debfb79affac9fb654f3de659112e3642ac37d39691"
@@ -144,8 +144,8 @@ def test_a_changed_file_is_refused(stored):
 def forged(stored: Stored, loop: Loop = LOOP, **fields) -> str:
     """Why a file is refused whose forger repairs digests and seals."""
     switching = change(stored.certificate.switching, **fields)
-    certificate = change(stored.certificate, scenario=digest(loop, SOFT), switching=switching)
-    verdict = verify(Stored(loop, SOFT, sealed(certificate)))
+    certificate = change(stored.certificate, scenario=digest(loop, SOFT.form()), switching=switching)
+    verdict = verify(Stored.of(loop, SOFT, sealed(certificate)))
     assert not verdict.proved
     return verdict.reason
 
@@ -170,8 +170,8 @@ def test_a_forger_who_repairs_the_digests_still_has_to_prove(stored):
 def test_a_proof_goes_with_its_range(stored):
     bare = sealed(change(stored.certificate, switching=msgspec.UNSET))
     assert verify(change(stored, certificate=bare)).reason.endswith("no proof is on file")
-    smuggled = sealed(change(stored.certificate, scenario=digest(CONSTANT, SOFT)))
-    assert "delays are constant" in verify(Stored(CONSTANT, SOFT, smuggled)).reason
+    smuggled = sealed(change(stored.certificate, scenario=digest(CONSTANT, SOFT.form())))
+    assert "delays are constant" in verify(Stored.of(CONSTANT, SOFT, smuggled)).reason
 
 
 def test_a_multiplier_below_zero_lends_no_damping():
@@ -179,8 +179,8 @@ def test_a_multiplier_below_zero_lends_no_damping():
     loop = CONSTANT.switching(DelayRange((1, 2), (2, 2)))
     found = jitter_proof(sent(STIFF), (1, 2), (2, 2), DELTA)
     with pytest.raises(ValueError, match="expected a positive number where the delay varies and 0 elsewhere"):
-        condition_block(loop, STIFF.build(T), (found.alpha[0], -1e6))
-    assert refuted(loop, STIFF.build(T), msgspec.UNSET).endswith("no proof is on file")
+        condition_block(loop, STIFF, (found.alpha[0], -1e6))
+    assert refuted(loop, STIFF, msgspec.UNSET).endswith("no proof is on file")
 
 
 @pytest.mark.parametrize(
@@ -302,7 +302,7 @@ def test_validate_and_audit_say_the_same(file, constant_file, tmp_path, capsys):
 
 def test_without_an_exact_proof_the_file_keeps_the_constants(tmp_path, capsys, monkeypatch):
     """A limit on states between the two models: said in the report, and the file claims no switching."""
-    monkeypatch.setattr(positive_real, "LARGEST", condition_block(LOOP, SOFT.build(T), (1.0, 1.0)).order - 1)
+    monkeypatch.setattr(positive_real, "LARGEST", condition_block(LOOP, SOFT, (1.0, 1.0)).order - 1)
     out = str(tmp_path / "c.json")
     options = ["--condition", "closed-loop", "--jitter", "1,2", "--out", out]
     code, outcome = told(capsys, design_main, *options)
@@ -348,7 +348,9 @@ def test_certify_judges_every_vertex_of_a_box(K, certified):
     loop = change(CONSTANT, box=Box((UncertainSpring(("mass", "contact 1"), (640.0, 960.0), absent=True),)))
     coupling = built.SpringDamper(K, (0.105, 1.68))
     found, nominal = certify(loop, coupling)["closed-loop"], certify(CONSTANT, coupling)["closed-loop"]
-    at = [closed_loop(force_map(environment(m.network, T), coupling, (1, 2), (0, 0)), DELTA) for m in loop.members()]
+    at = [
+        this_environment(force_map(environment(m.network, T), coupling, (1, 2), (0, 0)), DELTA) for m in loop.members()
+    ]
     assert len(at) == 4
     assert found.ratio == max(requirement.ratio for requirement in at)
     assert nominal.certified
@@ -360,7 +362,7 @@ def test_certify_judges_every_vertex_of_a_box(K, certified):
 def test_the_bridge_says_how_long_a_force_may_be_held(tmp_path):
     """Ages under isolated missed answers, from the line itself, lie within what the file proves."""
     loop = change(LOOP, theta=(1, 1), lam=(1, 1))
-    save(Stored(loop, SOFT, prove(loop, SOFT, "closed-loop")), tmp_path / "one.json")
+    save(Stored.of(loop, SOFT, prove(loop, SOFT, "closed-loop")), tmp_path / "one.json")
     first, second = ladder(scenario_of().replace(theta=(1, 1)), "I", str(tmp_path / "one.json"), None, 1, spare=1)
     assert first.remarks() == ["a force that is held through 1 missed answer is covered by the file's proof"]
     missed = np.ones((40, 2, 1), dtype=np.int64)

@@ -6,8 +6,8 @@ from scipy.integrate import quad
 
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.loop import force_map
 from controller.lti import Lti
-from controller.process import force_map
 from design.frequency import integral
 from design.result import CASE_I
 from design.transparency import decibels, transparency

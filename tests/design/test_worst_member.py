@@ -12,8 +12,9 @@ from cli.design import _store
 from controller.coupling import InternalModel
 from controller.environment import FIGURE_4, Box, Member, Network, Region, Spring, UncertainSpring, members, regions
 from design import optimal
-from design.certificate import Stored, data_of, load, prove, save, specification, verify
+from design.certificate import Stored, load, prove, save, verify
 from design.designs import certify
+from design.lmi import Specification
 from design.optimal import Wish
 from design.ranges import check_set, search, set_part, set_rows
 from design.result import Design, DesignFailed
@@ -191,8 +192,8 @@ def test_its_file_is_stored_for_the_environment_alone(known, tmp_path):
 
 
 def test_design_check_searches_again_and_rejects_a_file_that_was_made_without(tmp_path, capsys):
-    file, data = tmp_path / "c.json", data_of(VERTICES_ONLY)
-    save(Stored(EDGE, data, prove(EDGE, data, "closed-loop")), file)
+    file = tmp_path / "c.json"
+    save(Stored.of(EDGE, VERTICES_ONLY, prove(EDGE, VERTICES_ONLY, "closed-loop")), file)
     assert verify(load(file)).proved  # of the vertices it is a proof
     assert check_main([str(file), "--json", "-"]) == 1
     result = json.loads(capsys.readouterr().out)
@@ -206,7 +207,7 @@ def test_design_check_searches_again_and_rejects_a_file_that_was_made_without(tm
 
 def test_the_design_adds_what_the_search_finds_until_a_dense_sweep_finds_nothing():
     """Six functions at the two vertices alone need up to 1.04 of the damping between them."""
-    spec, wish = specification(MASS), Wish(functions=6)
+    spec, wish = Specification.of(MASS), Wish(functions=6)
     coupling, grown, _ = optimal.searched(spec, wish)
     assert len(grown.others) > len(spec.others)
     masses = np.geomspace(0.25, 4.0, 120)
@@ -218,7 +219,7 @@ def test_the_design_adds_what_the_search_finds_until_a_dense_sweep_finds_nothing
 def test_a_design_that_stays_violated_says_where(monkeypatch):
     monkeypatch.setattr(optimal, "MOST_ADDITIONS", 0)
     with pytest.raises(DesignFailed, match=r"still violated between the vertices: 1\.0\d+ of the damping .*mass 0\.5"):
-        optimal.searched(specification(MASS), Wish(functions=6))
+        optimal.searched(Specification.of(MASS), Wish(functions=6))
 
 
 def with_mass(mass: float) -> Network:

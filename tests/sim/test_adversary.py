@@ -12,7 +12,7 @@ from cli.suite import Check, rates, shortages, tightness
 from cli.suite import main as suite
 from cli.validate import main
 from controller.coupling import NoCoupling, SpringDamper
-from design.conditions import closed_loop as real
+from design.conditions import this_environment as real
 from design.result import CASE_I
 from models.device import RigidDevice
 from models.scene import build, plant

@@ -9,8 +9,8 @@ from cli import zwidth
 from cli.options import BAD_INPUT, DONE, execute
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring
-from design.conditions import Environments
 from design.frequency import on_circle
+from design.maps import Environments
 from models.scene import variants
 from sim.couplings import choose
 from sim.crowds import crowds

@@ -12,9 +12,10 @@ from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, Wall, environment
 from controller.gains import Gains, force_maps
-from controller.process import Process, Tape, contact, force_map
-from design.conditions import closed_loop_ratios, theorem4_ratios
+from controller.loop import force_map
+from controller.process import Process, Tape, contact
 from design.frequency import on_circle, suprema
+from design.maps import closed_loop_ratios, theorem4_ratios
 from models.device import CompliantDevice, RigidDevice
 from models.human import Human, Link
 from models.scene import build, variants
