@@ -2,7 +2,7 @@
 
 A report is a dictionary or a dataclass of plain figures, in SI units. Its table is made from rows, pairs of a name and
 a text; a row whose text is None is left out. The rows of a dataclass come from its fields, by the name and the format
-that `figure` gives them, and so do the columns of several such reports: a new figure is one field.
+that `figure` gives them: a new figure is one field.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
 
 
 def figure(name: str, form: Form = "{}", default: Any = MISSING) -> Any:
-    """A field of a report that its table shows under this name, in this format; None is "-"."""
+    """A field of a report that its table shows under this name, in this format."""
     return field(default=default, metadata={"name": name, "form": form})
 
 
@@ -167,26 +167,6 @@ def rows_of(report: Any) -> Rows:
     for one in _figures(report):
         value = getattr(report, one.name)
         yield one.metadata["name"], None if value is None else _formed(value, one.metadata["form"])
-
-
-def columns_of(title: str, reports: Sequence[Any], kind: type, left: Sequence[int] = (0,)) -> Table:
-    """Several dataclasses of a kind as a table, one a row; red where one says that it does not hold."""
-    heads = [one.metadata["name"] for one in _figures(kind)]
-    table = grid(title, heads, (), left)
-    for report in reports:
-        table.add_row(*cells(report), style=None if getattr(report, "holds", True) else "red")
-    return table
-
-
-def cells(report: Any) -> tuple[str, ...]:
-    """The figures of a dataclass as texts."""
-    pairs = ((getattr(report, one.name), one.metadata["form"]) for one in _figures(report))
-    return tuple("-" if value is None else _formed(value, form) for value, form in pairs)
-
-
-def heads_of(kind: type) -> tuple[str, ...]:
-    """The names of its figures."""
-    return tuple(one.metadata["name"] for one in _figures(kind))
 
 
 def _figures(report: Any) -> list[Any]:

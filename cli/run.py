@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from cli import options, render
-from design.certificate import Loop, assess, promise_of
+from controller.loop import Loop
+from design.certificate import assess, promise_of
 from design.ranges import SetCheck, check_set, set_part, set_rows
 from design.result import listed
 from design.transparency import transparency
@@ -70,7 +71,8 @@ def _parser() -> options.Parser:
     steps = "MuJoCo steps per period (default: what the plant asks)"
     parser.add_argument("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
     parser.add_argument("--duration", type=options.number(), metavar="SECONDS", help="default: the scenario's")
-    parser.add_argument("--human", metavar="FILE.toml", help="other humans: [[human]] per channel, [[person]]")
+    who = "other humans: [[human]] per channel in a .toml, or `humans` in a .py"
+    parser.add_argument("--human", metavar="FILE", help=who)
     vertex = "simulate at this vertex of the scenario's ranges (default 0: nominal)"
     parser.add_argument("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
     options.add_output_options(parser, picture=True)

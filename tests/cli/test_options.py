@@ -87,13 +87,12 @@ class Report:
 
 
 def test_a_figure_is_a_field(capsys):
-    """Its name and format stand beside it, and both kinds of table and JSON follow."""
+    """Its name and format stand beside it; table and JSON follow."""
     reports = [Report("a", 1.0), Report("b", None, False)]
     assert list(render.rows_of(reports[0])) == [("loop", "a"), ("growth [1/s]", "+1.00")]
     assert list(render.rows_of(reports[1])) == [("loop", "b"), ("growth [1/s]", None)]
     assert render.plain(reports[1]) == {"name": "b", "growth": None, "holds": False}
     screen = render.console(argparse.Namespace(json=None))
-    screen.print(render.columns_of("two loops", reports, Report))
+    screen.print(render.facts("a loop", render.rows_of(reports[0])))
     lines = capsys.readouterr().out.splitlines()
-    assert [part.strip() for part in lines[2].strip("┃").split("┃")] == ["loop", "growth [1/s]"]
-    assert [part.strip() for part in lines[5].strip("│").split("│")] == ["b", "-"]
+    assert [part.strip() for part in lines[3].strip("│").split("│")] == ["growth [1/s]", "+1.00"]
