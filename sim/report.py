@@ -17,7 +17,7 @@ from design.certificate import ANY, CAVEATS, assess, certificate_part, finite
 from design.conditions import Requirement
 from design.result import CONDITION_NAMES, PRINTED_TAU_DB, PUBLISHED, listed
 from design.transparency import Transparency, decibels
-from models.human import Human, Person
+from models.human import Person
 from sim.adversary import Worst
 from sim.couplings import Chosen
 from sim.crowds import MIXED, Findings, Validation
@@ -223,7 +223,7 @@ def _growth_under_delays(switched: Simulation, ticks: int) -> tuple[float, float
     one = HeldPlant(plant.A[None], plant.B[None], plant.C, T)
     process = unlimited(switched.process)
     engine = ExactBatchEngine(one, process.force_limit)
-    rate, _ = impulse_growth(process, engine, switched.scene, judged)
+    rate, _ = impulse_growth(process, engine, switched.scene, plant.A.shape[0], judged)
     return float(rate[0]), judged * T
 
 
@@ -322,7 +322,7 @@ def adversary_part(worst: Worst, ratio: float, certified: bool) -> dict[str, Any
     }
 
 
-def _humans(humans: tuple[Human, ...]) -> list[dict[str, Any]]:
+def _humans(humans: tuple[Any, ...]) -> list[dict[str, Any]]:
     """Links of each channel's human."""
     names = ("mass", "damping", "stiffness")
     return [{"links": [{name: getattr(link, name) for name in names} for link in human.links]} for human in humans]

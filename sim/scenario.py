@@ -257,7 +257,7 @@ def _run_file(path: str | Path) -> dict[str, Any]:
         raise InputError(f"--human {path}: {error.strerror}") from None
 
 
-def save_humans(path: Path, humans: tuple[Human, ...], remark: str, persons: tuple[Person, ...] = ()) -> Path:
+def save_humans(path: Path, humans: tuple[Any, ...], remark: str, persons: tuple[Person, ...] = ()) -> Path:
     """Write humans and persons without voluntary motion so that reading gives the same numbers.
 
     `remark` becomes a comment.

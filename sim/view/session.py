@@ -313,8 +313,8 @@ def _facts(prepared: PreparedLoop) -> dict[str, Any]:
         "coupling": prepared.label,
         "theta": list(prepared.scenario.theta),
         "psi": list(prepared.scenario.psi),
-        "exact_growth_rate_per_s": finite(prepared.mode.growth),
-        "exact_frequency_hz": prepared.mode.frequency_hz,
+        "exact_growth_rate_per_s": finite(float(prepared.mode.growth)),
+        "exact_frequency_hz": float(prepared.mode.frequency_hz),
         "certificates": {name: certificate_part(need) for name, need in prepared.requirements.items()},
         "promise": prepared.promise,
     }
