@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import sim  # noqa: F401 - at once, for Ctrl-C while a command of this package starts
 
 if TYPE_CHECKING:
-    from hw.api import Rehearsed, rehearse
+    from hw.rehearsal import Rehearsed, rehearse
 
 __all__ = ["Rehearsed", "rehearse"]
 
@@ -21,7 +21,7 @@ __all__ = ["Rehearsed", "rehearse"]
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'hw' has no attribute {name!r}")
-    return getattr(import_module("hw.api"), name)
+    return getattr(import_module("hw.rehearsal"), name)
 
 
 def __dir__() -> list[str]:

@@ -25,7 +25,7 @@ from design.margin import closed_loop
 from design.proof import positive_real
 from design.proof.rational import Matrix
 from design.store import BadFile, Certificate, DelayRange, Loop, SpringDamper, Stored, digest, load, save, sealed
-from hw.plan import ladder
+from hw.control import certified_couplings
 from sim.run import main as run_main
 from sim.scenario import load as scenario_of
 from sim.validate.__main__ import main as validate_main
@@ -351,7 +351,7 @@ def test_the_bridge_says_how_long_a_force_may_be_held(tmp_path):
     """Ages under isolated missed answers, from the line itself, lie within what the file proves."""
     loop = change(LOOP, theta=(1, 1), lam=(1, 1))
     save(Stored(loop, SOFT, prove(loop, SOFT, "closed-loop")), tmp_path / "one.json")
-    first, second = ladder(scenario_of().replace(theta=(1, 1)), "I", str(tmp_path / "one.json"), None, 1, spare=1)
+    first, second = certified_couplings(scenario_of().replace(theta=(1, 1)), "I", str(tmp_path / "one.json"), None, 1, spare=1)
     assert first.remarks() == ["a force that is held through 1 missed answer is covered by the file's proof"]
     missed = np.ones((40, 2, 1), dtype=np.int64)
     missed[5::3] = LOST

@@ -1,0 +1,146 @@
+"""What the commands at a port share: their options, the keyboard, and the session from HELLO to the end."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import termios
+import tty
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from typing import Any
+
+from cli.dashboard import Dashboard
+from hw.control import Program, link_delay
+from hw.emulator import spawned
+from hw.monitor import Ages, Settings
+from hw.session import Session
+from hw.transport import Live, Port
+from sim.command import numbers
+from sim.scenario import InputError
+
+USUAL_BAUD = 921_600
+SPARE = 600.0  # [s] beside the run, after which an orphan of --emulate would end by itself
+PASSED_ON = ("case", "scenario", "theta", "psi", "lam", "delta", "T")
+
+
+def add_link_options(parser: argparse.ArgumentParser) -> None:
+    """Which device, over which line, and how its delay is judged."""
+    link = parser.add_argument_group("the link")
+    link.add_argument("--port", metavar="PATH", help="serial port of the device, /dev/ttyACM0 or an emulator's")
+    link.add_argument("--emulate", action="store_true", help="start hw.emulator and drive that; it arms by itself")
+    link.add_argument("--fault", action="append", default=[], metavar="FAULT", help="for --emulate, see hw.emulator")
+    link.add_argument(
+        "--pace", default="1", metavar="P", help="slow motion for --emulate on a busy machine (default 1)"
+    )
+    link.add_argument("--arm", action="store_true", help="arm without being asked; else press a")
+    baud = "of a UART, checked against T; none: USB without one (default 921600; none for a pseudo-terminal)"
+    link.add_argument("--baud", metavar="N|none", help=baud)
+    link.add_argument("--quantile", default="0.99", metavar="Q", help="of the ages that theta covers (default 0.99)")
+    link.add_argument("--guard", default="1e-4", metavar="SECONDS", help="added to it (default 1e-4)")
+    link.add_argument("--measure", default="800", metavar="N", help="answers that are timed (default 800)")
+
+
+def check_link(args: argparse.Namespace) -> Settings:
+    """The settings of a session. Raises InputError where the options contradict each other."""
+    if bool(args.port) == args.emulate:
+        raise InputError("give either --port PATH or --emulate")
+    if args.fault and not args.emulate:
+        raise InputError("--fault is for --emulate; a device behind --port has its own")
+    if pace_from(args) != 1 and not args.emulate:
+        raise InputError("--pace is for --emulate: a device has its own timer")
+    if args.port and not args.arm and not sys.stdin.isatty():
+        raise InputError("no keyboard to arm with: give --arm, if nobody can get hurt")
+    number(args, "quantile", 0.5, 1.0)
+    number(args, "guard", 0.0, 0.1)
+    measure = numbers("--measure", args.measure, int, 1)[0]
+    if not 50 <= measure <= 100_000:
+        raise InputError(f"--measure is {measure}, allowed are 50 to 100000")
+    return Settings(baud=_baud(args), measure=measure)
+
+
+def _baud(args: argparse.Namespace) -> int | None:
+    """Of the UART in the line, None where there is none. Raises InputError.
+
+    A pseudo-terminal has none. Of /dev/ttyACM0 nobody can tell: native USB, or a chip with a UART behind it.
+    """
+    if args.baud is None:
+        pseudo = args.emulate or os.path.realpath(args.port).startswith("/dev/pts/")
+        return None if pseudo else USUAL_BAUD
+    if args.baud == "none":
+        return None
+    (baud,) = numbers("--baud", args.baud, int, 1)
+    if not 1200 <= baud <= 20_000_000:
+        raise InputError(f"--baud is {baud}, allowed are 1200 to 20000000, or none for a link without UART")
+    return baud
+
+
+def number(args: argparse.Namespace, name: str, low: float, high: float, default: float | None = None) -> float:
+    """One option as a number within its range. Raises InputError."""
+    text = getattr(args, name)
+    value = default if text is None else numbers(f"--{name}", text, float, 1)[0]
+    assert value is not None
+    if not low <= value <= high:
+        raise InputError(f"--{name} is {value:g}, allowed are {low:g} to {high:g}")
+    return value
+
+
+def pace_from(args: argparse.Namespace) -> float:
+    """Seconds of the device's clock per second. Raises InputError."""
+    pace = numbers("--pace", args.pace, float, 1)[0]
+    if not 0.01 <= pace <= 1:
+        raise InputError(f"--pace is {pace:g}, allowed are 0.01 to 1")
+    return pace
+
+
+def measured_link(args: argparse.Namespace, ages: Ages, T: float) -> int:
+    """Ticks of delay for the ages that were measured, by --quantile and --guard."""
+    return link_delay(ages, 1e6 * T, float(args.quantile), 1e6 * float(args.guard))
+
+
+def hold_session(
+    args: argparse.Namespace,
+    session: Session,
+    plan: Callable[[Ages], Sequence[Program]],
+    seconds: float,
+    seed: int,
+    extra: Sequence[str] = (),
+) -> Live:
+    """From opening the port, or starting an emulator with the options `extra`, to the end of the session."""
+    with ExitStack() as stack:
+        path = args.port or stack.enter_context(spawned([*_emulator_options(args, seed, seconds), *extra]))
+        port = stack.enter_context(Port(path, session.settings.baud))
+        keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
+        live = Live(session, port, plan, args.arm or args.emulate, seconds, keyboard, _view(stack), float(args.pace))
+        live.run()
+    return live
+
+
+def _emulator_options(args: argparse.Namespace, seed: int, seconds: float) -> list[str]:
+    """The same loop, the faults of --fault, and an end."""
+    options = [f"--{name}={getattr(args, name)}" for name in PASSED_ON if getattr(args, name) is not None]
+    options += [f"--fault={fault}" for fault in args.fault]
+    return [*options, f"--seed={seed}", f"--pace={args.pace}", f"--duration={seconds + SPARE:g}"]
+
+
+def _view(stack: ExitStack) -> Callable[[Session], None]:
+    """The dashboard, on a terminal."""
+    if not sys.stderr.isatty():
+        return lambda session: None
+    dashboard = Dashboard()
+    stack.callback(dashboard.close)
+    return dashboard
+
+
+@contextmanager
+def _keys() -> Iterator[int]:
+    """Standard input, key by key."""
+    keyboard = sys.stdin.fileno()
+    before: list[Any] = termios.tcgetattr(keyboard)
+    tty.setcbreak(keyboard, termios.TCSANOW)
+    try:
+        yield keyboard
+    finally:
+        with suppress(termios.error):  # it may have been closed
+            termios.tcsetattr(keyboard, termios.TCSANOW, before)
