@@ -27,6 +27,8 @@ def modules():
 
 
 def main_of(module):
+    if (ROOT / "cli" / f"{module.rpartition('.')[2]}.py").exists():  # the module is a door
+        return importlib.import_module(f"cli.{module.rpartition('.')[2]}").main
     package = (ROOT / module.replace(".", "/")).is_dir()
     return importlib.import_module(f"{module}.__main__" if package else module).main
 

@@ -45,7 +45,7 @@ HOMES = {
     },
     "cvxpy": {"design/"},
     "distributed": {"sim/validate/cluster.py"},
-    "serial": {"hw/port.py"},
+    "serial": {"hw/transport.py"},
     "matplotlib": {"sim/plot"},
     "PIL": {"sim/view/flat.py", "sim/view/film.py"},
 }

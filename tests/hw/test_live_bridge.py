@@ -245,10 +245,8 @@ def test_an_exception_stops_the_device_first(emulator, scenario):
 def test_an_emulator_ends_with_the_bridge_that_started_it():
     """However that ended: here by SIGKILL, which nobody can catch. An orphan would keep its terminal for minutes."""
     code = (
-        "import argparse, os, time; from hw.emulator import spawned\n"
-        "args = argparse.Namespace(case='I', scenario=None, theta=None, psi=None, lam=None, delta=None, T=None)\n"
-        "args.fault, args.pace = [], '0.2'\n"
-        "with spawned(args, 0, 60.0) as path: print(path, flush=True); time.sleep(600)"
+        "import time; from hw.emulator import spawned\n"
+        "with spawned(['--case=I', '--pace=0.2', '--duration=660']) as path: print(path, flush=True); time.sleep(600)"
     )
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     bridge_like = subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
