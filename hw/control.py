@@ -28,7 +28,7 @@ from hw.protocol import MAX_THETA, Config, State
 from sim.couplings import Chosen, choose
 from sim.scenario import InputError, Scenario
 
-FALLBACK = ("spring-damper", "theorem4")  # what softer couplings are where the one asked for cannot be had
+_FALLBACK = ("spring-damper", "theorem4")  # what softer couplings are where the one asked for cannot be had
 
 
 class Controller(Protocol):
@@ -259,7 +259,7 @@ def certified_couplings(
     the spring-damper by Theorem 4, which promises the most. Raises Fault where the first coupling is not certified;
     where no softer one is, the ladder ends.
     """
-    found, wanted = [certified_coupling(scenario, case, name, condition, link)], [(name, condition), FALLBACK]
+    found, wanted = [certified_coupling(scenario, case, name, condition, link)], [(name, condition), _FALLBACK]
     while len(found) <= spare and wanted:
         kind, by = wanted[0]
         try:

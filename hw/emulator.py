@@ -40,17 +40,17 @@ from sim.engine import outside_forces
 from sim.exact_engine import hold
 from sim.scenario import InputError, Scenario
 
-FOREVER = 1e9  # [s]
-STRETCH = 1000  # ticks of outside forces that are computed at once
-SUBSTEPS = 8  # per tick where there is Coulomb friction
-SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
+_FOREVER = 1e9  # [s]
+_STRETCH = 1000  # ticks of outside forces that are computed at once
+_SUBSTEPS = 8  # per tick where there is Coulomb friction
+_SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
 FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
-ENCODER_STEP = 1e-6  # [m] where the scenario has ideal encoders
-REACH = 0.1  # [m] assumed: the workspace is +-10 cm
-SETTLED = 50  # ticks at full cap after which the person starts to move
-FARTHEST = 2**31 - 1  # [counts]
-LINGER_US = 50_000  # after the cable was pulled: the device comes to rest by itself
-PATIENCE = 60.0  # [s] for the emulator to load MuJoCo and print its path
+_ENCODER_STEP = 1e-6  # [m] where the scenario has ideal encoders
+_REACH = 0.1  # [m] assumed: the workspace is +-10 cm
+_SETTLED = 50  # ticks at full cap after which the person starts to move
+_FARTHEST = 2**31 - 1  # [counts]
+_LINGER_US = 50_000  # after the cable was pulled: the device comes to rest by itself
+_PATIENCE = 60.0  # [s] for the emulator to load MuJoCo and print its path
 
 
 #: kind -> (what VALUE is, least, most, default), for the line
@@ -77,7 +77,7 @@ DEVICE = {
     "estop": ("no value: the emergency stop at the device", 0.0, 0.0, 0.0),
     "trip": ("no value: a fault that the firmware found", 0.0, 0.0, 0.0),
 }
-KINDS = LINE | DEVICE
+_KINDS = LINE | DEVICE
 _FORM = re.compile(r"(?:(up|down):)?([a-z]+)(?:=([^@+]+))?(?:@([^+]+)(?:\+(.+))?)?")
 
 
@@ -89,26 +89,26 @@ class FaultInjection:
     value: float
     where: str = "both"  # up | down | both: direction of the line
     start: float | None = None  # [s] after arming; None: always
-    duration: float = FOREVER  # [s]
+    duration: float = _FOREVER  # [s]
 
     @classmethod
     def parse(cls, text: str) -> Self:
         """The fault that `text` describes. Raises InputError naming what is wrong with it."""
         match = _FORM.fullmatch(text)
-        if not match or match[2] not in KINDS:
-            names = ", ".join(KINDS)
+        if not match or match[2] not in _KINDS:
+            names = ", ".join(_KINDS)
             raise InputError(f"--fault is {text!r}, expected KIND[=VALUE][@START[+DURATION]], KIND one of {names}")
         where, kind, value, start, duration = match.groups()
         if where and kind not in LINE:
             raise InputError(f"--fault {text}: {kind} happens to the device, not to one direction of the line")
-        what, low, high, default = KINDS[kind]
+        what, low, high, default = _KINDS[kind]
         try:
             given = default if value is None else float(value)
             begins = None if start is None else float(start)
-            lasts = FOREVER if duration is None else float(duration)
+            lasts = _FOREVER if duration is None else float(duration)
             require(f"{kind} ({what})", given, low, high, "")
-            require("START", begins or 0.0, 0.0, FOREVER, "s")
-            require("DURATION", lasts, 1e-6, FOREVER, "s")
+            require("START", begins or 0.0, 0.0, _FOREVER, "s")
+            require("DURATION", lasts, 1e-6, _FOREVER, "s")
             if kind == "leap" and given != int(given):
                 raise ValueError(f"VALUE is {given:g}, expected a whole number of ticks")
         except ValueError as error:
@@ -175,7 +175,7 @@ class EmulatedPlant:
     """
 
     def __init__(self, scenario: Scenario, encoder_step: Array, coulomb: float = 0.0) -> None:
-        self.coulomb, self._substeps = coulomb, SUBSTEPS if coulomb else 1
+        self.coulomb, self._substeps = coulomb, _SUBSTEPS if coulomb else 1
         self.scenario, self.encoder_step = scenario, encoder_step
         self.scene = build(scenario.device, scenario.human, scenario.person)
         held = hold(plant(self.scene.model), scenario.T / self._substeps)
@@ -201,7 +201,7 @@ class EmulatedPlant:
         w = np.zeros(self.scene.outside) if self.tick is None else self._next_outside()
         f, m, n = np.clip(f, -self._limit, self._limit), self.channels, len(self.s) // 2
         for _ in range(self._substeps):
-            friction = self.coulomb * np.tanh(self.s[n : n + m] / SLIP) if self.coulomb else 0.0
+            friction = self.coulomb * np.tanh(self.s[n : n + m] / _SLIP) if self.coulomb else 0.0
             self.s = self._product @ np.concatenate([self.s, w, f + friction])
 
     def _next_outside(self) -> Array:
@@ -209,7 +209,7 @@ class EmulatedPlant:
         row = self.tick - self._first
         if not row < len(self._outside):
             self._first, row = self.tick, 0
-            self._outside = outside_forces(self.scenario, self.scene, self._first, STRETCH)
+            self._outside = outside_forces(self.scenario, self.scene, self._first, _STRETCH)
         self.tick += 1
         return self._outside[row]
 
@@ -221,7 +221,7 @@ def nobody(scenario: Scenario) -> Scenario:
 
 def info_of(scenario: Scenario) -> Info:
     """What the emulated device says of itself: the scenario's devices, in the units of the wire."""
-    encoder = [round(1e12 * (device.encoder_step or ENCODER_STEP)) for device in scenario.device]
+    encoder = [round(1e12 * (device.encoder_step or _ENCODER_STEP)) for device in scenario.device]
     return Info(
         version=PROTOCOL,
         firmware="emulator",
@@ -231,7 +231,7 @@ def info_of(scenario: Scenario) -> Info:
         encoder_step=tuple(encoder),
         force_step=(FORCE_STEP,) * scenario.channels,
         hard_limit=tuple(min(0x7FFF, round(1e6 * d.force_limit / FORCE_STEP)) for d in scenario.device),
-        range=tuple(round(1e12 * REACH / step) for step in encoder),
+        range=tuple(round(1e12 * _REACH / step) for step in encoder),
     )
 
 
@@ -272,7 +272,7 @@ class Emulator:
         """A period begins: sample, latch, answer. `now` is the device's clock [us]; advance() goes with every tick."""
         self._misbehave(now)
         counts = tuple(
-            max(-FARTHEST, min(FARTHEST, n + o)) for n, o in zip(self.plant.counts(), self._offset, strict=True)
+            max(-_FARTHEST, min(_FARTHEST, n + o)) for n, o in zip(self.plant.counts(), self._offset, strict=True)
         )
         steps, data = self.device.tick(now, counts)
         if self.device.phase in RUNNING and self.armed_at is None:
@@ -288,7 +288,7 @@ class Emulator:
     def _wake_person(self) -> None:
         config = self.device.config
         self._ready += config is not None and self.armed_at is not None and self.device.run >= config.ramp_in
-        if self._ready >= SETTLED and self.begun_at is None:
+        if self._ready >= _SETTLED and self.begun_at is None:
             self.begun_at = self.device.k
             self.plant.begin()
 
@@ -400,7 +400,7 @@ class RealTimeEmulator:
             if self.emulator.unplugged and unplugged_at is None:
                 unplugged_at = due
                 self.terminal.unplug()
-            if unplugged_at is not None and due > unplugged_at + LINGER_US:
+            if unplugged_at is not None and due > unplugged_at + _LINGER_US:
                 return
 
     def _wait(self, due: float) -> None:
@@ -452,7 +452,7 @@ def spawned(options: Sequence[str]) -> Iterator[str]:
     assert child.stdout is not None
     assert child.stderr is not None
     try:
-        ready = select.select([child.stdout], [], [], PATIENCE)[0]
+        ready = select.select([child.stdout], [], [], _PATIENCE)[0]
         path = child.stdout.readline().strip() if ready else ""
         if not path:
             child.terminate()

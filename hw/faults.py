@@ -24,14 +24,14 @@ from hw.session import Session
 from sim.scenario import Scenario, load
 
 WHEN = 0.45  # [s] after arming: the gain is 1 after 0.25 s, the person moves after 0.31 s
-LASTS = 0.75  # [s] after arming that a case is watched
-T_MS = 1.2
+_LASTS = 0.75  # [s] after arming that a case is watched
+_T_MS = 1.2
 
 #: bounds on the time to zero [ms], each with one tick for the sampling of the fault
-AT_ONCE = 2 * T_MS  # an e-stop is taken at the next tick
-STOP = 8 * T_MS  # the frame that shows it, the STOP, 5 ticks of ramp
-WATCHDOG = 12 * T_MS  # theta, 4 ticks held, 5 of ramp, one to notice
-SILENCE = 6.0 + 1.0 + 8 * T_MS  # the host's time-out, looked at every millisecond, then a STOP
+_AT_ONCE = 2 * _T_MS  # an e-stop is taken at the next tick
+_STOP = 8 * _T_MS  # the frame that shows it, the STOP, 5 ticks of ramp
+_WATCHDOG = 12 * _T_MS  # theta, 4 ticks held, 5 of ramp, one to notice
+_SILENCE = 6.0 + 1.0 + 8 * _T_MS  # the host's time-out, looked at every millisecond, then a STOP
 
 Call = Callable[[Session, int], bytes]
 
@@ -54,7 +54,7 @@ class Case:
     counted: tuple[str, ...] = ()  # counters that must not be zero
     first_tick: int = 0
     period: float = 1.0  # of the device's clock, in T
-    lasts: float = LASTS  # [s] after arming
+    lasts: float = _LASTS  # [s] after arming
 
 
 def spoiled(force: float) -> Call:
@@ -84,7 +84,7 @@ def at(text: str) -> tuple[str, ...]:
 
 
 G, A = Stage, Stage.ARMED
-LATE = at("down:jitter=0.0007")
+_LATE = at("down:jitter=0.0007")
 CASES = (
     Case("nothing", A),
     Case("ticks wrap around", A, first_tick=65000),
@@ -105,58 +105,60 @@ CASES = (
     Case("host freezes for 4 ms", A, host_stall=0.004, counted=("misses",)),
     Case("handshake over a bad line", A, faults=("drop=0.04", "flip=0.01"), counted=("gaps",)),
     # the line, too much
-    Case("no STATE arrives", G.LOST, "no new STATE", at("up:drop=1"), SILENCE),
-    Case("no FORCE arrives", G.STOPPED, "cause watchdog", at("down:drop=1"), WATCHDOG),
-    Case("nothing arrives", G.LOST, "no new STATE", at("drop=1"), WATCHDOG),
-    Case("every STATE damaged", G.LOST, "no new STATE", at("up:flip=1"), SILENCE),
-    Case("every FORCE damaged", G.STOPPED, "cause watchdog", at("down:flip=1"), WATCHDOG),
-    Case("every frame cut short", G.LOST, "no new STATE", at("truncate=1"), WATCHDOG),
-    Case("noise all the time", G.LOST, "no new STATE", at("up:garbage=60"), SILENCE),
-    Case("noise at the device", G.STOPPED, "cause watchdog", at("down:garbage=60"), WATCHDOG),
+    Case("no STATE arrives", G.LOST, "no new STATE", at("up:drop=1"), _SILENCE),
+    Case("no FORCE arrives", G.STOPPED, "cause watchdog", at("down:drop=1"), _WATCHDOG),
+    Case("nothing arrives", G.LOST, "no new STATE", at("drop=1"), _WATCHDOG),
+    Case("every STATE damaged", G.LOST, "no new STATE", at("up:flip=1"), _SILENCE),
+    Case("every FORCE damaged", G.STOPPED, "cause watchdog", at("down:flip=1"), _WATCHDOG),
+    Case("every frame cut short", G.LOST, "no new STATE", at("truncate=1"), _WATCHDOG),
+    Case("noise all the time", G.LOST, "no new STATE", at("up:garbage=60"), _SILENCE),
+    Case("noise at the device", G.STOPPED, "cause watchdog", at("down:garbage=60"), _WATCHDOG),
     Case("40 % of FORCEs lost", G.STOPPED, "no answer in time|watchdog", at("down:drop=0.4"), 300.0),
-    Case("2 ms later both ways", G.STOPPED, "cause watchdog", at("delay=0.002"), WATCHDOG + 4.0),
-    Case("host freezes for 20 ms", G.STOPPED, "in ramp|in stopped", within=WATCHDOG, host_stall=0.02),
-    Case("cable pulled", G.LOST, "port is gone", at("unplug"), WATCHDOG),
+    Case("2 ms later both ways", G.STOPPED, "cause watchdog", at("delay=0.002"), _WATCHDOG + 4.0),
+    Case("host freezes for 20 ms", G.STOPPED, "in ramp|in stopped", within=_WATCHDOG, host_stall=0.02),
+    Case("cable pulled", G.LOST, "port is gone", at("unplug"), _WATCHDOG),
     # the delay
-    Case("answers get late", G.DISARMED, "theta = 2", LATE, 500.0, designed=True, counted=("late",), lasts=1.2),
-    Case("late, nothing softer", G.STOPPED, "nothing softer", LATE, 500.0, counted=("late",), lasts=1.2),
+    Case("answers get late", G.DISARMED, "theta = 2", _LATE, 500.0, designed=True, counted=("late",), lasts=1.2),
+    Case("late, nothing softer", G.STOPPED, "nothing softer", _LATE, 500.0, counted=("late",), lasts=1.2),
     Case("a slow link from the start", A, faults=("delay=0.004",), designed=True),
     Case("a link too slow", G.REFUSED, "at most theta = 15", ("delay=0.012",), designed=True),
     Case("a coupling not certified", G.REFUSED, "published is not certified", coupling="published", designed=True),
     Case("no coupling", G.REFUSED, "without coupling is not certified", coupling="none", designed=True),
     # while the gain rises
-    Case("answers late in ramp-in", G.DISARMED, "theta = 2", ("down:jitter=0.0007@0.02",), AT_ONCE, designed=True),
-    Case("no FORCE in ramp-in", G.STOPPED, "cause watchdog", ("down:drop=1@0.1",), AT_ONCE),
-    Case("40 % of FORCEs lost in ramp-in", G.STOPPED, "no answer in time|watchdog", ("down:drop=0.4@0.02",), AT_ONCE),
-    Case("tick number leaps in ramp-in", G.STOPPED, "leapt by 301, the watchdog allows 5", ("leap=300@0.03",), AT_ONCE),
+    Case("answers late in ramp-in", G.DISARMED, "theta = 2", ("down:jitter=0.0007@0.02",), _AT_ONCE, designed=True),
+    Case("no FORCE in ramp-in", G.STOPPED, "cause watchdog", ("down:drop=1@0.1",), _AT_ONCE),
+    Case("many FORCEs lost in ramp-in", G.STOPPED, "no answer in time|watchdog", ("down:drop=0.4@0.02",), _AT_ONCE),
+    Case(
+        "tick number leaps in ramp-in", G.STOPPED, "leapt by 301, the watchdog allows 5", ("leap=300@0.03",), _AT_ONCE
+    ),
     # the measurement
     Case("a third of FORCEs lost from the start", G.REFUSED, "% of the answers never reached", ("down:drop=0.33",)),
     Case("3 % lost from the start", G.REFUSED, "no delay keeps 99 %", ("down:drop=0.03",), designed=True),
     # the device
-    Case("tick number leaps by 300", G.STOPPED, "leapt by 301", at("leap=300"), STOP),
-    Case("tick number leaps by 3", G.STOPPED, "by its own clock", at("leap=3"), STOP),
-    Case("a force of its own", G.STOPPED, "it was told .*, and so for 5 ticks", at("own=2"), STOP + 6 * T_MS),
-    Case("a force of its own in ramp-in", G.STOPPED, "it was told", ("own=2@0.05",), AT_ONCE),
-    Case("a tick lasts twice as long", G.STOPPED, "by its own clock", at("period=2"), 2 * STOP + 6 * T_MS),
+    Case("tick number leaps by 300", G.STOPPED, "leapt by 301", at("leap=300"), _STOP),
+    Case("tick number leaps by 3", G.STOPPED, "by its own clock", at("leap=3"), _STOP),
+    Case("a force of its own", G.STOPPED, "it was told .*, and so for 5 ticks", at("own=2"), _STOP + 6 * _T_MS),
+    Case("a force of its own in ramp-in", G.STOPPED, "it was told", ("own=2@0.05",), _AT_ONCE),
+    Case("a tick lasts twice as long", G.STOPPED, "by its own clock", at("period=2"), 2 * _STOP + 6 * _T_MS),
     Case("clock drifts by 2 %", G.STOPPED, "lasts 12.. us by its own clock", at("period=1.02"), 250.0),
     Case("clock drifts by 0.5 %", A, faults=at("period=1.005")),
-    Case("device freezes for 20 ms", G.LOST, "no new STATE", at("stall=0.02"), 20.0 + WATCHDOG),
-    Case("device resets", G.LOST, "no new STATE", at("reset"), AT_ONCE),
+    Case("device freezes for 20 ms", G.LOST, "no new STATE", at("stall=0.02"), 20.0 + _WATCHDOG),
+    Case("device resets", G.LOST, "no new STATE", at("reset"), _AT_ONCE),
     Case("encoder jumps by 2 mm", A, faults=at("jump=2")),
-    Case("encoder jumps by 5 mm", G.STOPPED, "encoder 1 jumped by", at("jump=5"), STOP),
+    Case("encoder jumps by 5 mm", G.STOPPED, "encoder 1 jumped by", at("jump=5"), _STOP),
     Case("encoder out of its range", G.STOPPED, "its range is", ("jump=200",)),
-    Case("e-stop at the device", G.ESTOP, "estop_device", at("estop"), AT_ONCE),
+    Case("e-stop at the device", G.ESTOP, "estop_device", at("estop"), _AT_ONCE),
     Case("e-stop at the device before", G.REFUSED, "refuses the configuration: estop", ("estop",)),
-    Case("firmware finds a fault", G.STOPPED, "cause device", at("trip"), STOP),
+    Case("firmware finds a fault", G.STOPPED, "cause device", at("trip"), _STOP),
     Case("device clock runs 5 % fast", G.REFUSED, "by its own clock", period=1.05),
     # the controller
-    Case("controller asks for nan", G.STOPPED, "nan, nan N, which is no force", within=STOP, action=spoiled(np.nan)),
-    Case("controller asks for inf", G.STOPPED, "inf, inf N, which is no force", within=STOP, action=spoiled(np.inf)),
-    Case("controller raises", G.STOPPED, "ZeroDivisionError", within=STOP, action=spoiled(-np.inf)),
+    Case("controller asks for nan", G.STOPPED, "nan, nan N, which is no force", within=_STOP, action=spoiled(np.nan)),
+    Case("controller asks for inf", G.STOPPED, "inf, inf N, which is no force", within=_STOP, action=spoiled(np.inf)),
+    Case("controller raises", G.STOPPED, "ZeroDivisionError", within=_STOP, action=spoiled(-np.inf)),
     Case("controller asks for 100 N", A, action=spoiled(100.0), counted=("clipped", "slowed")),
     # people
-    Case("planned stop", G.FINISHED, "asked to", within=100.0 + STOP, action=person("stop")),
-    Case("e-stop at the host", G.ESTOP, "asked to", within=AT_ONCE, action=person("estop")),
+    Case("planned stop", G.FINISHED, "asked to", within=100.0 + _STOP, action=person("stop")),
+    Case("e-stop at the host", G.ESTOP, "asked to", within=_AT_ONCE, action=person("estop")),
     # the handshake
     Case("another protocol", G.REFUSED, "version 2", info=lambda i: i._replace(version=2)),
     Case(
@@ -186,7 +188,7 @@ CASES = (
 )
 
 
-MEASURED = 100  # answers whose age is measured: enough for a line that does not vary
+_MEASURED = 100  # answers whose age is measured: enough for a line that does not vary
 
 
 @dataclass(frozen=True)
@@ -226,7 +228,7 @@ def rehearse_case(
 ) -> tuple[Rehearsal, FaultOutcome]:
     """One case. `made` are couplings for a link of one tick, and softer ones."""
     info = info_of(scenario)
-    session = Session(scenario, Limits(tuple(d.force_limit for d in scenario.device)), Settings(case.baud, MEASURED))
+    session = Session(scenario, Limits(tuple(d.force_limit for d in scenario.device)), Settings(case.baud, _MEASURED))
     faults = tuple(FaultInjection.parse(text) for text in case.faults)
     emulator = Emulator(scenario, faults, case.info(info) if case.info else info)
     emulator.device.k = case.first_tick

@@ -25,33 +25,33 @@ from hw.session import Session
 from models.device import RigidDevice
 from sim.scenario import Scenario
 
-APART = 1  # [counts] that noise may move an encoder at rest: it reads two neighbours in turn
-WORTH = 5.0  # samples that one standstill counts as
+_APART = 1  # [counts] that noise may move an encoder at rest: it reads two neighbours in turn
+_WORTH = 5.0  # samples that one standstill counts as
 _Flags = NDArray[np.bool_]
-COULOMB = 2  # where Coulomb friction is among the parameters
-SHIFT = 1e-5  # of log parameters, and of Coulomb friction in newtons, for derivatives
-UNEXPLAINED = 0.7, 1.5e-3  # encoder steps rms (rounding alone leaves 0.29), or this part of the motion's rms
-SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
-COARSE, FINE = 3, 8  # substeps of a tick for which it is held: in a search, and at its end
-LEAD = 0.3  # [s] of zero force, in which the gain comes up
-MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a mode is looked for first
-PARTS = (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mass, that the motor may have
-STARTS = 2  # of the search in time
-SPECTRUM = 250  # frequencies that are compared first
-FLOOR = 1e-12  # of a ratio whose logarithm is taken
-OUTLIER = 0.1  # of a logarithm, from which it counts less: friction spoils the low frequencies, a resonance is narrow
-BANDWIDTH = 60  # [ticks] over which residuals may be correlated
-RECORDS = 40  # that might have been
-ROUNDING = 1 / 12  # variance of an error that is uniform within a step
-WIDEST = 0.2  # standard deviations of the parameters' logarithms beyond which they are not drawn
-EVALUATIONS = 60, 30  # of a search without Coulomb friction and with it, less those for derivatives
-POLISH = 15  # steps at the end, with friction integrated more finely
-ENOUGH = 1e-6  # part of the sum of squares, from which on a step is the last one
-ONE_SIDED_95 = 1.6449  # normal quantile
-VAGUE = 0.1  # standard error of b, as a part of b, above which nothing is said of it
-FRICTIONS = (1e-5, 0.01, 0.05)  # Coulomb friction that a search begins with, of the force's span
-SEARCH_REACH = 3.0  # of a search, in logarithms
-SUSPICIOUS = 0.1  # part by which an estimate may exceed the declared damping
+_COULOMB = 2  # where Coulomb friction is among the parameters
+_SHIFT = 1e-5  # of log parameters, and of Coulomb friction in newtons, for derivatives
+_UNEXPLAINED = 0.7, 1.5e-3  # encoder steps rms (rounding alone leaves 0.29), or this part of the motion's rms
+_SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
+_COARSE, _FINE = 3, 8  # substeps of a tick for which it is held: in a search, and at its end
+_LEAD = 0.3  # [s] of zero force, in which the gain comes up
+_MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a mode is looked for first
+_PARTS = (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mass, that the motor may have
+_STARTS = 2  # of the search in time
+_SPECTRUM = 250  # frequencies that are compared first
+_FLOOR = 1e-12  # of a ratio whose logarithm is taken
+_OUTLIER = 0.1  # of a logarithm, from which it counts less: friction spoils the low frequencies, a resonance is narrow
+_BANDWIDTH = 60  # [ticks] over which residuals may be correlated
+_RECORDS = 40  # that might have been
+_ROUNDING = 1 / 12  # variance of an error that is uniform within a step
+_WIDEST = 0.2  # standard deviations of the parameters' logarithms beyond which they are not drawn
+_EVALUATIONS = 60, 30  # of a search without Coulomb friction and with it, less those for derivatives
+_POLISH = 15  # steps at the end, with friction integrated more finely
+_ENOUGH = 1e-6  # part of the sum of squares, from which on a step is the last one
+_ONE_SIDED_95 = 1.6449  # normal quantile
+_VAGUE = 0.1  # standard error of b, as a part of b, above which nothing is said of it
+_FRICTIONS = (1e-5, 0.01, 0.05)  # Coulomb friction that a search begins with, of the force's span
+_SEARCH_REACH = 3.0  # of a search, in logarithms
+_SUSPICIOUS = 0.1  # part by which an estimate may exceed the declared damping
 
 
 # A force that does not depend on the motion: a chirp, then silence. What a device is identified with.
@@ -108,7 +108,7 @@ def chirp(
     low, high = band
     rate = np.log(high / low) / seconds
     wave = amplitude * np.cos(2 * np.pi * low * np.expm1(rate * t) / rate)
-    lead, tail = np.zeros(round(LEAD / T)), np.zeros(round(seconds / 2 / T))
+    lead, tail = np.zeros(round(_LEAD / T)), np.zeros(round(seconds / 2 / T))
     return Excitation(np.tile(np.concatenate([lead, wave, tail])[:, None], channels), T, link)
 
 
@@ -122,16 +122,16 @@ def chirp(
 def worth(counts: Array) -> Array:
     """Weights (N,) in (0, 1] of samples (N,) [counts]: 1 while the encoder moves, WORTH/L in a standstill of L samples.
 
-    A standstill is a stretch, as long as possible from left to right, in which the counts differ by APART at most.
+    A standstill is a stretch, as long as possible from left to right, in which the counts differ by _APART at most.
     """
     starts, low, high = [0], counts[0], counts[0]
     for k, n in enumerate(counts.tolist()):
         low, high = min(low, n), max(high, n)
-        if high - low > APART:
+        if high - low > _APART:
             starts.append(k)
             low = high = n
     lengths = np.diff([*starts, len(counts)])
-    return np.repeat(np.minimum(1.0, WORTH / lengths), lengths)
+    return np.repeat(np.minimum(1.0, _WORTH / lengths), lengths)
 
 
 # One axis: the displacement that a record of forces gives, for any mass, friction, transmission.
@@ -145,7 +145,7 @@ class _Model:
     """p = [log m1, log b, c, log m2, log k] -> simulated displacement."""
 
     def __init__(
-        self, x: Array, force: Array, used: _Flags, T: float, step: float, rigid: bool, substeps: int = COARSE
+        self, x: Array, force: Array, used: _Flags, T: float, step: float, rigid: bool, substeps: int = _COARSE
     ) -> None:
         self.x, self.force, self.used, self.T, self.step, self.rigid = x, force, used, T, step, rigid
         self.substeps = substeps
@@ -153,7 +153,7 @@ class _Model:
 
     def finer(self) -> _Model:
         """The same record, friction integrated more finely."""
-        return _Model(self.x, self.force, self.used, self.T, self.step, self.rigid, FINE)
+        return _Model(self.x, self.force, self.used, self.T, self.step, self.rigid, _FINE)
 
     def matrices(self, p: Array, T: float) -> tuple[Array, Array]:
         """The plant held for T: s+ = A s + B u with s = [positions; velocities]."""
@@ -171,14 +171,14 @@ class _Model:
 
     def simulate(self, p: Array) -> Array:
         """Displacement (N,) [m] from rest."""
-        substeps = self.substeps if p[COULOMB] else 1
+        substeps = self.substeps if p[_COULOMB] else 1
         A, B = self.matrices(p, self.T / substeps)
         play = _play_rigid if self.rigid else _play_compliant
-        return np.array(play(A.tolist(), B.tolist(), float(p[COULOMB]), self.force.tolist(), substeps))
+        return np.array(play(A.tolist(), B.tolist(), float(p[_COULOMB]), self.force.tolist(), substeps))
 
     def allowed(self) -> float:
         """What a fit may leave unexplained [m] rms."""
-        return max(UNEXPLAINED[0] * self.step, UNEXPLAINED[1] * float(np.std(self.x[self.used])))
+        return max(_UNEXPLAINED[0] * self.step, _UNEXPLAINED[1] * float(np.std(self.x[self.used])))
 
     def error(self, p: Array) -> Array:
         """Measured less simulated (used,) [m]; where the origin lies is not known."""
@@ -192,9 +192,9 @@ class _Model:
 
     def jacobian(self, p: Array) -> Array:
         """Derivatives of the displacement (used, p) by central differences."""
-        shifts = SHIFT * np.eye(p.size)
+        shifts = _SHIFT * np.eye(p.size)
         columns = [(self.simulate(p + s) - self.simulate(p - s))[self.used] for s in shifts]
-        return np.stack(columns, axis=1) / (2 * SHIFT)
+        return np.stack(columns, axis=1) / (2 * _SHIFT)
 
     def slopes(self, p: Array) -> Array:
         """Derivatives of what is subtracted in residual() (used, p)."""
@@ -214,7 +214,7 @@ def _play_rigid(A: list[list[float]], B: list[float], c: float, force: list[floa
     for f in force:
         out.append(x)
         for _ in range(substeps):
-            u = f - c * tanh(v / SLIP)
+            u = f - c * tanh(v / _SLIP)
             x, v = x + xv * v + bx * u, vv * v + bv * u
     return out
 
@@ -227,7 +227,7 @@ def _play_compliant(A: list[list[float]], B: list[float], c: float, force: list[
     for f in force:
         out.append(x)
         for _ in range(substeps):
-            u = f - c * tanh(v / SLIP)
+            u = f - c * tanh(v / _SLIP)
             x, y, v, w = (
                 a00 * x + a01 * y + a02 * v + a03 * w + b0 * u,
                 a10 * x + a11 * y + a12 * v + a13 * w + b1 * u,
@@ -251,40 +251,40 @@ class _Spectrum:
         force, moved = np.fft.rfft(model.force), np.fft.rfft(np.diff(model.x, append=model.x[-1]))
         loud = np.flatnonzero(np.abs(force) > 0.2 * np.abs(force).max())
         self.model, self.z = model, np.exp(2j * np.pi * loud / len(model.force))
-        self.measured = np.log(np.abs(moved[loud] / force[loud]) + FLOOR)
+        self.measured = np.log(np.abs(moved[loud] / force[loud]) + _FLOOR)
 
     def apart(self, point: Array, every: int = 1) -> Array:
         """Logarithms of the model's ratio less the measured one's, at every so many frequencies."""
         A, B = self.model.matrices(point, self.model.T)
         z = self.z[::every]
         G = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, np.broadcast_to(B[:, None], (z.size, len(A), 1)))
-        return np.log(np.abs((z - 1) * G[:, 0, 0]) + FLOOR) - self.measured[::every]
+        return np.log(np.abs((z - 1) * G[:, 0, 0]) + _FLOOR) - self.measured[::every]
 
     def refined(self, point: Array) -> tuple[float, Array]:
         """The nearest point by all frequencies, and how far it is; Coulomb friction stays."""
 
         def apart(p: Array) -> Array:
-            return self.apart(np.insert(p, COULOMB, point[COULOMB]))
+            return self.apart(np.insert(p, _COULOMB, point[_COULOMB]))
 
-        fit = least_squares(apart, np.delete(point, COULOMB), loss="soft_l1", f_scale=OUTLIER, max_nfev=40)
-        return float(fit.cost), np.insert(fit.x, COULOMB, point[COULOMB])
+        fit = least_squares(apart, np.delete(point, _COULOMB), loss="soft_l1", f_scale=_OUTLIER, max_nfev=40)
+        return float(fit.cost), np.insert(fit.x, _COULOMB, point[_COULOMB])
 
 
 def _spectral_starts(model: _Model, stiff: Array) -> list[Array]:
     """Parameters to begin with, best first, from those of a stiff device: [log m, log b, c]."""
     spectrum = _Spectrum(model)
-    every = max(1, spectrum.z.size // SPECTRUM)
+    every = max(1, spectrum.z.size // _SPECTRUM)
     points, mass = [], float(np.exp(stiff[0]))
-    for hz, part in product(MODES_HZ, PARTS):
+    for hz, part in product(_MODES_HZ, _PARTS):
         m1, m2 = part * mass, (1 - part) * mass
         k = (2 * np.pi * hz) ** 2 * m1 * m2 / mass
-        point = np.array([np.log(m1), max(stiff[1], -2.0), stiff[COULOMB], np.log(m2), np.log(k)])
+        point = np.array([np.log(m1), max(stiff[1], -2.0), stiff[_COULOMB], np.log(m2), np.log(k)])
         # absolute: a few bins of a resonance may lie far apart
         points.append((float(np.abs(spectrum.apart(point, every)).mean()), point))
     best: dict[float, Array] = {}
     for _, point in sorted(points, key=lambda entry: entry[0]):
         best.setdefault(round(float(point[0]), 6), point)  # the best mode of every split
-    refined = [spectrum.refined(point) for point in list(best.values())[:STARTS]]
+    refined = [spectrum.refined(point) for point in list(best.values())[:_STARTS]]
     return [point for _, point in sorted(refined, key=lambda entry: entry[0])]
 
 
@@ -313,17 +313,17 @@ def _spread(model: _Model, p: Array, seed: int = 0) -> _Spread:
     residual = model.error(p)
     covariance = _sandwich(J, residual, model.weight)
     share = model.weight / model.weight.sum()
-    noise = np.sqrt(max(0.0, float(share @ residual**2) / model.step**2 - ROUNDING))  # [counts]
+    noise = np.sqrt(max(0.0, float(share @ residual**2) / model.step**2 - _ROUNDING))  # [counts]
     generator = np.random.default_rng(seed)
     root = _root(covariance)
-    misses = np.array([_miss(model, p, root, J, noise, generator) for _ in range(RECORDS)])
+    misses = np.array([_miss(model, p, root, J, noise, generator) for _ in range(_RECORDS)])
     return _Spread(covariance + np.cov(misses.T), misses.mean(axis=0))
 
 
 def _miss(model: _Model, p: Array, root: Array, J: Array, noise: float, generator: np.random.Generator) -> Array:
     """By how much a record that might have been is estimated wrong (p,)."""
-    other = p + np.clip(root @ generator.standard_normal(p.size), -WIDEST, WIDEST)
-    other[COULOMB] = max(0.0, other[COULOMB])
+    other = p + np.clip(root @ generator.standard_normal(p.size), -_WIDEST, _WIDEST)
+    other[_COULOMB] = max(0.0, other[_COULOMB])
     exact = model.simulate(other)[model.used] / model.step + generator.uniform()
     counts = np.round(exact + noise * generator.standard_normal(exact.size))
     weight = worth(counts)
@@ -342,9 +342,9 @@ def _sandwich(J: Array, residual: Array, weight: Array) -> Array:
     centred = J - np.average(J, axis=0, weights=weight)
     scores = centred * (weight * residual)[:, None]
     middle = scores.T @ scores
-    for lag in range(1, min(BANDWIDTH, len(scores) - 1)):
+    for lag in range(1, min(_BANDWIDTH, len(scores) - 1)):
         shared = scores[lag:].T @ scores[:-lag]
-        middle += (1 - lag / BANDWIDTH) * (shared + shared.T)
+        middle += (1 - lag / _BANDWIDTH) * (shared + shared.T)
     bread = np.linalg.pinv(centred.T @ (weight[:, None] * centred))
     return bread @ middle @ bread
 
@@ -397,17 +397,17 @@ def _without_coulomb(model: _Model, start: Array) -> OptimizeResult:
     """
 
     def residual(p: Array) -> Array:
-        return model.residual(np.insert(p, COULOMB, 0.0))
+        return model.residual(np.insert(p, _COULOMB, 0.0))
 
-    bounds = (start - SEARCH_REACH, start + SEARCH_REACH)
-    return least_squares(residual, start, x_scale="jac", bounds=bounds, max_nfev=EVALUATIONS[0])
+    bounds = (start - _SEARCH_REACH, start + _SEARCH_REACH)
+    return least_squares(residual, start, x_scale="jac", bounds=bounds, max_nfev=_EVALUATIONS[0])
 
 
 def _with_coulomb(model: _Model, near: Array) -> OptimizeResult:
     """All parameters, from a start that lacks c: hardly any at first, then more as long as much is unexplained."""
     fits = []
-    for part in FRICTIONS:
-        fits.append(_search(model, np.insert(near, COULOMB, part * np.ptp(model.force))))
+    for part in _FRICTIONS:
+        fits.append(_search(model, np.insert(near, _COULOMB, part * np.ptp(model.force))))
         if model.rms(fits[-1].fun) <= model.allowed():
             break
     return min(fits, key=lambda fit: fit.cost)
@@ -416,11 +416,11 @@ def _with_coulomb(model: _Model, near: Array) -> OptimizeResult:
 def _search(model: _Model, start: Array) -> OptimizeResult:
     strongest = np.ptp(model.force)
     start = start.copy()
-    start[COULOMB] = np.clip(start[COULOMB], FRICTIONS[0] * strongest, strongest / 2)
-    free = np.arange(start.size) != COULOMB
-    bounds = (np.where(free, start - SEARCH_REACH, 0.0), np.where(free, start + SEARCH_REACH, strongest))
+    start[_COULOMB] = np.clip(start[_COULOMB], _FRICTIONS[0] * strongest, strongest / 2)
+    free = np.arange(start.size) != _COULOMB
+    bounds = (np.where(free, start - _SEARCH_REACH, 0.0), np.where(free, start + _SEARCH_REACH, strongest))
     # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
-    options: dict[str, Any] = {"x_scale": "jac", "max_nfev": EVALUATIONS[1], "ftol": 1e-4}
+    options: dict[str, Any] = {"x_scale": "jac", "max_nfev": _EVALUATIONS[1], "ftol": 1e-4}
     slopes: Any = lambda p: -model.slopes(p)  # noqa: E731 - SciPy's stub takes names only
     return least_squares(model.residual, start, slopes, bounds=bounds, **options)
 
@@ -431,11 +431,11 @@ def _polished(model: _Model, p: Array) -> Array:
     A search that stops where its sum of squares hardly changes may be several standard errors away.
     """
     residual = model.residual(p)
-    for _ in range(POLISH):
+    for _ in range(_POLISH):
         change = np.linalg.lstsq(model.slopes(p), residual, rcond=None)[0]
         for part in (1.0, 0.5, 0.1):
             other = p + part * change
-            other[COULOMB] = max(0.0, other[COULOMB])
+            other[_COULOMB] = max(0.0, other[_COULOMB])
             left = model.residual(other)
             if left @ left < residual @ residual:
                 break
@@ -443,7 +443,7 @@ def _polished(model: _Model, p: Array) -> Array:
             break
         gain = 1 - (left @ left) / (residual @ residual)
         p, residual = other, left
-        if gain < ENOUGH:
+        if gain < _ENOUGH:
             break
     return p
 
@@ -457,10 +457,10 @@ def _settled(model: _Model, p: Array) -> Estimate:
         )
     estimate = _estimate(model, p, rms)
     vague = estimate.errors["viscous"] / estimate.viscous
-    if vague > VAGUE:
+    if vague > _VAGUE:
         raise ValueError(
             f"the record does not tell viscous from dry friction: {estimate.viscous:.3g} N s/m, standard error "
-            f"{100 * vague:.0f} %, at most {100 * VAGUE:.0f} % may be; take one with more force or a longer one"
+            f"{100 * vague:.0f} %, at most {100 * _VAGUE:.0f} % may be; take one with more force or a longer one"
         )
     return estimate
 
@@ -481,7 +481,7 @@ def _estimate(model: _Model, p: Array, rms: float) -> Estimate:
         "coulomb": float(np.sqrt(covariance[2, 2])),
     }
     above = max(0.0, float(b * scatter.bias[1]))  # on average; a bias to the safe side is left where it is
-    delta = max(0.0, float(b) - above - ONE_SIDED_95 * errors["viscous"])
+    delta = max(0.0, float(b) - above - _ONE_SIDED_95 * errors["viscous"])
     return Estimate(float(mass), float(m1), float(b), float(p[2]), k, mode, errors, delta, rms, rms / model.step)
 
 
@@ -496,7 +496,7 @@ def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> lis
     """
     found = []
     for i, (e, said) in enumerate(zip(estimates, _declared(scenario, session), strict=False), start=1):
-        if e.viscous > (1 + SUSPICIOUS) * said:
+        if e.viscous > (1 + _SUSPICIOUS) * said:
             found.append(
                 f"axis {i}: {e.viscous:.4g} N s/m estimated, {said:.4g} declared (scenario, INFO): is somebody "
                 "holding it? No bound is offered; where the device really has more, declare it and take another record"

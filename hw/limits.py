@@ -15,11 +15,11 @@ from hw.protocol import MAX_RELEASE_NS, MAX_THETA, PROTOCOL, Config, Force, Info
 from models.quantity import require
 from sim.scenario import Scenario
 
-BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
-FEWEST_STEPS = 16  # of force up to the cap: coarser, and the certificate's linear loop is another one
-COARSEST = 0.1  # of the largest displacement in a tick that is taken for a hand's: one count of an encoder
-LARGEST_MARGIN_US = 30_000  # an age is read from a margin, which is an i16 in microseconds
-HOLD, RAMP_US = 4, 5000  # what the device does without answers: ticks held, then microseconds to zero
+_BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
+_FEWEST_STEPS = 16  # of force up to the cap: coarser, and the certificate's linear loop is another one
+_COARSEST = 0.1  # of the largest displacement in a tick that is taken for a hand's: one count of an encoder
+_LARGEST_MARGIN_US = 30_000  # an age is read from a margin, which is an i16 in microseconds
+_HOLD, _RAMP_US = 4, 5000  # what the device does without answers: ticks held, then microseconds to zero
 
 
 class Stage(StrEnum):
@@ -187,8 +187,8 @@ class Units:
 def _wire_time(baud: int, axes: int) -> tuple[float, str]:
     """Seconds for one STATE and one FORCE, and the arithmetic as text."""
     up, down = wire_bytes(State, axes), wire_bytes(Force, axes)
-    seconds = (up + down) * BITS_PER_BYTE / baud
-    return seconds, f"({up} + {down}) bytes x {BITS_PER_BYTE} bits / {baud} baud = {1e6 * seconds:.0f} us"
+    seconds = (up + down) * _BITS_PER_BYTE / baud
+    return seconds, f"({up} + {down}) bytes x {_BITS_PER_BYTE} bits / {baud} baud = {1e6 * seconds:.0f} us"
 
 
 def objections(info: Info, scenario: Scenario, limits: Limits, baud: int | None) -> list[str]:
@@ -235,11 +235,11 @@ def _impossible(i: int, info: Info) -> str | None:
 def _coarse(i: int, info: Info, limits: Limits, T: float) -> list[str]:
     """What is too coarse on axis i for limits on forces and displacements to mean anything."""
     reasons, force, count = [], 1e-6 * info.force_step[i], 1e-12 * info.encoder_step[i]
-    finest = min(limits.cap[i] / FEWEST_STEPS, limits.slew * T)
+    finest = min(limits.cap[i] / _FEWEST_STEPS, limits.slew * T)
     if force > finest:
         reasons.append(f"one force step of axis {i + 1} is {force:g} N, at most {finest:g} N is allowed")
-    if count > COARSEST * limits.jump:
-        finest = COARSEST * limits.jump
+    if count > _COARSEST * limits.jump:
+        finest = _COARSEST * limits.jump
         reasons.append(
             f"one encoder count of axis {i + 1} is {1e3 * count:g} mm, at most {1e3 * finest:g} mm is allowed"
         )
@@ -248,9 +248,9 @@ def _coarse(i: int, info: Info, limits: Limits, T: float) -> list[str]:
 
 def probe_delay(T: float) -> int:
     """The theta to measure with: the longest whose margin can be told. Raises ValueError where there is none."""
-    theta = min(MAX_THETA, int(LARGEST_MARGIN_US / (1e6 * T)))
+    theta = min(MAX_THETA, int(_LARGEST_MARGIN_US / (1e6 * T)))
     if theta < 1:
-        raise ValueError(f"T is {T:g} s, a serial link is for at most {1e-6 * LARGEST_MARGIN_US:g} s")
+        raise ValueError(f"T is {T:g} s, a serial link is for at most {1e-6 * _LARGEST_MARGIN_US:g} s")
     return theta
 
 
@@ -267,13 +267,13 @@ def require_period(T: float, limits: Limits) -> None:
 def configuration(info: Info, limits: Limits, theta: int) -> Config:
     """What the device is told: never more than the host allows itself, nor than the device can do."""
     T_ns = info.period_ns
-    ramp = max(1, min(0xFF, math.ceil(1000 * RAMP_US / T_ns)))
+    ramp = max(1, min(0xFF, math.ceil(1000 * _RAMP_US / T_ns)))
     steps = [1e-6 * step for step in info.force_step]
     most = [int(cap / step + 1e-9) for cap, step in zip(limits.cap, steps, strict=True)]
     slew = [min(0xFFFF, math.ceil(limits.slew * 1e-9 * T_ns / step)) for step in steps]
     return Config(
         theta=theta,
-        hold=max(0, min(HOLD, MAX_RELEASE_NS // T_ns - ramp)),
+        hold=max(0, min(_HOLD, MAX_RELEASE_NS // T_ns - ramp)),
         ramp=ramp,
         ramp_in=min(0xFFFF, math.ceil(1e9 * limits.ramp_in / T_ns)),
         cap=tuple(map(min, info.hard_limit, most)),

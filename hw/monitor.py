@@ -17,15 +17,15 @@ from hw.device import cap_after, limited
 from hw.limits import DRIVING, Fault, Limits, Stage
 from hw.protocol import NO_MARGIN, Config, Phase, State, distance
 
-STATES_PER_ANSWER = 8  # at most: a USB frame of 1 ms may bring several FORCEs, of which one margin is told
-MEASURED_TOLERANCE = 0.01  # of the device's clock against T, over the measurement
-UNTOLD = 0.9  # part of STATEs without a margin above which nobody can judge the link; a USB frame may carry several
-DEVICE_TOLERANCE, HOST_TOLERANCE = 0.01, 0.1  # of a clock over a block; a busy host and its buffers blur the second
+_STATES_PER_ANSWER = 8  # at most: a USB frame of 1 ms may bring several FORCEs, of which one margin is told
+_MEASURED_TOLERANCE = 0.01  # of the device's clock against T, over the measurement
+_UNTOLD = 0.9  # part of STATEs without a margin above which nobody can judge the link; a USB frame may carry several
+_DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # of a clock over a block; a busy host and its buffers blur the second
 BLOCK = 200  # ticks over which a clock is compared
-REMEMBERED = 64  # forces on their way, of which at most theta matter
-ROUNDING = 1  # [steps] for a firmware that rounds otherwise
+_REMEMBERED = 64  # forces on their way, of which at most theta matter
+_ROUNDING = 1  # [steps] for a firmware that rounds otherwise
 PATIENCE = 5  # ticks in a row
-FORGETTING = 8  # right ticks that make up for a wrong one: seldom wrong is stopped too, just later
+_FORGETTING = 8  # right ticks that make up for a wrong one: seldom wrong is stopped too, just later
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Measurement:
             self.ages.append(round(self._theta * self._T_us) - margin)
             self._missed -= margin < 0  # it was missed, but came after all
         everything = len(self.ages) + self.missing
-        if everything < self._needed and counted < STATES_PER_ANSWER * self._needed:
+        if everything < self._needed and counted < _STATES_PER_ANSWER * self._needed:
             return False
         part = 1 - len(self.ages) / (everything if everything >= self._needed else counted)
         if part > self._most_missing:
@@ -107,7 +107,7 @@ class Measurement:
         assert self._first is not None
         elapsed = (state.t_us - self._first.t_us) & 0xFFFFFFFF
         ticks = distance(state.tick, self._first.tick)
-        if ticks > 0 and abs(elapsed / (ticks * self._T_us) - 1) > MEASURED_TOLERANCE:
+        if ticks > 0 and abs(elapsed / (ticks * self._T_us) - 1) > _MEASURED_TOLERANCE:
             each = elapsed / ticks
             raise Fault(f"a tick of the device lasts {each:.1f} us by its own clock, T is {self._T_us:g} us")
 
@@ -194,9 +194,9 @@ class LinkMonitor:
         if self._gaps / window > most:
             part = f"{100 * self._gaps / window:.0f} % of {window} ticks"
             raise Fault(f"no STATE came of {part}: nobody can say what the device did")
-        if self._untold / window > UNTOLD:
+        if self._untold / window > _UNTOLD:
             raise Fault(
-                f"{100 * UNTOLD:g} % of the last {window} STATEs told no margin: nobody can say how late answers are"
+                f"{100 * _UNTOLD:g} % of the last {window} STATEs told no margin: nobody can say how late answers are"
             )
         if late > self.settings.late:
             return f"{100 * late:.0f} % of the last {window} answers were late"
@@ -256,8 +256,8 @@ class ClockMonitor:
     def __init__(self, limits: Limits, T: float) -> None:
         T_us = 1e6 * T
         self.most = max(1, int(limits.watchdog_us / T_us))  # [ticks] that may be missing at once
-        self._device = ClockDrift("its own", T_us, DEVICE_TOLERANCE, limits.watchdog_us)
-        self._host = ClockDrift("the host's", T_us, HOST_TOLERANCE, limits.watchdog_us)
+        self._device = ClockDrift("its own", T_us, _DEVICE_TOLERANCE, limits.watchdog_us)
+        self._host = ClockDrift("the host's", T_us, _HOST_TOLERANCE, limits.watchdog_us)
 
     def check(self, state: State, ticks: int, now: int) -> None:
         """Raise Fault where the STATE that came at `now` [us] cannot be `ticks` after the one before."""
@@ -299,7 +299,7 @@ class CommandMonitor:
     def tell(self, tick: int, steps: tuple[int, ...]) -> None:
         """`steps` answer `tick`."""
         self._forces[(tick + self._config.theta) & 0xFFFF] = steps
-        if len(self._forces) > REMEMBERED:
+        if len(self._forces) > _REMEMBERED:
             self._forces.pop(next(iter(self._forces)))
 
     def unlike(self, state: State, ticks: int) -> bool:
@@ -320,8 +320,8 @@ class CommandMonitor:
         if ticks > 1:
             return False
         wrong = not self._could(state, last.applied, told)
-        self._unlike = max(0, self._unlike + (FORGETTING if wrong else -1))
-        if self._unlike > FORGETTING * (PATIENCE - 1):
+        self._unlike = max(0, self._unlike + (_FORGETTING if wrong else -1))
+        if self._unlike > _FORGETTING * (PATIENCE - 1):
             what = f"told {told}" if state.phase == Phase.ARMED else f"to hold {last.applied}"
             raise Fault(f"the device applies {state.applied} steps, it was {what}, and so for {PATIENCE} ticks")
         return wrong
@@ -334,6 +334,6 @@ class CommandMonitor:
         config = self._config
         for force, before, asked, cap, slew in zip(state.applied, last, told, config.cap, config.slew, strict=True):
             may = [limited(asked, before, cap_after(config, cap, run), slew) for run in self._run]
-            if not min(may) - ROUNDING <= force <= max(may) + ROUNDING:
+            if not min(may) - _ROUNDING <= force <= max(may) + _ROUNDING:
                 return False
         return True

@@ -31,11 +31,11 @@ from sim.result import DAMAGED, Result
 from sim.scenario import InputError, Scenario
 
 #: what the link adds, one entry per tick: name -> axes of the array
-LINK = {"tick": 1, "arming": 1, "received": 1, "asked": 2, "gain": 1, "sent": 2, "margin_us": 1, "status": 1}
+_LINK = {"tick": 1, "arming": 1, "received": 1, "asked": 2, "gain": 1, "sent": 2, "margin_us": 1, "status": 1}
 _FLOATS, _WHOLE = ("asked", "gain"), ("tick", "arming", "sent", "margin_us", "status")
 #: link array -> least and most that a session writes
 _RANGES = {"gain": (0.0, 1.0), "tick": (0, 0xFFFF), "sent": (-0x7FFF, 0x7FFF), "margin_us": (-0x8000, 0x7FFF)}
-PERCENTILES = (50, 90, 99, 100)
+_PERCENTILES = (50, 90, 99, 100)
 
 
 class Recorder:
@@ -59,7 +59,7 @@ class Recorder:
         return len(self._floats) // (2 * self.channels + 1)
 
     def link(self) -> dict[str, NDArray[Any]]:
-        """Arrays by the names of LINK, with `x` (N, m) [m] and `applied` (N, m) [steps] beside them."""
+        """Arrays by the names of _LINK, with `x` (N, m) [m] and `applied` (N, m) [steps] beside them."""
         m, n = self.channels, len(self)
         floats = np.array(self._floats).reshape(n, 2 * m + 1)
         whole = np.array(self._whole).reshape(n, 2 * m + 5)
@@ -107,8 +107,8 @@ def result_of(recorder: Recorder, units: Units, T: float, meta: dict[str, Any]) 
 
 
 def save_npz(path: Path, result: Result, recorder: Recorder) -> Path:
-    """An npz that sim.result reads, with the arrays of LINK beside its own."""
-    link = {f"link_{name}": recorder.link()[name] for name in LINK}
+    """An npz that sim.result reads, with the arrays of _LINK beside its own."""
+    link = {f"link_{name}": recorder.link()[name] for name in _LINK}
     own = {name: getattr(result, name) for name in ("t", "x", "f", "x_handle", "v_handle", "w")}
     arrays: dict[str, Any] = {**own, **link, "meta": np.array(json.dumps(result.meta))}
 
@@ -132,11 +132,11 @@ def load(path: Path) -> tuple[Result, dict[str, Array]]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
-            link = {name: arrays[f"link_{name}"] for name in LINK}
+            link = {name: arrays[f"link_{name}"] for name in _LINK}
     except (OSError, *DAMAGED):
         raise InputError(f"{path}: a trace, but not of a bridge's session; hw.bridge writes one") from None
     n, m = result.x.shape
-    for name, axes in LINK.items():
+    for name, axes in _LINK.items():
         if link[name].shape != ((n, m) if axes == 2 else (n,)):
             raise InputError(
                 f"{path}: link_{name} has the shape {link[name].shape}, the trace {n} ticks of {m} channels"
@@ -233,7 +233,7 @@ def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
 
 
 def _percentiles(values: np.ndarray) -> dict[str, float] | None:
-    return {f"p{q}": float(np.percentile(values, q)) for q in PERCENTILES} if values.size else None
+    return {f"p{q}": float(np.percentile(values, q)) for q in _PERCENTILES} if values.size else None
 
 
 def save(out: Path, session: Session, recorder: Recorder, report: dict[str, Any], plot: bool) -> list[Path]:

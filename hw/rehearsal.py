@@ -30,11 +30,11 @@ from sim.command import require_constant_delay, require_linear
 from sim.result import Result
 from sim.scenario import InputError, Scenario
 
-MEASURE = 200  # answers that are timed: virtual time does not scatter
-QUANTILE, GUARD_US = 0.99, 100.0  # of the ages that the delay covers, and what is added [us]; as hw.bridge has it
-POLL_US = 1000
-GRACE_US = 20_000  # after the end
-LATENCY_US = 60  # one way, and as long for the host to answer: the measured median age of 130 us
+_MEASURE = 200  # answers that are timed: virtual time does not scatter
+_QUANTILE, _GUARD_US = 0.99, 100.0  # of the ages that the delay covers, and what is added [us]; as hw.bridge has it
+_POLL_US = 1000
+_GRACE_US = 20_000  # after the end
+_LATENCY_US = 60  # one way, and as long for the host to answer: the measured median age of 130 us
 
 Plan = Callable[[Ages], Sequence[Program]]
 
@@ -60,7 +60,7 @@ class Rehearsal:
     host_stalls: Sequence[tuple[float, float]] = ()  # (seconds after arming, seconds) in which the host is frozen
     arm: bool = True  # once; a softer coupling waits for a person
     operator: Operator | None = None  # in place of `arm`: the rule of a live session
-    latency_us: float = LATENCY_US
+    latency_us: float = _LATENCY_US
     clock: float = 1.0  # how long a tick of the device lasts, in T
     moments: list[Moment] = field(default_factory=list)
 
@@ -75,7 +75,7 @@ class Rehearsal:
         self._period = 1e6 * self.session.scenario.T * self.clock
         self._at(0, "tick", 0)
         self._at(500, "start", None)
-        self._at(POLL_US, "poll", None)
+        self._at(_POLL_US, "poll", None)
 
     def run(self, seconds: float) -> Session:
         """Until `seconds` of virtual time are over. Returns the session."""
@@ -86,7 +86,7 @@ class Rehearsal:
     def run_until_armed(self, seconds: float) -> Session:
         """Until `seconds` after arming, or a little longer than a session that is never armed."""
         while self.armed_us is None and not (
-            self.session.stage in ENDED and self._queue[0][0] > self._ended + GRACE_US
+            self.session.stage in ENDED and self._queue[0][0] > self._ended + _GRACE_US
         ):
             self._next()
         return self.run(1e-6 * self.armed_us + seconds) if self.armed_us is not None else self.session
@@ -138,7 +138,7 @@ class Rehearsal:
     def _on_poll(self, now: float, _: None) -> None:
         if (frozen := self._frozen(now)) > now:  # what came in the meantime is read first
             return self._at(frozen + 1, "poll", None)
-        self._at(now + POLL_US, "poll", None)
+        self._at(now + _POLL_US, "poll", None)
         since = self.emulator.since_armed(round(now))
         for i, (when, call) in enumerate(self.actions):
             if since is not None and since >= when and i not in self._done:
@@ -225,14 +225,14 @@ def rehearse(
     require_constant_delay(scenario, "rehearse")
     if min(scenario.delta) <= 0:
         raise InputError(f"delta is {list(scenario.delta)}: a device without damping can promise no human anything")
-    session = session_for(scenario, Settings(measure=MEASURE))
+    session = session_for(scenario, Settings(measure=_MEASURE))
     session.record = recorder = Recorder(scenario.channels)
     programs: list[CertifiedCoupling] = []
     delays: list[float] = []  # [s]
 
     def plan(ages: Ages) -> list[CertifiedCoupling]:
         delays.append(1e-6 * ages.median)
-        link = link_delay(ages, 1e6 * scenario.T, QUANTILE, GUARD_US)
+        link = link_delay(ages, 1e6 * scenario.T, _QUANTILE, _GUARD_US)
         if alone is None:
             programs.extend(certified_couplings(scenario, case, None, None, link))
         else:

@@ -46,13 +46,13 @@ from hw.protocol import (
 )
 from sim.scenario import InputError, Scenario
 
-RESEND_US, PATIENCE_US = 100_000, 2_000_000  # of a question: asked again, and given up
-ARMING_US = 500_000  # in which a device must follow ARM
-QUIET_US = 1_000_000  # longest silence of a device that has no force to take away
-STOPPING_US = 50_000  # in which a device that was stopped must say so
-OBEYING_US = 30_000  # in which one that was told to stop must rest: the longest hold and ramp, and half as long again
-STRONGEST = 12.0  # [N] whatever a scenario allows
-KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
+_RESEND_US, _PATIENCE_US = 100_000, 2_000_000  # of a question: asked again, and given up
+_ARMING_US = 500_000  # in which a device must follow ARM
+_QUIET_US = 1_000_000  # longest silence of a device that has no force to take away
+_STOPPING_US = 50_000  # in which a device that was stopped must say so
+_OBEYING_US = 30_000  # in which one that was told to stop must rest: the longest hold and ramp, and half as long again
+_STRONGEST = 12.0  # [N] whatever a scenario allows
+_KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
 
 
 class Event(NamedTuple):
@@ -188,10 +188,10 @@ class Session:
             return self._shutdown.again(now) if self._shutdown else b""
         if self.stage in (Stage.CONNECTING, Stage.CONFIGURING):
             return self._ask_again()
-        if self.stage == Stage.ARMING and self.gain == 0 and now - self.entered > ARMING_US:
-            return self._end(Stage.STOPPED, f"the device did not arm within {ARMING_US // 1000} ms")
+        if self.stage == Stage.ARMING and self.gain == 0 and now - self.entered > _ARMING_US:
+            return self._end(Stage.STOPPED, f"the device did not arm within {_ARMING_US // 1000} ms")
         silence = now - self.heard
-        if silence > (self.limits.watchdog_us if self.stage in DRIVING else QUIET_US) and self.stage != Stage.MEASURED:
+        if silence > (self.limits.watchdog_us if self.stage in DRIVING else _QUIET_US) and self.stage != Stage.MEASURED:
             return self._end(Stage.LOST, f"no new STATE for {silence / 1000:.1f} ms")
         return b""
 
@@ -218,10 +218,10 @@ class Session:
         """The question once more, where it is time for it; given up where there was time enough."""
         question = self._question
         waited = self.now - question.begun
-        if waited > PATIENCE_US:
+        if waited > _PATIENCE_US:
             name = type(question.message).__name__.upper()
             return self._end(Stage.LOST, f"no answer to {name} within {waited / 1e6:.1f} s")
-        if self.now - question.asked < RESEND_US:
+        if self.now - question.asked < _RESEND_US:
             return b""
         question.asked = self.now
         return encode(question.message)
@@ -270,7 +270,7 @@ class Session:
         if self.stage == Stage.CONFIGURING:
             if not _drives(state):
                 return b""
-            if self.now - self.entered > STOPPING_US:
+            if self.now - self.entered > _STOPPING_US:
                 raise Fault("the device drives, and nobody asked it to")
             return encode(Stop(Reason.DONE))
         ticks = self.link.take(state)
@@ -359,7 +359,7 @@ class Session:
         return encode(Stop(reason))
 
 
-def session_for(scenario: Scenario, settings: Settings, cap: float = STRONGEST) -> Session:
+def session_for(scenario: Scenario, settings: Settings, cap: float = _STRONGEST) -> Session:
     """A session that never asks for more than `cap` [N]. Raises InputError where T is none for a serial link."""
     try:
         limits = Limits(tuple(min(cap, d.force_limit) for d in scenario.device))
@@ -403,7 +403,7 @@ class _Shutdown:
 
     def again(self, now: int) -> bytes:
         """STOP, where no STATE has said for a tick that it was heard: the one before may be lost, and STATEs too."""
-        due = now - self._told >= self._every and now - self._began < STOPPING_US
+        due = now - self._told >= self._every and now - self._began < _STOPPING_US
         if self._rests or not due or not self._repeat:
             return b""
         self._told = now
@@ -411,10 +411,10 @@ class _Shutdown:
 
     def disobeyed(self, state: State, now: int) -> str | None:
         """Said once, of a device that goes on driving."""
-        if not self._obeys or now - self._began <= OBEYING_US or not _drives(state):
+        if not self._obeys or now - self._began <= _OBEYING_US or not _drives(state):
             return None
         self._obeys = False
-        return f"told to stop, the device still drives after {OBEYING_US // 1000} ms: cut its power"
+        return f"told to stop, the device still drives after {_OBEYING_US // 1000} ms: cut its power"
 
 
 @dataclass
@@ -440,7 +440,7 @@ class Operator:
 
     def press(self, key: str, session: Session, now: int) -> bytes:
         """A key of a person. `a` means something to a disarmed session only."""
-        match KEYS.get(key):
+        match _KEYS.get(key):
             case "arm" if session.stage == Stage.DISARMED:
                 self._asked = True
                 return session.arm(now)

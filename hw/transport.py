@@ -21,10 +21,10 @@ from hw.monitor import Ages
 from hw.session import Operator, Session
 from sim.scenario import InputError
 
-CHUNK = 4096  # bytes read at once; a tick brings a few dozen
-UNUSED = 9600  # baud that a port without UART is told: it does nothing, but 1200 resets many boards
-LONGEST_WAIT = 1e-3  # [s] between two looks at the time-outs
-GRACE_US = 50_000  # after the end, in which a STOP that was lost is repeated
+_CHUNK = 4096  # bytes read at once; a tick brings a few dozen
+_UNUSED = 9600  # baud that a port without UART is told: it does nothing, but 1200 resets many boards
+_LONGEST_WAIT = 1e-3  # [s] between two looks at the time-outs
+_GRACE_US = 50_000  # after the end, in which a STOP that was lost is repeated
 
 
 class PortLost(OSError):
@@ -42,7 +42,7 @@ class Port:
             raise InputError("--port needs pyserial: pip install 'haptic-loop[hw]'") from None
         self._error = serial.SerialException
         try:
-            self._serial = serial.Serial(path, baud or UNUSED, timeout=0, write_timeout=0, exclusive=True)
+            self._serial = serial.Serial(path, baud or _UNUSED, timeout=0, write_timeout=0, exclusive=True)
         except (serial.SerialException, ValueError, OSError) as error:
             raise InputError(f"--port {path}: {error}") from None
         with suppress(Exception):  # where the driver knows it: the latency timer of FTDI chips goes from 16 ms to 1 ms
@@ -55,7 +55,7 @@ class Port:
     def read(self) -> bytes:
         """What is there. Raises PortLost."""
         try:
-            return self._serial.read(CHUNK)
+            return self._serial.read(_CHUNK)
         except (self._error, OSError, TypeError) as error:  # TypeError: pyserial's own, on a port closed meanwhile
             raise PortLost(f"the port cannot be read: {error}") from None
 
@@ -125,7 +125,7 @@ class Live:
                     self._step()
                     self._steer()
                 ended = self.now()
-                while session.stage != Stage.LOST and self.now() - ended < GRACE_US:
+                while session.stage != Stage.LOST and self.now() - ended < _GRACE_US:
                     self._step()
             except PortLost as lost:
                 session.lost(str(lost), self.now())
@@ -137,7 +137,7 @@ class Live:
     def _step(self) -> None:
         """Wait for bytes or for a millisecond, and answer."""
         sources = [self.port] if self._keyboard is None else [self.port, self._keyboard]
-        ready = select.select(sources, [], [], LONGEST_WAIT)[0]
+        ready = select.select(sources, [], [], _LONGEST_WAIT)[0]
         if self.port in ready:
             self._write(self.session.receive(self.port.read(), self.now()))
         else:
