@@ -11,7 +11,7 @@ import sys
 from typing import Any
 
 from cli.session_cli import pace_from
-from hw.emulator import DEVICE, LINE, Emulator, FaultInjection, Line, RealTimeEmulator, Terminal, nobody
+from hw.emulator import AXIS, DEVICE, LINE, Emulator, FaultInjection, Line, RealTimeEmulator, Terminal, nobody
 from sim.command import (
     DONE,
     INTERRUPTED,
@@ -78,8 +78,9 @@ def _parser() -> argparse.ArgumentParser:
         "python -m hw.emulator --fault up:drop=0.05 --fault unplug@3",
     )
     add_loop_options(parser)
-    kinds = ", ".join((*LINE, *DEVICE))
-    what = "KIND[=VALUE][@START[+DURATION]], times in seconds after arming; up: or down: in front for one direction"
+    kinds = ", ".join((*LINE, *DEVICE, *AXIS))
+    what = "KIND[=VALUE][@START[+DURATION]], times in seconds after arming; in front up: or down: for one direction, "
+    what += "axis2: for an axis"
     parser.add_argument("--fault", action="append", default=[], metavar="FAULT", help=f"{what}; KIND is {kinds}")
     parser.add_argument("--duration", default="1000000", metavar="SECONDS", help="default: until interrupted")
     parser.add_argument("--nobody", action="store_true", help="no person at the handles")

@@ -7,6 +7,7 @@ as the link is no slower, and longer ones where it is.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
@@ -22,12 +23,13 @@ from design.failure import DesignFailed
 from design.margin import Requirement
 from design.promises import certificate_part, promise_of
 from design.summary import coupling_part
-from hw.limits import Fault, Gain, Limits, Units, check_jolt, check_jump, check_range, shape
-from hw.monitor import Ages, ClockMonitor, CommandMonitor, Counters
+from hw.limits import Fault, Gain, Heat, Limits, Units, check_jolt, check_jump, check_range, check_speed, shape
+from hw.monitor import Ages, ClockMonitor, CommandMonitor, Counters, EncoderMonitor, EncoderTest, Settings
 from hw.protocol import MAX_THETA, Config, State
 from sim.couplings import Chosen, choose
 from sim.scenario import InputError, Scenario
 
+_SPEED_SECONDS = 0.01  # over which a speed is taken: one count of the coarsest encoder is 0.03 m/s
 _FALLBACK = ("spring-damper", "theorem4")  # what softer couplings are where the one asked for cannot be had
 
 
@@ -86,6 +88,7 @@ class Row(NamedTuple):
     sent: tuple[int, ...]  # [steps]
     state: State | None
     arming: int = 0  # which arming of the session this belongs to
+    test: tuple[float, ...] | None = None  # (m,) [N] that encoders are tested with, behind the gain
 
 
 class Drive:
@@ -97,50 +100,76 @@ class Drive:
         units: Units,
         config: Config,
         limits: Limits,
+        settings: Settings,
         counters: Counters,
         record: Callable[[Row], None],
         arming: int = 0,
     ) -> None:
         self.controller, self.units, self.config, self.limits = controller, units, config, limits
-        self.T = controller.T
-        self.gain = Gain(limits, controller.T)
+        self.T = T = controller.T
+        self.gain = Gain(limits, T)
         self.force = (0.0,) * config.axes  # [N] the last one sent
         self.x: tuple[float, ...] | None = None  # [m] of the last STATE
+        self.reference: tuple[int, ...] | None = None  # [counts] that positions are counted from
+        self._rereference = settings.rereference
+        self._test = EncoderTest(limits.cap, T) if settings.test_encoders else None
+        self._encoders, self._heat = EncoderMonitor(units.force_step, T), Heat(limits, T)
+        self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] over which a speed is taken
+        self._recent: deque[tuple[int, tuple[float, ...]]] = deque()  # ticks since arming, and x [m]
+        self._ticks = 0  # since arming
         self._before: tuple[float, ...] | None = None  # [m] of the STATE before that, where none is missing
         self._counters, self._record, self._arming = counters, record, arming
-        self._commands, self._clock = CommandMonitor(config), ClockMonitor(limits, controller.T)
+        self._commands, self._clock = CommandMonitor(config), ClockMonitor(limits, T)
 
     def step(self, state: State, ticks: int, direction: int, now: int) -> tuple[int, ...]:
         """The force [steps] that answers `state`, which came at `now` [us], `ticks` after the one before.
 
-        The gain rises (direction 1), falls (-1) or stays (0). Raises Fault where the device, an encoder or the
-        controller is out of bounds.
+        The gain rises (direction 1), falls (-1) or stays (0); it rises once every encoder has answered its test.
+        Raises Fault where the device, an encoder or the controller is out of bounds.
         """
         if self.x is None:
             ticks = 1  # what went before does not count
         self._clock.check(state, ticks, now)
-        x = self.units.positions(state.counts)
-        check_range(x, self.units.reach)
-        if self.x is None:
-            positions = [x]
-        else:
-            check_jump(x, self.x, ticks, self.limits)
-            if ticks == 1 and self._before is not None:
-                check_jolt(x, self.x, self._before, self.limits)
-            positions = fill(self.x, x, ticks)
+        check_range(self.units.positions(state.counts), self.units.reach)
+        if self.reference is None:
+            self.reference = state.counts if self._rereference else (0,) * state.axes
+        x = self.units.positions(tuple(n - zero for n, zero in zip(state.counts, self.reference, strict=True)))
+        positions = self._check_motion(x, ticks)
         self._counters.unlike += self._commands.unlike(state, ticks)
+        self._encoders.check(state.counts, state.applied, ticks)
+        self._heat.check(self.units.forces(state.applied), ticks)
         self._miss(state, positions[:-1])
         asked = self.controller.step(x)
-        if direction:
-            (self.gain.rise if direction > 0 else self.gain.fall)(ticks)
-        shaped = shape(asked.tolist(), self.force, self.gain.value, self.limits, self.T)
+        test = self._test.force(state.counts, ticks) if self._test and direction > 0 else None
+        if direction > 0 and test is None:
+            self._test = None
+            self.gain.rise(ticks)
+        elif direction < 0:
+            self.gain.fall(ticks)
+        shaped = shape(asked.tolist(), self.force, self.gain.value, self.limits, self.T, test)
         self._before, self.x, self.force = self.x if ticks == 1 else None, x, shaped.force
         self._counters.clipped += shaped.clipped
         self._counters.slowed += shaped.slowed
         steps = self.units.steps(shaped.force, self.config.cap)
         self._commands.tell(state.tick, steps)
-        self._record(Row(state.tick, x, asked, self.gain.value, steps, state, self._arming))
+        self._record(Row(state.tick, x, asked, self.gain.value, steps, state, self._arming, test))
         return steps
+
+    def _check_motion(self, x: tuple[float, ...], ticks: int) -> list[tuple[float, ...]]:
+        """The displacements (m,) [m] of the `ticks` ticks up to x. Raises Fault where no hand moves like that."""
+        positions = [x]
+        if self.x is not None:
+            check_jump(x, self.x, ticks, self.limits)
+            if ticks == 1 and self._before is not None:
+                check_jolt(x, self.x, self._before, self.limits)
+            positions = fill(self.x, x, ticks)
+        self._ticks += ticks
+        while self._recent and self._recent[0][0] < self._ticks - self._window:
+            self._recent.popleft()
+        if self._recent and (since := self._ticks - self._recent[0][0]) >= self._window // 2:
+            check_speed(x, self._recent[0][1], since * self.T, self.limits)
+        self._recent.append((self._ticks, x))
+        return positions
 
     def _miss(self, state: State, positions: list[tuple[float, ...]]) -> None:
         """The controller moves on through ticks of which no STATE came."""

@@ -1,12 +1,13 @@
 """A device that is not there: the scenario's plant under the firmware's own state machine, with faults to order.
 
 Faults are what a cable, a process or a device can do wrong. They are written KIND[=VALUE][@START[+DURATION]], with
-`up:` (device to host) or `down:` in front for one direction of the line:
+`up:` (device to host) or `down:` in front for one direction of the line, `axis2:` for another axis than the first:
 
     drop=0.1          a tenth of all frames never arrives
     up:flip=0.02@1+2  from 1 s after arming, for 2 s, one bit of every fiftieth STATE is wrong
     stall=0.03@1      the device freezes for 30 ms, 1 s after arming
     unplug@1          the cable is pulled, 1 s after arming
+    axis2:freeze@1    encoder 2 shows the same count from 1 s after arming on
 
 Without @ a fault is there from the start. Every draw comes from a seeded generator.
 """
@@ -69,16 +70,23 @@ DEVICE = {
     "stall": ("seconds for which the device freezes", 0.0, 10.0, 0.01),
     "unplug": ("no value", 0.0, 0.0, 0.0),
     "reset": ("no value", 0.0, 0.0, 0.0),
-    "jump": ("millimetres by which encoder 1 jumps", -1000.0, 1000.0, 5.0),
     "leap": ("ticks by which its tick number leaps", 1.0, 32000.0, 300.0),
-    "own": ("newtons that its motors have while armed, whatever they are told", -12.0, 12.0, 2.0),
     "stuck": ("no value: it holds its force, without a watchdog and whatever STOP says", 0.0, 0.0, 0.0),
     "period": ("length of a tick in T", 0.5, 4.0, 2.0),
     "estop": ("no value: the emergency stop at the device", 0.0, 0.0, 0.0),
     "trip": ("no value: a fault that the firmware found", 0.0, 0.0, 0.0),
 }
-_KINDS = LINE | DEVICE
-_FORM = re.compile(r"(?:(up|down):)?([a-z]+)(?:=([^@+]+))?(?:@([^+]+)(?:\+(.+))?)?")
+#: kind -> the same, for one axis of it
+AXIS = {
+    "jump": ("millimetres by which its encoder jumps", -1000.0, 1000.0, 5.0),
+    "freeze": ("no value: its encoder shows the same count for ever", 0.0, 0.0, 0.0),
+    "toggle": ("no value: one channel of its encoder is dead, so that it toggles between two counts", 0.0, 0.0, 0.0),
+    "saturate": ("millimetres beyond which its encoder shows no more", -1000.0, 1000.0, 5.0),
+    "shake": ("millimetres by which its encoder is wrong at every other tick", -1000.0, 1000.0, 2.0),
+    "own": ("newtons that its motor has while armed, whatever it is told", -12.0, 12.0, 2.0),
+}
+_KINDS = LINE | DEVICE | AXIS
+_FORM = re.compile(r"(?:(up|down|axis[1-8]):)?([a-z]+)(?:=([^@+]+))?(?:@([^+]+)(?:\+(.+))?)?")
 
 
 @dataclass(frozen=True)
@@ -87,7 +95,7 @@ class FaultInjection:
 
     kind: str
     value: float
-    where: str = "both"  # up | down | both: direction of the line
+    where: str = "both"  # up | down | both: direction of the line; axis1 ..: of the device
     start: float | None = None  # [s] after arming; None: always
     duration: float = _FOREVER  # [s]
 
@@ -99,8 +107,10 @@ class FaultInjection:
             names = ", ".join(_KINDS)
             raise InputError(f"--fault is {text!r}, expected KIND[=VALUE][@START[+DURATION]], KIND one of {names}")
         where, kind, value, start, duration = match.groups()
-        if where and kind not in LINE:
+        if where in ("up", "down") and kind not in LINE:
             raise InputError(f"--fault {text}: {kind} happens to the device, not to one direction of the line")
+        if where and where.startswith("axis") and kind not in AXIS:
+            raise InputError(f"--fault {text}: {kind} does not happen to one axis; {', '.join(AXIS)} do")
         what, low, high, default = _KINDS[kind]
         try:
             given = default if value is None else float(value)
@@ -113,7 +123,12 @@ class FaultInjection:
                 raise ValueError(f"VALUE is {given:g}, expected a whole number of ticks")
         except ValueError as error:
             raise InputError(f"--fault {text}: {str(error).strip()}") from None
-        return cls(kind, given, where or "both", begins, lasts)
+        return cls(kind, given, where or ("axis1" if kind in AXIS else "both"), begins, lasts)
+
+    @property
+    def axis(self) -> int:
+        """Which axis it happens to, from 0."""
+        return int(self.where.removeprefix("axis")) - 1
 
     def active(self, since_armed: float | None) -> bool:
         """Whether it happens now, `since_armed` seconds after arming (None: not armed yet)."""
@@ -256,6 +271,12 @@ class Emulator:
         self.stretch = 1.0  # length of a tick in T
         self.applied: Array = np.zeros(scenario.channels)  # [N] by the motors
         self._offset = [0] * scenario.channels  # [counts] of an encoder that jumped
+        self._encoder: dict[int, Callable[[int], int]] = {}  # by axis: what a broken encoder makes of its count
+        for fault in faults:
+            if fault.kind in AXIS and fault.axis >= scenario.channels:
+                raise ValueError(
+                    f"--fault {fault.kind} is for {fault.where}, the scenario has {scenario.channels} channels"
+                )
         self._waiting = list(faults)
         self._ready = 0
 
@@ -272,7 +293,8 @@ class Emulator:
         """A period begins: sample, latch, answer. `now` is the device's clock [us]; advance() goes with every tick."""
         self._misbehave(now)
         counts = tuple(
-            max(-_FARTHEST, min(_FARTHEST, n + o)) for n, o in zip(self.plant.counts(), self._offset, strict=True)
+            max(-_FARTHEST, min(_FARTHEST, self._encoder.get(i, int)(n + o)))
+            for i, (n, o) in enumerate(zip(self.plant.counts(), self._offset, strict=True))
         )
         steps, data = self.device.tick(now, counts)
         if self.device.phase in RUNNING and self.armed_at is None:
@@ -284,6 +306,21 @@ class Emulator:
     def advance(self) -> None:
         """The plant moves on by a period, while the answer is on its way."""
         self.plant.advance(-self.applied)
+
+    def _in_counts(self, fault: FaultInjection) -> int:
+        return round(1e-3 * fault.value / (1e-12 * self.info.encoder_step[fault.axis]))
+
+    def _broken(self, fault: FaultInjection) -> Callable[[int], int]:
+        """What an encoder that breaks now makes of its counts."""
+        now, most = self.plant.counts()[fault.axis] + self._offset[fault.axis], self._in_counts(fault)
+        match fault.kind:
+            case "freeze":
+                return lambda n: now
+            case "toggle":
+                return lambda n: now + (n - now) % 2
+            case "saturate":
+                return lambda n: min(n, most) if most >= 0 else max(n, most)
+        return lambda n: n + most * (self.device.k % 2)
 
     def _wake_person(self) -> None:
         config = self.device.config
@@ -303,11 +340,13 @@ class Emulator:
                 case "reset":
                     self.device = Device(self.info)
                 case "jump":
-                    self._offset[0] += round(1e-3 * fault.value / (1e-12 * self.info.encoder_step[0]))
+                    self._offset[fault.axis] += self._in_counts(fault)
+                case "freeze" | "toggle" | "saturate" | "shake":
+                    self._encoder[fault.axis] = self._broken(fault)
                 case "leap":
                     self.device.k = (self.device.k + round(fault.value)) & 0xFFFF
                 case "own":
-                    self.device = _wilful(self.device, round(fault.value / self.force_step[0]))
+                    self.device = _wilful(self.device, fault.axis, round(fault.value / self.force_step[fault.axis]))
                 case "stuck":
                     self.device.halt = lambda cause: None
                 case "period":
@@ -318,14 +357,14 @@ class Emulator:
                     self.device.fault()
 
 
-def _wilful(device: Device, force: int) -> Device:
-    """The same device with motors that have `force` [steps] while it is armed, whatever it is told."""
+def _wilful(device: Device, axis: int, force: int) -> Device:
+    """The same device with a motor that has `force` [steps] while it is armed, whatever it is told."""
     obeys = device.latch
 
     def latch(frame: Force | None) -> None:
         obeys(frame)
         if device.phase in (Phase.ARMED, Phase.HOLDING):
-            device.applied = (force,) * device.info.axes
+            device.applied = (*device.applied[:axis], force, *device.applied[axis + 1 :])
 
     device.latch = latch
     return device

@@ -31,6 +31,7 @@ _T_MS = 1.2
 _AT_ONCE = 2 * _T_MS  # an e-stop is taken at the next tick
 _STOP = 8 * _T_MS  # the frame that shows it, the STOP, 5 ticks of ramp
 _WATCHDOG = 12 * _T_MS  # theta, 4 ticks held, 5 of ramp, one to notice
+_DEAD = 300.0  # a force has to change by more than 1 N first
 _SILENCE = 6.0 + 1.0 + 8 * _T_MS  # the host's time-out, looked at every millisecond, then a STOP
 
 Call = Callable[[Session, int], bytes]
@@ -138,6 +139,7 @@ CASES = (
     Case("tick number leaps by 300", G.STOPPED, "leapt by 301", at("leap=300"), _STOP),
     Case("tick number leaps by 3", G.STOPPED, "by its own clock", at("leap=3"), _STOP),
     Case("a force of its own", G.STOPPED, "it was told .*, and so for 5 ticks", at("own=2"), _STOP + 6 * _T_MS),
+    Case("the other force of axis 2", G.STOPPED, "it was told", at("axis2:own=-2"), _STOP + 6 * _T_MS),
     Case("a force of its own in ramp-in", G.STOPPED, "it was told", ("own=2@0.05",), _AT_ONCE),
     Case("a tick lasts twice as long", G.STOPPED, "by its own clock", at("period=2"), 2 * _STOP + 6 * _T_MS),
     Case("clock drifts by 2 %", G.STOPPED, "lasts 12.. us by its own clock", at("period=1.02"), 250.0),
@@ -146,7 +148,21 @@ CASES = (
     Case("device resets", G.LOST, "no new STATE", at("reset"), _AT_ONCE),
     Case("encoder jumps by 2 mm", A, faults=at("jump=2")),
     Case("encoder jumps by 5 mm", G.STOPPED, "encoder 1 jumped by", at("jump=5"), _STOP),
-    Case("encoder out of its range", G.STOPPED, "its range is", ("jump=200",)),
+    Case("encoder jumps by -5 mm", G.STOPPED, "encoder 1 jumped by", at("jump=-5"), _STOP),
+    Case("encoder 2 jumps by 5 mm", G.STOPPED, "encoder 2 jumped by", at("axis2:jump=5"), _STOP),
+    Case("encoder 2 jumps by -5 mm", G.STOPPED, "encoder 2 jumped by", at("axis2:jump=-5"), _STOP),
+    Case("encoder shakes by 2 mm", G.STOPPED, "encoder 1 shakes", at("shake=2"), _STOP + 2 * _T_MS),
+    Case("encoder 2 shakes by -2 mm", G.STOPPED, "encoder 2 shakes", at("axis2:shake=-2"), _STOP + 2 * _T_MS),
+    Case("encoder out of its range", G.STOPPED, r"encoder 1 is at \d.*its range is", ("jump=200",)),
+    Case("encoder 2 out of its range", G.STOPPED, "encoder 2 is at -.*its range is", ("axis2:jump=-200",)),
+    Case("encoder dead before", G.STOPPED, "axis 1 does not follow: it moved by 0 counts", ("freeze",), _AT_ONCE),
+    Case("encoder 2 dead before", G.STOPPED, "axis 2 does not follow: it moved by 0", ("axis2:freeze",), _AT_ONCE),
+    Case("a channel of it dead before", G.STOPPED, "axis 1 does not follow", ("toggle",), _AT_ONCE),
+    Case("encoder dies", G.STOPPED, "axis 1 does not follow", at("freeze"), _DEAD),
+    Case("encoder 2 dies", G.STOPPED, "axis 2 does not follow", at("axis2:freeze"), _DEAD),
+    Case("both encoders die", G.STOPPED, "axis . does not follow", at("freeze axis2:freeze"), _DEAD, lasts=1.5),
+    Case("a channel of encoder 2 dies", G.STOPPED, "axis 2 does not follow", at("axis2:toggle"), _DEAD),
+    Case("encoder 2 saturates", G.STOPPED, "axis 2 does not follow|2 jumped", at("axis2:saturate=1"), lasts=2.0),
     Case("e-stop at the device", G.ESTOP, "estop_device", at("estop"), _AT_ONCE),
     Case("e-stop at the device before", G.REFUSED, "refuses the configuration: estop", ("estop",)),
     Case("firmware finds a fault", G.STOPPED, "cause device", at("trip"), _STOP),

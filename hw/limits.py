@@ -55,9 +55,12 @@ class Limits:
     cap: tuple[float, ...]  # (m,) [N] largest force
     slew: float = 2000.0  # [N/s] fastest change of a force
     jump: float = 3e-3  # [m] largest displacement from tick to tick: 2.5 m/s at T = 1.2 ms
-    watchdog_us: int = 6000  # [us] longest silence of a device that is streaming
+    watchdog_us: int = 6000  # [us] longest silence of a device that is streaming; see watchdog_for
     ramp_in: float = 0.25  # [s] in which the gain rises from 0 to 1
     ramp_out: float = 0.1  # [s] in which it falls
+    speed: float = 1.0  # [m/s] fastest motion while forces act
+    continuous: tuple[float, ...] = ()  # (m,) [N] that every motor stands for ever; none: heating is not looked at
+    thermal: float = 10.0  # [s] time constant of the motors
 
     def __post_init__(self) -> None:
         for i, cap in enumerate(self.cap):
@@ -67,6 +70,12 @@ class Limits:
         require("watchdog_us", self.watchdog_us, 1000, 20000, "us")
         require("ramp_in", self.ramp_in, 0.1, 0.25, "s")
         require("ramp_out", self.ramp_out, 0.1, 0.25, "s")
+        require("speed", self.speed, 1e-3, 2.5, "m/s")
+        require("thermal", self.thermal, 0.1, 1000.0, "s")
+        if self.continuous and len(self.continuous) != len(self.cap):
+            raise ValueError(f"continuous has {len(self.continuous)} entries, cap {len(self.cap)}")
+        for i, (most, cap) in enumerate(zip(self.continuous, self.cap, strict=False)):
+            require(f"continuous[{i}]", most, 1e-3, cap, "N")
 
 
 @dataclass(frozen=True)
@@ -84,8 +93,17 @@ def _require_finite(force: Sequence[float]) -> None:
         raise Fault(f"the controller asked for {', '.join(f'{f:g}' for f in force)} N, which is no force")
 
 
-def shape(asked: Sequence[float], previous: Sequence[float], gain: float, limits: Limits, T: float) -> Shaped:
+def shape(
+    asked: Sequence[float],
+    previous: Sequence[float],
+    gain: float,
+    limits: Limits,
+    T: float,
+    test: Sequence[float] | None = None,
+) -> Shaped:
     """The force to send in place of `asked` (m,) [N], after `previous` (m,) [N], at a gain within [0, 1].
+
+    `test` (m,) [N] is added behind the gain: what an encoder is tested with.
 
     Raises Fault where `asked` is not finite; that is looked at first, and the result is looked at again.
     """
@@ -93,10 +111,11 @@ def shape(asked: Sequence[float], previous: Sequence[float], gain: float, limits
     if not 0.0 <= gain <= 1.0:
         raise Fault(f"the gain is {gain}, expected a number within [0, 1]")
     step, clipped, slowed, force = limits.slew * T, False, False, []
-    for wanted, last, cap in zip(asked, previous, limits.cap, strict=True):
-        capped = max(-cap, min(cap, gain * wanted))
+    for i, (raw, last, cap) in enumerate(zip(asked, previous, limits.cap, strict=True)):
+        wanted = gain * raw + (test[i] if test else 0.0)
+        capped = max(-cap, min(cap, wanted))
         sent = max(last - step, min(last + step, capped))
-        clipped |= capped != gain * wanted
+        clipped |= capped != wanted
         slowed |= sent != capped
         force.append(sent)
     _require_finite(force)
@@ -120,6 +139,13 @@ def check_jolt(x: Sequence[float], previous: Sequence[float], before: Sequence[f
         if not (change := abs(now - 2 * last + first)) <= limits.jump:
             most = f"{1e3 * limits.jump:g} mm in a tick"
             raise Fault(f"encoder {i} shakes: its speed changed by {1e3 * change:.3g} mm in a tick, allowed are {most}")
+
+
+def check_speed(x: Sequence[float], before: Sequence[float], seconds: float, limits: Limits) -> None:
+    """Raise Fault where an axis moved faster than allowed: x now, `before` so many `seconds` ago, (m,) [m]."""
+    for i, (now, then) in enumerate(zip(x, before, strict=True), start=1):
+        if not (speed := abs(now - then) / seconds) <= limits.speed:
+            raise Fault(f"axis {i} moves at {speed:.3g} m/s, allowed are {limits.speed:g} m/s while forces act")
 
 
 def check_range(x: Sequence[float], reach: Sequence[float]) -> None:
@@ -149,6 +175,27 @@ class Gain:
         """The gain `ticks` ticks later, on its way to 0."""
         self.value = max(0.0, self.value - ticks * self.T / self.limits.ramp_out)
         return self.value
+
+
+class Heat:
+    """The heating of every motor by the square of its force, I2t: a first-order lag that tends to the square.
+
+    At a constant force F it reaches the continuous force's square after -tau ln(1 - (F_continuous / F)^2).
+    """
+
+    def __init__(self, limits: Limits, T: float) -> None:
+        self._limits, self._T = limits, T
+        self._squares = [0.0] * len(limits.continuous)  # [N^2]
+
+    def check(self, force: Sequence[float], ticks: int) -> None:
+        """Take in the force (m,) [N] that acts for so many ticks. Raise Fault where a motor gets too hot."""
+        part = -math.expm1(-ticks * self._T / self._limits.thermal)
+        for i, most in enumerate(self._limits.continuous):
+            self._squares[i] += (force[i] ** 2 - self._squares[i]) * part
+            if self._squares[i] > most**2:
+                raise Fault(
+                    f"motor {i + 1} gets hot: {self._squares[i] ** 0.5:.3g} N rms, {most:g} N are allowed for long"
+                )
 
 
 # before anything moves: is this the device that the scenario is about, and can the line carry it?
@@ -254,14 +301,16 @@ def probe_delay(T: float) -> int:
     return theta
 
 
-def require_period(T: float, limits: Limits) -> None:
-    """Raise ValueError where the host's watchdog does not span two ticks: one lost STATE would end every session."""
-    if limits.watchdog_us * (1 + 1e-9) < 2e6 * T:
-        most = 0.5e-6 * limits.watchdog_us
-        raise ValueError(
-            f"T is {T:g} s, a serial link is for at most {most:g} s: the host's watchdog of "
-            f"{limits.watchdog_us / 1000:g} ms has to outlast one lost STATE"
-        )
+def watchdog_for(T: float) -> int:
+    """The longest silence [us] of a device that ticks every T [s]: five ticks, and at least the 6 ms of a busy host.
+
+    Raises ValueError where that is longer than a free handle may be pushed without being asked.
+    """
+    silence = max(6000, math.ceil(round(5e6 * T, 3)))
+    if silence > MAX_RELEASE_NS // 1000:
+        most = MAX_RELEASE_NS / 5e9
+        raise ValueError(f"T is {T:g} s, a serial link is for at most {most:g} s: the host's watchdog is five ticks")
+    return silence
 
 
 def configuration(info: Info, limits: Limits, theta: int) -> Config:

@@ -10,6 +10,7 @@ kept the last one; in DISARMED there is none.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -25,18 +26,23 @@ BLOCK = 200  # ticks over which a clock is compared
 _REMEMBERED = 64  # forces on their way, of which at most theta matter
 _ROUNDING = 1  # [steps] for a firmware that rounds otherwise
 PATIENCE = 5  # ticks in a row
+_CHANGE = 1.0  # [N] of force that moves any handle which is not against a stop
+_IMPULSE = 0.1  # [N s] of such a change without a motion: 100 ms of 1 N, 20 ms of 5 N
+_TEST_FORCE, _TEST_SECONDS, _TEST_HALF = 1.0, 0.24, 0.03  # [N] reached after so many seconds, and half a period
 _FORGETTING = 8  # right ticks that make up for a wrong one: seldom wrong is stopped too, just later
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How a session judges its link."""
+    """How a session judges its link, and how it arms."""
 
     baud: int | None = None  # of a UART; None for a link without one (USB, pseudo-terminal)
     measure: int = 800  # answers whose age is measured
     window: int = 200  # ticks over which misses are judged
     late: float = 0.1  # part of late answers above which the coupling is too fast for the link
     missed: float = 0.2  # part of missing answers above which nothing is certified: mean-square stability ends there
+    test_encoders: bool = True  # by a small force at every arming
+    rereference: bool = True  # positions count from where the handles are at arming
 
 
 # the delay, timed at zero force
@@ -337,3 +343,77 @@ class CommandMonitor:
             if not min(may) - _ROUNDING <= force <= max(may) + _ROUNDING:
                 return False
         return True
+
+
+# encoders: a hand that holds still looks like a cable that is off, but no hand is as stiff as a dead encoder
+
+
+class EncoderTest:
+    """A small force on every axis, up and down by turns and growing, until its encoder has moved by more than a count.
+
+    A free handle of 0.25 kg answers an encoder of 10 um within 25 ms, at 0.1 N. Raises Fault, naming the axis, where
+    1 N, or as much as is allowed, was answered by nothing.
+    """
+
+    def __init__(self, cap: Sequence[float], T: float) -> None:
+        self._cap, self._T = cap, T
+        self._band: list[list[int]] | None = None  # least and most counts of every axis
+        self._ticks = 0
+
+    def force(self, counts: Sequence[int], ticks: int) -> tuple[float, ...] | None:
+        """Forces fed back (m,) [N], `ticks` after the call before; None once every encoder has answered."""
+        self._band = _widened(self._band, counts)
+        dead = [i for i, (low, high) in enumerate(self._band) if high - low <= 1]
+        if not dead:
+            return None
+        t = self._ticks * self._T
+        if t > _TEST_SECONDS:
+            strongest = min(_TEST_FORCE, self._cap[dead[0]])
+            what = f"it moved by {self._band[dead[0]][1] - self._band[dead[0]][0]} counts at a test force of"
+            raise Fault(f"encoder of axis {dead[0] + 1} does not follow: {what} up to {strongest:g} N")
+        size = _TEST_FORCE * t / _TEST_SECONDS * (-1 if int(t / _TEST_HALF) % 2 else 1)
+        self._ticks += ticks
+        return tuple(
+            max(-cap, min(cap, size)) if i in dead else 0.0
+            for i, cap in zip(range(len(counts)), self._cap, strict=True)
+        )
+
+
+class EncoderMonitor:
+    """Whether encoders follow the force, while it acts.
+
+    The handle that a changing force does not move by more than one count is held by nothing that lives: an encoder of
+    which one channel is broken still toggles between two counts. What is compared is the force that the device says
+    it applies, with the one at the last motion; a change of more than 1 N is summed up over time.
+    """
+
+    def __init__(self, force_step: Sequence[float], T: float) -> None:
+        self._force_step, self._T = force_step, T
+        self._band: list[list[int]] | None = None
+        self._reference = [0.0] * len(force_step)  # [N] at the last motion
+        self._impulse = [0.0] * len(force_step)  # [N s] since then
+
+    def check(self, counts: Sequence[int], applied: Sequence[int], ticks: int) -> None:
+        """Raise Fault where an encoder has not moved. `applied` (m,) [steps] acts from these `counts` (m,) on."""
+        self._band = _widened(self._band, counts)
+        for i, (band, steps, step) in enumerate(zip(self._band, applied, self._force_step, strict=True)):
+            force = steps * step
+            if band[1] - band[0] > 1:
+                band[:] = counts[i], counts[i]
+                self._reference[i], self._impulse[i] = force, 0.0
+                continue
+            change = abs(force - self._reference[i])
+            if change > _CHANGE:
+                self._impulse[i] += change * ticks * self._T
+            if self._impulse[i] > _IMPULSE:
+                still = f"it stands still while the force changes by {change:.3g} N"
+                raise Fault(f"encoder of axis {i + 1} does not follow: {still}")
+
+
+def _widened(band: list[list[int]] | None, counts: Sequence[int]) -> list[list[int]]:
+    """Least and most of every axis's counts, with these."""
+    if band is None:
+        return [[n, n] for n in counts]
+    for pair, n in zip(band, counts, strict=True):
+        pair[0], pair[1] = min(pair[0], n), max(pair[1], n)
+    return band

@@ -32,7 +32,8 @@ from sim.scenario import InputError, Scenario
 
 #: what the link adds, one entry per tick: name -> axes of the array
 _LINK = {"tick": 1, "arming": 1, "received": 1, "asked": 2, "gain": 1, "sent": 2, "margin_us": 1, "status": 1}
-_FLOATS, _WHOLE = ("asked", "gain"), ("tick", "arming", "sent", "margin_us", "status")
+_LATER = {"test": 2}  # that older traces lack
+_FLOATS, _WHOLE = ("asked", "gain", "test"), ("tick", "arming", "sent", "margin_us", "status")
 #: link array -> least and most that a session writes
 _RANGES = {"gain": (0.0, 1.0), "tick": (0, 0xFFFF), "sent": (-0x7FFF, 0x7FFF), "margin_us": (-0x8000, 0x7FFF)}
 _PERCENTILES = (50, 90, 99, 100)
@@ -49,25 +50,26 @@ class Recorder:
     def __call__(self, row: Row) -> None:
         """Take in one tick."""
         m, state = self.channels, row.state
-        self._floats.extend((*row.x, *row.asked, row.gain))
+        self._floats.extend((*row.x, *row.asked, row.gain, *(row.test or (0.0,) * m)))
         if state is None:
             self._whole.extend((row.tick, row.arming, 0, *(0,) * (2 * m), NO_MARGIN, 0))
         else:
             self._whole.extend((row.tick, row.arming, 1, *row.sent, *state.applied, state.margin_us, state.status))
 
     def __len__(self) -> int:
-        return len(self._floats) // (2 * self.channels + 1)
+        return len(self._floats) // (3 * self.channels + 1)
 
     def link(self) -> dict[str, NDArray[Any]]:
         """Arrays by the names of _LINK, with `x` (N, m) [m] and `applied` (N, m) [steps] beside them."""
         m, n = self.channels, len(self)
-        floats = np.array(self._floats).reshape(n, 2 * m + 1)
+        floats = np.array(self._floats).reshape(n, 3 * m + 1)
         whole = np.array(self._whole).reshape(n, 2 * m + 5)
         tick, arming, received, sent, applied, rest = np.split(whole, [1, 2, 3, 3 + m, 3 + 2 * m], axis=1)
         return {
             "x": floats[:, :m],
             "asked": floats[:, m : 2 * m],
-            "gain": floats[:, -1],
+            "gain": floats[:, 2 * m],
+            "test": floats[:, 2 * m + 1 :],
             "tick": tick[:, 0],
             "arming": arming[:, 0],
             "received": received[:, 0].astype(bool),
@@ -108,7 +110,8 @@ def result_of(recorder: Recorder, units: Units, T: float, meta: dict[str, Any]) 
 
 def save_npz(path: Path, result: Result, recorder: Recorder) -> Path:
     """An npz that sim.result reads, with the arrays of _LINK beside its own."""
-    link = {f"link_{name}": recorder.link()[name] for name in _LINK}
+    recorded = recorder.link()
+    link = {f"link_{name}": recorded[name] for name in _LINK | _LATER}
     own = {name: getattr(result, name) for name in ("t", "x", "f", "x_handle", "v_handle", "w")}
     arrays: dict[str, Any] = {**own, **link, "meta": np.array(json.dumps(result.meta))}
 
@@ -133,10 +136,11 @@ def load(path: Path) -> tuple[Result, dict[str, Array]]:
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
             link = {name: arrays[f"link_{name}"] for name in _LINK}
+            link |= {name: arrays.get(f"link_{name}", np.zeros(arrays["x"].shape)) for name in _LATER}
     except (OSError, *DAMAGED):
         raise InputError(f"{path}: a trace, but not of a bridge's session; hw.bridge writes one") from None
     n, m = result.x.shape
-    for name, axes in _LINK.items():
+    for name, axes in (_LINK | _LATER).items():
         if link[name].shape != ((n, m) if axes == 2 else (n,)):
             raise InputError(
                 f"{path}: link_{name} has the shape {link[name].shape}, the trace {n} ticks of {m} channels"
@@ -324,10 +328,11 @@ def recipes_of(result: Result) -> list[_Recipe]:
 def _require_limits(raw: object) -> None:
     """Raise ValueError where a recipe has other limits than Limits: msgspec passes over those of a dataclass."""
     names = {field.name for field in fields(Limits)}
+    needed = names - {"speed", "continuous", "thermal"}  # which older traces lack
     for recipe in raw if isinstance(raw, list) else []:
         limits = recipe.get("limits") if isinstance(recipe, dict) else None
-        if isinstance(limits, dict) and set(limits) != names:
-            wrong = ", ".join(sorted(set(limits) ^ names))
+        if isinstance(limits, dict) and not needed <= set(limits) <= names:
+            wrong = ", ".join(sorted((needed - set(limits)) | (set(limits) - names)))
             raise ValueError(f"limits are {', '.join(sorted(names))}; missing or unknown: {wrong}")
 
 
@@ -362,7 +367,8 @@ def _again(
             continue
         try:
             gain = float(link["gain"][k])
-            force = shape(asked[k].tolist(), force, gain, recipe.limits, recipe.scenario.T).force
+            test = link["test"][k].tolist()
+            force = shape(asked[k].tolist(), force, gain, recipe.limits, recipe.scenario.T, test).force
         except Fault as fault:
             raise InputError(f"the trace cannot be replayed: tick {k}: {fault}") from None
         sent[k] = units.steps(force, recipe.cap)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from hw.control import Drive, Program, Row
 from hw.limits import (
@@ -24,7 +24,7 @@ from hw.limits import (
     configuration,
     objections,
     probe_delay,
-    require_period,
+    watchdog_for,
 )
 from hw.monitor import Counters, LinkMonitor, Measurement, Settings, check_state
 from hw.protocol import (
@@ -130,8 +130,16 @@ class Session:
         if self.stage == Stage.DISARMED:
             assert self.program
             assert self.config
-            controller, arming = self.program.controller(), len(self.armings)
-            self.drive = Drive(controller, self.units, self.config, self.limits, self.counters, self.record, arming)
+            self.drive = Drive(
+                self.program.controller(),
+                self.units,
+                self.config,
+                self.limits,
+                self.settings,
+                self.counters,
+                self.record,
+                len(self.armings),
+            )
             self.armings.append((self.program, self.config))
             self._enter(Stage.ARMING, "asked to")
         return b""
@@ -301,7 +309,11 @@ class Session:
         ready = state.phase != Phase.DISARMED
         direction = (-1 if self.stage == Stage.DISARMING else 1) if ready else 0
         self.missed_while_driving += self.link.missed
+        first = self.drive.reference is None
         steps = self.drive.step(state, ticks, direction, self.now)
+        if first and any(self.drive.reference or ()):
+            places = ", ".join(f"{1e3 * x:+.4g}" for x in self.units.positions(self.drive.reference or ()))
+            self._log(f"positions count from where the handles are: {places} mm")
         if self.stage != Stage.DISARMING and (late := self.link.too_late()):
             self._soften(late)
         if self.stage == Stage.ARMING and self.gain == 1.0:
@@ -359,12 +371,16 @@ class Session:
         return encode(Stop(reason))
 
 
+def limits_for(scenario: Scenario, cap: float = _STRONGEST, **more: Any) -> Limits:
+    """Limits for the scenario's devices, of at most `cap` [N]. Raises ValueError where T is none for a serial link."""
+    watchdog = watchdog_for(scenario.T)
+    return Limits(tuple(min(cap, d.force_limit) for d in scenario.device), watchdog_us=watchdog, **more)
+
+
 def session_for(scenario: Scenario, settings: Settings, cap: float = _STRONGEST) -> Session:
     """A session that never asks for more than `cap` [N]. Raises InputError where T is none for a serial link."""
     try:
-        limits = Limits(tuple(min(cap, d.force_limit) for d in scenario.device))
-        require_period(scenario.T, limits)
-        return Session(scenario, limits, settings)
+        return Session(scenario, limits_for(scenario, cap), settings)
     except ValueError as error:
         raise InputError(str(error)) from None
 

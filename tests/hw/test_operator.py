@@ -30,7 +30,8 @@ def rehearsal_of(scenario, rungs, operator, *faults):
 
 
 def stages(session):
-    return [event.stage for event in session.log]
+    """Those that were entered; a remark in the log is none."""
+    return [event.stage for event in session.log if not event.cause.startswith("positions count from")]
 
 
 @pytest.mark.parametrize("start", [0, 0.05, 0.2, 0.2496, 0.26, 0.5])
@@ -69,7 +70,7 @@ def test_a_key_arms_a_disarmed_session_only(scenario, rungs):
     session = rehearsal.run(0.5)
     assert session.stage == Stage.DISARMED
     assert operator.press("a", session, session.now) == b""
-    rehearsal.run_until_armed(0.27)
+    rehearsal.run_until_armed(0.3)
     assert session.stage == Stage.ARMED
     begun = session.now
     while session.stage != Stage.DISARMING:

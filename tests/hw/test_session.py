@@ -34,6 +34,7 @@ from sim.simulate import assemble, simulate
 from sim.stability import close, dominant_mode
 
 FAST = Settings(measure=100)
+AT_REST = Settings(measure=100, test_encoders=False)  # nothing moves the handles before the person does
 
 
 @pytest.fixture(scope="module")
@@ -51,9 +52,9 @@ def session_with(scenario, settings=FAST):
     return Session(scenario, Limits(tuple(d.force_limit for d in scenario.device)), settings)
 
 
-def rehearsal_of(scenario, rungs, *faults, recorder=None, **options):
+def rehearsal_of(scenario, rungs, *faults, recorder=None, settings=FAST, **options):
     faults = tuple(map(FaultInjection.parse, faults))
-    session = session_with(scenario)
+    session = session_with(scenario, settings)
     if recorder is not None:
         session.record = recorder
     return Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, **options)
@@ -190,7 +191,7 @@ def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
     half), forces to K of one encoder step, B of half a step per tick twice over, and one force step.
     """
     recorder = Recorder(2)
-    rehearsal = rehearsal_of(scenario, rungs, recorder=recorder)
+    rehearsal = rehearsal_of(scenario, rungs, recorder=recorder, settings=AT_REST)
     rehearsal.run_until_armed(2.5)
     emulator = rehearsal.emulator
     link, begun = recorder.link(), emulator.begun_at
@@ -211,7 +212,7 @@ def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
 def test_the_same_to_the_last_bit_but_for_rounded_forces(scenario, rungs):
     """An independent loop: held plant by expm, encoders rounded, F of the whole delay, forces rounded to steps."""
     recorder = Recorder(2)
-    rehearsal = rehearsal_of(scenario, rungs, recorder=recorder)
+    rehearsal = rehearsal_of(scenario, rungs, recorder=recorder, settings=AT_REST)
     rehearsal.run_until_armed(1.5)
     link = recorder.link()
     first = int(np.argmax(link["tick"] == rehearsal.emulator.begun_at))
