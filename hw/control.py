@@ -113,7 +113,7 @@ class Drive:
         self.reference: tuple[int, ...] | None = None  # [counts] that positions are counted from
         self._rereference = settings.rereference
         self._test = EncoderTest(limits.cap, T) if settings.test_encoders else None
-        self._encoders, self._heat = EncoderMonitor(units.force_step, T), Heat(limits, T)
+        self._encoders, self._heat = EncoderMonitor(units.encoder_step, units.force_step, T), Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] over which a speed is taken
         self._recent: deque[tuple[int, tuple[float, ...]]] = deque()  # ticks since arming, and x [m]
         self._ticks = 0  # since arming

@@ -111,8 +111,9 @@ def shape(
     if not 0.0 <= gain <= 1.0:
         raise Fault(f"the gain is {gain}, expected a number within [0, 1]")
     step, clipped, slowed, force = limits.slew * T, False, False, []
-    for i, (raw, last, cap) in enumerate(zip(asked, previous, limits.cap, strict=True)):
-        wanted = gain * raw + (test[i] if test else 0.0)
+    wishes = [gain * one + more for one, more in zip(asked, test or (0.0,) * len(asked), strict=True)]
+    _require_finite(wishes)
+    for wanted, last, cap in zip(wishes, previous, limits.cap, strict=True):
         capped = max(-cap, min(cap, wanted))
         sent = max(last - step, min(last + step, capped))
         clipped |= capped != wanted

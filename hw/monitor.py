@@ -28,6 +28,7 @@ _ROUNDING = 1  # [steps] for a firmware that rounds otherwise
 PATIENCE = 5  # ticks in a row
 _CHANGE = 1.0  # [N] of force that moves any handle which is not against a stop
 _IMPULSE = 0.1  # [N s] of such a change without a motion: 100 ms of 1 N, 20 ms of 5 N
+_HEAVIEST = 2.5  # [kg] of hand and handle
 _TEST_FORCE, _TEST_SECONDS, _TEST_HALF = 1.0, 0.24, 0.03  # [N] reached after so many seconds, and half a period
 _FORGETTING = 8  # right ticks that make up for a wrong one: seldom wrong is stopped too, just later
 
@@ -384,11 +385,12 @@ class EncoderMonitor:
 
     The handle that a changing force does not move by more than one count is held by nothing that lives: an encoder of
     which one channel is broken still toggles between two counts. What is compared is the force that the device says
-    it applies, with the one at the last motion; a change of more than 1 N is summed up over time.
+    it applies, with the one at the last motion; a change of more than 1 N is summed up over time. A mass M that a
+    change F turns around stays within two counts of q for 4 sqrt(q M / F): a coarse encoder gets twice as long.
     """
 
-    def __init__(self, force_step: Sequence[float], T: float) -> None:
-        self._force_step, self._T = force_step, T
+    def __init__(self, encoder_step: Sequence[float], force_step: Sequence[float], T: float) -> None:
+        self._encoder_step, self._force_step, self._T = encoder_step, force_step, T
         self._band: list[list[int]] | None = None
         self._reference = [0.0] * len(force_step)  # [N] at the last motion
         self._impulse = [0.0] * len(force_step)  # [N s] since then
@@ -405,7 +407,7 @@ class EncoderMonitor:
             change = abs(force - self._reference[i])
             if change > _CHANGE:
                 self._impulse[i] += change * ticks * self._T
-            if self._impulse[i] > _IMPULSE:
+            if self._impulse[i] > max(_IMPULSE, 8.0 * (self._encoder_step[i] * _HEAVIEST * change) ** 0.5):
                 still = f"it stands still while the force changes by {change:.3g} N"
                 raise Fault(f"encoder of axis {i + 1} does not follow: {still}")
 

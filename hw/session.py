@@ -51,6 +51,7 @@ _ARMING_US = 500_000  # in which a device must follow ARM
 _QUIET_US = 1_000_000  # longest silence of a device that has no force to take away
 _STOPPING_US = 50_000  # in which a device that was stopped must say so
 _OBEYING_US = 30_000  # in which one that was told to stop must rest: the longest hold and ramp, and half as long again
+_DEADMAN_US = 1_000_000  # after which nobody is there
 _STRONGEST = 12.0  # [N] whatever a scenario allows
 _KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
 
@@ -435,12 +436,18 @@ class _Shutdown:
 
 @dataclass
 class Operator:
-    """A person's part in a session: arming, the planned end, keys. It arms by itself at most once, ever."""
+    """A person's part in a session: arming, the planned end, keys. It arms by itself at most once, ever.
+
+    With a `deadman`, forces act only as long as it is told every second that somebody is there: by any key, or by
+    whatever answers `deadman`.
+    """
 
     auto_arm: bool
     seconds: float  # of forces at full gain, from each arming on
+    deadman: Callable[[], bool] | None = None  # whether somebody showed up since the last call
     _asked: bool = False  # auto_arm has been used up
     _armed_at: int | None = None  # [us]
+    _seen_at: int | None = None  # [us] when somebody showed up last
 
     def look(self, session: Session, now: int) -> bytes:
         """What is to be said at `now` [us] because of where the session stands."""
@@ -450,12 +457,18 @@ class Operator:
                 return self._arm_once(session, now)
         if session.stage == Stage.ARMED and self._armed_at is None:
             self._armed_at = now
+        if self.deadman:
+            if self.deadman() or session.stage not in DRIVING or self._seen_at is None:
+                self._seen_at = now
+            if now - self._seen_at > _DEADMAN_US and session.stage != Stage.DISARMING:
+                return session.stop(f"the deadman was let go for {_DEADMAN_US / 1e6:g} s", now)
         if self._armed_at is not None and now - self._armed_at > 1e6 * self.seconds:
             return session.stop("the time is over", now)
         return b""
 
     def press(self, key: str, session: Session, now: int) -> bytes:
-        """A key of a person. `a` means something to a disarmed session only."""
+        """A key of a person, who is there then. `a` means something to a disarmed session only."""
+        self._seen_at = now
         match _KEYS.get(key):
             case "arm" if session.stage == Stage.DISARMED:
                 self._asked = True

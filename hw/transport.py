@@ -103,9 +103,10 @@ class Live:
         keyboard: int | None = None,  # a file descriptor with single keys
         glance: Callable[[Session], None] = lambda session: None,  # called a few times a second
         pace: float = 1.0,  # seconds of the session per second; 1 with any real device
+        deadman: Callable[[], bool] | None = None,  # whether somebody showed up since the last call
     ) -> None:
         self.session, self.port, self._plan = session, port, plan
-        self._operator = Operator(auto_arm, seconds)
+        self._operator = Operator(auto_arm, seconds, deadman)
         self._keyboard, self._glance, self._pace = keyboard, glance, pace
         self.signals: list[int] = []
         self.dropped = 0  # bytes that the port would not take at once
@@ -151,7 +152,9 @@ class Live:
         if session.stage == Stage.MEASURED:
             self._load()
         self._write(self._operator.look(session, now))
-        if self.signals:
+        if signal.SIGUSR1 in self.signals:
+            self._write(session.estop("SIGUSR1", now))
+        elif self.signals:
             name = signal.Signals(self.signals[0]).name
             self._write(session.stop(name, now) if len(self.signals) == 1 else session.fail(f"{name} again", now))
         if now - self._glanced > 100_000:
@@ -201,8 +204,8 @@ class Live:
 
 @contextmanager
 def _signals(received: list[int]) -> Iterator[None]:
-    """SIGINT, SIGTERM, SIGHUP and SIGQUIT are noted, and dealt with between two ticks."""
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+    """SIGINT, SIGTERM, SIGHUP, SIGQUIT, and SIGUSR1, the emergency stop, are noted, and dealt with between two ticks."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1)
     before = {number: signal.signal(number, lambda got, frame: received.append(got)) for number in numbers}
     try:
         yield

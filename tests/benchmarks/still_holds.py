@@ -45,11 +45,12 @@ def still_holds(holds: int, seed: int = 0) -> tuple[int, int]:
             )
             x += h * v
     changing = int((np.ptp(applied * FORCE_STEP, axis=0) > 1.0).sum())
-    return sum(_stopped(counts[:, i].tolist(), applied[:, i].tolist()) for i in range(holds)), changing
+    stopped = (_stopped(counts[:, i].tolist(), applied[:, i].tolist(), step[i]) for i in range(holds))
+    return sum(stopped), changing
 
 
-def _stopped(counts: list[int], applied: list[int]) -> bool:
-    monitor = EncoderMonitor((FORCE_STEP,), T)
+def _stopped(counts: list[int], applied: list[int], step: float) -> bool:
+    monitor = EncoderMonitor((step,), (FORCE_STEP,), T)
     try:
         for n, force in zip(counts, applied, strict=True):
             monitor.check((n,), (force,), 1)

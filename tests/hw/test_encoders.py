@@ -126,7 +126,7 @@ def test_a_saturated_encoder_is_found(scenario, rungs, axis, most):
 @pytest.mark.parametrize(("newton", "after"), [(1.05, 0.1), (5.0, 0.02), (0.95, None)])
 def test_the_impulse_decides(axis, sign, newton, after):
     """1 N for 100 ms, 5 N for 20 ms: an impulse of 0.1 N s, since the last motion; less than 1 N never."""
-    monitor, applied = EncoderMonitor((STEP, STEP), T), [0, 0]
+    monitor, applied = EncoderMonitor((1e-6, 1e-6), (STEP, STEP), T), [0, 0]
     monitor.check((0, 0), applied, 1)
     applied[axis] = sign * round(newton / STEP)
 
@@ -142,8 +142,22 @@ def test_the_impulse_decides(axis, sign, newton, after):
     return None
 
 
+def test_a_coarse_encoder_gets_the_time_that_a_heavy_hand_needs_to_turn():
+    """8 sqrt(q M F) with 0.1 mm, 2.5 kg and 5 N is 0.283 N s, 57 ms: 48 ticks."""
+    monitor = EncoderMonitor((1e-4,), (STEP,), T)
+    monitor.check((0,), (0,), 1)
+
+    def stand_still(ticks):
+        for _ in range(ticks):
+            monitor.check((0,), (12_500,), 1)
+
+    stand_still(47)
+    with pytest.raises(Fault, match="axis 1 does not follow"):
+        stand_still(1)
+
+
 def test_a_motion_of_two_counts_begins_anew():
-    monitor = EncoderMonitor((STEP,), T)
+    monitor = EncoderMonitor((1e-6,), (STEP,), T)
     for k in range(2000):
         monitor.check((2 * (k // 15),), (2500 * (k % 2),), 1)  # 1 N up and down, two counts every 18 ms
 

@@ -11,6 +11,7 @@ from hw.limits import (
     ENDED,
     Fault,
     Gain,
+    Heat,
     Limits,
     Stage,
     Units,
@@ -18,12 +19,15 @@ from hw.limits import (
     check_jolt,
     check_jump,
     check_range,
+    check_speed,
     configuration,
     objections,
     probe_delay,
     shape,
+    watchdog_for,
 )
-from hw.protocol import MAX_RELEASE_NS, Force, Info, State, encode
+from hw.monitor import CommandMonitor, check_state
+from hw.protocol import MAX_RELEASE_NS, Config, Force, Info, Phase, State, encode
 from sim.scenario import load
 
 LIMITS = Limits((12.0, 6.0))
@@ -213,3 +217,114 @@ def test_an_encoder_that_shakes_is_found_though_no_step_is_too_large():
         check_jolt((2.9e-3,), (0.0,), (2.9e-3,), limits)
     with pytest.raises(Fault, match="shakes"):
         check_jolt((float("nan"),), (0.0,), (0.0,), limits)
+
+
+# every check, on every channel and for both signs
+
+
+MIRRORED = [(channel, sign) for channel in (0, 1) for sign in (1, -1)]
+
+
+def on(channel, value, rest=0.0):
+    return tuple(value if i == channel else rest for i in (0, 1))
+
+
+@pytest.mark.parametrize(("channel", "sign"), MIRRORED)
+def test_every_motion_check_is_for_both_channels_and_signs(channel, sign):
+    for name, inside, outside, check in (
+        (f"encoder {channel + 1} jumped by", 2.9e-3, 3.1e-3, lambda x: check_jump(x, (0.0, 0.0), 1, LIMITS)),
+        (f"encoder {channel + 1} shakes", 2.9e-3, 3.1e-3, lambda x: check_jolt(x, (0.0, 0.0), (0.0, 0.0), LIMITS)),
+        (f"encoder {channel + 1} shakes", 1.4e-3, 1.6e-3, lambda x: check_jolt((0.0, 0.0), x, (0.0, 0.0), LIMITS)),
+        (f"encoder {channel + 1} shakes", 2.9e-3, 3.1e-3, lambda x: check_jolt((0.0, 0.0), (0.0, 0.0), x, LIMITS)),
+        (f"encoder {channel + 1} is at", 0.099, 0.101, lambda x: check_range(x, (0.1, 0.1))),
+        (f"axis {channel + 1} moves at", 9.9e-3, 10.1e-3, lambda x: check_speed(x, (0.0, 0.0), 0.01, LIMITS)),
+        (f"axis {channel + 1} moves at", 9.9e-3, 10.1e-3, lambda x: check_speed((0.0, 0.0), x, 0.01, LIMITS)),
+    ):
+        check(on(channel, sign * inside))
+        with pytest.raises(Fault, match=name):
+            check(on(channel, sign * outside))
+
+
+@pytest.mark.parametrize(("channel", "sign"), MIRRORED)
+def test_the_cap_and_the_slew_limit_are_for_both_channels_and_signs(channel, sign):
+    cap, step = LIMITS.cap[channel], LIMITS.slew * T
+    for asked, last, sent, clipped, slowed in (
+        (cap - 0.1, cap - 0.2, cap - 0.1, False, False),
+        (cap + 0.1, cap - 0.2, cap, True, False),
+        (3.0, 0.0, step, False, True),
+        (-3.0, 0.0, -step, False, True),
+        (cap + 0.1, 0.0, step, True, True),
+    ):
+        shaped = shape(on(channel, sign * asked), on(channel, sign * last), 1.0, LIMITS, T)
+        assert shaped.force == on(channel, sign * sent)
+        assert (shaped.clipped, shaped.slowed) == (clipped, slowed)
+    half = shape(on(channel, sign * 2.0), (0.0, 0.0), 0.5, LIMITS, T, on(channel, sign * 0.25))
+    assert half.force == on(channel, sign * 1.25)  # the gain is for the controller, not for the test of an encoder
+
+
+@pytest.mark.parametrize("channel", [0, 1])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_force_that_is_none_is_found_on_both_channels(channel, value):
+    with pytest.raises(Fault, match="which is no force"):
+        shape(on(channel, value), (0.0, 0.0), 0.0, LIMITS, T)
+    with pytest.raises(Fault, match="which is no force"):
+        shape((0.0, 0.0), (0.0, 0.0), 0.0, LIMITS, T, on(channel, math.nan))
+
+
+@pytest.mark.parametrize(("channel", "sign"), MIRRORED)
+def test_a_motor_gets_hot_by_the_square_of_its_force(channel, sign):
+    """At twice what it stands for long, after tau ln(4/3); at 0.99 of it, never. Cold again after a while."""
+    limits = Limits((12.0, 12.0), continuous=(2.0, 2.0), thermal=5.0)
+    heat, ticks = Heat(limits, T), 0
+    for _ in range(20_000):
+        heat.check(on(channel, sign * 1.98), 1)
+
+    def push(heat):
+        nonlocal ticks
+        for _ in range(20_000):
+            heat.check(on(channel, sign * 4.0), 1)
+            ticks += 1
+
+    with pytest.raises(Fault, match=rf"motor {channel + 1} gets hot: 2 N rms, 2 N are allowed for long"):
+        push(Heat(limits, T))
+    assert ticks * T == pytest.approx(5.0 * math.log(4 / 3), abs=2 * T)
+    at_once = Heat(limits, T)
+    at_once.check(on(channel, sign * 3.0), 500)  # ticks that were missed count too
+    one_by_one = Heat(limits, T)
+    for _ in range(500):
+        one_by_one.check(on(channel, sign * 3.0), 1)
+    assert at_once._squares == pytest.approx(one_by_one._squares, rel=1e-9)
+
+
+@pytest.mark.parametrize(("channel", "sign"), MIRRORED)
+def test_what_the_device_says_is_checked_on_both_channels_and_signs(channel, sign):
+    config = Config(1, 4, 5, 0, (20000, 15000), (600, 600))
+
+    def said(tick, steps, phase=Phase.ARMED):
+        return State(phase, tick, 0, 100, 0, 0, 0, (0, 0), on(channel, sign * steps, 0))
+
+    cap = config.cap[channel]
+    check_state(said(0, cap), config, Stage.ARMED, 1.0)
+    with pytest.raises(Fault, match=r"the device applies .* the cap is"):
+        check_state(said(0, cap + 1), config, Stage.ARMED, 1.0)
+    with pytest.raises(Fault, match="is disarmed and applies"):
+        check_state(said(0, 1, Phase.DISARMED), config, Stage.DISARMED, 0.0)
+    for told, applied, wrong in ((500, 500, False), (500, 501, False), (500, 502, True), (500, 498, True)):
+        monitor = CommandMonitor(config)
+        monitor.unlike(said(0, 0), 1)
+        monitor.tell(0, on(channel, sign * told, 0))
+        assert monitor.unlike(said(1, applied), 1) == wrong
+    holding = CommandMonitor(config)
+    holding.unlike(said(0, 300), 1)
+    assert holding.unlike(said(1, 299, Phase.HOLDING), 1)
+    assert not holding.unlike(said(2, 299, Phase.HOLDING), 1)
+
+
+@pytest.mark.parametrize(("T", "watchdog"), [(3e-4, 6000), (1.2e-3, 6000), (3e-3, 15_000), (4e-3, 20_000)])
+def test_the_watchdog_is_five_ticks_and_no_less_than_a_busy_host_needs(T, watchdog):
+    assert watchdog_for(T) == watchdog
+
+
+def test_a_period_whose_five_ticks_are_too_long_is_refused():
+    with pytest.raises(ValueError, match=r"at most 0\.004 s"):
+        watchdog_for(4.1e-3)
