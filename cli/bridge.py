@@ -10,13 +10,22 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cli.session_cli import add_link_options, check_link, hold_session, measured_link, number
+from cli.session_cli import (
+    add_link_options,
+    add_safety_options,
+    check_link,
+    hold_session,
+    limits_from,
+    measured_link,
+    number,
+)
 from design.assess import CONDITIONS
 from design.promises import CAVEATS
 from hw.control import CertifiedCoupling, certified_couplings
@@ -55,7 +64,9 @@ def main(argv: list[str]) -> int:
     seconds = number(args, "duration", 0.1, LONGEST, scenario.duration)
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
-    session = session_for(scenario, settings)
+    session = session_for(
+        scenario, replace(settings, rereference=not args.no_rereference), **limits_from(args, scenario)
+    )
     session.record = recorder = Recorder(scenario.channels)
     out = out_folder(args, "bridge")
 
@@ -65,7 +76,7 @@ def main(argv: list[str]) -> int:
         print_certificate(ages, link, programs, console(args))
         return programs
 
-    live = hold_session(args, session, plan, seconds, seed)
+    live = hold_session(args, session, plan, seconds, seed, out)
     report = outcome(args.case, session, recorder, live.dropped, float(args.pace))
     try:  # first, for a disk may be full
         print_session(report, console(args))
@@ -77,7 +88,7 @@ def main(argv: list[str]) -> int:
     console(args).print("files: " + ", ".join(report["files"]), soft_wrap=True)
     if args.json:
         write_json(args.json, report)
-    if live.signals:
+    if set(live.signals) - {signal.SIGUSR1}:
         return INTERRUPTED
     return DONE if session.stage == Stage.FINISHED else DOES_NOT_HOLD
 
@@ -90,6 +101,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_loop_options(parser)
     add_link_options(parser)
+    add_safety_options(parser)
     names = ", ".join(NAMES)
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")

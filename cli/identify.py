@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
     coulomb = number(args, "coulomb", 0.0, 10.0)
     out = out_folder(args, "identify")
     asks_nothing = scenario.replace(delta=(1e-6,) * scenario.channels)  # what the damping is, is the question
-    session = session_for(asks_nothing, settings, cap=force)
+    session = session_for(asks_nothing, replace(settings, test_encoders=False), cap=force)
     session.record = recorder = Recorder(scenario.channels)
 
     def plan(ages: Ages) -> Sequence[Excitation]:
@@ -72,7 +72,7 @@ def main(argv: list[str]) -> int:
         return [chirp(scenario.channels, scenario.T, link, force, (low, high), seconds)]
 
     played = 1.5 * seconds + 0.1  # from full gain on: the lead has the ramp
-    live = hold_session(args, session, plan, played, seed, ["--nobody", f"--coulomb={coulomb}"])
+    live = hold_session(args, session, plan, played, seed, out, ["--nobody", f"--coulomb={coulomb}"])
     report, estimates = _identified(session, recorder, scenario, live.dropped, float(args.pace))
     report["files"] = [str(p) for p in _save(out, session, recorder, scenario, estimates, report)]
     _print(report, console(args))

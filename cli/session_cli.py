@@ -9,16 +9,18 @@ import termios
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 from cli.dashboard import Dashboard
 from hw.control import Program, link_delay
 from hw.emulator import spawned
 from hw.monitor import Ages, Settings
+from hw.recording import IncidentLog
 from hw.session import Session
-from hw.transport import Live, Port
-from sim.command import numbers
-from sim.scenario import InputError
+from hw.transport import Live, Port, preflight
+from sim.command import console, numbers
+from sim.scenario import InputError, Scenario
 
 USUAL_BAUD = 921_600
 SPARE = 600.0  # [s] beside the run, after which an orphan of --emulate would end by itself
@@ -32,7 +34,7 @@ def add_link_options(parser: argparse.ArgumentParser) -> None:
     link.add_argument("--emulate", action="store_true", help="start hw.emulator and drive that; it arms by itself")
     link.add_argument("--fault", action="append", default=[], metavar="FAULT", help="for --emulate, see hw.emulator")
     link.add_argument(
-        "--pace", default="1", metavar="P", help="slow motion for --emulate on a busy machine (default 1)"
+        "--pace", default="1", metavar="P", help="slow motion of an emulator, for busy machines (default 1)"
     )
     link.add_argument("--arm", action="store_true", help="arm without being asked; else press a")
     baud = "of a UART, checked against T; none: USB without one (default 921600; none for a pseudo-terminal)"
@@ -42,14 +44,61 @@ def add_link_options(parser: argparse.ArgumentParser) -> None:
     link.add_argument("--measure", default="800", metavar="N", help="answers that are timed (default 800)")
 
 
+def add_safety_options(parser: argparse.ArgumentParser) -> None:
+    """What the bridge never does, and who has to be there."""
+    safety = parser.add_argument_group("safety")
+    safety.add_argument(
+        "--force-cap", default="2", metavar="NEWTON", help="largest force (default 2, for first sessions)"
+    )
+    safety.add_argument("--max-speed", default="1", metavar="M/S", help="of a handle while forces act (default 1)")
+    heat = "force that each motor stands for ever, one is for all; above it, I2t (default: not looked at)"
+    safety.add_argument("--continuous-force", metavar="N,N,..", help=heat)
+    safety.add_argument("--thermal-time", default="10", metavar="SECONDS", help="of the motors' heating (default 10)")
+    absolute = "count positions from the encoders' zero, not from where the handles are at arming"
+    safety.add_argument("--no-rereference", action="store_true", help=absolute)
+    who = "forces act only while a key is pressed, or FILE is touched, once a second"
+    safety.add_argument("--deadman", metavar="key|FILE", help=who)
+    safety.add_argument("--no-preflight", action="store_true", help="do not look at this machine for two seconds first")
+
+
+def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
+    """The Limits of the safety options, with `cap`. Raises InputError."""
+    cap = number(args, "force-cap", 0.05, 12.0)
+    more: dict[str, Any] = {"cap": cap, "speed": number(args, "max-speed", 1e-3, 2.5)}
+    more["thermal"] = number(args, "thermal-time", 0.1, 1000.0)
+    if args.continuous_force is not None:
+        more["continuous"] = numbers("--continuous-force", args.continuous_force, float, scenario.channels)
+    if args.deadman == "key" and not sys.stdin.isatty():
+        raise InputError("--deadman key needs a terminal; without one give it a file to be touched")
+    return more
+
+
+def touched(path: str) -> Callable[[], bool]:
+    """Whether a file was touched since the call before; one that is not there is nobody's."""
+    last = [_mtime(path)]
+
+    def look() -> bool:
+        now, before = _mtime(path), last[0]
+        last[0] = now
+        return now is not None and now != before
+
+    return look
+
+
+def _mtime(path: str) -> int | None:
+    try:
+        return os.stat(path).st_mtime_ns
+    except OSError:
+        return None
+
+
 def check_link(args: argparse.Namespace) -> Settings:
     """The settings of a session. Raises InputError where the options contradict each other."""
     if bool(args.port) == args.emulate:
         raise InputError("give either --port PATH or --emulate")
     if args.fault and not args.emulate:
         raise InputError("--fault is for --emulate; a device behind --port has its own")
-    if pace_from(args) != 1 and not args.emulate:
-        raise InputError("--pace is for --emulate: a device has its own timer")
+    pace_from(args)
     if args.port and not args.arm and not sys.stdin.isatty():
         raise InputError("no keyboard to arm with: give --arm, if nobody can get hurt")
     number(args, "quantile", 0.5, 1.0)
@@ -78,7 +127,7 @@ def _baud(args: argparse.Namespace) -> int | None:
 
 def number(args: argparse.Namespace, name: str, low: float, high: float, default: float | None = None) -> float:
     """One option as a number within its range. Raises InputError."""
-    text = getattr(args, name)
+    text = getattr(args, name.replace("-", "_"))
     value = default if text is None else numbers(f"--{name}", text, float, 1)[0]
     assert value is not None
     if not low <= value <= high:
@@ -105,14 +154,28 @@ def hold_session(
     plan: Callable[[Ages], Sequence[Program]],
     seconds: float,
     seed: int,
+    out: Path,
     extra: Sequence[str] = (),
 ) -> Live:
     """From opening the port, or starting an emulator with the options `extra`, to the end of the session."""
     with ExitStack() as stack:
         path = args.port or stack.enter_context(spawned([*_emulator_options(args, seed, seconds), *extra]))
         port = stack.enter_context(Port(path, session.settings.baud))
+        if args.port and not getattr(args, "no_preflight", True):
+            console(args).print(preflight(path).line(), soft_wrap=True, highlight=False)
         keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
-        live = Live(session, port, plan, args.arm or args.emulate, seconds, keyboard, _view(stack), float(args.pace))
+        incidents, show = IncidentLog(out / "incidents.jsonl"), _view(stack)
+        stack.callback(incidents.close)
+        incidents.attach(session)
+
+        def glance(session: Session) -> None:
+            incidents.glance(session)
+            show(session)
+
+        named = getattr(args, "deadman", None)
+        deadman = None if named is None else touched(named) if named != "key" else lambda: False
+        auto_arm = args.arm or args.emulate
+        live = Live(session, port, plan, auto_arm, seconds, keyboard, glance, float(args.pace), deadman)
         live.run()
     return live
 

@@ -33,7 +33,7 @@ import numpy as np
 
 from controller.lti import Array
 from hw.device import RUNNING, Device
-from hw.protocol import PROTOCOL, Force, Info, Phase
+from hw.protocol import PROTOCOL, Force, Info, Phase, distance
 from models.human import Human, Link
 from models.quantity import require
 from models.scene import build, plant
@@ -83,6 +83,7 @@ AXIS = {
     "toggle": ("no value: one channel of its encoder is dead, so that it toggles between two counts", 0.0, 0.0, 0.0),
     "saturate": ("millimetres beyond which its encoder shows no more", -1000.0, 1000.0, 5.0),
     "shake": ("millimetres by which its encoder is wrong at every other tick", -1000.0, 1000.0, 2.0),
+    "drift": ("metres per second that its encoder shows beside its motion", -10.0, 10.0, 2.0),
     "own": ("newtons that its motor has while armed, whatever it is told", -12.0, 12.0, 2.0),
 }
 _KINDS = LINE | DEVICE | AXIS
@@ -312,6 +313,7 @@ class Emulator:
 
     def _broken(self, fault: FaultInjection) -> Callable[[int], int]:
         """What an encoder that breaks now makes of its counts."""
+        step = self.info.encoder_step[fault.axis]
         now, most = self.plant.counts()[fault.axis] + self._offset[fault.axis], self._in_counts(fault)
         match fault.kind:
             case "freeze":
@@ -320,6 +322,9 @@ class Emulator:
                 return lambda n: now + (n - now) % 2
             case "saturate":
                 return lambda n: min(n, most) if most >= 0 else max(n, most)
+            case "drift":
+                each, begun = fault.value * 1e-9 * self.info.period_ns, self.device.k
+                return lambda n: n + round(each / (1e-12 * step) * distance(self.device.k, begun))
         return lambda n: n + most * (self.device.k % 2)
 
     def _wake_person(self) -> None:
@@ -341,7 +346,7 @@ class Emulator:
                     self.device = Device(self.info)
                 case "jump":
                     self._offset[fault.axis] += self._in_counts(fault)
-                case "freeze" | "toggle" | "saturate" | "shake":
+                case "freeze" | "toggle" | "saturate" | "shake" | "drift":
                     self._encoder[fault.axis] = self._broken(fault)
                 case "leap":
                     self.device.k = (self.device.k + round(fault.value)) & 0xFFFF

@@ -50,6 +50,7 @@ class Case:
     host_stall: float = 0.0  # [s] at WHEN
     info: Callable[[Info], Info] | None = None  # a device that says something else of itself
     baud: int | None = None
+    continuous: tuple[float, ...] = ()  # [N] that the motors stand for ever
     coupling: str | None = None
     designed: bool = False  # the coupling for the measured delay, in place of one made beforehand
     counted: tuple[str, ...] = ()  # counters that must not be zero
@@ -153,6 +154,8 @@ CASES = (
     Case("encoder 2 jumps by -5 mm", G.STOPPED, "encoder 2 jumped by", at("axis2:jump=-5"), _STOP),
     Case("encoder shakes by 2 mm", G.STOPPED, "encoder 1 shakes", at("shake=2"), _STOP + 2 * _T_MS),
     Case("encoder 2 shakes by -2 mm", G.STOPPED, "encoder 2 shakes", at("axis2:shake=-2"), _STOP + 2 * _T_MS),
+    Case("a handle at 1.5 m/s", G.STOPPED, "axis 1 moves at 1", at("drift=1.5"), _STOP + 12 * _T_MS),
+    Case("handle 2 at -1.5 m/s", G.STOPPED, "axis 2 moves at 1", at("axis2:drift=-1.5"), _STOP + 12 * _T_MS),
     Case("encoder out of its range", G.STOPPED, r"encoder 1 is at \d.*its range is", ("jump=200",)),
     Case("encoder 2 out of its range", G.STOPPED, "encoder 2 is at -.*its range is", ("axis2:jump=-200",)),
     Case("encoder dead before", G.STOPPED, "axis 1 does not follow: it moved by 0 counts", ("freeze",), _AT_ONCE),
@@ -165,6 +168,7 @@ CASES = (
     Case("encoder 2 saturates", G.STOPPED, "axis 2 does not follow|2 jumped", at("axis2:saturate=1"), lasts=2.0),
     Case("e-stop at the device", G.ESTOP, "estop_device", at("estop"), _AT_ONCE),
     Case("e-stop at the device before", G.REFUSED, "refuses the configuration: estop", ("estop",)),
+    Case("a motor gets hot", G.STOPPED, "motor . gets hot", within=1500.0, continuous=(0.2, 0.2), lasts=2.5),
     Case("firmware finds a fault", G.STOPPED, "cause device", at("trip"), _STOP),
     Case("device clock runs 5 % fast", G.REFUSED, "by its own clock", period=1.05),
     # the controller
@@ -244,7 +248,8 @@ def rehearse_case(
 ) -> tuple[Rehearsal, FaultOutcome]:
     """One case. `made` are couplings for a link of one tick, and softer ones."""
     info = info_of(scenario)
-    session = Session(scenario, Limits(tuple(d.force_limit for d in scenario.device)), Settings(case.baud, _MEASURED))
+    cap = tuple(d.force_limit for d in scenario.device)
+    session = Session(scenario, Limits(cap, continuous=case.continuous, thermal=1.0), Settings(case.baud, _MEASURED))
     faults = tuple(FaultInjection.parse(text) for text in case.faults)
     emulator = Emulator(scenario, faults, case.info(info) if case.info else info)
     emulator.device.k = case.first_tick

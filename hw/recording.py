@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import time
 from array import array
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO
@@ -183,6 +186,44 @@ def _complaint(result: Result, link: dict[str, Array]) -> str | None:
 def _first(wrong: Array) -> int:
     """The first row of `wrong` (N,) or (N, m) with a True."""
     return int(np.argmax(wrong.reshape(len(wrong), -1).any(axis=1)))
+
+
+class IncidentLog:
+    """A file that is true up to the last second, however the process ended: appended to, never kept in memory.
+
+    One JSON object a line: every change of the stage at once, and every second where things stand. What was written
+    survives SIGKILL, though not a power failure.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises InputError where the file cannot be written."""
+        self.path = path
+        try:
+            self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise InputError(f"cannot write {path}: {error.strerror}") from None
+        self._told = 0  # [us]
+
+    def attach(self, session: Session) -> None:
+        """From now on, follow this session."""
+        self._write({"at": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "scenario": session.scenario.name, "pid": os.getpid()})
+        session.listen = lambda event: self._write({"t_us": event.t_us, "stage": event.stage, "cause": event.cause})
+
+    def glance(self, session: Session) -> None:
+        """Where things stand, once a second."""
+        if session.now - self._told < 1_000_000:
+            return
+        self._told, drive = session.now, session.drive
+        force, x = (list(drive.force), list(drive.x or ())) if drive else ([], [])
+        standing = {"t_us": session.now, "stage": session.stage, "gain": session.gain, "x_m": x, "f_n": force}
+        self._write(standing | {"counters": asdict(session.counters)})
+
+    def _write(self, line: dict[str, Any]) -> None:
+        with suppress(OSError):  # a full disk is no reason to drop the forces
+            os.write(self._file, (json.dumps(line) + "\n").encode())
+
+    def close(self) -> None:
+        os.close(self._file)
 
 
 # the report, and the files

@@ -84,6 +84,7 @@ class Session:
         self.drive: Drive | None = None  # the coupling at work, from one arming to the next end
         self.armings: list[tuple[Program, Config]] = []  # what forces came from, arming by arming
         self.record: Callable[[Row], None] = lambda row: None
+        self.listen: Callable[[Event], None] = lambda event: None
         self.missed_while_driving = 0  # ticks
         self.now = self.entered = self.heard = 0  # [us]
         self._units: Units | None = None
@@ -364,6 +365,7 @@ class Session:
 
     def _log(self, cause: str) -> None:
         self.log.append(Event(self.now, self.stage, cause))
+        self.listen(self.log[-1])
 
     def _end(self, stage: Stage, cause: str, reason: Reason = Reason.FAULT) -> bytes:
         self.drive = None
@@ -378,10 +380,10 @@ def limits_for(scenario: Scenario, cap: float = _STRONGEST, **more: Any) -> Limi
     return Limits(tuple(min(cap, d.force_limit) for d in scenario.device), watchdog_us=watchdog, **more)
 
 
-def session_for(scenario: Scenario, settings: Settings, cap: float = _STRONGEST) -> Session:
-    """A session that never asks for more than `cap` [N]. Raises InputError where T is none for a serial link."""
+def session_for(scenario: Scenario, settings: Settings, cap: float = _STRONGEST, **more: Any) -> Session:
+    """A session that never asks for more than `cap` [N], with `more` Limits. Raises InputError for what cannot be."""
     try:
-        return Session(scenario, limits_for(scenario, cap), settings)
+        return Session(scenario, limits_for(scenario, cap, **more), settings)
     except ValueError as error:
         raise InputError(str(error)) from None
 

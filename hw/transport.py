@@ -6,6 +6,7 @@ is frozen and the collector is off while forces act.
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import select
@@ -13,6 +14,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import Protocol, Self
 
 from hw.control import Program
@@ -24,6 +26,7 @@ from sim.scenario import InputError
 _CHUNK = 4096  # bytes read at once; a tick brings a few dozen
 _UNUSED = 9600  # baud that a port without UART is told: it does nothing, but 1200 resets many boards
 _LONGEST_WAIT = 1e-3  # [s] between two looks at the time-outs
+_STALL_SECONDS, _STALL_MS = 2.0, 2.0  # how long stalls are measured, and from which on something is said
 _GRACE_US = 50_000  # after the end, in which a STOP that was lost is repeated
 
 
@@ -79,6 +82,76 @@ class Port:
     def __exit__(self, *_: object) -> None:
         with suppress(Exception):
             self._serial.close()
+
+
+@dataclass(frozen=True)
+class Preflight:
+    """How well this machine can keep time, and what to do where it cannot."""
+
+    scheduling: str
+    memory: str
+    latency_timer: str
+    clock: str
+    worst_stall_ms: float
+
+    def line(self) -> str:
+        """One line, with what to do about each."""
+        stall = f"worst stall in {_STALL_SECONDS:g} s {self.worst_stall_ms:.1f} ms"
+        if self.worst_stall_ms > _STALL_MS:
+            stall += " (close what is busy; a real machine, no virtual one)"
+        return "pre-flight: " + "; ".join((self.scheduling, self.memory, self.latency_timer, self.clock, stall))
+
+
+def preflight(path: str) -> Preflight:
+    """Ask the system for real-time scheduling and locked memory, and measure for two seconds how late it wakes us."""
+    return Preflight(_scheduling(), _locked_memory(), _latency_timer(path), _clock_source(), 1e3 * _worst_stall())
+
+
+def _scheduling() -> str:
+    with suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+    policy = os.sched_getscheduler(0)
+    if policy in (os.SCHED_FIFO, os.SCHED_RR):
+        return f"real-time scheduling, priority {os.sched_getparam(0).sched_priority}"
+    return "no real-time scheduling (allow it: `rtprio 20` in /etc/security/limits.conf, or start by chrt -f 10)"
+
+
+def _locked_memory() -> str:
+    current, future = 1, 2
+    if ctypes.CDLL(None).mlockall(current | future) == 0:
+        return "memory locked"
+    return "memory not locked (allow it: `memlock unlimited` in /etc/security/limits.conf)"
+
+
+def _latency_timer(path: str) -> str:
+    name = os.path.basename(os.path.realpath(path))
+    try:
+        with open(f"/sys/bus/usb-serial/devices/{name}/latency_timer") as file:
+            ms = int(file.read())
+    except (OSError, ValueError):
+        return "no latency timer"
+    return f"latency timer {ms} ms" + (f" (setserial {path} low_latency)" if ms > 1 else "")
+
+
+def _clock_source() -> str:
+    try:
+        with open("/sys/devices/system/clocksource/clocksource0/current_clocksource") as file:
+            source = file.read().strip()
+    except OSError:
+        return "clock source unknown"
+    fast = source in ("tsc", "kvm-clock", "arch_sys_counter")
+    return f"clock {source}" + ("" if fast else " (slow to read; a kernel that trusts its tsc is better)")
+
+
+def _worst_stall() -> float:
+    """By how much a sleep of a millisecond is late at worst [s]."""
+    worst, begun = 0.0, time.monotonic()
+    last = begun
+    while last < begun + _STALL_SECONDS:
+        time.sleep(1e-3)
+        now = time.monotonic()
+        worst, last = max(worst, now - last - 1e-3), now
+    return worst
 
 
 class Wire(Protocol):
@@ -204,7 +277,7 @@ class Live:
 
 @contextmanager
 def _signals(received: list[int]) -> Iterator[None]:
-    """SIGINT, SIGTERM, SIGHUP, SIGQUIT, and SIGUSR1, the emergency stop, are noted, and dealt with between two ticks."""
+    """SIGINT, SIGTERM, SIGHUP, SIGQUIT and SIGUSR1 (emergency stop) are noted, and dealt with between two ticks."""
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1)
     before = {number: signal.signal(number, lambda got, frame: received.append(got)) for number in numbers}
     try:
