@@ -464,7 +464,7 @@ class RealTimeEmulator:
         *frames, self._partial = (self._partial + data).split(b"\0")
         if len(self._partial) > 4096:
             self._partial = b""
-        for frame in frames:
+        for frame in filter(None, frames):
             for when, part in self._down.send(frame + b"\0", now, self.emulator.since_armed(round(now))):
                 if when <= now:
                     self.emulator.receive(part, round(now))

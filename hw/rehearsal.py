@@ -154,7 +154,7 @@ class Rehearsal:
 
     def _send(self, data: bytes, now: float) -> None:
         since = self.emulator.since_armed(round(now))
-        for frame in data.split(b"\0")[:-1]:
+        for frame in filter(None, data.split(b"\0")):
             for when, part in self._down.send(frame + b"\0", now + self.latency_us / 6, since):
                 self._at(when, "device", part)
 

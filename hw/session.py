@@ -222,7 +222,7 @@ class Session:
 
     def _ask(self, question: Hello | Config) -> bytes:
         self._question = _Question(question, self.now)
-        return encode(question)
+        return b"\0" + encode(question)  # the zero ends whatever was left in the line
 
     def _ask_again(self) -> bytes:
         """The question once more, where it is time for it; given up where there was time enough."""
@@ -230,11 +230,13 @@ class Session:
         waited = self.now - question.begun
         if waited > _PATIENCE_US:
             name = type(question.message).__name__.upper()
-            return self._end(Stage.LOST, f"no answer to {name} within {waited / 1e6:.1f} s")
+            n = self.decoder.rejected
+            noise = f"; {n} unreadable frame{'s' if n > 1 else ''}: wrong baud rate?" if n else ""
+            return self._end(Stage.LOST, f"no answer to {name} within {waited / 1e6:.1f} s{noise}")
         if self.now - question.asked < _RESEND_US:
             return b""
         question.asked = self.now
-        return encode(question.message)
+        return b"\0" + encode(question.message)
 
     def _on_info(self, info: Info) -> bytes:
         if reasons := objections(info, self.scenario, self.limits, self.settings.baud):

@@ -416,14 +416,18 @@ def test_the_example_sketch_arms_follows_and_stops(sketch):
     sketch.feed(Hello())
     (about,) = sketch.run(1200)
     assert (about.axes, about.period_ns, about.firmware) == (2, 1_200_000, "example 1")
-    sketch.feed(Config(1, 4, 4, 0, (24000, 24000), (24000, 24000)))
+    assert sketch.lib.stub_resolution() == 12  # a step of force is a step of the PWM
+    assert about.hard_limit == (4095, 4095)
+    strongest = [n * step / 1e6 for n, step in zip(about.hard_limit, about.force_step, strict=True)]
+    assert strongest == pytest.approx([12.0] * 2, rel=1e-3)  # which the host allows it to be short of
+    sketch.feed(Config(1, 4, 4, 0, (4095, 4095), (4095, 4095)))
     ack, state = sketch.run(1200)
     assert ack.refused == Refused.ACCEPTED
-    for command, force in [(Command.ARM, (0, 0)), *[(Command.RUN, (12000, -24000))] * 3]:
+    for command, force in [(Command.ARM, (0, 0)), *[(Command.RUN, (2048, -4095))] * 3]:
         sketch.feed(Force(command, (state.tick + 1) & 0xFFFF, state.tick, force))
         (state,) = sketch.run(1200)
-    assert (state.phase, state.applied) == (Phase.ARMED, (12000, -24000))
-    assert [sketch.pin(p) for p in SKETCH_PINS["pwm"]] == [127, 255]
+    assert (state.phase, state.applied) == (Phase.ARMED, (2048, -4095))
+    assert [sketch.pin(p) for p in SKETCH_PINS["pwm"]] == [2048, 4095]
     assert [sketch.pin(p) for p in SKETCH_PINS["direction"]] == [0, 1]
     assert sketch.pin(SKETCH_PINS["enable"]) == 1
     *_, state = sketch.run(12_000)  # no host: the watchdog
@@ -433,7 +437,7 @@ def test_the_example_sketch_arms_follows_and_stops(sketch):
 
 @needs_gxx
 def test_the_example_sketch_counts_edges_and_obeys_its_button(sketch):
-    sketch.feed(Config(1, 4, 4, 0, (24000, 24000), (24000, 24000)))
+    sketch.feed(Config(1, 4, 4, 0, (4095, 4095), (4095, 4095)))
     sketch.run(1200)
     for level_b, level_a in [(0, 1), (1, 0), (0, 1), (1, 0), (1, 1)]:  # A after B: falling counts, the last one back
         sketch.lib.stub_set_pin(SKETCH_PINS["encoder B"], level_b)
@@ -450,7 +454,7 @@ def test_the_example_sketch_counts_edges_and_obeys_its_button(sketch):
 
 @needs_gxx
 def test_the_example_sketch_does_not_wait_for_a_host_that_reads_nothing_nor_catch_up(sketch):
-    sketch.feed(Config(1, 4, 4, 0, (24000, 24000), (24000, 24000)))
+    sketch.feed(Config(1, 4, 4, 0, (4095, 4095), (4095, 4095)))
     sketch.run(1200)
     sketch.lib.stub_room(0)
     assert sketch.run(12_000) == []
@@ -469,8 +473,157 @@ def test_a_board_with_a_small_write_buffer_sends_whole_frames(sketch, room):
     sketch.feed(Hello(7))
     (about,) = [m for m in sketch.run(10_000) if isinstance(m, Info)]
     assert about.axes == 2
-    sketch.feed(Config(1, 4, 4, 0, (24000, 24000), (24000, 24000)))
+    sketch.feed(Config(1, 4, 4, 0, (4095, 4095), (4095, 4095)))
     sketch.run(4_000)
     ticks = [m.tick for m in sketch.run(12_000)]
     assert len(ticks) == 10 if room > 1 else 4 <= len(ticks) < 10
     assert ticks == sorted(set(ticks))
+
+
+@needs_gxx
+def test_the_boards_watchdog_is_fed_by_ticks_and_nothing_else(sketch):
+    """Ticks feed it; a loop that turns on a clock that stands still, or one that hangs, does not."""
+    sketch.run(100_000)
+    assert not sketch.lib.stub_bites()
+    text = (HEADER / "example.ino").read_text()
+    loop = text[text.index("void loop()") :]
+    assert text.count("watchdogFeed();") == loop.count("watchdogFeed();") == 1
+    assert loop.index("not due yet") < loop.index("watchdogFeed();") > loop.index("writeForces(force);")
+
+
+# the rules of docs/protocol.md that no frame shows, on both sides
+
+
+@pytest.fixture(params=["python", pytest.param("c", marks=needs_gcc)])
+def device(request):
+    """Two axes of either side, ticked by hand, with what it last said."""
+    make = Device if request.param == "python" else lambda about: Firmware(request.getfixturevalue("library"), about)
+    return Hand(make(info(2)))
+
+
+class Hand:
+    def __init__(self, device) -> None:
+        self.device, self.now, self.k = device, 0, 0
+
+    def tell(self, *messages, after=100) -> None:
+        self.device.receive(b"".join(framed(m) for m in messages), self.now + after)
+
+    def tick(self, ticks=1) -> list:
+        said = []
+        for _ in range(ticks):
+            self.now, self.k = self.now + 1200, self.k + 1
+            self.force, out = self.device.tick(self.now, (0, 0))
+            said = Decoder().feed(out)
+        return said
+
+    def state(self, ticks=1):
+        return next(m for m in self.tick(ticks) if isinstance(m, State))
+
+    def armed(self, theta=2, hold=4, ramp=5, force=(1000, -1000)):
+        self.tell(Config(theta, hold, ramp, 0, (20000, 20000), (20000, 20000)))
+        self.tick()
+        for command, steps in [(Command.ARM, (0, 0))] + [(Command.RUN, force)] * (theta + 2):
+            self.answer(command, steps, theta)
+            self.tick()
+        return self
+
+    def answer(self, command, steps, theta):
+        self.tell(Force(command, shifted(self.k, theta), self.k, steps))
+
+
+@pytest.mark.parametrize(("theta", "hold", "ramp"), [(1, 4, 5), (2, 4, 5), (3, 0, 1), (15, 2, 8)])
+def test_after_the_hosts_death_zero_comes_after_theta_hold_and_ramp(device, theta, hold, ramp):
+    device.armed(theta, hold, ramp)
+    device.answer(Command.RUN, (1000, -1000), theta)  # the last one
+    forces = []
+    for _ in range(theta + hold + ramp + 1):
+        device.tick()
+        forces.append(device.force)
+    assert forces[-3 if ramp > 1 else -4] != (0, 0)
+    assert (
+        forces.index((0, 0)) == theta + hold + ramp - 1
+    )  # the tick (theta + hold + ramp) T after the last STATE answered
+    assert forces[theta + hold - 1] == (1000, -1000)
+
+
+def test_a_ramp_is_the_same_at_zero_force(device):
+    """RAMP at zero force lasts as long as any other, and refuses a CONFIG as any other."""
+    device.armed(theta=1, ramp=5, force=(0, 0))
+    device.tell(Stop(0))
+    phases = []
+    for _ in range(5):
+        device.tell(Config(1, 4, 5, 0, (1, 1), (1, 1)))
+        said = device.tick()
+        phases.append(next(m.phase for m in said if isinstance(m, State)))
+        assert device.force == (0, 0)
+    assert phases == [Phase.RAMP] * 4 + [Phase.STOPPED]
+
+
+def test_an_emergency_stop_takes_the_place_of_an_earlier_cause(device):
+    device.armed()
+    device.tell(Stop(0))
+    device.device.fault()
+    assert device.state().cause == Cause.HOST  # the first one stays
+    device.tell(Stop(Reason.ESTOP))
+    state = device.state()
+    assert (state.phase, state.cause) == (Phase.ESTOP, Cause.ESTOP_HOST)
+    device.device.estop()
+    assert device.state().cause == Cause.ESTOP_HOST  # of emergency stops the first stays, too
+
+
+def test_what_late_double_and_wrong_theta_forces_leave_behind(device):
+    """Late: echo and a margin below zero, no force. Double and wrong theta: nothing at all. None counts as an error."""
+    device.armed(theta=2)
+    before = device.state()
+    k = device.k
+    device.tell(Force(2, shifted(k, -1), shifted(k, -3), (7, 7)))
+    state = device.state()
+    assert (state.echo, state.applied) == (shifted(k, -3), before.applied)
+    assert state.margin_us < 0
+    device.armed(theta=2)
+    k = device.k
+    device.tell(Force(2, shifted(k, 2), k, (500, 0)))
+    device.tell(Force(2, shifted(k, 2), k, (600, 0)), after=200)
+    device.tell(Force(2, shifted(k, 1), k, (700, 0)), after=300)
+    state = device.state()
+    assert (state.echo, state.margin_us) == (k, 2300)  # of the first one
+    assert device.state().applied == (500, 0)
+    assert state.crc_errors == before.crc_errors
+
+
+def test_a_force_before_config_is_dropped_silently(device):
+    device.tell(Force(2, 3, 2, (5, 5)))
+    assert device.tick() == []
+    device.tell(Config(1, 4, 5, 0, (9, 9), (9, 9)))
+    state = device.state()
+    assert (state.crc_errors, state.margin_us, state.phase) == (0, -32768, Phase.DISARMED)
+
+
+def test_a_hello_of_another_version_is_answered(device):
+    """It is for the host to refuse; so it can say why."""
+    device.tell(Hello(9))
+    (about,) = device.tick()
+    assert (type(about), about.version) == (Info, 1)
+
+
+def test_a_config_leaves_the_counters_and_forgets_the_forces(device):
+    device.armed(theta=2)
+    device.device.receive(b"\x05nonsense\0", device.now)
+    device.tell(Force(2, shifted(device.k, 2), device.k, (500, 0)), Stop(0))
+    before = device.state(8)
+    assert before.misses > 0
+    assert before.crc_errors == 1
+    device.tell(Config(3, 4, 5, 0, (9, 9), (9, 9)))
+    state = device.state()
+    assert (state.crc_errors, state.tick) == (1, before.tick + 1)
+    assert state.misses == before.misses + 1  # disarmed, this tick had no force
+    assert (state.echo, state.margin_us, state.applied) == (0, -32768, (0, 0))
+
+
+def test_a_line_of_text_before_a_frame_costs_that_frame_at_most(device):
+    """Boot messages, and the noise of another baud rate, up to the next delimiter."""
+    device.device.receive(b"Booting v1.2 ...\r\n", 0)
+    device.tell(Hello())
+    assert device.tick() == []
+    device.tell(Hello())
+    assert [type(m) for m in device.tick()] == [Info]
