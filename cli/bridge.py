@@ -97,7 +97,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = Parser(
         "hw.bridge",
         "Drive a device over a serial port with a coupling that is certified for the delay measured.",
-        "python -m hw.bridge --emulate --case I --duration 2",
+        "python -m hw.bridge --rehearse --case I --duration 2",
     )
     add_loop_options(parser)
     add_link_options(parser)

@@ -72,7 +72,7 @@ def main(argv: list[str]) -> int:
         return [chirp(scenario.channels, scenario.T, link, force, (low, high), seconds)]
 
     played = 1.5 * seconds + 0.1  # from full gain on: the lead has the ramp
-    live = hold_session(args, session, plan, played, seed, out, ["--nobody", f"--coulomb={coulomb}"])
+    live = hold_session(args, session, plan, played, seed, out, nobody=True, coulomb=coulomb)
     report, estimates = _identified(session, recorder, scenario, live.dropped, float(args.pace))
     report["files"] = [str(p) for p in _save(out, session, recorder, scenario, estimates, report)]
     _print(report, console(args))
@@ -87,14 +87,14 @@ def _parser() -> argparse.ArgumentParser:
     parser = Parser(
         "hw.identify",
         "Estimate mass, friction and transmission of a device that nobody holds, and a lower bound of its damping.",
-        "python -m hw.identify --emulate",
+        "python -m hw.identify --rehearse",
     )
     add_loop_options(parser)
     add_link_options(parser)
     parser.add_argument("--force", default="1", metavar="NEWTON", help="amplitude of the chirp (default 1)")
     parser.add_argument("--band", default="3,200", metavar="LOW,HIGH", help="of the chirp [Hz] (default 3,200)")
     parser.add_argument("--seconds", default="2.5", metavar="SECONDS", help="of the chirp (default 2.5)")
-    parser.add_argument("--coulomb", default="0", metavar="NEWTON", help="dry friction of the device of --emulate")
+    parser.add_argument("--coulomb", default="0", metavar="NEWTON", help="dry friction of an emulated device")
     add_output_options(parser)
     return parser
 

@@ -9,17 +9,20 @@ import termios
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from cli.dashboard import Dashboard
 from hw.control import Program, link_delay
-from hw.emulator import spawned
+from hw.emulator import Emulator, FaultInjection, spawned
+from hw.emulator import nobody as without_hands
 from hw.monitor import Ages, Settings
 from hw.recording import IncidentLog
-from hw.session import Session
+from hw.rehearsal import Rehearsal
+from hw.session import Operator, Session
 from hw.transport import Live, Port, preflight
-from sim.command import console, numbers
+from sim.command import console, numbers, scenario_from
 from sim.scenario import InputError, Scenario
 
 USUAL_BAUD = 921_600
@@ -32,7 +35,12 @@ def add_link_options(parser: argparse.ArgumentParser) -> None:
     link = parser.add_argument_group("the link")
     link.add_argument("--port", metavar="PATH", help="serial port of the device, /dev/ttyACM0 or an emulator's")
     link.add_argument("--emulate", action="store_true", help="start hw.emulator and drive that; it arms by itself")
-    link.add_argument("--fault", action="append", default=[], metavar="FAULT", help="for --emulate, see hw.emulator")
+    rehearse = (
+        "the whole session in virtual time with an emulated device: no port, no waiting, the same on every machine"
+    )
+    link.add_argument("--rehearse", action="store_true", help=rehearse)
+    fault = "for --emulate and --rehearse, see hw.emulator"
+    link.add_argument("--fault", action="append", default=[], metavar="FAULT", help=fault)
     link.add_argument(
         "--pace", default="1", metavar="P", help="slow motion of an emulator, for busy machines (default 1)"
     )
@@ -94,10 +102,10 @@ def _mtime(path: str) -> int | None:
 
 def check_link(args: argparse.Namespace) -> Settings:
     """The settings of a session. Raises InputError where the options contradict each other."""
-    if bool(args.port) == args.emulate:
-        raise InputError("give either --port PATH or --emulate")
-    if args.fault and not args.emulate:
-        raise InputError("--fault is for --emulate; a device behind --port has its own")
+    if bool(args.port) + args.emulate + args.rehearse != 1:
+        raise InputError("give either --port PATH or --emulate or --rehearse")
+    if args.fault and args.port:
+        raise InputError("--fault is for --emulate and --rehearse; a device behind --port has its own")
     pace_from(args)
     if args.port and not args.arm and not sys.stdin.isatty():
         raise InputError("no keyboard to arm with: give --arm, if nobody can get hurt")
@@ -115,7 +123,7 @@ def _baud(args: argparse.Namespace) -> int | None:
     A pseudo-terminal has none. Of /dev/ttyACM0 nobody can tell: native USB, or a chip with a UART behind it.
     """
     if args.baud is None:
-        pseudo = args.emulate or os.path.realpath(args.port).startswith("/dev/pts/")
+        pseudo = not args.port or os.path.realpath(args.port).startswith("/dev/pts/")
         return None if pseudo else USUAL_BAUD
     if args.baud == "none":
         return None
@@ -148,6 +156,14 @@ def measured_link(args: argparse.Namespace, ages: Ages, T: float) -> int:
     return link_delay(ages, 1e6 * T, float(args.quantile), 1e6 * float(args.guard))
 
 
+@dataclass(frozen=True)
+class Held:
+    """What came to pass beside the session: signals, and bytes that the port would not take at once."""
+
+    signals: Sequence[int] = ()
+    dropped: int = 0
+
+
 def hold_session(
     args: argparse.Namespace,
     session: Session,
@@ -155,18 +171,26 @@ def hold_session(
     seconds: float,
     seed: int,
     out: Path,
-    extra: Sequence[str] = (),
-) -> Live:
-    """From opening the port, or starting an emulator with the options `extra`, to the end of the session."""
+    nobody: bool = False,
+    coulomb: float = 0.0,
+) -> Held:
+    """From opening the port, or starting an emulator, to the end of the session.
+
+    An emulated device has `nobody` at its handles where that is asked for, and dry friction `coulomb` [N].
+    """
     with ExitStack() as stack:
-        path = args.port or stack.enter_context(spawned([*_emulator_options(args, seed, seconds), *extra]))
+        incidents = IncidentLog(out / "incidents.jsonl")
+        stack.callback(incidents.close)
+        incidents.attach(session)
+        if args.rehearse:
+            return _rehearsed(args, session, plan, seconds, seed, incidents, nobody, coulomb)
+        options = [*_emulator_options(args, seed, seconds), *["--nobody"][:nobody], f"--coulomb={coulomb}"]
+        path = args.port or stack.enter_context(spawned(options))
         port = stack.enter_context(Port(path, session.settings.baud))
         if args.port and not getattr(args, "no_preflight", True):
             console(args).print(preflight(path).line(), soft_wrap=True, highlight=False)
         keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
-        incidents, show = IncidentLog(out / "incidents.jsonl"), _view(stack)
-        stack.callback(incidents.close)
-        incidents.attach(session)
+        show = _view(stack)
 
         def glance(session: Session) -> None:
             incidents.glance(session)
@@ -177,7 +201,31 @@ def hold_session(
         auto_arm = args.arm or args.emulate
         live = Live(session, port, plan, auto_arm, seconds, keyboard, glance, float(args.pace), deadman)
         live.run()
-    return live
+    return Held(live.signals, live.dropped)
+
+
+def _rehearsed(
+    args: argparse.Namespace,
+    session: Session,
+    plan: Callable[[Ages], Sequence[Program]],
+    seconds: float,
+    seed: int,
+    incidents: IncidentLog,
+    nobody: bool,
+    coulomb: float,
+) -> Held:
+    """The session in virtual time; whoever would be there arms once, and holds the deadman."""
+    faults = tuple(FaultInjection.parse(text) for text in args.fault)
+    try:
+        scenario = without_hands(scenario_from(args)) if nobody else scenario_from(args)
+        emulator = Emulator(scenario, faults, coulomb=coulomb)
+    except ValueError as error:
+        raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
+    operator = Operator(True, seconds)
+    Rehearsal(
+        session, emulator, plan, faults, seed, operator=operator, keep=False, glance=incidents.glance
+    ).run_to_the_end(seconds + SPARE)
+    return Held()
 
 
 def _emulator_options(args: argparse.Namespace, seed: int, seconds: float) -> list[str]:

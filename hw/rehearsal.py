@@ -62,6 +62,8 @@ class Rehearsal:
     operator: Operator | None = None  # in place of `arm`: the rule of a live session
     latency_us: float = _LATENCY_US
     clock: float = 1.0  # how long a tick of the device lasts, in T
+    keep: bool = True  # every tick of the device in `moments`
+    glance: Callable[[Session], None] = lambda session: None  # called every millisecond
     moments: list[Moment] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -91,6 +93,14 @@ class Rehearsal:
             self._next()
         return self.run(1e-6 * self.armed_us + seconds) if self.armed_us is not None else self.session
 
+    def run_to_the_end(self, most: float) -> Session:
+        """Until the session has ended and its device has come to rest, or for `most` seconds of virtual time."""
+        while not (self.session.stage in ENDED and self._queue[0][0] > self._ended + _GRACE_US):
+            if self._queue[0][0] > 1e6 * most:
+                break
+            self._next()
+        return self.session
+
     def _next(self) -> None:
         now, _, what, data = heapq.heappop(self._queue)
         getattr(self, f"_on_{what}")(now, data)
@@ -106,7 +116,8 @@ class Rehearsal:
             return self._at(emulator.stalled_until, "tick", None)
         data = emulator.tick(clock)
         emulator.advance()
-        self.moments.append(Moment(clock, emulator.device.phase, emulator.applied))
+        if self.keep:
+            self.moments.append(Moment(clock, emulator.device.phase, emulator.applied))
         self._at(now + self._period * emulator.stretch, "tick", None)
         if emulator.unplugged and not self._gone:
             self._gone = True
@@ -144,6 +155,7 @@ class Rehearsal:
             if since is not None and since >= when and i not in self._done:
                 self._done.add(i)
                 self._send(call(self.session, round(now)), now)
+        self.glance(self.session)
         return self._send(self.session.poll(round(now)), now)
 
     def _on_gone(self, now: float, _: None) -> None:

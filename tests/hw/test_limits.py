@@ -328,3 +328,13 @@ def test_the_watchdog_is_five_ticks_and_no_less_than_a_busy_host_needs(T, watchd
 def test_a_period_whose_five_ticks_are_too_long_is_refused():
     with pytest.raises(ValueError, match=r"at most 0\.004 s"):
         watchdog_for(4.1e-3)
+
+
+def test_a_force_step_is_judged_by_what_the_output_can_really_do():
+    """Eight bits of PWM for 12 N: fine for a cap of 2 N, too coarse for one of 0.5 N; twelve bits are not."""
+    eight = INFO._replace(force_step=(47_059,) * 2, hard_limit=(255,) * 2)
+    twelve = INFO._replace(force_step=(2930,) * 2, hard_limit=(4095,) * 2)
+    assert objections(eight, load(), Limits((2.0, 2.0)), None) == []
+    coarse = objections(eight, load(), Limits((0.5, 0.5)), None)
+    assert coarse[0] == "one force step of axis 1 is 0.047059 N, at most 0.03125 N is allowed"
+    assert objections(twelve, load(), Limits((0.5, 0.5)), None) == []

@@ -6,11 +6,12 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
+from dataclasses import replace as changed
 from pathlib import Path
 
 import pytest
 
+from cli import bridge, identify, replay
 from cli.bridge import _parser
 from cli.session_cli import limits_from, touched
 from hw.control import certified_couplings
@@ -189,5 +190,63 @@ def test_the_preflight_says_what_the_machine_can_do():
 def test_a_busy_machine_is_told_what_to_do():
     good = Preflight("s", "m", "l", "c", 0.5)
     assert "close what is busy" not in good.line()
-    assert "close what is busy" in replace(good, worst_stall_ms=5.0).line()
+    assert "close what is busy" in changed(good, worst_stall_ms=5.0).line()
     assert preflight.__doc__
+
+
+# the whole command in virtual time
+
+
+@pytest.fixture(scope="module")
+def rehearsed(tmp_path_factory):
+    """Twice the same: report and trace."""
+    found = []
+    for name in ("one", "two"):
+        out = tmp_path_factory.mktemp(name)
+        assert bridge.main(["--rehearse", "--duration", "0.5", "--out", str(out), "--json", str(out / "r.json")]) == 0
+        found.append((json.loads((out / "r.json").read_text()), (out / "trace.csv").read_text(), out))
+    return found
+
+
+def test_a_rehearsal_has_the_stages_and_files_of_a_session(rehearsed):
+    report, _, out = rehearsed[0]
+    stages = ["connecting", "configuring", "measuring", "measured", "configuring", "disarmed", "arming", "armed"]
+    assert [event["stage"] for event in report["session"]["log"]] == [*stages, "disarming", "finished"]
+    assert {path.name for path in out.iterdir()} >= {
+        "trace.npz",
+        "trace.csv",
+        "figure.png",
+        "report.json",
+        "incidents.jsonl",
+    }
+    assert report["link"]["missed_percent"] == 0
+    assert replay.main([str(out / "trace.npz")]) == 0
+
+
+def test_a_rehearsal_is_the_same_every_time(rehearsed):
+    (first, trace, _), (second, again, _) = rehearsed
+    assert trace == again
+    assert {k: v for k, v in first.items() if k != "files"} == {k: v for k, v in second.items() if k != "files"}
+
+
+def test_a_rehearsal_shows_the_faults_that_are_ordered(tmp_path, capsys):
+    assert bridge.main(["--rehearse", "--duration", "1", "--fault", "axis2:jump=-5@0.5", "--out", str(tmp_path)]) == 1
+    assert "encoder 2 jumped by" in capsys.readouterr().out
+
+
+def test_a_device_is_identified_in_virtual_time(tmp_path):
+    """The emulated device's own 1.37 N s/m, with dry friction beside it."""
+    out = ["--out", str(tmp_path), "--json", str(tmp_path / "r.json")]
+    assert identify.main(["--rehearse", "--coulomb", "0.02", "--seconds", "1.5", *out]) == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert [1.36 < axis["delta"] <= 1.37 for axis in report["axes"]] == [True, True]
+    assert [axis["coulomb"] for axis in report["axes"]] == pytest.approx([0.02] * 2, rel=0.01)
+
+
+def test_unreadable_frames_ask_about_the_baud_rate(scenario):
+    session = Session(scenario, Limits((2.0, 2.0)))
+    session.start(0)
+    for now in range(0, 2_000_000, 5000):
+        session.receive(b"\x81\x92noise\x00", now)
+    session.poll(2_100_000)
+    assert session.cause == "no answer to HELLO within 2.1 s; 400 unreadable frames: wrong baud rate?"
