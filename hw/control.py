@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import sub
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -130,15 +131,20 @@ class Drive:
         if self.x is None:
             ticks = 1  # what went before does not count
         self._clock.check(state, ticks, now)
-        check_range(self.units.positions(state.counts), self.units.reach)
+        absolute = self.units.positions(state.counts)
+        check_range(absolute, self.units.reach)
         if self.reference is None:
             self.reference = state.counts if self._rereference else (0,) * state.axes
-        x = self.units.positions(tuple(n - zero for n, zero in zip(state.counts, self.reference, strict=True)))
-        positions = self._check_motion(x, ticks)
+        x = absolute
+        if any(self.reference):
+            x = self.units.positions(tuple(map(sub, state.counts, self.reference)))
+        self._check_motion(x, ticks)
         self._counters.unlike += self._commands.unlike(state, ticks)
         self._encoders.check(state.counts, state.applied, ticks)
-        self._heat.check(self.units.forces(state.applied), ticks)
-        self._miss(state, positions[:-1])
+        if self.limits.continuous:
+            self._heat.check(self.units.forces(state.applied), ticks)
+        if ticks > 1 and self.x is not None:
+            self._miss(state, fill(self.x, x, ticks)[:-1])
         asked = self.controller.step(x)
         test = self._test.force(state.counts, ticks) if self._test and direction > 0 else None
         if direction > 0 and test is None:
@@ -155,21 +161,19 @@ class Drive:
         self._record(Row(state.tick, x, asked, self.gain.value, steps, state, self._arming, test))
         return steps
 
-    def _check_motion(self, x: tuple[float, ...], ticks: int) -> list[tuple[float, ...]]:
-        """The displacements (m,) [m] of the `ticks` ticks up to x. Raises Fault where no hand moves like that."""
-        positions = [x]
+    def _check_motion(self, x: tuple[float, ...], ticks: int) -> None:
+        """Raise Fault where no hand moves to x (m,) [m] within so many ticks."""
         if self.x is not None:
             check_jump(x, self.x, ticks, self.limits)
             if ticks == 1 and self._before is not None:
                 check_jolt(x, self.x, self._before, self.limits)
-            positions = fill(self.x, x, ticks)
         self._ticks += ticks
-        while self._recent and self._recent[0][0] < self._ticks - self._window:
-            self._recent.popleft()
-        if self._recent and (since := self._ticks - self._recent[0][0]) >= self._window // 2:
-            check_speed(x, self._recent[0][1], since * self.T, self.limits)
-        self._recent.append((self._ticks, x))
-        return positions
+        recent = self._recent
+        while recent and recent[0][0] < self._ticks - self._window:
+            recent.popleft()
+        if recent and (since := self._ticks - recent[0][0]) >= self._window // 2:
+            check_speed(x, recent[0][1], since * self.T, self.limits)
+        recent.append((self._ticks, x))
 
     def _miss(self, state: State, positions: list[tuple[float, ...]]) -> None:
         """The controller moves on through ticks of which no STATE came."""

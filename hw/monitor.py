@@ -339,9 +339,13 @@ class CommandMonitor:
         if told is None:
             return False
         config = self._config
+        fewest, most = self._run
         for force, before, asked, cap, slew in zip(state.applied, last, told, config.cap, config.slew, strict=True):
-            may = [limited(asked, before, cap_after(config, cap, run), slew) for run in self._run]
-            if not min(may) - _ROUNDING <= force <= max(may) + _ROUNDING:
+            low = high = limited(asked, before, cap_after(config, cap, most), slew)
+            if fewest < most and fewest < config.ramp_in:
+                other = limited(asked, before, cap_after(config, cap, fewest), slew)
+                low, high = min(low, other), max(high, other)
+            if not low - _ROUNDING <= force <= high + _ROUNDING:
                 return False
         return True
 
@@ -363,7 +367,9 @@ class EncoderTest:
 
     def force(self, counts: Sequence[int], ticks: int) -> tuple[float, ...] | None:
         """Forces fed back (m,) [N], `ticks` after the call before; None once every encoder has answered."""
-        self._band = _widened(self._band, counts)
+        self._band = [[n, n] for n in counts] if self._band is None else self._band
+        for pair, n in zip(self._band, counts, strict=True):
+            pair[0], pair[1] = min(pair[0], n), max(pair[1], n)
         dead = [i for i, (low, high) in enumerate(self._band) if high - low <= 1]
         if not dead:
             return None
@@ -397,25 +403,21 @@ class EncoderMonitor:
 
     def check(self, counts: Sequence[int], applied: Sequence[int], ticks: int) -> None:
         """Raise Fault where an encoder has not moved. `applied` (m,) [steps] acts from these `counts` (m,) on."""
-        self._band = _widened(self._band, counts)
-        for i, (band, steps, step) in enumerate(zip(self._band, applied, self._force_step, strict=True)):
-            force = steps * step
-            if band[1] - band[0] > 1:
-                band[:] = counts[i], counts[i]
+        if self._band is None:
+            self._band = [[n, n] for n in counts]
+        for i, (n, steps) in enumerate(zip(counts, applied, strict=True)):
+            force, band = steps * self._force_step[i], self._band[i]
+            if n > band[0] + 1 or n < band[1] - 1:
+                band[:] = n, n
                 self._reference[i], self._impulse[i] = force, 0.0
                 continue
+            if n > band[1]:
+                band[1] = n
+            elif n < band[0]:
+                band[0] = n
             change = abs(force - self._reference[i])
             if change > _CHANGE:
                 self._impulse[i] += change * ticks * self._T
             if self._impulse[i] > max(_IMPULSE, 8.0 * (self._encoder_step[i] * _HEAVIEST * change) ** 0.5):
                 still = f"it stands still while the force changes by {change:.3g} N"
                 raise Fault(f"encoder of axis {i + 1} does not follow: {still}")
-
-
-def _widened(band: list[list[int]] | None, counts: Sequence[int]) -> list[list[int]]:
-    """Least and most of every axis's counts, with these."""
-    if band is None:
-        return [[n, n] for n in counts]
-    for pair, n in zip(band, counts, strict=True):
-        pair[0], pair[1] = min(pair[0], n), max(pair[1], n)
-    return band

@@ -46,6 +46,10 @@ class Cause(IntEnum):
     ESTOP_HOST = 6  # a STOP with reason ESTOP
 
 
+#: by value: what an enumeration takes ten times as long for, and a tick asks ten times
+_PHASES, _CAUSES = {int(phase): phase for phase in Phase}, {int(cause): cause for cause in Cause}
+
+
 class Command(IntEnum):
     """What a FORCE asks for; only RUN may carry a force other than zero."""
 
@@ -141,11 +145,11 @@ class State(NamedTuple):
 
     @property
     def phase(self) -> Phase:
-        return Phase(self.status & 15)
+        return _PHASES[self.status & 15]
 
     @property
     def cause(self) -> Cause:
-        return Cause(self.status >> 4)
+        return _CAUSES[self.status >> 4]
 
 
 class Force(NamedTuple):

@@ -51,22 +51,34 @@ class Port:
         with suppress(Exception):  # where the driver knows it: the latency timer of FTDI chips goes from 16 ms to 1 ms
             self._serial.set_low_latency_mode(True)
 
+        self._fd = self._serial.fileno()
+
     def fileno(self) -> int:
         """For select."""
-        return self._serial.fileno()
+        return self._fd
 
     def read(self) -> bytes:
-        """What is there. Raises PortLost."""
+        """What is there, once select has said that something is. Raises PortLost.
+
+        By the file descriptor, as write(): pyserial's own take 31 us of every tick.
+        """
         try:
-            return self._serial.read(_CHUNK)
-        except (self._error, OSError, TypeError) as error:  # TypeError: pyserial's own, on a port closed meanwhile
+            data = os.read(self._fd, _CHUNK)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
             raise PortLost(f"the port cannot be read: {error}") from None
+        if not data:
+            raise PortLost("the port cannot be read: it was hung up")
+        return data
 
     def write(self, data: bytes) -> int:
         """How many of these bytes could be sent without waiting. Raises PortLost."""
         try:
-            return self._serial.write(data) or 0
-        except (self._error, OSError, TypeError) as error:
+            return os.write(self._fd, data)
+        except BlockingIOError:
+            return 0
+        except OSError as error:
             raise PortLost(f"the port cannot be written: {error}") from None
 
     def discard(self) -> None:
