@@ -1,1 +1,1 @@
-"""The command line: options, tables and exit codes, one file per command."""
+"""The command line: options, tables, one file per command."""

@@ -17,23 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cli.session_cli import (
-    add_link_options,
-    add_safety_options,
-    check_link,
-    hold_session,
-    limits_from,
-    measured_link,
-    number,
-)
-from design.assess import CONDITIONS
-from design.promises import CAVEATS
-from hw.control import CertifiedCoupling, certified_couplings
-from hw.limits import Stage
-from hw.monitor import Ages
-from hw.recording import Recorder, outcome, save
-from hw.session import session_for
-from sim.command import (
+from cli.options import (
     DOES_NOT_HOLD,
     DONE,
     INTERRUPTED,
@@ -47,10 +31,25 @@ from sim.command import (
     scenario_from,
     seed_from,
 )
+from cli.session_cli import (
+    add_link_options,
+    add_safety_options,
+    check_link,
+    hold_session,
+    limits_from,
+    measured_link,
+    number,
+)
+from design.certificate import CAVEATS, CONDITIONS
+from hw.control import CertifiedCoupling, certified_couplings
+from hw.limits import Stage
+from hw.monitor import Ages
+from hw.recording import Recorder, outcome, save
+from hw.session import session_for
 from sim.couplings import NAMES
 from sim.files import write_json
-from sim.growth import told
 from sim.scenario import InputError
+from sim.trace import told
 
 LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
 

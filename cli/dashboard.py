@@ -15,8 +15,8 @@ from typing import Any
 from rich.live import Live
 from rich.table import Table
 
+from cli.options import Screen
 from hw.session import Session
-from sim.screen import Screen
 
 WIDTH = 72  # columns
 BAR = 30  # characters of a bar

@@ -10,9 +10,7 @@ import signal
 import sys
 from typing import Any
 
-from cli.session_cli import pace_from
-from hw.emulator import AXIS, DEVICE, LINE, Emulator, FaultInjection, Line, RealTimeEmulator, Terminal, nobody
-from sim.command import (
+from cli.options import (
     DONE,
     INTERRUPTED,
     Parser,
@@ -23,6 +21,8 @@ from sim.command import (
     scenario_from,
     seed_from,
 )
+from cli.session_cli import pace_from
+from hw.emulator import AXIS, DEVICE, LINE, Emulator, FaultInjection, Line, RealTimeEmulator, Terminal, nobody
 from sim.scenario import InputError
 
 

@@ -16,13 +16,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from cli.session_cli import add_link_options, check_link, hold_session, measured_link, number
-from hw.identify import Estimate, Excitation, capped, chirp, estimate, held
-from hw.limits import Stage
-from hw.monitor import Ages
-from hw.recording import Recorder, outcome, result_of
-from hw.session import Session, session_for
-from sim.command import (
+from cli.options import (
     DOES_NOT_HOLD,
     DONE,
     INTERRUPTED,
@@ -38,6 +32,12 @@ from sim.command import (
     scenario_from,
     seed_from,
 )
+from cli.session_cli import add_link_options, check_link, hold_session, measured_link, number
+from hw.identify import Estimate, Excitation, capped, chirp, estimate, held
+from hw.limits import Stage
+from hw.monitor import Ages
+from hw.recording import Recorder, outcome, result_of
+from hw.session import Session, session_for
 from sim.files import write, write_json
 from sim.scenario import InputError, Scenario
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from rich.table import Table
 
+from cli.options import DOES_NOT_HOLD, DONE, Parser, check_json, console
 from hw.recording import Comparison, load, replay
-from sim.command import DOES_NOT_HOLD, DONE, Parser, check_json, console
 from sim.files import write_json
-from sim.result import Result
+from sim.trace import Result
 
 
 def main(argv: list[str]) -> int:

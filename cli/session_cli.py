@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from cli.dashboard import Dashboard
+from cli.options import console, numbers, scenario_from
 from hw.control import Program, link_delay
 from hw.emulator import Emulator, FaultInjection, spawned
 from hw.emulator import nobody as without_hands
@@ -22,7 +23,6 @@ from hw.recording import IncidentLog
 from hw.rehearsal import Rehearsal
 from hw.session import Operator, Session
 from hw.transport import Live, Port, preflight
-from sim.command import console, numbers, scenario_from
 from sim.scenario import InputError, Scenario
 
 USUAL_BAUD = 921_600

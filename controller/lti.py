@@ -1,20 +1,47 @@
-"""Discrete-time linear systems: x+ = A x + B u, y = C x + D u, sampled every T seconds."""
+"""Discrete-time linear systems x+ = A x + B u, y = C x + D u, in any arithmetic, and their sampled responses.
+
+One expression serves every use. `Lti` holds floats, a stack of systems (leading axes), or Fractions; `Sampled` holds
+G(z) at points of the circle. They share the operators
+
+    G @ H   series G(z) H(z)        G + H, G - H, -G, c * G        M @ G, G @ M, G + M   with a constant matrix M
+    G.feedback(H)   (I + G H)^-1 G                                 G.split_at_one()      G(1), (G(z) - G(1))/(z - 1)
+
+The period decides the arithmetic: built with a float T, blocks are floating point; with a Fraction T they are exact,
+and a stored float stands for its shortest decimal, the one that a person wrote: 0.0012 is 12/10000.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import block_diag, schur
+from scipy.linalg import schur
 
 Array = NDArray[np.floating[Any]]
+Complex = NDArray[np.complex128]
+Number = float | Fraction
 
 
 class SingularLoop(ValueError):
-    """A feedback interconnection whose algebraic loop has no solution."""
+    """A feedback interconnection whose algebraic loop has no solution, or an exact system with a pole at z = 1."""
+
+
+def rational(value: Any) -> Fraction:
+    """The exact value of a number; a float stands for its shortest decimal."""
+    return Fraction(repr(float(value))) if isinstance(value, float) else Fraction(value)
+
+
+def numbers(values: ArrayLike, T: Number) -> Any:
+    """The values as an array in the arithmetic of T: float64, or Fractions. A scalar stays a scalar."""
+    if isinstance(T, Fraction):
+        exact = np.frompyfunc(rational, 1, 1)(np.asarray(values, dtype=object))
+        return exact if isinstance(exact, np.ndarray) else Fraction(exact)
+    return np.asarray(values, dtype=np.float64) if np.ndim(values) else float(values)  # type: ignore[arg-type]
 
 
 def frozen(value: ArrayLike, ndim: int, name: str = "") -> Array:
@@ -37,64 +64,98 @@ def _unlike(name: str, value: ArrayLike, ndim: int, got: str = "") -> ValueError
 
 @dataclass(frozen=True, eq=False)
 class Lti:
-    """A state-space block with n states, m inputs and p outputs. `G @ H` is the series G(z) H(z)."""
+    """A state-space block with n states, m inputs and p outputs; `...` are the axes of a stack, none for one system."""
 
-    A: Array  # (n, n)
-    B: Array  # (n, m)
-    C: Array  # (p, n)
-    D: Array  # (p, m)
-    T: float  # [s]
+    A: Array  # (..., n, n)
+    B: Array  # (..., n, m)
+    C: Array  # (..., p, n)
+    D: Array  # (..., p, m)
+    T: Any  # [s] float or Fraction
+
+    __array_ufunc__ = None  # so that `matrix @ G` comes here
 
     if TYPE_CHECKING:  # what __post_init__ accepts is more than what the fields then hold
 
-        def __init__(self, A: ArrayLike, B: ArrayLike, C: ArrayLike, D: ArrayLike, T: float) -> None: ...
+        def __init__(self, A: ArrayLike, B: ArrayLike, C: ArrayLike, D: ArrayLike, T: Number) -> None: ...
 
     def __post_init__(self) -> None:
+        exact = isinstance(self.T, Fraction)
         for name in "ABCD":
-            object.__setattr__(self, name, frozen(getattr(self, name), 2, name))
-        (n, m), p = self.B.shape, self.C.shape[0]
+            object.__setattr__(self, name, _exact(getattr(self, name)) if exact else _floats(getattr(self, name), name))
+        (n, m), p = self.B.shape[-2:], self.C.shape[-2]
         shapes = {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m)}
         for name, shape in shapes.items():
             matrix = getattr(self, name)
-            if matrix.shape != shape:
+            if matrix.shape[-2:] != shape:
                 raise ValueError(f"{name} has shape {matrix.shape}, expected {shape}")
-            if not np.isfinite(matrix).all():
+            if not exact and not np.isfinite(matrix).all():
                 raise ValueError(f"{name} has entries that are not finite")
         if not 0 < self.T < np.inf:
             raise ValueError(f"T must be positive and finite, got {self.T}")
 
     @classmethod
-    def constant(cls, D: ArrayLike, T: float) -> Self:
+    def constant(cls, D: ArrayLike, T: Number) -> Self:
         """The memoryless block y = D u."""
-        D = frozen(D, 2)
-        p, m = D.shape
-        return cls(np.zeros((0, 0)), np.zeros((0, m)), np.zeros((p, 0)), D, T)
+        gain: Any = numbers(D, T) if isinstance(T, Fraction) else np.asarray(D, dtype=np.float64)
+        if gain.ndim < 2:
+            raise ValueError(f"expected an array of numbers with 2 axes, got shape {gain.shape}")
+        *lead, p, m = gain.shape
+        return cls(np.zeros((*lead, 0, 0)), np.zeros((*lead, 0, m)), np.zeros((*lead, p, 0)), gain, T)
 
     @classmethod
     def diag(cls, *blocks: Lti) -> Self:
         """The blocks side by side, each with its own inputs and outputs."""
-        A, B, C, D = (np.asarray(block_diag(*(getattr(g, name) for g in blocks))) for name in "ABCD")
+        A, B, C, D = (block_diagonal([getattr(g, name) for g in blocks]) for name in "ABCD")
+        return cls(A, B, C, D, _common_period(*blocks))
+
+    @classmethod
+    def stacked(cls, blocks: Sequence[Lti]) -> Self:
+        """A stack of systems of the same shape."""
+        A, B, C, D = (np.stack([getattr(g, name) for g in blocks]) for name in "ABCD")
         return cls(A, B, C, D, _common_period(*blocks))
 
     @property
     def order(self) -> int:
-        return self.A.shape[0]
+        return self.A.shape[-1]
 
     @property
     def inputs(self) -> int:
-        return self.B.shape[1]
+        return self.B.shape[-1]
 
     @property
     def outputs(self) -> int:
-        return self.C.shape[0]
+        return self.C.shape[-2]
 
-    def at(self, z: ArrayLike) -> NDArray[np.complex128]:
-        """G(z), shape z.shape + (p, m).
+    @property
+    def is_exact(self) -> bool:
+        return isinstance(self.T, Fraction)
 
-        By back substitution in the complex Schur form of A, which stays accurate for the defective
+    @property
+    def count(self) -> int:
+        """How many systems are in the stack."""
+        return np.broadcast_shapes(*(getattr(self, name).shape[:-2] for name in "ABCD"))[0]
+
+    def __getitem__(self, i: int) -> Lti:
+        """System i of a stack."""
+        A, B, C, D = (part[i] if part.ndim > 2 else part for part in (self.A, self.B, self.C, self.D))
+        return Lti(A, B, C, D, self.T)
+
+    def floats(self) -> Lti:
+        """The same in floating point, every coefficient correctly rounded."""
+        A, B, C, D = (np.asarray(getattr(self, name), dtype=np.float64) for name in "ABCD")
+        return Lti(A, B, C, D, float(self.T))
+
+    def at(self, z: ArrayLike) -> Complex:
+        """G(z), shape z.shape + (p, m); of a stack, whose axes come first in z: (n, k) or (1, k) to (n, k, p, m).
+
+        One system: by back substitution in the complex Schur form of A, which stays accurate for the defective
         matrices of delay lines where an eigenvector basis does not exist.
         """
         z = np.asarray(z, dtype=np.complex128)
+        if self.A.ndim > 2 or self.B.ndim > 2 or self.C.ndim > 2 or self.D.ndim > 2:
+            one = np.eye(self.order)
+            A, B, C, D = (getattr(self, name)[..., None, :, :] for name in "ABCD")
+            return C @ np.linalg.solve(z[..., None, None] * one - A, B + 0j) + D
         points = z.ravel()
         S, U = self._schur
         rhs = U.conj().T @ self.B
@@ -106,7 +167,7 @@ class Lti:
         return np.moveaxis(G, -1, 0).reshape(*z.shape, self.outputs, self.inputs)
 
     @cached_property
-    def _schur(self) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    def _schur(self) -> tuple[Complex, Complex]:
         """S, U with A = U S U* and S upper triangular: once per block, however often it is evaluated."""
         if not self.order:
             return np.zeros((0, 0), dtype=np.complex128), np.zeros((0, 0), dtype=np.complex128)
@@ -114,45 +175,68 @@ class Lti:
         return S, U
 
     def dc(self) -> Array:
-        """G(1), shape (p, m)."""
-        return self.C @ np.linalg.solve(np.eye(self.order) - self.A, self.B) + self.D
+        """G(1), shape (..., p, m)."""
+        return self.C @ _solve(_identity(self) - self.A, self.B) + self.D
 
-    def poles(self) -> NDArray[np.complex128]:
-        """Eigenvalues of A, shape (n,)."""
+    def poles(self) -> Complex:
+        """Eigenvalues of A, shape (..., n)."""
         return np.linalg.eigvals(self.A).astype(np.complex128)
 
     def is_stable(self) -> bool:
         """Whether every pole lies strictly inside the unit circle."""
         return bool(np.all(np.abs(self.poles()) < 1))
 
+    def split_at_one(self) -> tuple[Array, Lti]:
+        """G(1), and (G(z) - G(1))/(z - 1): stable where G is, so G/(z - 1) without its pole at z = 1.
+
+        Raises SingularLoop where an exact A has the eigenvalue one.
+        """
+        C = -np.swapaxes(_solve(np.swapaxes(_identity(self) - self.A, -1, -2), np.swapaxes(self.C, -1, -2)), -1, -2)
+        return self.D - C @ self.B, Lti(self.A, self.B, C, np.zeros_like(self.D), self.T)
+
     def quotient_at_one(self) -> Lti:
-        """(G(z) - G(1)) / (z - 1): stable where G is, so G/(z - 1) without its pole at z = 1."""
-        C = -np.linalg.solve((np.eye(self.order) - self.A).T, self.C.T).T
-        return Lti(self.A, self.B, C, np.zeros_like(self.D), self.T)
+        """(G(z) - G(1))/(z - 1)."""
+        return self.split_at_one()[1]
 
-    def __matmul__(self, other: Lti) -> Lti:
+    def __matmul__(self, other: Lti | Array) -> Lti:
+        if not isinstance(other, Lti):
+            return Lti(self.A, self.B @ other, self.C, self.D @ other, self.T)
         T = _common_period(self, other)
-        A = np.block(
-            [
-                [other.A, np.zeros((other.order, self.order))],
-                [self.B @ other.C, self.A],
-            ]
+        zero = np.zeros((other.order, self.order), dtype=int)
+        A = _block([[other.A, zero], [self.B @ other.C, self.A]])
+        return Lti(
+            A, _block([[other.B], [self.B @ other.D]]), _block([[self.D @ other.C, self.C]]), self.D @ other.D, T
         )
-        B = np.vstack([other.B, self.B @ other.D])
-        C = np.hstack([self.D @ other.C, self.C])
-        return Lti(A, B, C, self.D @ other.D, T)
 
-    def __add__(self, other: Lti) -> Lti:
+    def __rmatmul__(self, matrix: Array) -> Lti:
+        return Lti(self.A, self.B, matrix @ self.C, matrix @ self.D, self.T)
+
+    def __add__(self, other: Lti | Array) -> Lti:
+        if not isinstance(other, Lti):
+            return Lti(self.A, self.B, self.C, self.D + other, self.T)
         T = _common_period(self, other)
-        A = np.asarray(block_diag(self.A, other.A))
-        B = np.vstack([self.B, other.B])
-        return Lti(A, B, np.hstack([self.C, other.C]), self.D + other.D, T)
+        A = block_diagonal([self.A, other.A])
+        return Lti(A, _block([[self.B], [other.B]]), _block([[self.C, other.C]]), self.D + other.D, T)
+
+    __radd__ = __add__
 
     def __neg__(self) -> Lti:
         return Lti(self.A, self.B, -self.C, -self.D, self.T)
 
-    def __sub__(self, other: Lti) -> Lti:
+    def __sub__(self, other: Lti | Array) -> Lti:
         return self + (-other)
+
+    def __rsub__(self, other: Array) -> Lti:
+        return -self + other
+
+    def __mul__(self, factor: Any) -> Lti:
+        return Lti(self.A, self.B, self.C * factor, self.D * factor, self.T)
+
+    __rmul__ = __mul__
+
+    def rows(self, which: Any) -> Lti:
+        """Some of the outputs, with the same states."""
+        return Lti(self.A, self.B, self.C[..., which, :], self.D[..., which, :], self.T)
 
     def feedback(self, other: Lti) -> Lti:
         """(I + G H)^-1 G: this block with H = `other` in negative feedback around it.
@@ -160,20 +244,246 @@ class Lti:
         Raises SingularLoop where I + D_G D_H cannot be inverted.
         """
         T = _common_period(self, other)
-        loop = np.eye(self.outputs) + self.D @ other.D
-        if np.linalg.cond(loop) > 1e12:
-            raise SingularLoop(f"the algebraic loop I + D_G D_H is singular: {loop.tolist()}")
-        S = np.linalg.inv(loop)
+        S = inverse(_eye(self.outputs, T) + self.D @ other.D)
         # y = S (C x - D_G C_H h + D_G u), and the feedback block is driven by y
-        y_x = np.hstack([S @ self.C, -S @ self.D @ other.C])
+        y_x = _block([[S @ self.C, -(S @ self.D @ other.C)]])
         y_u = S @ self.D
-        u_x = np.hstack([np.zeros((self.inputs, self.order)), -other.C]) - other.D @ y_x
-        u_u = np.eye(self.inputs) - other.D @ y_u
-        A = np.asarray(block_diag(self.A, other.A)) + np.vstack([self.B @ u_x, other.B @ y_x])
-        return Lti(A, np.vstack([self.B @ u_u, other.B @ y_u]), y_x, y_u, T)
+        u_x = _block([[np.zeros((self.inputs, self.order), dtype=int), -other.C]]) - other.D @ y_x
+        u_u = _eye(self.inputs, T) - other.D @ y_u
+        A = block_diagonal([self.A, other.A]) + _block([[self.B @ u_x], [other.B @ y_x]])
+        return Lti(A, _block([[self.B @ u_u], [other.B @ y_u]]), y_x, y_u, T)
+
+    def inverse(self) -> Lti:
+        """G^-1, where D has an inverse. Raises SingularLoop where it has none."""
+        D = inverse(self.D)
+        return Lti(self.A - self.B @ D @ self.C, self.B @ D, -(D @ self.C), D, self.T)
 
 
-def _common_period(*blocks: Lti) -> float:
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """G(z) at points z of the circle other than 1: the responses of many systems, one where n = 1."""
+
+    z: Complex  # (n, k) or (1, k)
+    G: Complex  # (n, k, p, m)
+    T: float  # [s]
+
+    __array_ufunc__ = None
+
+    @classmethod
+    def of(cls, system: Lti, z: Complex) -> Sampled:
+        return cls(z, system.at(z), system.T)
+
+    def __matmul__(self, other: Sampled | Array) -> Sampled:
+        return self._with(self.G @ (other.G if isinstance(other, Sampled) else other))
+
+    def __rmatmul__(self, matrix: Array) -> Sampled:
+        return self._with(matrix @ self.G)
+
+    def __add__(self, other: Sampled | Array) -> Sampled:
+        return self._with(self.G + (other.G if isinstance(other, Sampled) else other))
+
+    __radd__ = __add__
+
+    def __neg__(self) -> Sampled:
+        return self._with(-self.G)
+
+    def __sub__(self, other: Sampled | Array) -> Sampled:
+        return self + (-other)
+
+    def __rsub__(self, other: Array) -> Sampled:
+        return -self + other
+
+    def __mul__(self, factor: Number) -> Sampled:
+        return self._with(self.G * float(factor))
+
+    __rmul__ = __mul__
+
+    def rows(self, which: Any) -> Sampled:
+        return self._with(self.G[..., which, :])
+
+    def feedback(self, other: Sampled) -> Sampled:
+        return self._with(np.linalg.solve(np.eye(self.G.shape[-2]) + self.G @ other.G, self.G))
+
+    def inverse(self) -> Sampled:
+        return self._with(np.linalg.inv(self.G))
+
+    def split_at_one(self) -> tuple[Array, Sampled]:
+        """0 and G/(z - 1): off z = 1 its Hermitian part is that of the split, since He[G(1)/(z - 1)] = -G(1)/2."""
+        return np.zeros(self.G.shape[-2:]), self._with(self.G / (self.z - 1)[..., None, None])
+
+    def _with(self, G: Any) -> Sampled:
+        return Sampled(self.z, G, self.T)
+
+
+Block = TypeVar("Block", Lti, Sampled)  # what an expression over blocks is written for
+
+
+def vstack(*blocks: Any) -> Any:
+    """The outputs of several blocks of one input, one below the other; those that share A and B share the states."""
+    first = blocks[0]
+    if isinstance(first, Sampled):
+        return Sampled(first.z, np.concatenate([b.G for b in blocks], axis=-2), first.T)
+    T = _common_period(*blocks)
+    C, D = [[b.C] for b in blocks], _block([[b.D] for b in blocks])
+    if all(b.A is first.A and b.B is first.B for b in blocks):
+        return Lti(first.A, first.B, _block(C), D, T)
+    A, B = block_diagonal([b.A for b in blocks]), _block([[b.B] for b in blocks])
+    return Lti(A, B, block_diagonal([b.C for b in blocks]), D, T)
+
+
+def hstack(*blocks: Any) -> Any:
+    """One output from the inputs of several blocks, side by side."""
+    first = blocks[0]
+    if isinstance(first, Sampled):
+        return Sampled(first.z, np.concatenate([b.G for b in blocks], axis=-1), first.T)
+    T = _common_period(*blocks)
+    A, B = block_diagonal([b.A for b in blocks]), block_diagonal([b.B for b in blocks])
+    return Lti(A, B, _block([[b.C for b in blocks]]), _block([[b.D for b in blocks]]), T)
+
+
+def as_like(block: Lti | Sampled, system: Lti) -> Any:
+    """A system as it is, or sampled where the block is."""
+    return Sampled(block.z, system.at(block.z), block.T) if isinstance(block, Sampled) else system
+
+
+def constant_like(block: Block, D: Any) -> Block:
+    """The memoryless block y = D u, of the kind of another."""
+    if isinstance(block, Sampled):
+        D = np.asarray(D, dtype=np.float64)
+        return Sampled(block.z, np.broadcast_to(D + 0j, (*block.G.shape[:2], *D.shape[-2:])), block.T)
+    return Lti.constant(D, block.T)
+
+
+def taps(weights: Sequence[Any], T: Number) -> Lti:
+    """One channel, w_0 + w_1/z + ... + w_n z^-n."""
+    n = len(weights) - 1
+    row = numbers(list(weights), T)
+    if n < 0:
+        raise ValueError("taps need at least one weight")
+    first = np.zeros((n, 1), dtype=int)
+    first[:1] = 1
+    return Lti(np.eye(n, k=-1, dtype=int), first, row[1:].reshape(1, n), row[:1].reshape(1, 1), T)
+
+
+def block_diagonal(parts: Sequence[Array]) -> Array:
+    """The parts along the diagonal, of any arithmetic and any stack."""
+    zeros = [[np.zeros((p.shape[-2], q.shape[-1]), dtype=int) for q in parts] for p in parts]
+    return _block([[p if i == j else zeros[i][j] for j in range(len(parts))] for i, p in enumerate(parts)])
+
+
+def _block(rows: Sequence[Sequence[Array]]) -> Array:
+    """numpy.block over the last two axes; the leading ones are broadcast."""
+    lead = np.broadcast_shapes(*(b.shape[:-2] for row in rows for b in row))
+    whole = [[np.broadcast_to(b, (*lead, *b.shape[-2:])) for b in row] for row in rows]
+    return np.concatenate([np.concatenate(row, axis=-1) for row in whole], axis=-2)
+
+
+def _floats(value: ArrayLike, name: str) -> Array:
+    if isinstance(value, np.ndarray) and value.dtype == np.float64 and value.ndim > 1 and not value.flags.writeable:
+        return value  # blocks that share their states keep sharing them, see vstack
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise _unlike(name, value, 2) from None
+    if array.ndim < 2:
+        raise _unlike(name, value, 2, f", got shape {array.shape}")
+    array.setflags(write=False)
+    return array
+
+
+_ZERO, _ONE = Fraction(0), Fraction(1)
+
+
+def _exact(value: Any) -> Any:
+    """A copy as Fractions."""
+    array = np.asarray(value, dtype=object)
+    if isinstance(value, np.ndarray) and not value.flags.writeable and all(type(v) is Fraction for v in value.ravel()):
+        return value
+    out = np.empty(array.shape, dtype=object)
+    out.ravel()[:] = [v if type(v) is Fraction else _ZERO if v == 0 else rational(v) for v in array.ravel()]
+    out.setflags(write=False)
+    return out
+
+
+def _eye(n: int, T: Number) -> Array:
+    return numbers(np.eye(n), T) if n else np.zeros((0, 0), dtype=object if isinstance(T, Fraction) else float)
+
+
+def _identity(G: Lti) -> Array:
+    return _eye(G.order, G.T)
+
+
+def inverse(M: Array) -> Array:
+    """M^-1 in its own arithmetic. Raises SingularLoop."""
+    if M.dtype == object:
+        return _solve(M, _exact(np.eye(M.shape[-1])))
+    if M.size and np.max(np.linalg.cond(M)) > 1e12:
+        raise SingularLoop(f"the algebraic loop I + D_G D_H is singular: {M.tolist()}")
+    return np.linalg.inv(M)
+
+
+def _solve(M: Array, right: Array) -> Array:
+    if M.dtype != object:
+        return np.linalg.solve(M, right)
+    return solve_exactly(M, right)
+
+
+def solve_exactly(M: Any, right: Any) -> Any:
+    """X with M X = right over the Fractions, by sparse elimination. Raises SingularLoop.
+
+    The models here are series of small blocks, triangular when read in the right order: the next pivot is in the row
+    with the fewest entries, and there in the column with the fewest (Markowitz), so next to nothing fills in.
+    """
+    n = M.shape[0]
+    rows = [{j: v for j, v in enumerate(row) if v} for row in M]
+    values = [{j: v for j, v in enumerate(row) if v} for row in right]
+    columns: list[set[int]] = [{i for i in range(n) if j in rows[i]} for j in range(n)]
+    active, order = set(range(n)), []
+    while active:
+        i = min(active, key=lambda r: len(rows[r]))
+        if not rows[i]:
+            raise SingularLoop(f"a {n} x {n} matrix is singular: a pole at z = 1 or an algebraic loop without solution")
+        j = min(rows[i], key=lambda c: len(columns[c]))
+        active.remove(i)
+        order.append((i, j))
+        for c in rows[i]:
+            columns[c].discard(i)
+        for r in list(columns[j]):
+            factor = rows[r].pop(j) / rows[i][j]
+            _subtract(rows[r], {c: v for c, v in rows[i].items() if c != j}, factor, columns, r)
+            _subtract(values[r], values[i], factor)
+        columns[j].clear()
+    solution: list[dict[int, Fraction]] = [{} for _ in range(n)]
+    for i, j in reversed(order):
+        total = values[i]
+        for c, v in rows[i].items():
+            if c != j:
+                _subtract(total, solution[c], v)
+        solution[j] = {k: x / rows[i][j] for k, x in total.items()}
+    result = np.full((n, right.shape[1]), _ZERO, dtype=object)
+    for i, row in enumerate(solution):
+        for k, v in row.items():
+            result[i, k] = v
+    return result
+
+
+def _subtract(
+    row: dict[int, Fraction], other: dict[int, Fraction], factor: Fraction, columns: Any = None, r: int = 0
+) -> None:
+    """Take factor times `other` off a sparse row; `columns` are the rows of each column, kept up to date."""
+    for c, v in other.items():
+        entry = row.get(c, _ZERO) - factor * v
+        if entry:
+            row[c] = entry
+            if columns is not None:
+                columns[c].add(r)
+        else:
+            row.pop(c, None)
+            if columns is not None:
+                columns[c].discard(r)
+
+
+def _common_period(*blocks: Lti) -> Any:
     periods = {g.T for g in blocks}
     if len(periods) != 1:
         raise ValueError(f"blocks with different sampling periods: {sorted(periods)}")

@@ -15,21 +15,172 @@ Where delays vary, Theta is not in the block: its forces pass through a line tha
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from controller.contact import Contact, State
 from controller.coupling import Coupling
 from controller.delay import HeldLine, Ticks, delay, packet_delays
-from controller.lti import Array, Lti, frozen
+from controller.environment import Network, Wall, walled_environment
+from controller.lti import Array, Lti, SingularLoop, frozen
+
+# ----------------------------------------------------------------------------------------------------
+# Walls: springs that push and never pull, so that contact is made and broken.
+#
+# Across a wall of stiffness K and damping B the way into it is d = y - gap, and it pushes with
+#
+#         p[k] = max(0, K h[k] + B (h[k] - h[k-1])/T),    h = max(0, d),
+#
+# which is a ramp, p = a max(0, d - c) with a = K + B/T and c = B h[k-1] / (T a): continuous and monotone in d. It
+# dissipates: p[k] (d[k] - d[k-1]) >= K h[k]^2/2 - K h[k-1]^2/2 for every d, whatever B. While a wall touches, it is
+# the spring-damper between the same nodes, but for the constant force of its gap.
+#
+# The wall forces enter the linear block as further inputs and the ways are further outputs, y = y_free - D p: the
+# environment and the coupling give way at once. So the algebraic loop of a tick is the linear complementarity problem
+#
+#         p >= 0,   s = (1/a + D) p - (y_free - gap - c) >= 0,   p's = 0,
+#
+# whose matrix has positive principal minors, since D is positive semidefinite for a passive environment and coupling:
+# there is exactly one solution, and it is found by trying every set of touching walls.
 
 
-def force_map(environment: Lti, coupling: Coupling, theta: Sequence[int], psi: Sequence[int]) -> Lti:
-    """F = Theta (I + Psi E V)^-1 Psi E (6): displacements to forces, as the devices see them."""
-    delayed = delay(psi, environment.T) @ environment
-    return delay(theta, environment.T) @ coupling.around(delayed)
+State = tuple[bool, ...]  # which walls touch
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """The linear block [x; p] -> [f; y] of a loop, and the walls that turn y into p.
+
+    Its state is that of the block, then h [m], how deep each wall was pressed at the tick before.
+    Raises SingularLoop where the walls' forces are not determined.
+    """
+
+    block: Lti  # m + w inputs and outputs
+    walls: tuple[Wall, ...]
+
+    def __post_init__(self) -> None:
+        if not len(self.walls) <= min(self.block.inputs, self.block.outputs):
+            raise ValueError(f"a block of {self.block.inputs} inputs cannot serve {len(self.walls)} walls")
+        _ = self.problem
+
+    @property
+    def channels(self) -> int:
+        return self.block.inputs - len(self.walls)
+
+    @property
+    def steepness(self) -> Array:
+        """a = K + B/T of each wall, (w,) [N/m]."""
+        return np.array([w.stiffness + w.damping / self.block.T for w in self.walls])
+
+    @cached_property
+    def problem(self) -> Complementarity:
+        """What a tick solves for the wall forces."""
+        m = self.channels
+        return Complementarity(np.diag(1 / self.steepness) - self.block.D[m:, m:])
+
+    @property
+    def open(self) -> Lti:
+        """F while no wall touches, with the state of the whole: h does not reach the force."""
+        G, m, w = self.block, self.channels, len(self.walls)
+        A, B = np.pad(G.A, ((0, w), (0, w))), np.pad(G.B[:, :m], ((0, w), (0, 0)))
+        return Lti(A, B, np.pad(G.C[:m], ((0, 0), (0, w))), G.D[:m, :m], G.T)
+
+    def frozen(self) -> dict[State, Lti]:
+        """F of every contact state, without the gaps' constant forces; none touches in the first, all in the last."""
+        m, T, walls = self.channels, self.block.T, range(len(self.walls))
+        zero, one = np.zeros((1, 1)), np.ones((1, 1))
+        stiff = [Lti(zero, one, w.damping / T * one, -(w.stiffness + w.damping / T) * one, T) for w in self.walls]
+        none, maps = Lti.constant([[0.0]], T), {}
+        for touching in itertools.product((False, True), repeat=len(self.walls)):
+            back = Lti.diag(*[none] * m, *(stiff[i] if touching[i] else none for i in walls))
+            G = self.block.feedback(back)
+            maps[touching] = Lti(G.A, G.B[:, :m], G.C[:m], G.D[:m, :m], T)
+        return maps
+
+    def transition(self) -> Callable[[Array, Array], None]:
+        """One tick for any number of simulations: see Process.transition."""
+        G, m, w, F = self.block, self.channels, len(self.walls), self.open
+        gap = np.array([wall.gap for wall in self.walls])[:, None]
+        memory = (np.array([wall.damping for wall in self.walls]) / G.T / self.steepness)[:, None]
+        linear = np.block([[F.C, F.D], [F.A, F.B]]).dot
+        reach = np.block([G.C[m:], np.zeros((w, w)), G.D[m:, :m]]).dot
+        kick, give = np.vstack([G.D[:m, m:], G.B[:, m:], np.zeros((w, w))]).dot, G.D[m:, m:].dot
+        solve, depth = self.problem.solve, slice(G.order, G.order + w)
+
+        def tick(before: Array, after: Array) -> None:
+            way = reach(before) - gap  # into the walls, if these did not push
+            force = solve(way - memory * before[depth])
+            linear(before, after)
+            after += kick(force)
+            np.maximum(way + give(force), 0.0, out=after[-w:])
+
+        return tick
+
+    def depths(self, z: Array) -> Array:
+        """h [m] at each tick but the last, (ticks - 1, w, ..), from the states at all of them, (ticks, order, ..)."""
+        return z[1:, -len(self.walls) :]
+
+
+def contact(network: Network, coupling: Coupling, theta: Sequence[int], psi: Sequence[int], T: float) -> Contact:
+    """F of (6) with the walls of the network as further ports. Psi and Theta delay what the devices feel of them."""
+    w = len(network.walls)
+
+    def late(steps: Sequence[int]) -> Lti:
+        return Lti.diag(delay(steps, T), Lti.constant(np.eye(w), T))
+
+    coupled = coupling.around(late(psi) @ walled_environment(network, T), further=w)
+    return Contact(late(theta) @ coupled, network.walls)
+
+
+@dataclass(frozen=True, eq=False)
+class Complementarity:
+    """p >= 0, M p - q >= 0, p'(M p - q) = 0: one solution for every q if M has positive principal minors.
+
+    Raises SingularLoop where it has not.
+    """
+
+    M: Array  # (w, w)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "M", frozen(self.M, 2))
+        _ = self._candidates
+
+    def solve(self, q: Array) -> Array:
+        """p for every column of q, (w, nsim)."""
+        diagonal = self._diagonal
+        if self._separate:
+            return np.maximum(q, 0.0) / diagonal
+        forces = (self._candidates @ q).reshape(-1, *q.shape)
+        # rounding leaves the right set some 1e-16 short of either sign, every other set more
+        short = np.minimum(forces * diagonal, np.matmul(self.M, forces) - q).min(axis=1)
+        best = np.take_along_axis(forces, short.argmax(axis=0)[None, None, :], axis=0)[0]
+        return np.maximum(best, 0.0)
+
+    @cached_property
+    def _diagonal(self) -> Array:
+        return np.diag(self.M)[:, None].copy()
+
+    @cached_property
+    def _separate(self) -> bool:
+        """Whether no wall's force moves another wall within the tick."""
+        return np.count_nonzero(self.M - np.diag(np.diag(self.M))) == 0
+
+    @cached_property
+    def _candidates(self) -> Array:
+        """q to p, if exactly the walls of a set push: for every set, stacked, (2^w w, w)."""
+        w, maps = len(self.M), []
+        for pushing in itertools.product((False, True), repeat=w):
+            chosen = np.ix_(pushing, pushing)
+            part, inverse = self.M[chosen], np.zeros((w, w))
+            if not np.linalg.det(part / np.abs(self.M).max(initial=1e-300)) > 0:
+                which = [i + 1 for i, on in enumerate(pushing) if on]
+                raise SingularLoop(f"the forces of walls {which} are not determined: {part.tolist()}")
+            inverse[chosen] = np.linalg.inv(part)
+            maps.append(inverse)
+        return np.concatenate(maps)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,20 +14,15 @@ what it does not need.
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from design.api import Options, certify, design_coupling, promise, transparency_of
-    from design.failure import DesignFailed
-    from design.margin import Requirement
-    from design.result import Design
-    from design.store import Loop
+    from controller.loop import Loop
+    from design.conditions import Requirement
+    from design.designs import Options, certify, design_coupling, promise, transparency_of
+    from design.result import Design, DesignFailed
     from design.transparency import Transparency
-
-if sys.argv[:1] == ["-m"]:  # a command starts, and may be interrupted; scripts do not need sim for a design
-    import sim  # noqa: F401
 
 __all__ = [
     "Design",
@@ -44,9 +39,9 @@ __all__ = [
 
 _HOMES = {
     "Design": "design.result",
-    "DesignFailed": "design.failure",
-    "Loop": "design.store",
-    "Requirement": "design.margin",
+    "DesignFailed": "design.result",
+    "Loop": "design.certificate",
+    "Requirement": "design.conditions",
     "Transparency": "design.transparency",
 }
 
@@ -54,7 +49,7 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'design' has no attribute {name!r}")
-    return getattr(import_module(_HOMES.get(name, "design.api")), name)
+    return getattr(import_module(_HOMES.get(name, "design.designs")), name)
 
 
 def __dir__() -> list[str]:

@@ -1,60 +1,397 @@
-"""Certificates of couplings: proved once, stored, and proved again from the file alone without a solver.
-
-closed-loop: F(1) is exactly symmetric and positive semidefinite, and with F(z) = F(1) + (z - 1) R(z) the block
-    R + Delta_D/T - F(1)/2
-is strictly positive real (design.proof.positive_real). On |z| = 1 the Hermitian part of F(1)/(z - 1) is -F(1)/2, so
-He[F/(z-1)] > -Delta_D/T there; the same certificate shows that F is stable.
-
-theorem4, psi = 0: with H = V - Theta-hat (11), (12), V-hat = (1 - 1/z) H/T, H(1) is exactly symmetric, and with
-H(z) = H(1) + (z - 1) R(z) the block
-    H(1)/2 - R
-is strictly positive real. Then He V-hat = |1 - 1/z|^2 He[H(1)/2 - R]/T >= Delta_V V-hat* V-hat for a small
-Delta_V > 0, as V-hat carries the same factor: V-hat is stable and output strictly passive. The environment is
-passive because every parameter of the network is non-negative (the Network type refuses others), so
-Phi = 0 satisfies Lemma 4, whatever the environment.
-
-With a box around the environment the same is proved for the environment (P) and for every vertex (P1, P2, ..); nothing
-is proved of the environments in between, or of one that changes.
-
-A loop whose delays may switch within a range carries a second proof, of any switching (design.jitter.proof).
-
-theorem4, psi >= 1: a multiplier Phi, stored too, and two blocks (design.proof.delayed); it is of this environment.
-"""
+"""What both conditions ask of a coupling in its loop, proved exactly wherever that is possible."""
 
 from __future__ import annotations
 
+import hashlib
+import math
+import os
 import platform
-from collections.abc import Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 import scipy
 
-from controller import coupling as controller_coupling
-from controller.environment import environment
-from design import margin
-from design.box.members import in_each, worst
-from design.condition.delayed import theorem4_delayed
-from design.jitter.proof import prove_switching, refuted
-from design.promises import switching_promise
-from design.proof import exact
-from design.proof.delayed import coupling_block, environment_block
-from design.proof.exact import Exact
-from design.proof.positive_real import find_storage, too_large
-from design.proof.rational import Matrix, SingularMatrix, definiteness, rational
-from design.proof.stored_matrix import refuted_rows, rows_of
-from design.store import Certificate, Condition, CouplingData, Loop, Stored, SwitchingProof, digest, sealed
+from controller.coupling import Coupling, Form, InternalModel, SpringDamper, Strict, require_channels
+from controller.delay import delay
+from controller.environment import Member, frozen_states
+from controller.loop import DelayRange, Loop
+from controller.lti import Array, Lti, SingularLoop, rational
+from design.conditions import (
+    Condition,
+    JitterProof,
+    Requirement,
+    any_environment,
+    any_environment_delayed,
+    any_environment_demand,
+    any_environment_per_channel,
+    delayed_coupling_block,
+    delayed_environment_block,
+    jitter_proof,
+    jitter_refusal,
+    refusal,
+    switching_block,
+    this_environment,
+    this_environment_demand,
+)
+from design.exact import Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
+
+# ----------------------------------------------------------------------------------------------------
+# The file in which a coupling is kept: the loop it was made for, its coefficients and its certificate, as JSON.
+#
+# Numbers are plain decimals, rationals are strings "p/q". Reading is strict: an unknown or ill-typed field is an
+# error that names it.
+
+
+Rows = tuple[tuple[float, ...], ...]
+Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=4000)]
+
+
+class BadFile(ValueError):
+    """A file that is no stored coupling; the message is one line that names the field."""
+
+
+class SwitchingProof(Strict, frozen=True):
+    """What proves that the delays may switch within the loop's range (design.jitter.proof)."""
+
+    required: tuple[float, ...]  # (m,) [N s/m] with this multiplier, from a refined sweep
+    margin: float  # available / required
+    alpha: tuple[float, ...]  # (m,) multiplier [N/m], 0 where the delay does not vary
+    P: tuple[tuple[Rational, ...], ...]  # rationals "p/q"
+
+
+class Certificate(Strict, frozen=True):
+    """What is claimed of a coupling in its loop, and what proves it."""
+
+    condition: Condition
+    required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep
+    available: tuple[float, ...]  # (m,) [N s/m], the damping for which it is proved
+    margin: float  # available / required
+    promise: Literal["any passive environment", "a set", "this environment"]
+    proof: Literal["sampled", "kyp", "rational"]
+    matrices: dict[str, tuple[tuple[Rational, ...], ...]]  # rationals "p/q"
+    scenario: str  # digest of the loop and the coupling
+    versions: dict[str, str]
+    seal: str = ""  # digest of all other fields
+    switching: SwitchingProof | msgspec.UnsetType = msgspec.UNSET  # of a loop with jitter; left out of other files
+
+
+class Stored(Strict, frozen=True):
+    """A coupling with its loop and, once it is proved, its certificate."""
+
+    loop: Loop
+    coupling: Form
+    certificate: Certificate | None = None
+    version: Literal[1] = 1
+
+    def __post_init__(self) -> None:
+        require_channels(self.coupling, self.loop.channels)
+
+    @classmethod
+    def of(cls, loop: Loop, coupling: Coupling, certificate: Certificate | None = None) -> Stored:
+        """What a file keeps of a coupling in its loop."""
+        return cls(loop, coupling.form(), certificate)
+
+    def built(self) -> Coupling:
+        """The coupling."""
+        return self.coupling.build(self.loop.T)
+
+
+def digest(*parts: msgspec.Struct) -> str:
+    """sha256 over the canonical JSON (sorted keys, shortest decimals, 7 as 7.0 where it is a float) of the parts."""
+    read_back = [msgspec.json.decode(msgspec.json.encode(part), type=type(part)) for part in parts]
+    return hashlib.sha256(msgspec.json.encode(read_back, order="deterministic")).hexdigest()
+
+
+def sealed(certificate: Certificate) -> Certificate:
+    """The certificate with the digest of all its other fields."""
+    plain = msgspec.structs.replace(certificate, seal="")
+    return msgspec.structs.replace(certificate, seal=digest(plain))
+
+
+def load(path: str | Path) -> Stored:
+    """Read a stored coupling. Raises BadFile with one line that names the field, OSError if there is no file."""
+    content = Path(path).read_bytes()
+    if not content.strip():
+        raise BadFile(f"{path}: is empty, expected a coupling as python -m design stores it")
+    try:
+        return msgspec.json.decode(content, type=Stored)
+    except msgspec.ValidationError as error:
+        raise BadFile(f"{path}: is no stored coupling: {' '.join(str(error).split())}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise BadFile(f"{path}: {_place(content, str(error))}{' '.join(str(error).split())}") from None
+
+
+def _place(content: bytes, message: str) -> str:
+    """Number and beginning of the line that a message points to as "(byte N)", or nothing."""
+    found = re.search(r"\(byte (\d+)\)", message)
+    if not found:
+        return ""
+    above = content[: int(found[1])].count(b"\n")
+    return f"line {above + 1}, {content.splitlines()[above].decode(errors='replace').strip()[:40]!r}: "
+
+
+def save(stored: Stored, path: str | Path) -> None:
+    """Write through a temporary file beside `path`, so that a reader never sees half of it."""
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(stored), indent=1) + b"\n")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+# ----------------------------------------------------------------------------------------------------
+# What may be said of a coupling: required against available damping, for which environments, and what is left out.
+
+
+ANY, SET, HERE, WALL = "any passive environment", "a set", "this environment", "a rigid wall only"
+FROZEN = "each frozen contact state of this environment (contact that makes and breaks is not covered)"
+
+#: What no certificate covers.
+CAVEATS = (
+    "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted), "
+    "not for contacts that make and break (except walls under theorem4, without delay in the environment), "
+    "jitter of T, quantisation, velocity filters or friction compensation."
+)
+
+
+def finite(value: float) -> float | None:
+    """JSON knows neither infinity nor not-a-number."""
+    return float(value) if math.isfinite(value) else None
+
+
+def certificate_part(requirement: Requirement) -> dict[str, Any]:
+    """Required against available damping."""
+    part = {
+        "condition": requirement.condition,
+        "required_damping": [finite(b) for b in requirement.required],
+        "available_damping": list(requirement.available),
+        "margin": finite(1 / requirement.ratio) if requirement.ratio > 0 else None,
+        "binding_frequency_hz": requirement.frequency_hz,
+        "certified": requirement.certified,
+        "proof": requirement.proof,
+    }
+    return part | ({"reason": requirement.reason} if requirement.reason else {})
+
+
+def promise(
+    theorem4: bool, closed_loop: bool, *, rigid: bool = False, walls: bool = False, whole_set: bool = False
+) -> str | None:
+    """For which environments a coupling is certified, given which conditions hold.
+
+    `rigid` if E is a rigid wall that is never left, `walls` if contact is made and broken, `whole_set` if closed-loop
+    is proved at every vertex of a box around E and a search has found no violation between them.
+    """
+    if theorem4:
+        return ANY
+    if whole_set:
+        return SET
+    return (WALL if rigid else FROZEN if walls else HERE) if closed_loop else None
+
+
+def switching_promise(span: DelayRange) -> str:
+    """Which delays of the forces a coupling is certified for that bears switching, in the environment of its loop."""
+    return f"delays switching within {span}"
+
+
+def promise_of(requirements: Mapping[str, Requirement], loop: Loop, whole_set: bool = False) -> str | None:
+    """The promise of a coupling by its requirements; the multiplier that psi >= 1 takes is of one environment."""
+    held = {name: requirement.certified for name, requirement in requirements.items()}
+    walls = bool(loop.environment.walls)
+    return promise(held["theorem4"] and not any(loop.psi), any(held.values()), walls=walls, whole_set=whole_set)
+
+
+# ----------------------------------------------------------------------------------------------------
+# A coupling in every environment of a set: what the closed-loop condition asks at each vertex of a box.
+
+
+def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[Requirement]:
+    """The closed-loop condition of this coupling around each of the members, every one frozen."""
+    return [_required(loop, coupling, member) for member in members]
+
+
+def worst(requirements: Sequence[Requirement]) -> int:
+    """Which of them asks the most."""
+    return max(range(len(requirements)), key=lambda i: requirements[i].ratio)
+
+
+def _required(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
+    try:
+        F = loop.at(member.network).F(coupling)
+    except SingularLoop as error:
+        return refusal("closed-loop", loop.delta, str(error))
+    return this_environment(F, loop.delta)
+
+
+# ----------------------------------------------------------------------------------------------------
+# An exact proof that no switching of the delays within a loop's range is dangerous: made, stored, proved again.
+#
+# With G the forces as they leave, F = Theta_nom G, F(z) = F(1) + (z - 1) R(z) and F(1) exactly symmetric and positive
+# semidefinite, the block
+#     [[R + Delta_D/T - diag(alpha)/2 - F(1)/2,  0], [2 h G,  2 diag(alpha)]]
+# is strictly positive real (design.proof.positive_real): its Hermitian part on |z| = 1 is the matrix of condition.py.
+# Channels whose delay does not vary have no row and column of the second kind, and alpha = 0.
+
 
 CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
+
+
+def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) -> JitterProof:
+    """What switching within the loop's range asks, by a sweep; with the multiplier `alpha` [N/m] where it is given."""
+    span = loop.delays
+    try:
+        G = loop.sent(coupling)
+    except SingularLoop as error:
+        return jitter_refusal(loop.delta, str(error))
+    return jitter_proof(G, span.lo, span.hi, loop.delta, alpha)
+
+
+def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
+    """An exact proof of any switching within the loop's range, or why there is none."""
+    found = swept(loop, coupling)
+    requirement = found.requirement
+    if not requirement.certified:
+        needed, have = (", ".join(f"{d:.6g}" for d in side) for side in (requirement.required, requirement.available))
+        return requirement.reason or f"needs {needed} N s/m of damping, has {have}"
+    P = storage(loop, coupling, found.alpha)
+    if isinstance(P, str):
+        return P
+    return SwitchingProof(requirement.required, _margin(found), found.alpha, rows_of(P))
+
+
+def storage(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Matrix | str:
+    """The matrix that proves the condition for these alpha [N/m] at the loop's damping, or why there is none."""
+    try:
+        condition = condition_block(loop, coupling, alpha)
+    except (SingularLoop, ValueError) as error:
+        return str(error)
+    P, reason = find_storage(condition)
+    return str(reason) if P is None else P
+
+
+def refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof | msgspec.UnsetType) -> str | None:
+    """Why what is on file does not prove that the delays may switch within the loop's range, or None if it does."""
+    if loop.jitter is None:
+        return None if proof is msgspec.UNSET else "a proof for switching delays, but the loop's delays are constant"
+    reason = "no proof is on file" if proof is msgspec.UNSET else _refuted(loop, coupling, proof)
+    return reason and f"{switching_promise(loop.jitter)}: {reason}"
+
+
+def _refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof) -> str | None:
+    try:
+        condition = condition_block(loop, coupling, proof.alpha)
+    except (SingularLoop, ValueError) as error:
+        return str(error)
+    found = swept(loop, coupling, proof.alpha)
+    required = found.requirement.required
+    if len(proof.required) != len(required) or not np.allclose(proof.required, required, rtol=CLAIM_TOLERANCE):
+        return f"required is {list(proof.required)}, the sweep finds {list(required)}"
+    if not np.isclose(proof.margin, _margin(found), rtol=CLAIM_TOLERANCE):
+        return f"margin is {proof.margin:.9g}, the sweep finds {_margin(found):.9g}"
+    return refuted_rows("P", condition, proof.P)
+
+
+def condition_block(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Lti:
+    """The exact block that must be strictly positive real.
+
+    Raises ValueError where alpha [N/m] is no multiplier of this range, the model has too many states, or F(1) is not
+    exactly as it must be; SingularLoop where the loop has a pole at z = 1.
+    """
+    span, m = loop.delays, loop.channels
+    widths = [hi - lo for lo, hi in zip(span.lo, span.hi, strict=True)]
+    if len(alpha) != m or any((a > 0) != (width > 0) or a < 0 for a, width in zip(alpha, widths, strict=True)):
+        raise ValueError(f"alpha is {list(alpha)}, expected a positive number where the delay varies and 0 elsewhere")
+    G = loop.sent(coupling, exact=True)
+    if reason := too_large(G.order + sum(span.hi)):  # splitting it takes long too
+        raise ValueError(reason)
+    block, F1 = switching_block(G, span.lo, span.hi, loop.delta, alpha)
+    static = Matrix.of(F1)
+    if not static.equals(static.T) or not definiteness(static).semidefinite:
+        raise ValueError("G(1) is not exactly symmetric and positive semidefinite")
+    return block
+
+
+def _margin(found: JitterProof) -> float:
+    return 1 / max(found.requirement.ratio, 1e-12)
+
+
+# ----------------------------------------------------------------------------------------------------
+# What a report says of delays that vary: the jitter-proof requirement beside that of the playout buffer.
+
+
+NOT_COVERED = (
+    "Covered: any ages of the forces within the range, at every tick and on every channel. Not covered: jitter on the "
+    "measured positions, jitter of T, or forces older than the range, which lost packets make."
+)
+
+
+def switching_requirement(loop: Loop, coupling: Coupling) -> JitterProof:
+    """The damping that switching within loop.jitter asks; `proof` is "rational" where exact arithmetic confirms it."""
+    found = swept(loop, coupling)
+    if not found.requirement.certified or not isinstance(storage(loop, coupling, found.alpha), Matrix):
+        return found
+    return replace(found, requirement=replace(found.requirement, proof="rational"))
+
+
+def switching_part(found: JitterProof, G: Lti, span: DelayRange) -> dict[str, Any]:
+    """The requirement with its multiplier, and what a playout buffer to the constant delay hi would need.
+
+    G is the force map without Theta.
+    """
+    buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available)
+    return certificate_part(found.requirement) | {
+        "lo": list(span.lo),
+        "hi": list(span.hi),
+        "alpha": [finite(a) for a in found.alpha],
+        "playout": {
+            "theta": list(span.hi),
+            "required_damping": [finite(d) for d in buffered.required],
+            "certified": buffered.certified,
+        },
+        "not_covered": NOT_COVERED,
+    }
+
+
+# ----------------------------------------------------------------------------------------------------
+# Certificates of couplings: proved once, stored, and proved again from the file alone without a solver.
+#
+# closed-loop: F(1) is exactly symmetric and positive semidefinite, and with F(z) = F(1) + (z - 1) R(z) the block
+#     R + Delta_D/T - F(1)/2
+# is strictly positive real (design.proof.positive_real). On |z| = 1 the Hermitian part of F(1)/(z - 1) is -F(1)/2, so
+# He[F/(z-1)] > -Delta_D/T there; the same certificate shows that F is stable.
+#
+# theorem4, psi = 0: with H = V - Theta-hat (11), (12), V-hat = (1 - 1/z) H/T, H(1) is exactly symmetric, and with
+# H(z) = H(1) + (z - 1) R(z) the block
+#     H(1)/2 - R
+# is strictly positive real. Then He V-hat = |1 - 1/z|^2 He[H(1)/2 - R]/T >= Delta_V V-hat* V-hat for a small
+# Delta_V > 0, as V-hat carries the same factor: V-hat is stable and output strictly passive. The environment is
+# passive because every parameter of the network is non-negative (the Network type refuses others), so
+# Phi = 0 satisfies Lemma 4, whatever the environment.
+#
+# With a box around the environment the same is proved for the environment (P) and for every vertex (P1, P2, ..);
+# nothing is proved of the environments in between, or of one that changes.
+#
+# A loop whose delays may switch within a range carries a second proof, of any switching (design.jitter.proof).
+#
+# theorem4, psi >= 1: a multiplier Phi, stored too, and two blocks (design.proof.delayed); it is of this environment.
+
+
+CLAIM_TOLERANCE_CERTIFICATE = (
+    1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
+)
 
 
 class NotProved(ValueError):
     """No proof of the condition was found; carries the requirement that the sweep found, if there is one."""
 
-    def __init__(self, reason: str, requirement: margin.Requirement | None = None) -> None:
+    def __init__(self, reason: str, requirement: Requirement | None = None) -> None:
         super().__init__(reason)
         self.requirement = requirement
 
@@ -67,7 +404,7 @@ class Verdict:
     reason: str | None = None
 
 
-def prove(loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequence[float] | None = None) -> Certificate:
+def prove(loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[float] | None = None) -> Certificate:
     """A certificate with an exact proof of the condition; `phi` [N s/m] is Theorem 4's multiplier where psi >= 1.
 
     Raises NotProved with the reason.
@@ -78,15 +415,15 @@ def prove(loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequenc
         needed = ", ".join(f"{d:.6g}" for d in requirement.required)
         have = ", ".join(f"{d:.6g}" for d in requirement.available)
         reason = requirement.reason or f"needs {needed} N s/m of damping, has {have}"
-        place = f"P{worst(in_each(loop, coupling.build(loop.T), loop.members()))}" if loop.box else "P"
-        raise NotProved(f"{_place(loop, condition, place)}{reason}", requirement)
+        place = f"P{worst(in_each(loop, coupling, loop.members()))}" if loop.box else "P"
+        raise NotProved(f"{_place_certificate(loop, condition, place)}{reason}", requirement)
     proof: dict[str, Matrix] = {}
-    for name, block in _blocks(loop, coupling, condition, multiplier).items():
-        _require_size(block, requirement)
-        P, reason = find_storage(block)
+    for name, real in _blocks(loop, coupling, condition, multiplier).items():
+        _require_size(real.order, requirement)
+        P, reason = find_storage(real)
         if P is None:
             asked = f"the sweep asks {requirement.ratio:.9f} of the available damping"
-            raise NotProved(f"{_place(loop, condition, name)}{reason}; {asked}", requirement)
+            raise NotProved(f"{_place_certificate(loop, condition, name)}{reason}; {asked}", requirement)
         proof[name] = P
     if multiplier is not None:
         proof["Phi"] = Matrix.of([multiplier])
@@ -99,20 +436,18 @@ def prove(loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequenc
             promise=_promise(loop, condition),
             proof="rational",
             matrices={name: rows_of(M) for name, M in proof.items()},
-            scenario=digest(loop, coupling),
+            scenario=digest(loop, coupling.form()),
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
             switching=_switching(loop, coupling, requirement),
         )
     )
 
 
-def _switching(
-    loop: Loop, coupling: CouplingData, requirement: margin.Requirement
-) -> SwitchingProof | msgspec.UnsetType:
+def _switching(loop: Loop, coupling: Coupling, requirement: Requirement) -> SwitchingProof | msgspec.UnsetType:
     """The proof that the delays may switch, of a loop with a range of them. Raises NotProved."""
     if loop.jitter is None:
         return msgspec.UNSET
-    proof = prove_switching(loop, coupling.build(loop.T))
+    proof = prove_switching(loop, coupling)
     if isinstance(proof, str):
         raise NotProved(f"{switching_promise(loop.jitter)}: {proof}", requirement)
     return proof
@@ -120,56 +455,47 @@ def _switching(
 
 def verify(stored: Stored) -> Verdict:
     """Prove the stored certificate again: its bookkeeping, its figures, then its matrices in exact arithmetic."""
-    certificate = stored.certificate
+    certificate, loop = stored.certificate, stored.loop
     if certificate is None:
         return Verdict(False, "the file carries no certificate")
-    if certificate.scenario != digest(stored.loop, stored.coupling):
+    if certificate.scenario != digest(loop, stored.coupling):
         return Verdict(False, "scenario digest differs: the loop or the coupling was changed after it was certified")
     if sealed(certificate).seal != certificate.seal:
         return Verdict(False, "seal differs: the certificate was changed after it was made")
+    coupling = stored.built()
     try:
-        reason = _refuted_claims(stored.loop, stored.coupling, certificate) or _refuted_proof(
-            stored.loop, stored.coupling, certificate
-        )
+        reason = _refuted_claims(loop, coupling, certificate) or _refuted_proof(loop, coupling, certificate)
     except NotProved as refusal:
         reason = str(refusal)
     return Verdict(reason is None, reason)
 
 
 def required_damping(
-    loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequence[Fraction] | None = None
-) -> margin.Requirement:
+    loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[Fraction] | None = None
+) -> Requirement:
     """The damping that the condition asks, from a refined sweep: closed-loop, the most over all members of the set.
 
     Raises NotProved where it is undefined: theorem4 with psi >= 1 needs the multiplier phi.
     """
-    built = coupling.build(loop.T)
     if loop.environment.walls and (condition == "closed-loop" or any(loop.psi)):
         raise NotProved("of walls only theorem4 without delay in the environment is proved; the rest is for linear E")
     if condition == "closed-loop":
-        requirements = in_each(loop, built, loop.members())
+        requirements = in_each(loop, coupling, loop.members())
         return requirements[worst(requirements)]
-    match built:
-        case controller_coupling.SpringDamper():
-            V = built.compliance(loop.T)
-        case controller_coupling.Compliance(V=V):
-            pass
-        case _:
-            V = None
-    if V is not None and not any(loop.psi):
-        return margin.theorem4(V, loop.theta, loop.delta)
-    if V is not None:
-        if phi is None or len(phi) != len(loop.delta):
-            raise NotProved("theorem4 with psi >= 1 needs a multiplier Phi, one entry per channel")
-        E = environment(loop.environment, loop.T)
-        values = np.array([float(p) for p in phi])
-        return theorem4_delayed(V, E, loop.theta, loop.psi, loop.delta, values)
-    return margin.refusal("theorem4", loop.delta, no_compliance(built))
+    V = coupling.compliance(loop.T)
+    if V is None:
+        return refusal("theorem4", loop.delta, no_compliance(coupling))
+    if not any(loop.psi):
+        return any_environment(V, loop.theta, loop.delta)
+    if phi is None or len(phi) != len(loop.delta):
+        raise NotProved("theorem4 with psi >= 1 needs a multiplier Phi, one entry per channel")
+    values = np.array([float(p) for p in phi])
+    return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, values)
 
 
-def no_compliance(coupling: controller_coupling.Coupling) -> str:
+def no_compliance(coupling: Coupling) -> str:
     """Why Theorem 4 has nothing to say of a coupling that is no V of its own."""
-    if isinstance(coupling, controller_coupling.InternalModel):
+    if isinstance(coupling, InternalModel):
         return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
     return "without a coupling there is nothing that Theorem 4 could use"
 
@@ -181,76 +507,67 @@ def _promise(loop: Loop, condition: Condition) -> Literal["any passive environme
     return "a set" if loop.box else "this environment"
 
 
-def _place(loop: Loop, condition: Condition, matrix: str) -> str:
+def _place_certificate(loop: Loop, condition: Condition, matrix: str) -> str:
     """Which member of a set the matrix P, P1, P2, .. is about, as the beginning of a message."""
     if loop.box is None or condition == "theorem4":
         return ""
     return f"{loop.members()[int(matrix[1:] or 0)].name}: "
 
 
-def _blocks(
-    loop: Loop, coupling: CouplingData, condition: Condition, phi: Sequence[Fraction] | None
-) -> dict[str, Exact]:
-    """The blocks that must be strictly positive real, by the name of the matrix that proves it. Raises NotProved."""
+def _blocks(loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[Fraction] | None) -> dict[str, Lti]:
+    """The exact blocks to be strictly positive real, by the name of the matrix that proves it. Raises NotProved."""
     if condition == "closed-loop":
-        names = [f"P{i or ''}" for i in range(len(loop.members()))]
         loops = [loop.at(member.network) for member in loop.members()]
-        return {name: _block(each, coupling, condition) for name, each in zip(names, loops, strict=True)}
-    if not any(loop.psi):
-        return {"P": _block(loop, coupling, condition)}
-    assert phi is not None  # required_damping has refused the rest
-    T, delta = rational(loop.T), [rational(d) for d in loop.delta]
+        return {f"P{i or ''}": _this_environment(each, coupling) for i, each in enumerate(loops)}
+    T = rational(loop.T)
+    V = coupling.compliance(T)
+    assert V is not None  # required_damping has refused the rest
+    _require_size(V.order + sum(loop.theta))
     try:
-        E = exact.delay(loop.psi) @ exact.environment(loop.environment, T)
-        E1, passive = environment_block(E, phi, T)
-        H = exact.shifted_compliance(exact.compliance(coupling.build(loop.T), len(delta), T), loop.theta, delta, T)
-        H1, excess = coupling_block(H, phi, delta, T)
-    except (SingularMatrix, ValueError) as error:
+        if not any(loop.psi):
+            demand = any_environment_demand(V, loop.theta, loop.delta)
+            _require_symmetric("H(1)", demand.static["V(1)"])
+            return {"P": demand.gain + demand.free}
+        assert phi is not None
+        E1, passive = delayed_environment_block(delay(loop.psi, T) @ loop.E(exact=True), phi)
+        H1, excess = delayed_coupling_block(V, loop.theta, phi, [rational(d) for d in loop.delta])
+    except (SingularLoop, ValueError) as error:
         raise NotProved(str(error)) from None
     _require_static("E(1)", E1)
     _require_symmetric("H(1)", H1)
     return {"P": excess, "P_E": passive}
 
 
-def _block(loop: Loop, coupling: CouplingData, condition: Condition) -> Exact:
-    """The block that must be strictly positive real, after the exact test at z = 1. Raises NotProved."""
-    T, delta = rational(loop.T), [rational(d) for d in loop.delta]
-    built = coupling.build(loop.T)
+def _this_environment(loop: Loop, coupling: Coupling) -> Lti:
+    """The block of this-environment, after the exact test at z = 1. Raises NotProved."""
     try:
-        if condition == "closed-loop":
-            F = exact.force_map(exact.environment(loop.environment, T), built, loop.theta, loop.psi, T)
-            _require_size(F)
-            F1, R = F.split_at_one()
-            _require_static("F(1)", F1)
-            return Exact(R.A, R.B, R.C, Matrix.diag(d / T for d in delta) - F1.scaled(Fraction(1, 2)))
-        V = exact.compliance(built, len(delta), T)
-        H = exact.shifted_compliance(V, loop.theta, delta, T)
-        _require_size(H)
-        H1, R = H.split_at_one()
-    except SingularMatrix as error:
+        F = loop.F(coupling, exact=True)
+        _require_size(F.order)
+        demand = this_environment_demand(F, loop.delta)
+    except SingularLoop as error:
         raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
-    _require_symmetric("H(1)", H1)
-    return Exact(R.A, R.B, -R.C, H1.scaled(Fraction(1, 2)))
+    _require_static("F(1)", demand.static["F(1)"])
+    return demand.gain + demand.free
 
 
-def _require_size(block: Exact, requirement: margin.Requirement | None = None) -> None:
-    if reason := too_large(block):
+def _require_size(states: int, requirement: Requirement | None = None) -> None:
+    if reason := too_large(states):
         raise NotProved(reason, requirement)
 
 
-def _require_symmetric(name: str, value: Matrix) -> None:
-    if not value.equals(value.T):
+def _require_symmetric(name: str, value: Array) -> None:
+    if not (value == value.T).all():
         raise NotProved(f"{name} is not exactly symmetric")
 
 
-def _require_static(name: str, value: Matrix) -> None:
+def _require_static(name: str, value: Array) -> None:
     _require_symmetric(name, value)
-    outcome = definiteness(value)
+    outcome = definiteness(Matrix.of(value))
     if not outcome.semidefinite:
         raise NotProved(f"{name} is not positive semidefinite: {outcome}")
 
 
-def _refuted_claims(loop: Loop, coupling: CouplingData, certificate: Certificate) -> str | None:
+def _refuted_claims(loop: Loop, coupling: Coupling, certificate: Certificate) -> str | None:
     """Why the figures on file do not follow from the loop and the coupling, or None."""
     if certificate.proof != "rational":
         return f"the certificate is {certificate.proof}: it carries no exact proof"
@@ -260,15 +577,15 @@ def _refuted_claims(loop: Loop, coupling: CouplingData, certificate: Certificate
         return f"available is {list(certificate.available)}, the loop has delta = {list(loop.delta)}"
     requirement = required_damping(loop, coupling, certificate.condition, _multiplier(certificate))
     if len(certificate.required) != len(loop.delta) or not np.allclose(
-        certificate.required, requirement.required, rtol=CLAIM_TOLERANCE
+        certificate.required, requirement.required, rtol=CLAIM_TOLERANCE_CERTIFICATE
     ):
         return f"required is {list(certificate.required)}, the sweep finds {list(requirement.required)}"
-    if not np.isclose(certificate.margin, 1 / max(requirement.ratio, 1e-12), rtol=CLAIM_TOLERANCE):
+    if not np.isclose(certificate.margin, 1 / max(requirement.ratio, 1e-12), rtol=CLAIM_TOLERANCE_CERTIFICATE):
         return f"margin is {certificate.margin:.9g}, the sweep finds {1 / max(requirement.ratio, 1e-12):.9g}"
     return None
 
 
-def _refuted_proof(loop: Loop, coupling: CouplingData, certificate: Certificate) -> str | None:
+def _refuted_proof(loop: Loop, coupling: Coupling, certificate: Certificate) -> str | None:
     """Why the matrices prove nothing, or None if they prove the condition."""
     phi = _multiplier(certificate)
     blocks = _blocks(loop, coupling, certificate.condition, phi)
@@ -276,10 +593,10 @@ def _refuted_proof(loop: Loop, coupling: CouplingData, certificate: Certificate)
     if set(certificate.matrices) != expected:
         found = ", ".join(certificate.matrices) or "none"
         return f"matrices are {found}, expected {', '.join(sorted(expected))}"
-    for name, block in blocks.items():
-        if reason := refuted_rows(name, block, certificate.matrices[name]):
-            return f"{_place(loop, certificate.condition, name)}{reason}"
-    return refuted(loop, coupling.build(loop.T), certificate.switching)
+    for name, real in blocks.items():
+        if reason := refuted_rows(name, real, certificate.matrices[name]):
+            return f"{_place_certificate(loop, certificate.condition, name)}{reason}"
+    return refuted(loop, coupling, certificate.switching)
 
 
 def _multiplier(certificate: Certificate) -> list[Fraction] | None:
@@ -291,3 +608,61 @@ def _multiplier(certificate: Certificate) -> list[Fraction] | None:
         return [Fraction(value) for value in rows[0]]
     except (IndexError, ValueError, ZeroDivisionError):
         raise NotProved("Phi is no row of rational numbers") from None
+
+
+CONDITIONS: tuple[Condition, ...] = ("theorem4", "closed-loop")
+
+
+def assess(loop: Loop, coupling: Coupling, phi: Array | None = None) -> dict[str, Requirement]:
+    """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
+
+    closed-loop is about the nominal environment alone (design.box.check asks for the rest of its box) and the constant
+    theta (design.jitter.part asks for the rest of its range); where there are walls it is about the frozen contact
+    state that asks for most.
+    """
+    loop = loop.at(loop.environment).switching(None)
+    return {
+        "theorem4": _proved(loop, coupling, theorem4_of(loop, coupling, phi), phi),
+        "closed-loop": _proved(loop, coupling, closed_loop_of(loop, coupling)),
+    }
+
+
+def closed_loop_of(loop: Loop, coupling: Coupling) -> Requirement:
+    """What this-environment asks; of an environment with walls, in its most demanding contact state."""
+    states = (loop.at(state) for state in frozen_states(loop.environment).values())
+    requirements = [this_environment(state.F(coupling), loop.delta) for state in states]
+    return max(requirements, key=lambda requirement: requirement.ratio)
+
+
+def theorem4_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Requirement:
+    """What any-environment asks; walls are covered without delay in the environment, and refused with it."""
+    if loop.environment.walls and any(loop.psi):
+        reason = "with delay in the environment its multiplier is of a linear one: no walls"
+        return refusal("theorem4", loop.delta, reason)
+    if isinstance(coupling, SpringDamper) and not any(loop.psi):
+        return any_environment_per_channel(coupling.channels(loop.T), loop.theta, loop.delta)
+    V = coupling.compliance(loop.T)
+    if V is None:
+        return refusal("theorem4", loop.delta, no_compliance(coupling))
+    if not any(loop.psi):
+        return any_environment(V, loop.theta, loop.delta)
+    if phi is None:
+        from design.lmi import least_phi  # only an environment with delay inside needs the solver
+
+        try:
+            phi = least_phi(loop)
+        except ValueError as error:
+            return refusal("theorem4", loop.delta, str(error))
+    assert phi is not None  # psi >= 1 has a multiplier or none is possible
+    return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, phi)
+
+
+def _proved(loop: Loop, coupling: Coupling, requirement: Requirement, phi: Array | None = None) -> Requirement:
+    """The requirement with `proof` = 'rational' where an exact proof was found, as it is where not."""
+    if not requirement.certified:
+        return requirement
+    try:
+        prove(loop, coupling, requirement.condition, None if phi is None else phi.tolist())
+    except NotProved:
+        return requirement
+    return replace(requirement, proof="rational")

@@ -1,12 +1,23 @@
-"""The designs by name."""
+"""`from design import design_coupling, certify, ..`: what python -m design does, for scripts. SI units."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Literal, TypedDict, Unpack
 
-from design.result import Design, Row
-from design.specification import Specification
+from controller.coupling import Coupling
+from controller.loop import Loop
+from design import certificate as promises
+from design.certificate import Stored, assess, switching_requirement
+from design.conditions import Condition, Requirement
+from design.ranges import check_set
+from design.result import Design, Row, bare, known, of_kind, one_of
+from design.transparency import Transparency, transparency
+
+# ----------------------------------------------------------------------------------------------------
+# The designs by name.
+
 
 #: name -> the conditions that it can be made for, its own first
 KINDS = {"spring-damper": ("theorem4", "closed-loop"), "ccl": ("theorem4",), "optimal": ("closed-loop",)}
@@ -18,12 +29,9 @@ OPTIONS = {
     "optimal": ("functions", "filter", "diagonal", "objective", "high_gain", "margin", "switching"),
 }
 
-#: how a state-space coupling of fixed order may be sought
-METHODS = ("complementarity", "inner", "fixed-poles")
 
-
-def design_coupling(
-    spec: Specification,
+def design_by_kind(
+    loop: Loop,
     kind: str = "spring-damper",
     condition: str | None = None,
     progress: Callable[[str, int, int], None] = lambda what, done, total: None,
@@ -41,9 +49,12 @@ def design_coupling(
     condition = condition or KINDS[kind][0]
     if condition not in KINDS[kind]:
         raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(KINDS[kind])}")
-    from design import ccl, optimal, spring_damper  # cvxpy takes a second to import
-    from design.parameter.wish import Wish
+    from design import fixed_order as ccl  # cvxpy takes a second to import
+    from design import optimal, spring_damper
+    from design.lmi import Specification
+    from design.optimal import Wish
 
+    spec = Specification.of(loop)
     if kind == "ccl":
         return ccl.design(spec, **options)
     if kind == "optimal":
@@ -51,8 +62,113 @@ def design_coupling(
     return spring_damper.design(spec, condition, **options)
 
 
-def compare_methods(spec: Specification) -> tuple[Row, ...]:
+def compare_methods(loop: Loop) -> tuple[Row, ...]:
     """Every method on the same specification: norm, convex problems, seconds."""
-    from design import ccl
+    from design import fixed_order as ccl
+    from design.lmi import Specification
 
-    return ccl.compare(spec)
+    return ccl.compare(Specification.of(loop))
+
+
+Kind = Literal["spring-damper", "ccl", "optimal"]
+LOOP = 'a Loop, as scenario.loop("I") gives it'
+
+
+class Options(TypedDict, total=False):
+    """What else can be asked of a kind, see design.designs.OPTIONS.
+
+    design.parameter.wish.Wish says more about the last five.
+    """
+
+    order: int  # ccl: states per channel
+    method: str  # ccl: complementarity, inner or fixed-poles
+    diagonal: bool  # ccl, optimal: no gain across channels
+    switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of delays that vary
+    functions: int  # optimal: basis functions per entry of Q
+    filter: str  # optimal: where the poles of the basis are
+    objective: Literal["rms", "sup"]  # optimal: of the mismatch relative to the environment
+    high_gain: float | None  # optimal: times the environment that the devices may feel at high frequency
+    margin: float  # optimal: share of the damping that stays unused
+
+
+def design_coupling(
+    loop: Loop, kind: Kind = "spring-damper", condition: Condition | None = None, **options: Unpack[Options]
+) -> Design:
+    """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
+
+    `kind` is "spring-damper", "ccl" or "optimal"; `condition` is "theorem4" (any passive environment) or "closed-loop"
+    (this environment), None for the kind's own. `options` are those of the kind, see Options; switching is not taken
+    from loop.jitter.
+
+    Returns a Design: `coupling` (for a spring-damper with K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the damping
+    that it needs, from a sweep of the coupling alone), `figure` and `objective` (what was minimised, and its value).
+
+    Raises TypeError for an argument of another type or an option that the kind does not have, ValueError for a kind,
+    condition or loop that makes no sense, DesignFailed where no such coupling exists.
+    """
+    of_kind("loop", loop, Loop, LOOP)
+    one_of("kind", kind, KINDS)
+    known(options, OPTIONS[kind], f"kind {kind!r}")
+    return design_by_kind(loop, kind, condition, **options)
+
+
+def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[str]]:
+    """What both conditions, "theorem4" and "closed-loop", ask of a coupling in its loop.
+
+    With a box around the loop's environment closed-loop is about the environment and every vertex: the figure is that
+    of the one that asks the most, proved only if all are. Between the vertices nothing is proved, but searched: a
+    violation found there (design.box.worst_member) is the figure then, and not certified. With a range of delays,
+    loop.jitter, there is a third, "jitter-proof": what any switching within the range asks.
+
+    Each Requirement has `required` and `available` (m,) [N s/m], `certified` (required < available), the frequency [Hz]
+    where it binds, and `proof`: "rational" where exact arithmetic confirms it, "sampled" where a refined sweep says so.
+    A condition that no damping satisfies has infinite `required` and a `reason`.
+
+    Raises TypeError for an argument of another type, ValueError where coupling and loop do not fit each other,
+    SingularLoop where their algebraic loop has no solution.
+    """
+    of_kind("loop", loop, Loop, LOOP)
+    phi = coupling.phi if isinstance(coupling, Design) else None
+    alone = _fitting(loop, coupling)
+    requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, phi))
+    if whole := check_set(loop, alone, samples=0):
+        _, worst = whole.worst if whole.proved else whole.worst_found
+        requirements["closed-loop"] = replace(worst, proof="rational" if whole.proved else "sampled")
+    if loop.jitter:
+        requirements["jitter-proof"] = switching_requirement(loop, alone).requirement
+    return requirements
+
+
+def promise(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str | None:
+    """For which environments `certify(loop, coupling)` says that a coupling is safe, in words; None where for none.
+
+    "any passive environment", "a set" (the loop's environment and its box), "this environment", or each contact state
+    of an environment with walls. Raises TypeError for an argument of another type, ValueError for other requirements.
+    """
+    of_kind("loop", loop, Loop, LOOP)
+    of_kind("requirements", requirements, Mapping, "what certify returned")
+    if "closed-loop" not in requirements:
+        raise ValueError(f"requirements has {', '.join(requirements) or 'nothing'}, expected what certify returned")
+    held = requirements["closed-loop"]
+    whole_set = loop.box is not None and held.certified and held.proof == "rational"
+    return promises.promise_of(requirements, loop, whole_set)
+
+
+def transparency_of(loop: Loop, coupling: Coupling | Design) -> Transparency:
+    """How close what the devices feel comes to the environment: figures of the mismatch (8), M = F - Lambda E.
+
+    `mismatch_db` is its largest share of the environment between 0.5 and 80 Hz, `rms_mismatch_db` the mean one: 0 dB
+    is as wrong as feeling nothing. `dc_ratio` is the share of the static stiffness that is felt. In the loop's own
+    environment; of one with walls, touching them all.
+
+    Raises TypeError and ValueError as `certify` does.
+    """
+    of_kind("loop", loop, Loop, LOOP)
+    return transparency(loop.F(_fitting(loop, coupling)), loop.E(), loop.lam)
+
+
+def _fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:
+    """The coupling alone. Raises ValueError where it is one of another number of channels."""
+    alone = bare(coupling)
+    Stored.of(loop, alone)
+    return alone

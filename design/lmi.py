@@ -13,15 +13,485 @@ Two transfer matrices of the paper can never satisfy the strict inequalities pri
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+import time
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, cast
 
 import cvxpy as cp
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cholesky, solve_discrete_lyapunov, svd
 
 from controller.delay import delay
-from controller.lti import Lti
-from design.specification import regular_part
+from controller.environment import Region, environment, members, regions, shrunk
+from controller.loop import Loop
+from controller.lti import Array, Lti
+from design.conditions import dampings, regular_part, uncovered
+from design.frequency import frequencies, hermitian, on_circle, supremum
+from design.result import Attempt, DesignFailed, Infeasible
+
+#: Designs ask for (1 - RESERVE) of the damping that there is, so that they are certified as stored.
+RESERVE = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Specification:
+    """N channels in, N channels out. Raises ValueError naming the field that is wrong."""
+
+    environment: Lti  # E(z), N x N, passive
+    theta: tuple[int, ...]  # (N,) transmission delays [samples]
+    psi: tuple[int, ...]  # (N,) environment delays [samples]
+    lam: tuple[int, ...]  # (N,) delays of the reference Lambda (7) [samples], 0 <= lam <= theta + psi
+    delta: tuple[float, ...]  # (N,) device dampings [N s/m]
+    W1: Lti | None = None  # weight on the left of (22); the identity if None
+    W2: Lti | None = None  # diagonal weight on its right; low_pass if None
+    others: Mapping[str, Lti] = field(default_factory=dict)  # by name: what else the environment may be, for `optimal`
+    regions: tuple[Region, ...] = ()  # the box of the others, in which the design is searched for violations
+    shrunk: Callable[[float], Mapping[str, Lti]] | None = None  # the others of a box with ranges so many times as wide
+
+    def __post_init__(self) -> None:
+        E = self.environment
+        if E.inputs != E.outputs:
+            raise ValueError(f"environment is {E.outputs} x {E.inputs}, expected one force per contact")
+        for name in ("theta", "psi", "lam"):
+            object.__setattr__(self, name, _delays(name, getattr(self, name), E.inputs))
+        object.__setattr__(self, "delta", dampings(self.delta, E.inputs))
+        if min(self.delta) == 0:
+            raise ValueError(f"delta is {list(self.delta)}, expected positive dampings in N s/m")
+        ahead = [i for i, spare in enumerate(self.advance) if spare < 0]
+        if ahead:
+            i = ahead[0]
+            limit = self.theta[i] + self.psi[i]
+            raise ValueError(f"lam[{i}] is {self.lam[i]}, expected at most theta + psi = {limit} samples (7)")
+        W1 = self.W1 or Lti.constant(np.eye(E.inputs), E.T)
+        W2 = self.W2 or low_pass(E.inputs, E.T)
+        object.__setattr__(self, "W1", W1)
+        object.__setattr__(self, "W2", W2)
+        _check_weights(W1, W2, E)
+        check_passive(E)
+
+    @classmethod
+    def of(cls, loop: Loop) -> Specification:
+        """The loop as a request for a design, every wall touching. Raises ValueError naming the field that is wrong."""
+        box = loop.box
+        if box is None:
+            return cls(loop.E(), loop.theta, loop.psi, loop.lam, loop.delta)
+
+        def others(factor: float = 1.0) -> dict[str, Lti]:
+            _, *vertices = members(loop.environment, box if factor == 1 else shrunk(loop.environment, box, factor))
+            return {vertex.name: environment(vertex.network, loop.T) for vertex in vertices}
+
+        delays, parts = (loop.theta, loop.psi, loop.lam), regions(loop.environment, box)
+        return cls(loop.E(), *delays, loop.delta, others=others(), regions=parts, shrunk=others)
+
+    @property
+    def channels(self) -> int:
+        return self.environment.inputs
+
+    @property
+    def T(self) -> float:
+        return self.environment.T
+
+    @property
+    def advance(self) -> tuple[int, ...]:
+        """(N,) samples by which the round trip is later than the reference: the exponent of Psi Lambda^-1 Theta."""
+        return tuple(t + p - n for t, p, n in zip(self.theta, self.psi, self.lam, strict=True))
+
+    @property
+    def delayed_environment(self) -> Lti:
+        """Psi E."""
+        return delay(self.psi, self.T) @ self.environment
+
+    @property
+    def usable(self) -> Array:
+        """(N,) the damping that a design may spend [N s/m]."""
+        return (1 - RESERVE) * np.asarray(self.delta)
+
+
+def low_pass(channels: int, T: float, f0: float = 80.0) -> Lti:
+    """w(z) I, the backward Euler discretisation of 1/(1 + s/(2 pi f0)), f0 in Hz (section 6 of the paper)."""
+    a = 2 * np.pi * f0 * T
+    gain, pole = a / (1 + a), 1 / (1 + a)
+    one = np.eye(channels)
+    return Lti(pole * one, one, gain * pole * one, gain * one, T)
+
+
+def check_passive(E: Lti, tolerance: float = 1e-9) -> None:
+    """Raise ValueError unless E z/(z-1), from displacement, is positive real and E(1) symmetric and >= 0."""
+    if not E.is_stable():
+        raise ValueError("environment is not passive: it has a pole on or outside the unit circle")
+    static = E.dc()
+    scale = np.abs(static).max() + np.abs(E.D).max()
+    if np.abs(static - static.T).max() > tolerance * scale:
+        raise ValueError("environment is not passive: its static stiffness E(1) is not symmetric")
+    if np.linalg.eigvalsh((static + static.T) / 2)[0] < -tolerance * scale:
+        raise ValueError("environment is not passive: its static stiffness E(1) has a negative direction")
+    regular = regular_part(E)
+
+    def active(w: Array) -> Array:
+        return -np.linalg.eigvalsh(hermitian(regular.at(on_circle(w))))[:, 0]
+
+    worst, w = supremum(active, np.concatenate([[0.0], frequencies(E)]))
+    if worst > tolerance * scale:
+        raise ValueError(f"environment is not passive: it produces energy at {w / (2 * np.pi * E.T):.4g} Hz")
+
+
+def _delays(name: str, steps: Sequence[int], channels: int) -> tuple[int, ...]:
+    if len(steps) != channels:
+        raise ValueError(f"{name} has {len(steps)} entries for {channels} channels")
+    if any(n != int(n) or n < 0 for n in steps):
+        raise ValueError(f"{name} is {list(steps)}, expected whole numbers of samples, zero or more")
+    return tuple(int(n) for n in steps)
+
+
+def _check_weights(W1: Lti, W2: Lti, E: Lti) -> None:
+    if W1.inputs != E.outputs or (W2.inputs, W2.outputs) != (E.inputs, E.inputs):
+        raise ValueError(f"W1 and W2 must fit the {E.inputs} channels on the inside, W2 also on the outside")
+    for name, W in (("W1", W1), ("W2", W2)):
+        if not W.is_stable():
+            raise ValueError(f"{name} has a pole on or outside the unit circle, so no norm is finite")
+    z = on_circle(np.array([0.1, 1.0, 3.0]))
+    response = W2.at(z)
+    if np.abs(response - response * np.eye(E.inputs)).max() > 1e-9 * np.abs(response).max():
+        raise ValueError("W2 must be diagonal: the convex-concave step divides by it channel by channel")
+
+
+def least_phi(loop: Loop) -> Array | None:
+    """The multiplier that any-environment takes where psi >= 1; see `shortage`."""
+    return shortage(Specification.of(loop))
+
+
+# ----------------------------------------------------------------------------------------------------
+# The only caller of cvxpy's solve.
+#
+# A solver's status is a claim. A result is used only if every variable is finite, the constraints hold when they are
+# evaluated again, and the caller's own `accept` agrees; otherwise the next settings of the ladder are tried. Settings
+# change what the solver does to the data, so one that breaks down seldom takes the others with it.
+
+
+#: Largest violation of a constraint that is taken for rounding; problems are posed in units where 1 is large.
+TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A solver and its options."""
+
+    name: str
+    solver: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+_TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
+_LOOSE = {"tol_gap_abs": 1e-6, "tol_gap_rel": 1e-6, "tol_feas": 1e-6}
+
+LADDER = (
+    Settings("default", cp.CLARABEL),
+    Settings("tight", cp.CLARABEL, {**_TIGHT, "max_step_fraction": 0.95}),
+    Settings("as given", cp.CLARABEL, {"equilibrate_enable": False, "chordal_decomposition_enable": False}),
+    Settings("loose", cp.CLARABEL, {**_LOOSE, "static_regularization_constant": 1e-7}),
+)
+CROSS_CHECK = Settings("splitting", cp.SCS, {"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 200_000})
+
+
+def solve(
+    problem: cp.Problem,
+    what: str,
+    accept: Callable[[], bool] | None = None,
+    ladder: Sequence[Settings] = LADDER,
+) -> tuple[Attempt, ...]:
+    """Leave a verified optimum in the problem's variables; return the attempts, the last of which succeeded.
+
+    `what` names the problem in the message of an error. Raises Infeasible when two settings agree that there is no
+    solution and none found one, DesignFailed otherwise. After either, no variable holds a value.
+    """
+    attempts: list[Attempt] = []
+    for settings in ladder:
+        attempts.append(_attempt(problem, settings, accept))
+        if attempts[-1].reason is None:
+            return tuple(attempts)
+        if sum(a.status == cp.INFEASIBLE for a in attempts) >= 2:
+            break
+    _forget(problem)
+    statuses = ", ".join(f"{a.settings}: {a.status}" for a in attempts)
+    if sum(a.status == cp.INFEASIBLE for a in attempts) >= 2:
+        raise Infeasible(problem, attempts, f"{what} has no solution ({statuses})")
+    advice = "try fewer delays, a larger damping or a lower order; the error carries the problem"
+    raise DesignFailed(problem, attempts, f"{what} could not be solved ({statuses}); {advice}")
+
+
+def solved(x: cp.Expression) -> Array:
+    """The value that `solve` has left in x."""
+    assert x.value is not None, "read before it was solved for"
+    return np.asarray(x.value)
+
+
+def _attempt(problem: cp.Problem, settings: Settings, accept: Callable[[], bool] | None) -> Attempt:
+    started = time.perf_counter()
+    status, reason = _call(problem, settings)
+    if reason is None:
+        reason = _doubt(problem, accept)
+    value = None if reason else float(cast(float, problem.value))
+    return Attempt(settings.name, status, value, time.perf_counter() - started, reason)
+
+
+def _call(problem: cp.Problem, settings: Settings) -> tuple[str, str | None]:
+    """(status, reason for refusing it or None). A cached solver would keep the options of the rung before."""
+    _forget(problem)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # cvxpy's "may be inaccurate": we measure that
+            problem.solve(solver=settings.solver, warm_start=False, **settings.options)
+    except BaseException as error:  # Clarabel's Rust panics are not Exceptions
+        panicked = type(error).__name__ == "PanicException"
+        if not panicked and not isinstance(error, cp.SolverError):
+            raise
+        return ("panic" if panicked else cp.SOLVER_ERROR), str(error)
+    if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+        return problem.status, f"the solver reports {problem.status}"
+    return problem.status, None
+
+
+def _doubt(problem: cp.Problem, accept: Callable[[], bool] | None) -> str | None:
+    """Why the values in the variables may not be used, or None."""
+    if any(v.value is None or not np.isfinite(v.value).all() for v in problem.variables()):
+        return "a variable has no finite value"
+    worst = max((float(np.max(c.violation(), initial=0.0)) for c in problem.constraints), default=0.0)
+    if not worst <= TOLERANCE:
+        return f"a constraint is violated by {worst:.1e}"
+    return None if accept is None or accept() else "the result does not pass the caller's verification"
+
+
+def _forget(problem: cp.Problem) -> None:
+    """A failed solve leaves the values of the one before in place."""
+    for variable in problem.variables():
+        variable.value = None
+
+
+# ----------------------------------------------------------------------------------------------------
+# The loop-shaping objective of section 5 of the paper: ||W1 L W2||_inf with L = I + Psi E V - Psi Lambda^-1 Theta.
+
+
+Complex = NDArray[np.complex128]
+
+
+class Shaping:
+    """L (22) for one specification, evaluated fast for many couplings."""
+
+    def __init__(self, spec: Specification) -> None:
+        assert spec.W1 is not None  # the identity and a low-pass filter, where none were given
+        assert spec.W2 is not None
+        self.spec, self.W1, self.W2 = spec, spec.W1, spec.W2
+        one = Lti.constant(np.eye(spec.channels), spec.T)
+        self.late = one - delay(spec.advance, spec.T)  # I - Psi Lambda^-1 Theta
+        self.environment = spec.delayed_environment
+
+    def parts(self, w: Array) -> tuple[Complex, Complex, Complex]:
+        """W1 Psi E, W2 and W1 (I - Psi Lambda^-1 Theta) at exp(jw), each (k, ., .)."""
+        z = on_circle(w)
+        W1 = self.W1.at(z)
+        return W1 @ self.environment.at(z), self.W2.at(z), W1 @ self.late.at(z)
+
+    def grid(self, *systems: Lti) -> Array:
+        """Frequencies [rad/sample] from 0 to pi that resolve every pole of E, the weights and `systems`."""
+        known = (self.environment, self.W1, self.W2, *systems)
+        return np.concatenate([[0.0], frequencies(*known)])
+
+    def gain(self, V: Lti, w: Array) -> Array:
+        """sigma_max of W1 L W2 at exp(jw), shape (k,)."""
+        left, right, late = self.parts(w)
+        return np.linalg.norm((left @ V.at(on_circle(w)) + late) @ right, 2, axis=(1, 2))
+
+    def norm(self, V: Lti) -> tuple[float, float]:
+        """(||W1 L W2||_inf, the frequency where it is attained [rad/sample])."""
+        return supremum(lambda w: self.gain(V, w), self.grid(V))
+
+
+# ----------------------------------------------------------------------------------------------------
+# Affine matrix functions of a real vector, handed to cvxpy as one product with constant coefficients.
+
+
+def affine(function: Callable[[Array], Array], x: cp.Expression) -> cp.Expression:
+    """function(x), for an affine `function` from vectors (p,) to matrices, by its values at 0 and the unit vectors.
+
+    Compiling a block matrix of expressions costs cvxpy far more than these p + 1 evaluations.
+    """
+    constant = function(np.zeros(x.size))
+    slopes = np.stack([(function(e) - constant).ravel() for e in np.eye(x.size)], axis=1)
+    return cp.reshape(slopes @ x + constant.ravel(), constant.shape, order="C")
+
+
+def packed(n: int) -> int:
+    """Number of free entries of a symmetric matrix (n, n)."""
+    return n * (n + 1) // 2
+
+
+def symmetric_from(vector: Array, n: int) -> Array:
+    """The symmetric (n, n) matrix whose upper triangle, row by row, is `vector`."""
+    M = np.zeros((n, n))
+    M[np.triu_indices(n)] = vector
+    return M + np.triu(M, 1).T
+
+
+# ----------------------------------------------------------------------------------------------------
+# State coordinates and units in which matrix inequalities are well scaled.
+
+
+def unit_environment(E: Lti, delta: Sequence[float]) -> Lti:
+    """E in units where T = 1 and Delta_D = I: T Delta_D^-1/2 E Delta_D^-1/2."""
+    root = 1 / np.sqrt(np.asarray(delta))
+    return _scaled(E, E.T * root, root)
+
+
+def unit_coupling(V: Lti, delta: Sequence[float]) -> Lti:
+    """V in the same units: Delta_D^1/2 V Delta_D^1/2 / T, so that E V keeps its eigenvalues."""
+    root = np.sqrt(np.asarray(delta))
+    return _scaled(V, root / V.T, root)
+
+
+def balanced(G: Lti, negligible: float = 1e-11) -> Lti:
+    """G, stable, with equal diagonal Gramians; states of Hankel value below `negligible` of the largest are left out.
+
+    Square-root method. Only states that no input reaches or no output shows to rounding are left out, so the
+    response is unchanged: this is not a model reduction.
+    """
+    if G.order == 0:
+        return G
+    reach, show = _root(G.A, G.B), _root(G.A.T, G.C.T)
+    U, hankel, Vt = svd(show.T @ reach)
+    keep = hankel > negligible * max(hankel[0], 1e-300)
+    scale = 1 / np.sqrt(hankel[keep])
+    left = (show @ U[:, keep] * scale).T
+    right = reach @ Vt[keep].T * scale
+    return Lti(left @ G.A @ right, left @ G.B, G.C @ right, G.D, G.T)
+
+
+def reachability_scaled(G: Lti) -> Array:
+    """S (n, n) such that the states S^-1 x of G have the identity as reachability Gramian (regularised)."""
+    W = solve_discrete_lyapunov(G.A, G.B @ G.B.T)
+    size = max(np.trace(W) / max(G.order, 1), 1e-300)
+    return cholesky((W + W.T) / 2 + 1e-9 * size * np.eye(G.order), lower=True)
+
+
+def _root(A: Array, B: Array) -> Array:
+    """R with R R' = the Gramian of (A, B), defined for singular ones too."""
+    W = solve_discrete_lyapunov(A, B @ B.T)
+    values, basis = np.linalg.eigh((W + W.T) / 2)
+    return basis * np.sqrt(np.maximum(values, 0.0))
+
+
+def _scaled(G: Lti, left: Array, right: Array) -> Lti:
+    return Lti(G.A, G.B * right, left[:, None] * G.C, left[:, None] * G.D * right, 1.0)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Hermitian matrix inequalities at sampled frequencies, affine in real variables, with cutting planes.
+#
+# A problem in frequency has infinitely many constraints of which few bind. It is solved with some of them, the result
+# is checked on a refined sweep by code that knows no solver, and the worst frequency is added.
+
+
+def real_form(H: Complex) -> Array:
+    """[[X, -Y], [Y, X]] of H = X + jY, (..., n, n) -> (..., 2n, 2n): Hermitian >= 0 iff symmetric >= 0."""
+    return np.concatenate(
+        [
+            np.concatenate([H.real, -H.imag], axis=-1),
+            np.concatenate([H.imag, H.real], axis=-1),
+        ],
+        axis=-2,
+    )
+
+
+def affine_lmis(constant: Complex, slopes: Complex, x: cp.Expression) -> list[cp.Constraint]:
+    """constant[k] + sum_i slopes[i, k] x_i >= 0 for every frequency k.
+
+    constant (k, n, n) and slopes (p, k, n, n) are Hermitian in their last two axes, x is (p,). One product
+    with a constant matrix each: cvxpy compiles this much faster than block matrices of complex expressions.
+    """
+    fixed, by_x = real_form(constant), real_form(slopes)
+    size = fixed.shape[-1]
+    return [
+        cp.reshape(by_x[:, k].reshape(len(by_x), -1).T @ x + fixed[k].ravel(), (size, size), order="C") >> 0
+        for k in range(len(fixed))
+    ]
+
+
+def gain_lmi(
+    rows: Complex, row_slopes: Complex, base: Complex, base_slopes: Complex | Array
+) -> tuple[Complex, Complex]:
+    """Constant and slopes of [[base, rows*], [rows, t I]], whose last variable is t.
+
+    rows (k, p, m) with slopes (q, k, p, m); base (k, m, m) with slopes (q, k, m, m). Where base >= 0 it says
+    rows* rows <= t base.
+    """
+    q, k, p, m = row_slopes.shape
+    constant = np.zeros((k, m + p, m + p), dtype=np.complex128)
+    slopes = np.zeros((q + 1, k, m + p, m + p), dtype=np.complex128)
+    for target, top, low in ((constant, base, rows), (slopes[:q], base_slopes, row_slopes)):
+        target[..., :m, :m] = top
+        target[..., m:, :m] = low
+        target[..., :m, m:] = np.conj(np.swapaxes(low, -1, -2))
+    slopes[q, :, m:, m:] = np.eye(p)
+    return constant, slopes
+
+
+# ----------------------------------------------------------------------------------------------------
+# The least multiplier Phi of Theorem 4 for an environment with delay inside (psi >= 1), by (17).
+
+
+#: Phi is enlarged by this, relatively, so that a sweep confirms what a solver found to its own tolerance.
+ROOM = 1e-6
+
+
+def shortage(spec: Specification) -> Array | None:
+    """`least_multiplier`, verified on a refined sweep; None where psi = 0, since a passive environment needs none."""
+    if not any(spec.psi):
+        return None
+    phi = least_multiplier(spec) + ROOM * np.asarray(spec.delta)
+    short = uncovered(spec.environment, spec.psi, np.diag(phi))
+    if short > 0:
+        raise DesignFailed(None, (), f"the multiplier Phi = {phi.tolist()} leaves {short:.2e} N s/m uncovered")
+    return phi
+
+
+def least_multiplier(spec: Specification) -> Array:
+    """Diagonal Phi of least trace [N s/m], shape (N,), with E-hat + Phi passive and Phi < Delta_D.
+
+    Raises Infeasible, with the damping that would be needed, where even a full Phi is not below Delta_D.
+    """
+    regular = balanced(e_hat_regular(unit_environment(spec.environment, spec.delta), spec.psi))
+    N = spec.channels
+    full, s = cp.Variable((N, N), symmetric=True), cp.Variable()
+    _minimise(s, full, regular, [full << s * np.eye(N)])
+    least = float(solved(s))
+    if least >= 1:
+        raise Infeasible(None, (), _needs(spec, least))
+    phi = cp.Variable(N)
+    _minimise(s, cp.diag(phi), regular, [phi <= s])
+    least = float(solved(s))
+    if least >= 1:
+        raise Infeasible(None, (), _needs(spec, least))
+    # halfway between the least largest entry and Delta_D: least trace alone may touch Delta_D
+    _minimise(cast(cp.Expression, cp.sum(phi)), cp.diag(phi), regular, [phi <= (1 + least) / 2])
+    return np.maximum(solved(phi), 0.0) * np.asarray(spec.delta)
+
+
+def _minimise(objective: cp.Expression, Phi: cp.Expression, regular, constraints: list[cp.Constraint]) -> None:
+    P = cp.Variable((regular.order,) * 2, symmetric=True)
+    passive = lemma1(Ports.same(regular), P, np.zeros(Phi.shape), -Phi)
+    problem = cp.Problem(cp.Minimize(objective), [passive >> 0, P >> 0, *constraints])
+    solve(problem, "the multiplier Phi of the environment")
+
+
+def _needs(spec: Specification, least: float) -> str:
+    required = ", ".join(f"{least * d:.4g}" for d in spec.delta)
+    return (
+        f"Theorem 4 admits no coupling: with psi = {spec.psi} the environment alone uses up {required} N s/m of device "
+        f"damping and delta is {spec.delta}; use less psi, a softer environment or more device damping"
+    )
+
 
 Matrix = Any  # Array or cvxpy expression, (rows, columns)
 

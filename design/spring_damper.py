@@ -6,27 +6,401 @@ Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from typing import cast
 
 import cvxpy as cp
 import numpy as np
+from scipy.optimize import OptimizeResult, minimize
 
 from controller.coupling import SpringDamper
+from controller.delay import delay
+from controller.loop import force_map
 from controller.lti import Array
-from controller.process import force_map
-from design.condition.delayed import theorem4_delayed
-from design.failure import DesignFailed, Infeasible
-from design.gains.convex_concave import step
-from design.gains.frozen_environment import least_rms
-from design.gains.gain_set import solve_within
-from design.gains.switching_search import least_rms_switching
-from design.margin import Requirement, closed_loop, theorem4
-from design.result import Design
-from design.semidefinite.multiplier import shortage
-from design.shaping import Shaping
-from design.solve import solved
-from design.specification import Specification
+from design.conditions import (
+    Requirement,
+    any_environment,
+    any_environment_delayed,
+    half_widths,
+    jitter_proof,
+    this_environment,
+)
+from design.frequency import frequencies, hermitian, on_circle, peaks
+from design.lmi import RESERVE, Complex, Shaping, Specification, affine_lmis, gain_lmi, shortage, solve, solved
+from design.maps import nominal_over_step
+from design.result import Design, DesignFailed, Infeasible
+from design.transparency import BAND_HZ, transparency
+
+# ----------------------------------------------------------------------------------------------------
+# The exact convex set of spring-damper gains that satisfy Theorem 4, channel by channel.
+#
+# With D = (z-1)/(Tz), W = K/D + B and N = (1 - z^-n)/(2 delta), n = theta + 1, the transformed coupling (11) is V-hat
+# = 1/W - N (a number per channel), and He V-hat >= Delta_V |V-hat|^2 times |W|^2 reads, in units k = KT/delta, b =
+# B/delta and Sigma = delta/Delta_V,
+#
+#     k/2 + b >= |y|^2/4 + |1 - y/2|^2 / Sigma    on |z| = 1,    y = k (1 + ... + 1/z^theta) + b (1 - z^-n).
+#
+# y is a polynomial in 1/z, affine in (k, b), so this is one linear matrix inequality, without conservatism. psi = 0
+# needs no excess of passivity in V-hat (Sigma = inf): the last term is absent.
+#
+# Its matrix has theta + 2 rows and its solution costs their fifth power, so beyond LARGEST_GRAM samples the
+# inequality is imposed frequency by frequency - a second-order cone in the two unknowns - and where the solution
+# fails in between, there too (`solve_within`). The cones contain the set and the rounds shrink them to it: both ways
+# end at the same gains.
+
+
+LARGEST_GRAM = 12  # samples of delay
+PER_LOBE = 8  # frequencies per ripple of y at which the inequality is imposed first
+MISSED = 2e-6  # of the usable damping: what the inequality may miss in between, far less than the reserve of a design
+MOST_ROUNDS = 12
+
+
+def gain_set(k: cp.Expression, b: cp.Expression, theta: int, sigma: float) -> list[cp.Constraint]:
+    """Constraints on the scalars k and b (units above); sigma = inf where psi = 0.
+
+    Gram form: a trigonometric polynomial r - |c(z)|^2 is non-negative iff c c' <= Q for some Q >= 0 whose
+    diagonals sum to r on the main one and to zero on the others.
+    """
+    n = theta + 1
+    y = cp.hstack([k + b, *[k] * (n - 1), -b])  # coefficients of 1, 1/z, ..., z^-n
+    columns = [y / 2]
+    if np.isfinite(sigma):
+        one = np.eye(n + 1)[0]
+        columns.append((one - y / 2) / np.sqrt(sigma))
+    c = cp.vstack(columns).T
+    Q = cp.Variable((n + 1, n + 1), symmetric=True)
+    sums = [cp.trace(Q) == k / 2 + b]
+    sums += [cp.sum(cp.diag(Q, d)) == 0 for d in range(1, n + 1)]
+    constraints = [cp.bmat([[Q, c], [c.T, np.eye(len(columns))]]) >> 0, *sums, k >= 0, b >= 0]
+    return cast(list[cp.Constraint], constraints)  # cvxpy gives the type of == as bool
+
+
+def solve_within(
+    objective: cp.Minimize | cp.Maximize,
+    gains: cp.Expression,
+    theta: Sequence[int],
+    sigma: Array,
+    what: str,
+    more: Sequence[cp.Constraint] = (),
+    largest_gram: int = LARGEST_GRAM,
+) -> cp.Problem:
+    """The solved problem with every channel of gains = (k_1, ..., k_N, b_1, ..., b_N) in its set.
+
+    Raises as `solve`, and DesignFailed where an inequality still fails after all rounds.
+    """
+    N = len(theta)
+    cones = {i: first_frequencies(theta[i]) for i in range(N) if theta[i] > largest_gram}
+    for _ in range(MOST_ROUNDS):
+        problem = cp.Problem(objective, [*_constraints(gains, theta, sigma, cones), *more])
+        solve(problem, what)
+        k, b = np.split(solved(gains), 2)
+        missed = {i: missed_frequencies(k[i], b[i], theta[i], float(sigma[i])) for i in cones}
+        if not any(w.size for w in missed.values()):
+            return problem
+        cones = {i: np.union1d(w, missed[i]) for i, w in cones.items()}
+    line = f"{what}: after {MOST_ROUNDS} rounds Theorem 4 still fails between the frequencies"
+    raise DesignFailed(None, (), line)
+
+
+def _constraints(
+    gains: cp.Expression, theta: Sequence[int], sigma: Array, cones: Mapping[int, Array]
+) -> list[cp.Constraint]:
+    N, constraints = len(theta), []
+    for i in range(N):
+        k, b = gains[i], gains[N + i]
+        if i in cones:
+            constraints += gain_cones(k, b, theta[i], float(sigma[i]), cones[i])
+        else:
+            constraints += gain_set(k, b, theta[i], float(sigma[i]))
+    return constraints
+
+
+def gain_cones(k: cp.Expression, b: cp.Expression, theta: int, sigma: float, w: Array) -> list[cp.Constraint]:
+    """The inequality at the frequencies w [rad/sample]: |(2c, r - 1)| <= r + 1 says |c|^2 <= r."""
+    of_k, of_b = _polynomials(theta, w)
+    rows = [part * k + other * b for part, other in zip(_parts(of_k), _parts(of_b), strict=True)]
+    if np.isfinite(sigma):
+        rows += [(2 * (i == 0) - row) / np.sqrt(sigma) for i, row in enumerate(rows)]
+    room = (k / 2 + b) * np.ones(w.size)
+    cones = cp.SOC(room + 1, cp.vstack([*rows, room - 1]), axis=0)
+    return cast(list[cp.Constraint], [cones, k >= 0, b >= 0])
+
+
+def missed_frequencies(k: float, b: float, theta: int, sigma: float) -> Array:
+    """Peaks [rad/sample] at which the gains miss the inequality by more than MISSED."""
+
+    def excess(w: Array) -> Array:
+        of_k, of_b = _polynomials(theta, w)
+        y = k * of_k + b * of_b
+        return np.abs(y) ** 2 / 4 + np.abs(1 - y / 2) ** 2 / sigma - (k / 2 + b)
+
+    return peaks(excess, first_frequencies(2 * theta + 1), MISSED)
+
+
+def first_frequencies(theta: int) -> Array:
+    """PER_LOBE to each ripple of y, from 0 to pi [rad/sample]."""
+    return np.linspace(0, np.pi, PER_LOBE * (theta + 1) + 1)
+
+
+def _polynomials(theta: int, w: Array) -> tuple[Array, Array]:
+    """1 + ... + z^-theta and 1 - z^-n at exp(jw), complex, (w,) each."""
+    n = theta + 1
+    turned = np.exp(-1j * w * n)
+    still = np.abs(np.exp(-1j * w) - 1) < 1e-12
+    window = np.where(still, n, (1 - turned) / np.where(still, 1, 1 - np.exp(-1j * w)))
+    return window, 1 - turned
+
+
+def _parts(values: Array) -> tuple[Array, Array]:
+    return values.real, values.imag
+
+
+# ----------------------------------------------------------------------------------------------------
+# One step of the convex-concave sequence for ||W1 L W2||_inf (23) over spring-damper gains.
+#
+# With g = k + b (1 - 1/z) per channel the norm is below mu iff (W1 L g W2)* (W1 L g W2) <= mu^2 g* g on |z| = 1: L g
+# is affine in the gains, and g* g is replaced by its tangent at the gains before, which lies below it. So every step
+# keeps what the one before achieved, and mu^2 enters linearly: no bisection.
+
+
+def step(spec: Specification, sigma: Array, shaping: Shaping, at: Array, norm: float, w: Array) -> tuple[Array, float]:
+    """(gains, bound on the norm at the frequencies w) of one convex-concave step from the gains `at`."""
+    N = spec.channels
+    gains, t = cp.Variable(2 * N), cp.Variable()
+    constant, slopes = _tangent(spec, shaping, at, norm, w)
+    cuts = affine_lmis(constant, slopes, cp.hstack([gains, t]))
+    solve_within(cp.Minimize(t), gains, spec.theta, sigma, "a step of the convex sequence", cuts)
+    return solved(gains), norm * float(np.sqrt(solved(t)))
+
+
+def _tangent(spec: Specification, shaping: Shaping, at: Array, norm: float, w: Array) -> tuple[Complex, Complex]:
+    """[[g0* g + g* g0 - g0* g0, (W1 L g W2)*], [W1 L g W2, t norm^2]], scaled to order one; t is the last variable."""
+    N = spec.channels
+    left, right, late = shaping.parts(w)
+    difference = 1 - np.exp(-1j * w)
+    basis = np.eye(N)[:, None, :] * np.ones((w.size, 1))  # (N, k, N): e_i at every frequency
+    g = np.concatenate([basis, basis * difference[:, None]])  # (2N, k, N): diagonals of g by variable
+    g0 = np.tensordot(at, g, axes=1)  # (k, N)
+    scale = 1 / np.abs(g0)  # columns are divided by |g0|, rows by the norm
+    rows = (left * (spec.T / spec.usable)) @ right * scale[:, None, :] / norm
+    row_slopes = (late * g[:, :, None, :]) @ right * scale[:, None, :] / norm
+    tangent = 2 * (np.conj(g0) * g).real * scale**2
+    diagonal = np.eye(N)
+    base = -np.broadcast_to(diagonal, (w.size, N, N)).astype(np.complex128)
+    return gain_lmi(rows, row_slopes, base, tangent[..., None] * diagonal)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Spring-damper gains under the closed-loop condition, for one environment: a local search from several starts.
+#
+# The set is not convex in (K, B), so nothing here is proved best. The rms mismatch is minimised by sequential
+# quadratic programming with the condition at sampled frequencies; where the refined sweep of design.margin finds it
+# violated in between, that frequency is added and the search resumed. What is returned passes that sweep.
+
+
+#: The sampled condition keeps half as much again as the promised reserve, for what lies between the samples.
+SAMPLED_RESERVE = 1.5 * RESERVE
+SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
+CLOSEST_POLE = 1e-5  # from the unit circle
+STUCK = 1e-3  # a search that leaves the sampled condition violated by this has no feasible point nearby
+MOST_ROUNDS_FROZEN_ENVIRONMENT = 8
+
+
+class Sampled:
+    """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta), shape (2N,)."""
+
+    def __init__(self, spec: Specification) -> None:
+        self.spec = spec
+        per_hz = 2 * np.pi * spec.T
+        low, high = (per_hz * f for f in BAND_HZ)
+        self.band = frequencies(spec.environment, low=low, high=min(high, np.pi), points=80)
+        self.conditions = frequencies(spec.environment, low=1e-3, points=80)
+        self.loop_in_band, self.loop_at_conditions = self._loop(self.band), self._loop(self.conditions)
+        E = spec.environment.at(on_circle(self.band))
+        self.size2 = (np.abs(E) ** 2).sum(axis=(1, 2))
+        self.target = delay(spec.lam, spec.T).at(on_circle(self.band)) @ E
+        self.root = np.sqrt(spec.T / np.asarray(spec.delta))
+
+    def coupling(self, x: Array) -> SpringDamper:
+        log_k, b = np.split(x, 2)
+        return SpringDamper(np.exp(log_k), np.maximum(b, 0.0) * self.spec.delta)
+
+    def point(self, coupling: SpringDamper) -> Array:
+        return np.concatenate([np.log(coupling.K), coupling.B / self.spec.delta])
+
+    def add(self, w: float) -> None:
+        """Impose the condition at the frequency w [rad/sample] too."""
+        self.conditions = np.append(self.conditions, w)
+        self.loop_at_conditions = self._loop(self.conditions)
+
+    def _loop(self, w: Array) -> tuple[Complex, Complex, Complex]:
+        """(z-1)/(Tz), Psi E and Theta at exp(jw)."""
+        spec, z = self.spec, on_circle(w)
+        return (z - 1) / (spec.T * z), spec.delayed_environment.at(z), delay(spec.theta, spec.T).at(z)
+
+    def force(self, x: Array, loop: tuple[Complex, Complex, Complex]) -> Complex:
+        """F = Theta G (G + Psi E)^-1 Psi E with G = V^-1, (k, N, N)."""
+        D, E, theta = loop
+        log_k, b = np.split(x, 2)
+        G = (np.exp(log_k) + D[:, None] * (b * self.spec.delta))[:, :, None] * np.eye(self.spec.channels)
+        return theta @ G @ np.linalg.solve(G + E, E)
+
+    def square_mismatch(self, x: Array) -> float:
+        """Logarithm of the mean over log frequency of ||M||_F^2 / ||E||_F^2."""
+        M = self.force(x, self.loop_in_band) - self.target
+        ratio = (np.abs(M) ** 2).sum(axis=(1, 2)) / self.size2
+        log_w = np.log(self.band)
+        return float(np.log(np.trapezoid(ratio, log_w) / (log_w[-1] - log_w[0])))
+
+    def room(self, x: Array) -> Array:
+        """1 - SAMPLED_RESERVE less the damping ratio that each sampled frequency asks for; (k,), or (k + 1,).
+
+        Delay in the environment can make the loop unstable where the sampled condition still holds, so there the
+        distance of its poles from the circle is the last entry.
+        """
+        ratio = self.force(x, self.loop_at_conditions) / (on_circle(self.conditions) - 1)[:, None, None]
+        need = -hermitian(self.root[:, None] * ratio * self.root)
+        room = 1 - SAMPLED_RESERVE - np.linalg.eigvalsh(need)[:, -1]
+        return np.append(room, self.stability(x)) if any(self.spec.psi) else room
+
+    def stability(self, x: Array) -> float:
+        """By how much more than CLOSEST_POLE the poles keep away from the circle."""
+        F = force_map(self.spec.environment, self.coupling(x), self.spec.theta, self.spec.psi)
+        return float(1 - CLOSEST_POLE - np.abs(F.poles()).max(initial=0.0))
+
+    def search(self, x: Array) -> OptimizeResult:
+        return self.minimised(x, [])
+
+    def minimised(self, x: Array, more: list[tuple[float, float]]) -> OptimizeResult:
+        """The local optimum from x; `more` bounds the unknowns behind the gains."""
+        N = self.spec.channels
+        bounds = [(np.log(SOFTEST), np.log(STIFFEST))] * N + [(0.0, 20.0)] * N + more
+        condition = {"type": "ineq", "fun": self.room}
+        options = {"maxiter": 100, "ftol": 1e-7}
+        return minimize(self.square_mismatch, x, method="SLSQP", bounds=bounds, constraints=condition, options=options)
+
+
+Optimum = Callable[[SpringDamper], tuple[SpringDamper | None, int]]  # start -> (gains or None, searches)
+
+
+def least_rms(
+    spec: Specification, starts: Iterable[SpringDamper], optimum: Optimum | None = None
+) -> tuple[SpringDamper | None, float, int]:
+    """(gains, rms mismatch as a ratio, searches) of the best local optimum; gains None if none was found.
+
+    `optimum` searches from one start; the default finds what closed-loop certifies.
+    """
+    optimum = optimum or partial(_certified_optimum, spec)
+    best, least, searches = None, np.inf, 0
+    for start in starts:
+        coupling, runs = optimum(start)
+        searches += runs
+        if coupling is None:
+            continue
+        F = force_map(spec.environment, coupling, spec.theta, spec.psi)
+        rms = transparency(F, spec.environment, spec.lam).rms_mismatch
+        if rms < least:
+            best, least = coupling, rms
+    return best, least, searches
+
+
+def _certified_optimum(spec: Specification, start: SpringDamper) -> tuple[SpringDamper | None, int]:
+    """(a local optimum that passes the refined sweep or None, searches), adding the frequencies where one fails."""
+    sampled = Sampled(spec)
+    x = sampled.point(start)
+    for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
+        x = sampled.search(x).x
+        coupling = sampled.coupling(x)
+        requirement = this_environment(force_map(spec.environment, coupling, spec.theta, spec.psi), spec.delta)
+        if requirement.ratio <= 1 - RESERVE:
+            return coupling, searches
+        stuck = sampled.room(x).min() < -STUCK
+        if stuck or requirement.frequency_hz is None:  # None: unstable, so there is no frequency to add
+            return None, searches
+        binding = 2 * np.pi * spec.T * requirement.frequency_hz
+        sampled.add(max(binding, 1e-6))
+    return None, MOST_ROUNDS_FROZEN_ENVIRONMENT
+
+
+# ----------------------------------------------------------------------------------------------------
+# Spring-damper gains that are safe under any switching of their delays: a local search as in frozen_environment.py.
+#
+# Its sampled condition is that of design.jitter.condition: the multiplier is searched together with the gains. What
+# is returned passes that module's own sweep, which knows nothing of the multiplier found here.
+
+
+FIRST = 0.5  # the multiplier alpha T/delta that a search begins with where the start has none
+MULTIPLIERS = (1e-4, 10.0)  # ... and its bounds
+
+
+class SwitchingSampled(Sampled):
+    """As Sampled, with x = (log K, B/delta, log alpha T/delta of the channels whose delay varies)."""
+
+    def __init__(self, spec: Specification, lo: Sequence[int], hi: Sequence[int]) -> None:
+        self.range, self.h = (lo, hi), half_widths(lo, hi)
+        self.active = np.flatnonzero(self.h)
+        super().__init__(spec)
+
+    def coupling(self, x: Array) -> SpringDamper:
+        return super().coupling(self._gains(x))
+
+    def point(self, coupling: SpringDamper) -> Array:
+        """The gains with their best multiplier."""
+        spec = self.spec
+        found = jitter_proof(
+            force_map(spec.environment, coupling, (0,) * spec.channels, spec.psi), *self.range, spec.delta
+        )
+        a = np.array(found.alpha)[self.active] * spec.T / np.array(spec.delta)[self.active]
+        a = np.clip(np.where(np.isfinite(a), a, FIRST), *MULTIPLIERS)
+        return np.concatenate([super().point(coupling), np.log(a)])
+
+    def force(self, x: Array, loop: tuple[Complex, Complex, Complex]) -> Complex:
+        return super().force(self._gains(x), loop)
+
+    def room(self, x: Array) -> Array:
+        """1 - SAMPLED_RESERVE less the damping ratio at each sampled frequency, with the multiplier in x."""
+        a = np.exp(x[2 * self.spec.channels :])
+        D, E, _ = self.loop_at_conditions
+        now = np.broadcast_to(np.eye(self.spec.channels, dtype=complex), E.shape)
+        G = self.root[:, None] * self.force(x, (D, E, now)) * self.root
+        nominal = nominal_over_step(on_circle(self.conditions), *self.range)[:, :, None] * G
+        error = (self.h[:, None] * G)[:, self.active]
+        diagonal = np.zeros(self.h.size)
+        diagonal[self.active] = a / 2
+        need = np.diag(diagonal) - hermitian(nominal) + np.conj(np.swapaxes(error, 1, 2)) @ (error / (2 * a[:, None]))
+        room = (1 - SAMPLED_RESERVE - np.linalg.eigvalsh(need)[:, -1]).astype(float)
+        return np.append(room, self.stability(x)) if any(self.spec.psi) else room
+
+    def search(self, x: Array) -> OptimizeResult:
+        return self.minimised(x, [(np.log(MULTIPLIERS[0]), np.log(MULTIPLIERS[1]))] * self.active.size)
+
+    def _gains(self, x: Array) -> Array:
+        return x[: 2 * self.spec.channels]
+
+
+def least_rms_switching(
+    spec: Specification, lo: Sequence[int], hi: Sequence[int], starts: Iterable[SpringDamper]
+) -> tuple[SpringDamper | None, float, int]:
+    """(gains, rms mismatch as a ratio, searches) of the best local optimum that is safe under any switching."""
+    return least_rms(spec, starts, lambda start: _safe_optimum(SwitchingSampled(spec, lo, hi), start))
+
+
+def _safe_optimum(sampled: SwitchingSampled, start: SpringDamper) -> tuple[SpringDamper | None, int]:
+    """(a local optimum that passes the refined sweep or None, searches)."""
+    spec, x = sampled.spec, sampled.point(start)
+    for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
+        x = sampled.search(x).x
+        coupling = sampled.coupling(x)
+        G = force_map(spec.environment, coupling, (0,) * spec.channels, spec.psi)
+        requirement = jitter_proof(G, *sampled.range, spec.delta).requirement
+        if requirement.ratio <= 1 - RESERVE:
+            return coupling, searches
+        if sampled.room(x).min() < -STUCK or requirement.frequency_hz is None:
+            return None, searches
+        sampled.add(max(2 * np.pi * spec.T * requirement.frequency_hz, 1e-6))
+    return None, MOST_ROUNDS_FROZEN_ENVIRONMENT
+
 
 #: The sequence stops when a step improves the norm by less than this, relatively.
 SETTLED = 1e-6
@@ -43,8 +417,8 @@ def design(
 ) -> Design:
     """The best spring-damper under `condition`; by default the starts are chosen, a start need not be feasible.
 
-    theorem4: minimises ||W1 L W2||_inf (23) over the exact set; the result does not depend on the start (the first
-    one is used). closed-loop: minimises the rms mismatch in this environment from every start, local optima only; with
+    any-environment: minimises ||W1 L W2||_inf (23) over the exact set; the result does not depend on the start.
+    closed-loop: minimises the rms mismatch in this environment from every start, local optima only; with
     `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it (design.jitter).
     Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for closed-loop.
     """
@@ -54,7 +428,7 @@ def design(
         return _for_this_environment(spec, starts, switching)
     if switching:
         raise ValueError("delays that vary are designed for by the closed-loop condition only")
-    raise ValueError(f"condition is {condition!r}, expected 'theorem4' or 'closed-loop'")
+    raise ValueError(f"condition is {condition!r}, expected 'any_environment' or 'closed-loop'")
 
 
 def _for_any_environment(spec: Specification, start: SpringDamper | None) -> Design:
@@ -94,7 +468,7 @@ def _for_this_environment(
         raise DesignFailed(None, (), line)
     coupling = SpringDamper(coupling.K, np.where(NEGLIGIBLE * spec.usable > coupling.B, 0.0, coupling.B))
     F = force_map(spec.environment, coupling, spec.theta, spec.psi)
-    requirement = closed_loop(F, spec.delta)
+    requirement = this_environment(F, spec.delta)
     return Design(coupling, "closed-loop", "rms", rms, requirement, searches, time.perf_counter() - started)
 
 
@@ -128,13 +502,15 @@ def verified(spec: Specification, coupling: SpringDamper, phi: Array | None) -> 
     """Theorem 4's requirement from the coupling alone; raises DesignFailed unless it is certified."""
     V = coupling.compliance(spec.T)
     requirement = (
-        theorem4(V, spec.theta, spec.delta)
+        any_environment(V, spec.theta, spec.delta)
         if phi is None
-        else theorem4_delayed(V, spec.environment, spec.theta, spec.psi, spec.delta, phi)
+        else any_environment_delayed(V, spec.environment, spec.theta, spec.psi, spec.delta, phi)
     )
     if not requirement.certified:
         why = requirement.reason or f"it requires {max(requirement.required):.6g} N s/m"
-        raise DesignFailed(None, (), f"the designed coupling is not certified by theorem4: {why}; try another start")
+        raise DesignFailed(
+            None, (), f"the designed coupling is not certified by any_environment: {why}; try another start"
+        )
     return requirement
 
 

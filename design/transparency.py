@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from controller.delay import delay
 from controller.lti import Array, Lti
-from design.frequency.quadrature import integral
-from design.frequency.sweep import frequencies, on_circle, supremum
+from design.frequency import frequencies, integral, on_circle, supremum
 
 BAND_HZ = (0.5, 80.0)
 ROUNDING = 1e-10  # of the environment: two responses that differ by less are one

@@ -10,8 +10,6 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-import sim  # noqa: F401 - at once, for Ctrl-C while a command of this package starts
-
 if TYPE_CHECKING:
     from hw.rehearsal import Rehearsed, rehearse
 

@@ -2,6 +2,6 @@
 
 if __name__ == "__main__":
     from cli.bridge import main
-    from sim.command import execute
+    from cli.options import execute
 
     execute(main)

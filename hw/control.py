@@ -15,15 +15,14 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from cli.run import coupling_part
 from controller.coupling import Coupling
 from controller.environment import environment
+from controller.loop import force_map
 from controller.lti import Array, Lti
-from controller.process import force_map
-from design.assess import assess
-from design.failure import DesignFailed
-from design.margin import Requirement
-from design.promises import certificate_part, promise_of
-from design.summary import coupling_part
+from design.certificate import assess, certificate_part, promise_of
+from design.conditions import Requirement
+from design.result import DesignFailed
 from hw.limits import Fault, Gain, Heat, Limits, Units, check_jolt, check_jump, check_range, check_speed, shape
 from hw.monitor import Ages, ClockMonitor, CommandMonitor, Counters, EncoderMonitor, EncoderTest, Settings
 from hw.protocol import MAX_THETA, Config, State

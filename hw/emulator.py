@@ -34,11 +34,10 @@ import numpy as np
 from controller.lti import Array
 from hw.device import RUNNING, Device
 from hw.protocol import PROTOCOL, Force, Info, Phase, distance
+from models.device import require
 from models.human import Human, Link
-from models.quantity import require
 from models.scene import build, plant
-from sim.engine import outside_forces
-from sim.exact_engine import hold
+from sim.engines import hold, outside_forces
 from sim.scenario import InputError, Scenario
 
 _FOREVER = 1e9  # [s]
@@ -510,6 +509,6 @@ def spawned(options: Sequence[str]) -> Iterator[str]:
 
 if __name__ == "__main__":
     from cli.emulator import main
-    from sim.command import execute
+    from cli.options import execute
 
     execute(main)

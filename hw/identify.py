@@ -542,6 +542,6 @@ def estimate(
 
 if __name__ == "__main__":
     from cli.identify import main
-    from sim.command import execute
+    from cli.options import execute
 
     execute(main)

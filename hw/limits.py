@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from hw.protocol import MAX_RELEASE_NS, MAX_THETA, PROTOCOL, Config, Force, Info, State, wire_bytes
-from models.quantity import require
+from models.device import require
 from sim.scenario import Scenario
 
 _BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit

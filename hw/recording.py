@@ -21,17 +21,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.coupling import Form
 from controller.lti import Array
-from design.store import CouplingData, data_of
 from hw.control import CertifiedCoupling, LinearController, Program, Row, host_controller
 from hw.limits import Fault, Limits, Units, shape
 from hw.protocol import NO_MARGIN, Config
 from hw.session import Session
-from models.quantity import require
+from models.device import require
 from sim.files import write, write_json
-from sim.growth import growths
-from sim.result import DAMAGED, Result
 from sim.scenario import InputError, Scenario
+from sim.trace import DAMAGED, Result, growths
 
 #: what the link adds, one entry per tick: name -> axes of the array
 _LINK = {"tick": 1, "arming": 1, "received": 1, "asked": 2, "gain": 1, "sent": 2, "margin_us": 1, "status": 1}
@@ -289,7 +288,7 @@ def save(out: Path, session: Session, recorder: Recorder, report: dict[str, Any]
         result = result_of(recorder, session.units, session.scenario.T, report | {"replay": replay})
         files += [save_npz(out / "trace.npz", result, recorder), result.save_csv(out / "trace.csv")]
         if plot:
-            from sim.plot import plot_run
+            from sim.plots import plot_run
 
             title = f"{report['scenario']}, case {report['case']}: a session that ended {session.stage}"
             files.append(plot_run(result, out / "figure.png", title, 10.0))
@@ -303,7 +302,7 @@ def _recipe_of(session: Session, program: Program, config: Config) -> dict[str, 
     assert isinstance(program, CertifiedCoupling)
     return {
         "scenario": json.loads(msgspec.json.encode(program.scenario)),
-        "coupling": json.loads(msgspec.json.encode(data_of(program.chosen.coupling))),
+        "coupling": json.loads(msgspec.json.encode(program.chosen.coupling.form())),
         "link_delay": program.link,
         "limits": asdict(session.limits),
         "force_step": list(session.units.force_step),
@@ -318,7 +317,7 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a trace says of the controller that made it."""
 
     scenario: Scenario
-    coupling: CouplingData
+    coupling: Form
     link_delay: int
     limits: Limits
     force_step: tuple[float, ...]

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cli.options import require_constant_delay, require_linear
 from controller.coupling import Coupling
 from controller.lti import Array
-from design.argument import COUPLING, bare, number, of_kind, whole
-from design.margin import Requirement
-from design.promises import promise_of
-from design.result import Design
+from design.certificate import promise_of
+from design.conditions import Requirement
+from design.result import COUPLING, Design, bare, number, of_kind, whole
 from hw.control import CertifiedCoupling, Program, certified_coupling, certified_couplings, link_delay
 from hw.emulator import Emulator, FaultInjection, Line
 from hw.limits import ENDED, Fault, Stage
@@ -26,9 +26,8 @@ from hw.monitor import Ages, Settings
 from hw.protocol import Phase
 from hw.recording import Recorder, result_of
 from hw.session import Operator, Session, session_for
-from sim.command import require_constant_delay, require_linear
-from sim.result import Result
 from sim.scenario import InputError, Scenario
+from sim.trace import Result
 
 _MEASURE = 200  # answers that are timed: virtual time does not scatter
 _QUANTILE, _GUARD_US = 0.99, 100.0  # of the ages that the delay covers, and what is added [us]; as hw.bridge has it

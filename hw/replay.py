@@ -1,7 +1,7 @@
 """python -m hw.replay: a recorded session through the controller again, bit by bit; the command is cli/replay.py."""
 
 if __name__ == "__main__":
+    from cli.options import execute
     from cli.replay import main
-    from sim.command import execute
 
     execute(main)

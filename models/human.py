@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from models.quantity import require
+from models.device import require
 
 Array = NDArray[np.floating[Any]]
 Range = tuple[float, float]

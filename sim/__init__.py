@@ -15,22 +15,18 @@ it does not need.
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from sim.graphics import set_aside
-from sim.interrupt import while_starting
 
 if TYPE_CHECKING:
     from sim.api import simulate, validate
-    from sim.plot import plot_run
-    from sim.result import Result
+    from sim.crowds import Findings
+    from sim.plots import plot_run
     from sim.scenario import InputError, Scenario, load, parse
-    from sim.validate.examine import Findings
+    from sim.trace import Result
 
-while_starting()
 set_aside()
 
 __all__ = ["Findings", "InputError", "Result", "Scenario", "load", "parse", "plot_run", "simulate", "validate"]
@@ -38,29 +34,18 @@ __all__ = ["Findings", "InputError", "Result", "Scenario", "load", "parse", "plo
 _HOMES = {
     "simulate": "sim.api",
     "validate": "sim.api",
-    "Findings": "sim.validate.examine",
-    "plot_run": "sim.plot",
-    "Result": "sim.result",
+    "Findings": "sim.crowds",
+    "plot_run": "sim.plots",
+    "Result": "sim.trace",
 }
 
 
-class _Package(ModuleType):
-    """`sim.simulate` and `sim.validate` are files too, and importing a file would put it in the function's place."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in __all__ and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-    def __getattr__(self, name: str) -> Any:
-        if name not in __all__:
-            raise AttributeError(f"module 'sim' has no attribute {name!r}")
-        value = getattr(import_module(_HOMES.get(name, "sim.scenario")), name)
-        setattr(self, name, value)
-        return value
-
-    def __dir__(self) -> list[str]:
-        """For help() and completion: what is for scripts, and what every package has."""
-        return [*__all__, *(name for name in vars(self) if name.startswith("__"))]
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'sim' has no attribute {name!r}")
+    return getattr(import_module(_HOMES.get(name, "sim.scenario")), name)
 
 
-sys.modules[__name__].__class__ = _Package
+def __dir__() -> list[str]:
+    """For help() and completion: what is for scripts, and what every package has."""
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]

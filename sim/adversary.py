@@ -22,14 +22,14 @@ from scipy.optimize import OptimizeResult, differential_evolution
 
 from controller.coupling import Coupling
 from controller.environment import environment
+from controller.loop import force_map
 from controller.lti import Array, Lti
-from controller.process import force_map
-from design.margin import closed_loop
-from models.crowd import Crowd, variants
+from design.conditions import this_environment
 from models.human import Human, Person
-from sim.loop import Progress
+from models.scene import Crowd, variants
+from sim.run import Progress
 from sim.scenario import Scenario
-from sim.verdicts import dominant_modes, exact_loops
+from sim.stability import dominant_modes, exact_loops
 
 MASS, STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
 DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9
@@ -125,14 +125,14 @@ def attempts(
     generations: int = 150,
     attempted: Callable[[Attempt], None] = lambda attempt: None,
 ) -> list[Attempt]:
-    """Attack every loop at every shortage: devices get (1 - short) times the damping that `closed_loop` requires.
+    """Attack every loop at every shortage: devices get (1 - short) times the damping that `this_environment` requires.
 
     A negative shortage gives the devices more than required: there the search must fail. `attempted` hears of each.
     """
     rows = []
     for name, (scenario, coupling) in loops.items():
         F = force_map(environment(scenario.environment, scenario.T), coupling, scenario.theta, scenario.psi)
-        required = np.array(closed_loop(F, scenario.delta).required)
+        required = np.array(this_environment(F, scenario.delta).required)
         for short in shortages:
             placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
             rows.append(Attempt(name, float(short), search(placed, F, seed, generations=generations, first=True)))

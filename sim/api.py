@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
+from cli import run as report
+from cli.options import require_linear
 from controller.coupling import Coupling, NoCoupling
-from design.argument import COUPLING, bare, number, of_kind, one_of, whole
-from design.result import Design
-from sim import report
-from sim.command import require_linear
-from sim.loop import Progress
-from sim.mujoco_engine import INTEGRATORS, LEAPFROG
-from sim.result import Result
+from design.result import COUPLING, Design, bare, number, of_kind, one_of, whole
+from sim.crowds import ENGINES, Findings, Question
+from sim.crowds import validate as examine_all
+from sim.engines import INTEGRATORS, LEAPFROG
+from sim.run import ENGINES as ALONE
+from sim.run import Progress, assemble
+from sim.run import simulate as close_loop
 from sim.scenario import InputError, Scenario
-from sim.simulate import ENGINES as ALONE
-from sim.simulate import assemble
-from sim.simulate import simulate as close_loop
-from sim.substeps import LEAST, MOST, check_substeps, default_substeps
-from sim.switching.drawn import switching
-from sim.validate.examine import ENGINES, Findings, Question
-from sim.validate.shards import validate as examine_all
+from sim.stability import LEAST, MOST, check_substeps, default_substeps
+from sim.switching import switching
+from sim.trace import Result
 
 MOST_HUMANS = 1_000_000
 SCENARIO = 'a Scenario, as load("omega-pair") gives it'

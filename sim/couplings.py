@@ -5,15 +5,73 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.coupling import Coupling, NoCoupling
+from controller.coupling import Compliance, Coupling, InternalModel, NoCoupling
+from controller.loop import DelayRange, Loop
 from controller.lti import Array
-from design.assess import specification
-from design.designs import KINDS, design_coupling
-from design.failure import DesignFailed
-from design.published import PUBLISHED
-from design.store import DelayRange
+from design import certificate as store
+from design.certificate import Stored, switching_promise, verify
+from design.designs import KINDS, design_by_kind
+from design.result import PUBLISHED, DesignFailed
 from sim.scenario import InputError, Scenario
-from sim.stored import fitted, read_coupling, standing
+
+# ----------------------------------------------------------------------------------------------------
+# Stored couplings as a command meets them: read, fitted to its loop, and doubted.
+
+
+def read_coupling(path: str | Path) -> Stored:
+    """A stored coupling. Raises InputError where there is none that can be read."""
+    try:
+        return store.load(path)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from None
+    except store.BadFile as error:
+        raise InputError(str(error)) from None
+
+
+def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
+    """The stored coupling in a loop of so many channels at T [s]. Raises InputError where it cannot stand there."""
+    if len(stored.loop.delta) != channels:
+        raise InputError(f"{path} couples {len(stored.loop.delta)} channels, the loop has {channels}")
+    coupling = stored.coupling.build(T)
+    if isinstance(coupling, Compliance | InternalModel) and stored.loop.T != T:
+        raise InputError(f"{path}: its coefficients are for T = {stored.loop.T:g} s, the loop has {T:g} s")
+    return coupling
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What a coupling's file is worth in a loop."""
+
+    notes: tuple[str, ...]  # what a reader should know of it
+    switching: DelayRange | None = None  # the file proves that any switching of the delays within it is safe here
+
+
+def standing(stored: Stored, loop: Loop) -> Standing:
+    """Whether the certificate on file holds, and what it says of the coupling in this loop."""
+    try:
+        reason = verify(stored).reason if stored.certificate else None
+    except (ValueError, ArithmeticError) as error:
+        reason = str(error)
+    notes = [f"the certificate in the coupling's file does not hold: {reason}"] if reason else []
+    delays = ("theta", "jitter", "lam")  # lam matters to transparency only
+    differ = [n for n in loop.__struct_fields__ if n not in delays and getattr(loop, n) != getattr(stored.loop, n)]
+    proved = stored.certificate is not None and not reason and not differ
+    switching = stored.loop.jitter if proved else None
+    if switching and switching.contains(loop.jitter or DelayRange(loop.theta, loop.theta)):
+        if loop.theta != stored.loop.theta or loop.jitter not in (None, switching):
+            here = switching_promise(loop.jitter) if loop.jitter else f"the constant theta = {list(loop.theta)}"
+            notes.append(f"the file proves {switching_promise(switching)}, which covers {here}")
+        return Standing(tuple(notes), switching)
+    differ += ["theta"] if loop.theta != stored.loop.theta else []
+    if loop.jitter and proved:
+        made_for = switching_promise(switching) if switching else "constant delays"
+        notes.append(f"the file proves {made_for}: {switching_promise(loop.jitter)} are judged anew here")
+    if differ:
+        notes.append(
+            f"the coupling was stored for another loop (different {', '.join(differ)}), and is judged anew here"
+        )
+    return Standing(tuple(notes), switching)
+
 
 NAMES = ("none", "published", *KINDS)
 
@@ -46,7 +104,7 @@ def choose(scenario: Scenario, case: str, name: str | None = None, condition: st
         return _published(scenario, case, condition)
     if name in KINDS:
         try:
-            design = design_coupling(specification(scenario.loop(case)), name, condition)
+            design = design_by_kind(scenario.loop(case), name, condition)
         except DesignFailed:
             raise
         except ValueError as error:

@@ -15,7 +15,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from sim.scenario import InputError
+
+class InputError(ValueError):
+    """Something that the user gave and can put right: one line, naming the field."""
 
 
 def check_file(option: str, path: Path, expected: str = "a file") -> Path:

@@ -6,18 +6,24 @@ MuJoCo looks at it when it is imported, and cannot be imported where what it nam
 from __future__ import annotations
 
 import os
-
-from sim.interrupt import starting
+import sys
 
 OURS = "HAPTIC_LOOP_GL"  # the same, for us and the processes that we start
 
 
 def set_aside() -> None:
     """In a command of ours, before MuJoCo is imported; a script's own MuJoCo keeps what it was given."""
-    if starting() and "MUJOCO_GL" in os.environ:
+    if _command_starts() and "MUJOCO_GL" in os.environ:
         os.environ[OURS] = os.environ.pop("MUJOCO_GL")
 
 
 def asked() -> str:
     """What the user has asked for, in lower case; empty where nothing."""
     return (os.environ.get(OURS) or os.environ.get("MUJOCO_GL") or "").lower().strip()
+
+
+def _command_starts() -> bool:
+    """Whether this process is one of our commands that Python is still looking for."""
+    words = sys.orig_argv
+    module = words[words.index("-m") + 1] if "-m" in words[:-1] else ""
+    return sys.argv[:1] == ["-m"] and module.split(".")[0] in ("design", "sim", "hw")

@@ -1,4 +1,4 @@
-"""What a run is made of, read strictly from TOML: an unknown key or an impossible number never passes."""
+"""Humans as a TOML file, one [[human]] per channel: how a human that was found is kept and replayed."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ from typing import Any, Self, get_args
 import msgspec
 import numpy as np
 
-from controller.box import Box, UncertainSpring
-from controller.environment import Network, Spring, Wall, environment
-from controller.jitter import Jitter
-from design.store import DelayRange, Loop
-from models.device import MOST_DAMPING, Device, passivity_level, with_damping
+from controller.delay import Jitter
+from controller.environment import Box, Network, Spring, UncertainSpring, Wall, environment
+from controller.loop import DelayRange, Loop
+from models.device import MOST_DAMPING, Device, passivity_level, require, with_damping
 from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
-from models.quantity import require
+from sim.files import InputError, write
+
+# ----------------------------------------------------------------------------------------------------
+# What a run is made of, read strictly from TOML: an unknown key or an impossible number never passes.
+
 
 CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"
@@ -27,10 +30,6 @@ DEFAULT = "omega-pair"
 
 LONGEST_DELAY = 1000  # [samples]; every one is a state
 Delays = tuple[int, ...]
-
-
-class InputError(ValueError):
-    """Something that the user gave and can put right: one line, naming the field."""
 
 
 class Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -104,12 +103,6 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def channels(self) -> int:
         return len(self.environment.contacts)
-
-    @property
-    def holders(self) -> tuple[int, ...]:
-        """Who holds each device, (m,): a number per human, one for all devices of the same person."""
-        owner = {channel: p for p, person in enumerate(self.person) for channel in person.holds}
-        return tuple(owner.get(i, len(self.person) + i) for i in range(1, self.channels + 1))
 
     @property
     def switches(self) -> bool:
@@ -279,3 +272,54 @@ _STRUCTS = (
     Scenario, Tap, Jitter, Human, Link, Voluntary, Person, Cross, Population, Network, Spring, Wall, Box,
     UncertainSpring, *get_args(Device)
 )  # fmt: skip
+
+
+class HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole file."""
+
+    human: tuple[Human, ...]
+    person: tuple[Person, ...] = ()
+
+
+def load_humans(path: str | Path, channels: int) -> HumanFile:
+    """The humans of a file, one per channel, and who holds several devices.
+
+    Raises InputError with one line that names the file and the field.
+    """
+    try:
+        people = msgspec.convert(tomllib.loads(Path(path).read_text(encoding="utf-8")), HumanFile)
+    except OSError as error:
+        raise InputError(f"--human {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"--human {path}: not a text file in UTF-8") from None
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"--human {path}: not valid TOML: {error}") from None
+    except msgspec.ValidationError as error:
+        raise InputError(f"--human {path}: {error}") from None
+    if len(people.human) != channels:
+        raise InputError(
+            f"--human {path} has {len(people.human)} [[human]] tables, expected {channels} (one per channel)"
+        )
+    try:
+        check_holds(people.person, channels)
+    except ValueError as error:
+        raise InputError(f"--human {path}: {error}") from None
+    return people
+
+
+def save_humans(path: Path, humans: tuple[Human, ...], remark: str, persons: tuple[Person, ...] = ()) -> Path:
+    """Write humans and persons without voluntary motion so that reading gives the same numbers.
+
+    `remark` becomes a comment.
+    """
+    lines = [f"# {line}" for line in remark.splitlines()]
+    for human in humans:
+        rows = (
+            f"    {{ mass = {x.mass!r}, damping = {x.damping!r}, stiffness = {x.stiffness!r} }}," for x in human.links
+        )
+        lines += ["", "[[human]]", "links = [", *rows, "]"]
+    for person in persons:
+        body = [f"{name} = {getattr(person, name)!r}" for name in ("mass", "damping", "stiffness")]
+        cross = f"cross = {{ damping = {person.cross.damping!r}, stiffness = {person.cross.stiffness!r} }}"
+        lines += ["", "[[person]]", f"holds = {list(person.holds)}", *body, cross]
+    return write(path, "\n".join(lines) + "\n")

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from controller.lti import Array
 from models.scene import Plant, Scene, plant
-from sim.exact_engine import HeldPlant, hold
+from sim.engines import HeldPlant, hold
 
 STIFFNESS, DAMPING = 200.0, 3.0  # [N/m], [N s/m]: as firm as the hands of the default scenario
 

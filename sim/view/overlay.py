@@ -6,7 +6,7 @@ import textwrap
 
 import numpy as np
 
-from design.margin import Requirement
+from design.conditions import Requirement
 from sim.view.events import GIVEN, KEYS, Couple, words
 from sim.view.session import HISTORY, Frame
 

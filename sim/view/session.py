@@ -16,9 +16,8 @@ import numpy as np
 
 from controller.lti import Array, Lti
 from controller.process import Tape
-from sim.engine import outside_forces
-from sim.exact_engine import ExactEngine
-from sim.loop import stretch
+from sim.engines import ExactEngine, outside_forces
+from sim.run import stretch
 from sim.view.events import Couple, Delay, Event, Push, Restart, Script, words
 from sim.view.grip import Grip, gripped
 from sim.view.pace import LONGEST_LAG, Pace

@@ -6,16 +6,14 @@ from dataclasses import dataclass
 
 from controller.coupling import Coupling
 from controller.lti import SingularLoop
-from design.assess import assess
+from design.certificate import assess, promise_of
+from design.conditions import Requirement
 from design.designs import KINDS
-from design.failure import DesignFailed
-from design.margin import Requirement
-from design.promises import promise_of
+from design.result import DesignFailed
 from sim.couplings import Chosen, choose
-from sim.one_period import worst_mode
+from sim.run import Assembly, assemble
 from sim.scenario import LONGEST_DELAY, InputError, Scenario
-from sim.simulate import Assembly, assemble
-from sim.stability import Mode
+from sim.stability import Mode, worst_mode
 from sim.view.events import COUPLINGS, GIVEN, Couple, Delay
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.console import Console
 
-from design.promises import certificate_part, finite
+from design.certificate import certificate_part, finite
 from sim.view.session import Session
 from sim.view.setting import Setting
 

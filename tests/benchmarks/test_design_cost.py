@@ -8,15 +8,14 @@ from time import perf_counter
 import pytest
 
 from controller.environment import environment
-from controller.process import force_map
-from design import ccl, optimal, spring_damper
-from design.assess import assess, specification
-from design.audit.report import report
-from design.audit.subject import Subject
-from design.certificate import prove, verify
-from design.parameter.wish import Wish
-from design.published import CASE_I
-from design.store import Stored, data_of
+from controller.loop import force_map
+from design import fixed_order as ccl
+from design import optimal, spring_damper
+from design.audit import Subject, report
+from design.certificate import Stored, assess, prove, verify
+from design.lmi import Specification
+from design.optimal import Wish
+from design.result import CASE_I
 from design.transparency import decibels, transparency
 from sim.scenario import load
 
@@ -30,7 +29,7 @@ WISHES = {
 
 
 def test_spring_damper(benchmark):
-    design = benchmark.pedantic(lambda: spring_damper.design(specification(LOOP)), rounds=5, warmup_rounds=1)
+    design = benchmark.pedantic(lambda: spring_damper.design(Specification.of(LOOP)), rounds=5, warmup_rounds=1)
     need, seconds = design.requirement.ratio, benchmark.stats.stats.median
     work = f"{design.sdps} convex problems, {seconds:.2f} s"
     print(f"\ncase I, spring-damper, theorem4: norm {design.objective:.4f} in {work}; needs {need:.6f} delta")
@@ -38,7 +37,7 @@ def test_spring_damper(benchmark):
 
 
 def test_inner_convex_approximation(benchmark):
-    design = benchmark.pedantic(lambda: ccl.design(specification(LOOP)), rounds=1)
+    design = benchmark.pedantic(lambda: ccl.design(Specification.of(LOOP)), rounds=1)
     print(f"\nccl, order one per channel: norm {design.objective:.4f} in {design.sdps} SDPs")
     assert design.objective < 9.8
 
@@ -48,9 +47,9 @@ def test_inner_convex_approximation(benchmark):
 def test_optimal(benchmark, case, name):
     """The proof is timed beside it, once."""
     loop = load().loop(case)
-    design = benchmark.pedantic(lambda: optimal.design(specification(loop), WISHES[name]), rounds=3, warmup_rounds=1)
+    design = benchmark.pedantic(lambda: optimal.design(Specification.of(loop), WISHES[name]), rounds=3, warmup_rounds=1)
     begin = perf_counter()
-    proof = prove(loop, data_of(design.coupling), "closed-loop").proof
+    proof = prove(loop, design.coupling, "closed-loop").proof
     proving = perf_counter() - begin
     E = environment(loop.environment, loop.T)
     found = transparency(force_map(E, design.coupling, loop.theta, loop.psi), E, loop.lam)
@@ -61,15 +60,15 @@ def test_optimal(benchmark, case, name):
 
 
 def test_both_margins_and_their_proofs(benchmark):
-    coupling = spring_damper.design(specification(LOOP)).coupling
+    coupling = spring_damper.design(Specification.of(LOOP)).coupling
     requirements = benchmark.pedantic(lambda: assess(LOOP, coupling), rounds=5, warmup_rounds=1)
     print(f"\nboth conditions, swept and proved: {[r.proof for r in requirements.values()]}")
     assert all(r.proof == "rational" for r in requirements.values())
 
 
 def test_a_stored_proof_is_checked_again(benchmark):
-    data = data_of(spring_damper.design(specification(LOOP)).coupling)
-    stored = Stored(LOOP, data, prove(LOOP, data, "theorem4"))
+    coupling = spring_damper.design(Specification.of(LOOP)).coupling
+    stored = Stored.of(LOOP, coupling, prove(LOOP, coupling, "theorem4"))
     verdict = benchmark.pedantic(lambda: verify(stored), rounds=5, warmup_rounds=1)
     assert verdict.proved
 

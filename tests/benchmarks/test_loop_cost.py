@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from design.published import CASE_I
-from sim.mujoco_engine import discretised, profiler_off
+from design.result import CASE_I
+from sim.engines import discretised, profiler_off
+from sim.run import assemble, simulate
 from sim.scenario import load
-from sim.simulate import assemble, simulate
 
 pytestmark = pytest.mark.benchmark(group="loop")
 

@@ -10,18 +10,15 @@ import pytest
 
 from controller.coupling import NoCoupling
 from controller.process import Tape
-from design.margin import closed_loop
-from design.published import CASE_I
-from models.crowd import variants
+from design.conditions import this_environment
+from design.result import CASE_I
+from models.scene import variants
 from sim.adversary import attempts
-from sim.batch_engine import ExactBatchEngine
-from sim.exact_engine import hold
-from sim.loop import stretch
-from sim.mujoco_engine import MujocoBatchEngine, profiler_off
-from sim.population import crowds
+from sim.crowds import crowds
+from sim.engines import ExactBatchEngine, MujocoBatchEngine, hold, profiler_off
+from sim.run import assemble, stretch
 from sim.scenario import load
-from sim.simulate import assemble
-from sim.verdicts import disagree, dominant_modes, exact_loops, mujoco_loops, unstable
+from sim.stability import disagree, dominant_modes, exact_loops, mujoco_loops, unstable
 
 pytestmark = pytest.mark.benchmark(group="validation")
 HUMANS = 1000
@@ -128,7 +125,7 @@ def test_how_tight_the_certificate_is(benchmark):
         found = [row.worst.destabilises for row in rows if row.short == short]
         print(f"\n{short:.0%} short: {sum(found) / len(found):.0%} destabilised", end="")
     for name, (_, coupling) in loops.items():
-        frequency = closed_loop(assemble(scenario, coupling).F, scenario.delta).frequency_hz
+        frequency = this_environment(assemble(scenario, coupling).F, scenario.delta).frequency_hz
         x = np.pi * frequency * scenario.T
         print(f"\n{name}: binds at {frequency:.1f} Hz, where a sinusoid loses {1 - (np.sin(x) / x) ** 2:.1%}", end="")
     assert all(row.worst.destabilises for row in rows if row.short >= 0.05)

@@ -26,8 +26,8 @@ from hw.protocol import NO_MARGIN, Ack, Command, Config, Force, Phase, Reason, S
 from hw.recording import Recorder, outcome, result_of
 from hw.rehearsal import Rehearsal
 from hw.session import Session
-from sim.growth import growths
 from sim.scenario import load as scenario_of
+from sim.trace import growths
 
 T_US = 1200
 CONFIG = Config(2, 4, 5, 50, (20000, 20000), (600, 600))

@@ -15,8 +15,8 @@ from hw.recording import Recorder
 from hw.rehearsal import Rehearsal
 from hw.session import Session
 from models.device import RigidDevice
-from sim.result import Result
 from sim.scenario import InputError, load
+from sim.trace import Result
 
 STEP = 5e-6  # [m] a coarse encoder: half of an Omega's 0.01 mm
 

@@ -22,14 +22,14 @@ import pytest
 
 from cli import bridge, identify, replay
 from cli import emulator as emulator_command
+from cli.options import Parser
 from cli.session_cli import add_link_options, check_link
-from controller.jitter import Jitter
+from controller.delay import Jitter
 from hw.control import certified_coupling, certified_couplings
 from hw.limits import ENDED, Limits, Stage
 from hw.monitor import Settings
 from hw.session import Session
 from hw.transport import Live, Port
-from sim.command import Parser
 from sim.scenario import InputError
 from sim.scenario import load as scenario_of
 

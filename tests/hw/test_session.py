@@ -10,9 +10,9 @@ from rich.console import Console
 
 from cli import bridge
 from cli import replay as replay_command
-from design.assess import assess
-from design.store import Stored, data_of
-from design.store import save as save_coupling
+from cli import trace as trace_command
+from design.certificate import Stored, assess
+from design.certificate import save as save_coupling
 from hw.control import CertifiedCoupling, LinearController, certified_coupling, certified_couplings, fill, link_delay
 from hw.emulator import Emulator, FaultInjection
 from hw.faults import CASES, Case, at, lively, person, rehearse_case
@@ -23,15 +23,13 @@ from hw.recording import Recorder, digest, load, outcome, recipes_of, replay, re
 from hw.rehearsal import Rehearsal
 from hw.session import Session
 from models.scene import plant
-from sim import trace as trace_command
 from sim.couplings import choose
-from sim.engine import outside_forces
-from sim.exact_engine import hold
-from sim.result import Result
+from sim.engines import hold, outside_forces
+from sim.run import assemble, simulate
 from sim.scenario import InputError
 from sim.scenario import load as scenario_of
-from sim.simulate import assemble, simulate
 from sim.stability import close, dominant_mode
+from sim.trace import Result
 
 FAST = Settings(measure=100)
 AT_REST = Settings(measure=100, test_encoders=False)  # nothing moves the handles before the person does
@@ -311,7 +309,7 @@ def test_an_optimal_coupling_has_a_spring_damper_in_reserve(optimal_rungs, capsy
 
 def test_a_coupling_from_a_file_has_one_too(scenario, optimal_rungs, tmp_path):
     path = tmp_path / "stiff.json"
-    save_coupling(Stored(scenario.loop("I"), data_of(optimal_rungs[0].chosen.coupling)), path)
+    save_coupling(Stored(scenario.loop("I"), optimal_rungs[0].chosen.coupling.form()), path)
     rungs = certified_couplings(scenario, "I", str(path), None, 1)
     assert [r.chosen.kind for r in rungs] == ["stiff.json", "spring-damper", "spring-damper"]
     assert [r.link for r in rungs] == [1, 2, 3]

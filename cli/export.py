@@ -1,0 +1,155 @@
+"""python -m design.export coupling.json: a stored coupling, or its whole discrete process, for use elsewhere.
+
+Like design.check it works from the file alone, loop included: what is exported is what is certified.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from rich.table import Table
+
+from cli.options import DOES_NOT_HOLD, DONE, Parser, add_output_options, check_json, console, seed_from
+from controller.coupling import SpringDamperForm
+from design.certificate import HERE, SET, Stored, Verdict, switching_promise, verify
+from design.export import (
+    Block,
+    NothingToExport,
+    Trial,
+    c_source,
+    control_source,
+    coupling_block,
+    data,
+    process_block,
+    trial,
+)
+from design.result import listed
+from sim.couplings import read_coupling
+from sim.files import out_file, write, write_json
+from sim.scenario import InputError
+
+SUFFIX = {"c": ".c", "json": ".json", "npz": ".npz", "control": ".py"}
+
+
+def main(argv: list[str]) -> int:
+    """Export a stored coupling. 0: written, 1: written, but the certificate in its file does not hold."""
+    args = _parser().parse_args(argv)
+    seed = seed_from(args)
+    check_json(args)
+    if args.without_theta and not args.process:
+        raise InputError("--without-theta without --process: a coupling alone has no delay")
+    stored = read_coupling(args.coupling)
+    verdict = _verdict(stored)
+    block = _block(args, stored, verdict)
+    path = _destination(args, block)
+    test = trial(block, seed)
+    write(path, _content(args.format, block, test, path.name))
+
+    outcome = {
+        "file": str(path),
+        "format": args.format,
+        "what": block.name,
+        "channels": block.system.inputs,
+        "states": block.system.order,
+        "T_s": block.system.T,
+        "certificate": {"proved": verdict.proved, "reason": verdict.reason},
+        "test": {"ticks": len(test.inputs), "seed": seed, "largest_output": float(np.abs(test.outputs).max())},
+    }
+    console(args).print(_table(outcome))
+    if args.json:
+        write_json(args.json, outcome)
+    return DOES_NOT_HOLD if stored.certificate and not verdict.proved else DONE
+
+
+def _parser() -> Parser:
+    parser = Parser(
+        "design.export",
+        "Write a stored coupling, or its whole discrete process, as C99, plain data or a python-control block.",
+        "python -m design.export coupling.json --process --format c",
+    )
+    parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling, which names its loop")
+    parser.add_argument("--format", choices=tuple(SUFFIX), default="c", help="(default c)")
+    parser.add_argument("--process", action="store_true", help="coupling, environment and delays as one block (6)")
+    link = "leave out Theta, where the link to the devices is that delay"
+    parser.add_argument("--without-theta", action="store_true", help=link)
+    add_output_options(parser, "FILE", "the file (default out/export/<coupling>-<what>.<suffix>)")
+    return parser
+
+
+def _verdict(stored: Stored) -> Verdict:
+    try:
+        return verify(stored)
+    except (ValueError, ArithmeticError) as error:
+        return Verdict(False, str(error))
+
+
+def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> Block:
+    """The block that was asked for, with lines on where it comes from. Raises InputError."""
+    try:
+        block = process_block(stored, not args.without_theta) if args.process else coupling_block(stored)
+    except NothingToExport as error:
+        raise InputError(f"{args.coupling}: {error} (--process)") from None
+    origin = (
+        f"Written by python -m design.export from {Path(args.coupling).name}: {_gains(stored)}",
+        *block.about,
+        _promise(stored, verdict),
+    )
+    return Block(block.name, block.system, block.input, block.output, origin)
+
+
+def _gains(stored: Stored) -> str:
+    coupling = stored.coupling
+    if isinstance(coupling, SpringDamperForm):
+        return f"spring-damper, K = {listed(coupling.K)} N/m, B = {listed(coupling.B)} N s/m"
+    return f"coupling of kind {coupling.__struct_config__.tag}"
+
+
+def _promise(stored: Stored, verdict: Verdict) -> str:
+    claim = stored.certificate
+    if claim is None or not verdict.proved:
+        return f"NOT CERTIFIED: {verdict.reason}"
+    needs = f"needs {listed(claim.required)} of {listed(claim.available)} N s/m of device damping"
+    delays = f"; {switching_promise(stored.loop.jitter)}, in {HERE}" if stored.loop.jitter else ""
+    how = f"{claim.condition}, proof: {claim.proof}"
+    if claim.promise == SET:
+        how += "; at the vertices, between them nothing is proved: design.check searches there"
+    return f"Certified for {claim.promise}{delays} ({how}): {needs}; linear forces only."
+
+
+def _destination(args: argparse.Namespace, block: Block) -> Path:
+    path = out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}{SUFFIX[args.format]}")
+    if path.resolve() == Path(args.coupling).resolve():
+        raise InputError(f"--out {path}: is the coupling that is exported; name another file")
+    return path
+
+
+def _content(kind: str, block: Block, test: Trial, file: str) -> Any:
+    """What `sim.files.write` takes."""
+    if kind == "c":
+        return c_source(block, test, file)
+    if kind == "control":
+        return control_source(block, test)
+    plain = data(block, test)
+    if kind == "json":
+        return json.dumps(plain, indent=1, allow_nan=False) + "\n"
+
+    arrays: dict[str, Any] = {name: np.array(value) for name, value in plain.items()}
+
+    def archive(destination: BinaryIO) -> None:
+        np.savez(destination, **arrays)
+
+    return archive
+
+
+def _table(outcome: dict[str, Any]) -> Table:
+    table = Table(title=f"{outcome['what']} as {outcome['format']}", show_header=False, title_justify="left")
+    table.add_row("file", outcome["file"])
+    table.add_row("block", f"{outcome['channels']} channels, {outcome['states']} states, T = {outcome['T_s']:g} s")
+    proved = outcome["certificate"]["proved"]
+    table.add_row("certificate", "[green]proved[/]" if proved else f"[red]none[/]: {outcome['certificate']['reason']}")
+    table.add_row("test vector", f"{outcome['test']['ticks']} ticks, in the file")
+    return table

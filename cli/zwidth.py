@@ -1,0 +1,551 @@
+"""python -m sim.zwidth: the K-B map that haptics people draw - certified, exact for random humans, simulated.
+
+options -> the loop (Ground: K and B are the coupling's; Surroundings: the environment's) -> Grid -> Map -> files
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from cli.options import (
+    DOES_NOT_HOLD,
+    DONE,
+    INTERRUPTED,
+    Parser,
+    add_loop_options,
+    add_output_options,
+    add_rigid_option,
+    console,
+    numbers,
+    out_folder,
+    progress_bar,
+    require_constant_delay,
+    rigid_loop,
+    scenario_from,
+    seed_from,
+)
+from cli.run import coupling_part
+from controller.lti import Array
+from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, promise_of
+from design.maps import contact_springs
+from design.ranges import check_set, set_part
+from sim.couplings import NAMES, Chosen, choose
+from sim.files import write, write_json
+from sim.scenario import InputError, Scenario
+from sim.stability import MARGINAL, SUSTAINED, slowest_seen
+from sim.zwidth import (
+    DECIDED,
+    MODEL_KEPT,
+    UNDECIDED,
+    Effects,
+    Grid,
+    Ground,
+    Map,
+    MapLoop,
+    Mark,
+    Plan,
+    Range,
+    Surroundings,
+    Truth,
+    draw_map,
+    holders,
+    look,
+    make_grid,
+    one_sided,
+    truth,
+)
+
+# ----------------------------------------------------------------------------------------------------
+# What a K-B map says, in a few lines on the terminal.
+
+
+def print_map(outcome: dict[str, Any], console: Console) -> None:
+    """What the map says in a few lines."""
+    cells = len(outcome["grid"]["K"]) * len(outcome["grid"]["B"])
+    K, B = outcome["grid"]["K"], outcome["grid"]["B"]
+    title = f"K {K[0]:.4g} to {K[-1]:.4g} N/m, B {B[0]:.4g} to {B[-1]:.4g} N s/m, {cells} couplings"
+    table = Table(title=title, title_justify="left", show_header=False)
+    errors = outcome.get("error", {})
+    if outcome["axes"] == "environment":
+        for row in _designed_rows(outcome):
+            table.add_row(*row)
+    for name in outcome["conditions"]:
+        error = errors.get(name)
+        near = f"; edge within {100 * error['edge_relative_in_K']:.2g} % of design.margin" if error else ""
+        table.add_row(f"certified, {name}", f"{_share(outcome[name]['certified_cells'], cells)}{near}")
+    crowd = outcome["population"]
+    who = f"stable with all of {crowd['humans']} random humans"
+    table.add_row(who, f"{_share(crowd['stable_cells'], cells)} ({crowd['decided_cells']} decided)")
+    simulation = outcome["simulation"]
+    if simulation["points"]:
+        beside = f"{simulation['undecided']} {UNDECIDED}, {simulation['differ_from_linear']} unlike the linear loop"
+        ends = f"{simulation['oscillate']} of {len(simulation['points'])} oscillate, {beside}"
+        table.add_row(f"simulated{_effects(simulation)}", ends)
+    table.add_row("seconds", ", ".join(f"{stage} {wall:.1f}" for stage, wall in outcome["wall_s"].items()) or "-")
+    console.print(table)
+    for mark in outcome.get("marks", ()):
+        console.print(_mark_line(mark, crowd["humans"]))
+    for line in _remarks(outcome):
+        console.print(f"[dim]·[/] {line}")
+
+
+def _designed_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
+    """The fixed coupling in the environment that it was designed for."""
+    designed = outcome["designed_for"]
+    each = (f"{' - '.join(s['between'])} {s['K']:g} N/m, {s['B']:g} N s/m" for s in designed["contact_springs"])
+    needs = "; ".join(
+        f"{name} needs {100 / part['margin']:.4g} % of the damping ({part['proof']})"
+        for name, part in designed["certificates"].items()
+        if part["margin"]
+    )
+    return [
+        ("coupling", f"{outcome['coupling']['kind']}, fixed"),
+        ("designed for", ", ".join(each)),
+        ("there", f"promise: {designed['promise'] or 'none'}; {needs or 'no damping is enough'}"),
+    ]
+
+
+def _about(outcome: dict[str, Any]) -> str:
+    """What the axes are, and what a certified cell promises."""
+    line = "K and B are those of every spring at a contact; each is certified for its environment alone, by a sweep"
+    if MODEL_KEPT not in outcome["conditions"]:
+        return f"{line}."
+    return (
+        f"{line}: closed-loop, the population and MuJoCo with the coupling's model set to the cell's environment, "
+        f"{MODEL_KEPT} with the model left at what the coupling was designed for."
+    )
+
+
+def _mark_line(mark: dict[str, Any], humans: int) -> str:
+    ends = ", ".join(f"{name} {_stiffest(K)}" for name, K in mark["stiffest_K_at_this_B"].items())
+    needs = ", ".join(
+        f"{name} needs {max(mark[name]['required_damping'], key=lambda d: d or np.inf) or np.inf:.6g} of "
+        f"{min(mark[name]['available_damping']):.6g} N s/m "
+        f"({'[green]certified[/]' if mark[name]['certified'] else '[red]not certified[/]'})"
+        for name in mark["stiffest_K_at_this_B"]
+        if name != "population"
+    )
+    met = f"{mark['unstable_humans']} of {humans} humans make it unstable"
+    return f"K {mark['K']:g}, B {mark['B']:g}: {needs}; {met}; stiffest at this B: {ends}"
+
+
+def _stiffest(K: float | str | None) -> str:
+    return "none" if K is None else K if isinstance(K, str) else f"{K:.5g} N/m"
+
+
+def _effects(simulation: dict[str, Any]) -> str:
+    effects = simulation["effects"]
+    on = {
+        "quantisation": any(effects["encoder_step_m"]),
+        "friction": any(effects["friction_n"]),
+        "saturation": effects["force_limit_n"] is not None,
+        "one-sided contact": effects["one_sided"],
+    }
+    names = [name for name, present in on.items() if present]
+    return f" with {', '.join(names)}" if names else ", linear loop"
+
+
+def _remarks(outcome: dict[str, Any]) -> list[str]:
+    lines = []
+    simulation = outcome["simulation"]
+    if outcome["axes"] == "environment":
+        lines += [*outcome["remarks"], _about(outcome)]
+    for name in outcome["conditions"]:
+        if outcome[name].get("reason"):
+            lines.append(f"{name}: {outcome[name]['reason']}.")
+        if outcome[name].get("contradicted_cells"):
+            lines.append(f"[red]CONTRADICTION[/]: {outcome[name]['contradicted_cells']} certified cells are unstable.")
+    if not simulation["nonlinear"] and simulation["differ_from_linear"]:
+        lines.append(f"[red]DISAGREEMENT[/]: MuJoCo and the linear loop at {simulation['differ_from_linear']} points.")
+    if outcome["velocity_filter_hz"]:
+        lines.append("The velocity filter is in all maps: it is linear, and part of the coupling.")
+    if outcome["one_sided"]:
+        lines.append(
+            "One-sided contact: closed-loop and the population are about each frozen contact state, theorem4 (psi = 0) "
+            "and the simulated points about contact made and broken."
+        )
+    if simulation["points"]:
+        lines.append(
+            f"A simulated point oscillates if, at the end of {simulation['duration_s']:g} s, an octave above "
+            f"{simulation['from_hz']:.3g} Hz keeps {100 * SUSTAINED:g} % of its amplitude, over "
+            f"{simulation['threshold_m']:g} m; {UNDECIDED} where the linear loop is within {DECIDED:g} 1/s of the edge."
+        )
+    if outcome["interrupted"]:
+        lines.append("Interrupted: the map has what was finished.")
+    return [*lines, *outcome["files"]]
+
+
+def _share(count: int, cells: int) -> str:
+    return f"{100 * count / cells:.1f} % of the map"
+
+
+# ----------------------------------------------------------------------------------------------------
+# A K-B map as JSON and CSV; sim.zwidth.text prints it.
+
+
+NOT_REACHED = "not reached before the interruption"
+
+
+def summary(ground: MapLoop, drawn: Map, plan: Plan, population: dict[str, Any]) -> dict[str, Any]:
+    """The whole map. Rows are stiffnesses; null is infinite, or not reached before an interruption."""
+    known = np.isfinite(drawn.growth)
+    unsafe = known & (drawn.growth > MARGINAL)
+    part: dict[str, Any] = {
+        "rigid": ground.network is None,
+        "T": ground.T,
+        "theta": list(ground.theta),
+        "psi": list(ground.psi),
+        "delta": list(ground.delta),
+        "velocity_filter_hz": ground.cutoff,
+        "one_sided": ground.walled is not None,
+        "conditions": list(drawn.ratio),
+        "grid": {"K": drawn.grid.K.tolist(), "B": drawn.grid.B.tolist(), "scale": drawn.grid.scale},
+    }
+    for name, ratio in drawn.ratio.items():
+        reason = _nulls(ground, drawn, name)
+        part[name] = ({"reason": reason} if reason else {}) | {
+            "required_over_available": _rows(drawn, ratio),
+            "certified_cells": int((ratio < 1).sum()),
+        }
+        if name in CONDITIONS:  # the population meets the loop that they are about
+            part[name]["contradicted_cells"] = int(((ratio < 1) & unsafe).sum())
+    part["population"] = {
+        **population,
+        "growth_rate_per_s": _rows(drawn, drawn.growth),
+        "unstable_humans_at_least": _rows(drawn, drawn.unstable),
+        "stable_cells": int((known & ~unsafe).sum()),
+        "decided_cells": int(known.sum()),
+    } | ({"reason": f"null: {NOT_REACHED}"} if np.isnan(drawn.growth).any() else {})
+    part["simulation"] = _simulation(ground, drawn, plan)
+    contradicted = sum(part[name]["contradicted_cells"] for name in CONDITIONS)
+    disagree = 0 if part["simulation"]["nonlinear"] else part["simulation"]["differ_from_linear"]
+    part["holds"] = contradicted == 0 and disagree == 0
+    part["interrupted"] = drawn.interrupted
+    part["wall_s"] = drawn.seconds
+    part["not_covered"] = CAVEATS
+    return part
+
+
+def _nulls(ground: MapLoop, drawn: Map, name: str) -> str | None:
+    """Why a condition has cells without a figure, in words of one such cell; None where it has none."""
+    if name in ground.refusals:
+        return ground.refusals[name]
+    ratio, (K, B) = drawn.ratio[name], drawn.grid.flat
+    unreached, infinite = np.isnan(ratio), np.flatnonzero(np.isposinf(ratio))
+    parts = [f"null at {unreached.sum()} cells: {NOT_REACHED}"] if unreached.any() else []
+    if infinite.size:
+        first = infinite[0]
+        why = ground.requirement(name, float(K[first]), float(B[first])).reason or "the figure grows without end"
+        at = f"at K {K[first]:.4g}, B {B[first]:.4g}, {why}"
+        parts.append(f"null at {infinite.size} cells: no damping is enough; {at}")
+    return "; ".join(parts) or None
+
+
+def _simulation(ground: MapLoop, drawn: Map, plan: Plan) -> dict[str, Any]:
+    points, (K, B) = drawn.points, drawn.grid.flat
+    rows = [
+        {
+            "K": float(K[cell]),
+            "B": float(B[cell]),
+            "verdict": points.verdicts[i],
+            "amplitude_m": finite(points.amplitude[i]),
+            "frequency_hz": finite(points.frequency_hz[i]),
+            "linear_growth_rate_per_s": finite(points.growth[i]),
+            "differs_from_linear": bool(points.differ[i]),
+        }
+        for i, cell in enumerate(points.cell.tolist())
+    ]
+    devices = plan.effects.on(ground.devices)
+    return {
+        "effects": {
+            "encoder_step_m": [device.encoder_step for device in devices],
+            "friction_n": [device.friction for device in devices],
+            "force_limit_n": [d.force_limit for d in devices] if plan.effects.saturation else None,
+            "one_sided": ground.walled is not None,
+        },
+        "nonlinear": plan.effects.nonlinear(ground.devices) or ground.walled is not None,
+        "trials": plan.trials,
+        "duration_s": plan.duration,
+        "start_m": plan.start,
+        "press_n": plan.press,
+        "threshold_m": plan.threshold,
+        "from_hz": slowest_seen(plan.duration),
+        "points": rows,
+        "oscillate": points.verdicts.count("oscillates"),
+        "undecided": points.verdicts.count(UNDECIDED),
+        "differ_from_linear": int(points.differ.sum()),
+    }
+
+
+def add_truth(outcome: dict[str, Any], found: dict[str, Truth | None]) -> None:
+    """How far the map is from design.margin."""
+    outcome["error"] = {
+        name: truth
+        and {"figure_relative": truth.ratio, "edge_relative_in_K": truth.edge, "columns_compared": truth.columns}
+        for name, truth in found.items()
+    }
+
+
+def add_marks(outcome: dict[str, Any], marks: Sequence[Mark]) -> None:
+    """What is asked about single couplings; the whole holds only if closed-loop certifies them all."""
+    outcome["marks"] = [
+        {
+            "K": mark.K,
+            "B": mark.B,
+            **{name: certificate_part(requirement) for name, requirement in mark.requirement.items()},
+            "growth_rate_per_s": finite(mark.growth),
+            "unstable_humans": mark.unstable,
+            "stiffest_K_at_this_B": {name: _beyond(K) for name, K in mark.stiffest.items()},
+        }
+        for mark in marks
+    ]
+    certified = all(mark.requirement["closed-loop"].certified for mark in marks)
+    outcome["holds"] = outcome["holds"] and certified
+
+
+def save_csv(drawn: Map, path: Path) -> Path:
+    """One line per cell, SI units in the header; empty where nothing is known."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    figures = [f"{name} required/available" for name in drawn.ratio]
+    table.writerow(["K [N/m]", "B [N s/m]", *figures, "growth [1/s]", "unstable humans", "simulated", "amplitude [m]"])
+    point = {int(cell): i for i, cell in enumerate(drawn.points.cell)}
+    for cell, (K, B) in enumerate(zip(*drawn.grid.flat, strict=True)):
+        values = [K, B, *(ratio[cell] for ratio in drawn.ratio.values()), drawn.growth[cell], drawn.unstable[cell]]
+        row = ["" if np.isnan(value) else f"{value:.9g}" for value in values]
+        i = point.get(cell)
+        row += ["", ""] if i is None else _simulated(drawn, i)
+        table.writerow(row)
+    return write(path, text.getvalue())
+
+
+def _simulated(drawn: Map, i: int) -> list[str]:
+    points = drawn.points
+    return [points.verdicts[i], f"{points.amplitude[i]:.4g}"]
+
+
+def _beyond(K: float | None) -> float | str | None:
+    return "beyond the map" if K is not None and np.isinf(K) else K
+
+
+def _rows(drawn: Map, values: Array) -> list[list[float | None]]:
+    return [[finite(value) for value in row] for row in values.reshape(drawn.grid.shape).tolist()]
+
+
+EXAMPLE = """python -m sim.zwidth --theta 1 --grid 30
+  python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0
+  python -m sim.zwidth --rigid --theta 1 --quantisation 1e-5 --saturation --friction 0.2 --wall"""
+FINEST = 1e-5  # [m] least default threshold: what a desk device's encoders resolve
+
+
+def main(argv: list[str]) -> int:
+    """Draw a map. 0: nothing contradicts it and every mark is certified, 1: else, 130: interrupted."""
+    args = _parser().parse_args(argv)
+    of_coupling = args.coupling is None
+    args.grid, args.press = args.grid or ("60" if of_coupling else "24"), args.press or ("3" if of_coupling else "0")
+    scenario = scenario_from(args)
+    require_constant_delay(scenario, "sim.zwidth")
+    _check_case(args)
+    seed, humans = seed_from(args), _whole(args, "humans", 1, 100_000)
+    marks = tuple(_pair("--mark", mark) for mark in args.mark or ())
+    chosen = _chosen(args, scenario)
+    ground: MapLoop = _surroundings(scenario, chosen) if chosen else _ground(args, scenario)
+    grid = _grid(args, ground, marks)
+    plan = _plan(args, ground)
+    out = out_folder(args, "zwidth")
+
+    crowd = holders(ground.devices, ground.population, seed, humans, ground.population.links, ground.T)
+    bar, moved = progress_bar("certificates")
+    with bar:
+        drawn = draw_map(
+            ground,
+            grid,
+            crowd,
+            plan,
+            lambda stage, k, of: moved(k, of) or bar.update(bar.task_ids[0], description=stage),
+        )
+    outcome = summary(ground, drawn, plan, {"humans": humans, "seed": seed})
+    outcome |= {"scenario": None if args.rigid else scenario.name, "scenario_digest": scenario.digest}
+    outcome |= _coupling(args, scenario, chosen, seed) if chosen else {"axes": "coupling", "coupling": None}
+    if not drawn.interrupted:
+        add_truth(outcome, {name: truth(ground, drawn, name) for name in drawn.ratio})
+        add_marks(outcome, [look(ground, crowd, *mark, grid.K) for mark in marks])
+    _save(args, ground, drawn, outcome, out)
+    print_map(outcome, console(args))
+    if args.json:
+        write_json(args.json, outcome)
+    if drawn.interrupted:
+        return INTERRUPTED
+    return DONE if outcome["holds"] else DOES_NOT_HOLD
+
+
+def _parser() -> Parser:
+    parser = Parser("sim.zwidth", "Draw the K-B map: which spring-dampers are safe, for whom, by which test.", EXAMPLE)
+    add_loop_options(parser)
+    add_rigid_option(parser)
+    of_map = parser.add_argument_group("the map (K and B are the same on all channels)")
+    names = ", ".join(NAMES)
+    fixed = f"this coupling, fixed, and K and B of the environment's contact springs on the axes: {names} or FILE.json"
+    of_map.add_argument("--coupling", metavar="NAME|FILE", help=f"{fixed} (default: K and B of the coupling)")
+    of_map.add_argument("--condition", choices=CONDITIONS, help="that such a coupling is designed for")
+    of_map.add_argument("--grid", metavar="N", help="rows and columns (default 60; 24 with --coupling)")
+    of_map.add_argument("--K-range", metavar="LOW,HIGH", help="[N/m]; default from delta, theta and T")
+    of_map.add_argument("--B-range", metavar="LOW,HIGH", help="[N s/m]; default from delta")
+    of_map.add_argument("--scale", choices=("linear", "log"), help="default linear with --rigid, else log")
+    of_map.add_argument("--mark", action="append", metavar="K,B", help="where does this coupling lie? (repeatable)")
+    of_map.add_argument("--humans", default="200", metavar="N", help="random humans per device (default 200)")
+    of_map.add_argument("--no-plot", action="store_true", help="write no picture")
+    points = parser.add_argument_group("the points simulated in MuJoCo, and what they have beside the linear loop")
+    points.add_argument("--points", default="10", metavar="N", help="rows and columns of them (default 10, 0 for none)")
+    points.add_argument("--trials", default="1", metavar="N", help="humans at each, the most critical (default 1)")
+    points.add_argument("--duration", default="3", metavar="SECONDS", help="of each (default 3)")
+    points.add_argument(
+        "--start", default="1e-3", metavar="METRES", help="first swing of motor or handle (default 1e-3)"
+    )
+    pressing = "steady force of every hand (default 3; 0 with --coupling, whose soft environments give way to it)"
+    points.add_argument("--press", metavar="NEWTONS", help=pressing)
+    points.add_argument("--threshold", metavar="METRES", help="amplitude of an oscillation (default 2 steps or 1e-5)")
+    points.add_argument("--quantisation", metavar="METRES", help="encoder step of every device")
+    points.add_argument("--saturation", action="store_true", help="motors have their force limits")
+    points.add_argument("--friction", metavar="NEWTONS", help="Coulomb friction of every device")
+    points.add_argument("--wall", action="store_true", help="contacts push and never pull")
+    points.add_argument(
+        "--velocity-filter", metavar="HERTZ", help="first-order cut-off of the damped velocity; in all maps"
+    )
+    add_output_options(parser)
+    return parser
+
+
+def _check_case(args: argparse.Namespace) -> None:
+    """Whether the options ask for a map of one kind. Raises InputError."""
+    if args.case == "none":
+        instead = "use --case I, or --coupling none for a map over environments"
+        raise InputError(f"--case none is the loop without coupling, and the map is of couplings: {instead}")
+    if args.coupling is None and args.condition:
+        raise InputError(f"--condition {args.condition}: without --coupling nothing is designed, and both are drawn")
+    for name in ("rigid", "wall", "velocity_filter"):
+        if args.coupling is not None and getattr(args, name):
+            what = "is about a map of spring-dampers; with --coupling the axes are the environment's"
+            raise InputError(f"--{name.replace('_', '-')} with --coupling {args.coupling}: it {what}")
+
+
+def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
+    """The coupling that stays as it is over the whole map, or None where the axes are the coupling's own gains."""
+    if args.coupling is None:
+        return None
+    if args.coupling == "optimal" and scenario.environment.walls:
+        raise InputError("environment.walls: an optimal coupling holds a linear model, so it cannot face walls")
+    return choose(scenario, args.case, args.coupling, args.condition)
+
+
+def _surroundings(scenario: Scenario, chosen: Chosen) -> Surroundings:
+    """The loop with that coupling. Raises InputError."""
+    who = scenario.device, scenario.population
+    try:
+        return Surroundings(*who, scenario.environment, scenario.T, scenario.theta, scenario.psi, chosen.coupling)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, seed: int) -> dict[str, Any]:
+    """The fixed coupling and what is promised of it where it was designed, in the scenario's own environment."""
+    loop = scenario.loop(args.case)
+    with (bar := progress_bar("searching the box"))[0]:
+        whole = check_set(loop, chosen.coupling, seed, progress=bar[1])
+    requirements = assess(loop, chosen.coupling, chosen.phi)
+    springs = contact_springs(loop.environment)
+    return {
+        "axes": "environment",
+        "coupling": coupling_part(chosen.kind, chosen.coupling, scenario.T),
+        "designed_for": {
+            "contact_springs": [{"between": s.between, "K": s.stiffness, "B": s.damping} for s in springs],
+            "certificates": {name: certificate_part(r) for name, r in requirements.items()},
+            "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
+            "set": whole and set_part(whole),
+        },
+        "remarks": list(chosen.notes),
+    }
+
+
+def _ground(args: argparse.Namespace, scenario: Scenario) -> Ground:
+    """The loop without its coupling. Raises InputError."""
+    cutoff = None
+    if args.velocity_filter is not None:
+        cutoff = _number(args, "velocity_filter", 1e-3, 1e6, "Hz")
+    loop: dict[str, Any] = {"network": scenario.environment, "theta": scenario.theta, "psi": scenario.psi}
+    devices = scenario.device
+    try:
+        if args.rigid:
+            loop, devices = {"network": None, **rigid_loop(args, scenario)}, devices[:1]
+        elif args.wall:
+            loop["network"] = one_sided(scenario.environment)
+        return Ground(
+            devices, scenario.population, T=scenario.T, cutoff=cutoff, one_sided=args.rigid and args.wall, **loop
+        )
+    except ValueError as error:
+        raise error if isinstance(error, InputError) else InputError(str(error)) from None
+
+
+def _grid(args: argparse.Namespace, ground: MapLoop, marks: tuple[Range, ...]) -> Grid:
+    K, B = (
+        None if getattr(args, f"{name}_range") is None else _pair(f"--{name}-range", getattr(args, f"{name}_range"))
+        for name in "KB"
+    )
+    for stiffness, damping in marks:
+        if not (1e-3 <= stiffness <= 1e9 and 0 <= damping <= 1e6):
+            raise InputError(f"--mark is {stiffness:g},{damping:g}, allowed are K 1e-3 to 1e9 N/m, B 0 to 1e6 N s/m")
+    return make_grid(ground, _whole(args, "grid", 4, 400), K, B, args.scale, marks)
+
+
+def _plan(args: argparse.Namespace, ground: MapLoop) -> Plan:
+    step = None if args.quantisation is None else _number(args, "quantisation", 0, 1e-2, "m")
+    friction = None if args.friction is None else _number(args, "friction", 0, 1e3, "N")
+    effects = Effects(step, friction, args.saturation)
+    coarsest = max(device.encoder_step for device in effects.on(ground.devices))
+    threshold = max(2 * coarsest, FINEST) if args.threshold is None else _number(args, "threshold", 1e-9, 1, "m")
+    duration = _number(args, "duration", max(1.5, 1024 * ground.T), 1e4, "s")
+    trials, points = _whole(args, "trials", 1, 100), _whole(args, "points", 0, 400)
+    start, press = _number(args, "start", 1e-9, 1, "m"), _number(args, "press", 0, 1e3, "N")
+    return Plan(effects, points, trials, start, press, duration, threshold)
+
+
+def _save(args: argparse.Namespace, ground: MapLoop, drawn: Map, outcome: dict[str, Any], out: Path) -> None:
+    """The picture, the table and the report; `outcome` learns where they are."""
+    files = [save_csv(drawn, out / "map.csv")]
+    if not args.no_plot:
+        from sim.plots import plot_zwidth
+
+        files.append(plot_zwidth(drawn, outcome, out / "zwidth.png"))
+    outcome["files"] = [str(path) for path in (*files, out / "report.json")]
+    write_json(out / "report.json", outcome)
+
+
+def _whole(args: argparse.Namespace, name: str, least: int, most: int) -> int:
+    (value,) = numbers(f"--{name}", getattr(args, name), int, 1)
+    if not least <= value <= most:
+        raise InputError(f"--{name} is {value}, allowed are {least} to {most}")
+    return value
+
+
+def _number(args: argparse.Namespace, name: str, least: float, most: float, unit: str) -> float:
+    option = f"--{name.replace('_', '-')}"
+    (value,) = numbers(option, getattr(args, name), float, 1)
+    if not least <= value <= most:
+        raise InputError(f"{option} is {value:g}, allowed are {least:g} to {most:g} {unit}")
+    return value
+
+
+def _pair(option: str, text: str) -> Range:
+    if text.count(",") != 1:
+        raise InputError(f"{option} is {text!r}, expected two numbers separated by a comma")
+    first, second = numbers(option, text, float, 2)
+    return first, second

@@ -1,0 +1,129 @@
+"""What is to be made safe: all that a design, a check, a map or a bridge knows of a haptic loop.
+
+                 x  sampled                                     Delta_D  damping that the devices guarantee
+    devices ---------------> (+) ---> Psi E ---+---> Theta ---> f  held for T
+                              ^-               |
+                              +----- V <-------+                F = Theta (I + Psi E V)^-1 Psi E     (6)
+
+No device is known but by its damping, and no human at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+import msgspec
+
+from controller.coupling import Coupling, Strict
+from controller.delay import delay
+from controller.environment import Box, Member, Network, environment, held, members
+from controller.lti import Lti, Number, rational
+
+Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=100)], ...]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class DelayRange(Strict, frozen=True):
+    """Delays that may be any from lo to hi, on every channel and anew at every tick."""
+
+    lo: Steps  # (m,) [samples]
+    hi: Steps  # (m,) [samples]
+
+    def __post_init__(self) -> None:
+        if len(self.lo) != len(self.hi) or any(not 0 <= a <= b for a, b in zip(self.lo, self.hi, strict=True)):
+            raise ValueError(f"delays from {list(self.lo)} to {list(self.hi)}, expected 0 <= lo <= hi on every channel")
+
+    def __str__(self) -> str:
+        """'[1, 2] samples', or '[1, 2], [0, 3] samples' where the channels differ."""
+        spans = [f"[{a}, {b}]" for a, b in zip(self.lo, self.hi, strict=True)]
+        return f"{', '.join(spans if len(set(spans)) > 1 else spans[:1])} samples"
+
+    def contains(self, other: DelayRange) -> bool:
+        """Whether every delay that `other` allows is allowed here; a constant theta is DelayRange(theta, theta)."""
+        below, above = zip(self.lo, other.lo, strict=True), zip(self.hi, other.hi, strict=True)
+        return all(a <= b for a, b in below) and all(a >= b for a, b in above)
+
+
+class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without box and jitter keeps the digest it had
+    """All that enters a condition beside the coupling."""
+
+    T: Positive  # [s]
+    theta: Steps  # (m,) transmission delays [samples]
+    psi: Steps  # (m,) environment delays [samples]
+    lam: Steps  # (m,) delays of the reference [samples]; they matter to transparency only
+    delta: tuple[Positive, ...]  # (m,) damping that the devices guarantee [N s/m]
+    environment: Network
+    box: Box | None = None  # what else the environment may be
+    jitter: DelayRange | None = None  # what else the delays of the forces may be, switching at every tick
+
+    def __post_init__(self) -> None:
+        m = len(self.environment.contacts)
+        for name in ("theta", "psi", "lam", "delta"):
+            if len(getattr(self, name)) != m:
+                raise ValueError(f"{name} has {len(getattr(self, name))} entries, the environment has {m} contacts")
+        if any(n > t + p for n, t, p in zip(self.lam, self.theta, self.psi, strict=True)):
+            raise ValueError(f"lam is {list(self.lam)}, expected at most theta + psi on every channel")
+        for member in self.members():
+            try:
+                environment(member.network, self.T)  # raises ValueError if nothing holds an internal node
+            except ValueError as error:
+                raise ValueError(f"{member.name}: {error}" if self.box else str(error)) from None
+        if self.jitter:
+            self._check_jitter(self.jitter)
+
+    def _check_jitter(self, jitter: DelayRange) -> None:
+        if self.box or self.environment.walls:
+            other = "box" if self.box else "environment.walls"
+            raise ValueError(f"jitter and {other}: switching delays are judged in one linear environment")
+        if len(jitter.lo) != len(self.theta):
+            raise ValueError(f"jitter has {len(jitter.lo)} ranges for {len(self.theta)} channels")
+        if not jitter.contains(DelayRange(self.theta, self.theta)):
+            raise ValueError(f"theta is {list(self.theta)}, outside of its jitter, {jitter}")
+
+    @property
+    def channels(self) -> int:
+        return len(self.theta)
+
+    def period(self, exact: bool = False) -> Number:
+        """T, whose type decides the arithmetic of what is built with it."""
+        return rational(self.T) if exact else self.T
+
+    def E(self, exact: bool = False) -> Lti:
+        """The environment E(z), every wall touching."""
+        return environment(held(self.environment), self.period(exact))
+
+    def sent(self, coupling: Coupling, exact: bool = False) -> Lti:
+        """G = (I + Psi E V)^-1 Psi E: the forces as they leave for the devices. Raises SingularLoop."""
+        return sent(self.E(exact), coupling, self.psi)
+
+    def F(self, coupling: Coupling, exact: bool = False) -> Lti:
+        """F = Theta G (6): displacements to forces, as the devices see them. Raises SingularLoop."""
+        return force_map(self.E(exact), coupling, self.theta, self.psi)
+
+    def members(self) -> tuple[Member, ...]:
+        """The environment, and the vertices of its box where it has one."""
+        return members(self.environment, self.box)
+
+    def at(self, network: Network) -> Loop:
+        """The loop around this environment, known exactly."""
+        return msgspec.structs.replace(self, environment=network, box=None)
+
+    def switching(self, jitter: DelayRange | None) -> Loop:
+        """The loop whose delays may switch within this range, or are the constant theta."""
+        return msgspec.structs.replace(self, jitter=jitter)
+
+    @property
+    def delays(self) -> DelayRange:
+        """What the delays of the forces may be; of no width where they are constant."""
+        return self.jitter or DelayRange(self.theta, self.theta)
+
+
+def sent(E: Lti, coupling: Coupling, psi: Sequence[int]) -> Lti:
+    """G = (I + Psi E V)^-1 Psi E."""
+    return coupling.around(delay(psi, E.T) @ E)
+
+
+def force_map(E: Lti, coupling: Coupling, theta: Sequence[int], psi: Sequence[int]) -> Lti:
+    """F = Theta (I + Psi E V)^-1 Psi E (6): displacements to forces, as the devices see them."""
+    return delay(theta, E.T) @ sent(E, coupling, psi)

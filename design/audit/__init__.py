@@ -1,1 +1,0 @@
-"""python -m design.audit: are these gains safe, with what margin, and where does it bind?"""

@@ -1,0 +1,635 @@
+"""The limit curve and the ladder as tables and sentences."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from controller.coupling import Coupling, NoCoupling
+from controller.delay import delay
+from controller.environment import environment
+from controller.loop import Loop
+from controller.lti import Array, Lti
+from design.certificate import NotProved, digest, finite, prove, theorem4_of
+from design.conditions import (
+    Condition,
+    Requirement,
+    any_environment_demand,
+    delayed_demand,
+    least_scale,
+    this_environment,
+    this_environment_demand,
+)
+from design.designs import design_by_kind
+from design.frequency import Response, frequencies, on_circle
+from design.optimal import Wish
+from design.result import PUBLISHED, Design, DesignFailed
+from design.transparency import decibels, transparency
+
+# ----------------------------------------------------------------------------------------------------
+# A coupling over frequency: singular values, the demand for damping, and what a hand perceives.
+
+
+LOWEST_HZ = 0.1
+FEEL_HZ = (1.0, 10.0)  # where perceived stiffness and damping are quoted
+
+
+@dataclass(frozen=True, eq=False)
+class Perceived:
+    """The effective impedance of one channel with the others held still: x -> f read as a spring and a damper."""
+
+    stiffness: Array  # (k, m) Re G_ii [N/m]
+    damping: Array  # (k, m) Im G_ii / omega [N s/m]; below zero where motion is fed
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A coupling in its loop, with what both conditions ask of the devices."""
+
+    F: Lti
+    requirements: dict[str, Requirement]
+    demands: dict[str, Response | None]  # w -> required over available damping; None where no damping helps
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """One coupling at the frequencies `hz` of its picture."""
+
+    sigma_F: Array  # (k, m) singular values of F [N/m], largest first
+    sigma_M: Array  # (k, m) of the mismatch F - Lambda E [N/m]
+    perceived: Perceived
+    demands: dict[str, Array | None]  # (k,) required over available damping
+
+
+def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Judged:
+    """Both conditions of a coupling, as figures and over frequency. Raises SingularLoop."""
+    F = loop.F(coupling)
+    phi = _multiplier(loop, coupling) if phi is None and any(loop.psi) else phi
+    requirements = {
+        "closed-loop": this_environment(F, loop.delta),
+        "theorem4": theorem4_of(loop, coupling, phi),
+    }
+    demands: dict[str, Response | None] = dict.fromkeys(requirements)
+    if np.isfinite(requirements["closed-loop"].ratio):
+        demands["closed-loop"] = partial(least_scale, this_environment_demand(F, loop.delta))
+    V = coupling.compliance(loop.T)
+    if V is not None and np.isfinite(requirements["theorem4"].ratio):
+        if any(loop.psi):
+            assert phi is not None  # a finite figure had a multiplier
+            demands["theorem4"] = delayed_demand(V, loop.theta, np.asarray(loop.delta), phi)
+        else:
+            demands["theorem4"] = partial(least_scale, any_environment_demand(V, loop.theta, loop.delta))
+    return Judged(F, requirements, demands)
+
+
+def grid(loop: Loop, couplings: Sequence[Judged], low_hz: float = LOWEST_HZ) -> Array:
+    """Frequencies [Hz] up to Nyquist's, dense around every pole, with FEEL_HZ and where conditions bind."""
+    per_hz = 2 * np.pi * loop.T
+    systems = (environment(loop.environment, loop.T), *(judged.F for judged in couplings))
+    even = frequencies(*systems, low=low_hz * per_hz, high=np.pi, points=200) / per_hz
+    binding = [r.frequency_hz for judged in couplings for r in judged.requirements.values()]
+    wanted = (*FEEL_HZ, *(hz for hz in binding if hz is not None))
+    return np.unique([*even, *(hz for hz in wanted if low_hz <= hz <= even[-1])])
+
+
+def curves(loop: Loop, judged: Judged, hz: Array) -> Curves:
+    """The curves of one coupling at `hz` (k,)."""
+    w = 2 * np.pi * hz * loop.T
+    z = on_circle(w)
+    E = environment(loop.environment, loop.T)
+    target = (delay(loop.lam, loop.T) @ E).at(z)
+    F = judged.F.at(z)
+    demands = {name: None if demand is None else demand(w) for name, demand in judged.demands.items()}
+    return Curves(singular_values(F), singular_values(F - target), perceived(F, hz), demands)
+
+
+def ideal(loop: Loop, hz: Array) -> tuple[Array, Perceived]:
+    """Singular values of E (k, m) [N/m] and its effective impedance: what an undelayed loop without coupling gives."""
+    E = environment(loop.environment, loop.T).at(on_circle(2 * np.pi * hz * loop.T))
+    return singular_values(E), perceived(E, hz)
+
+
+def singular_values(G: NDArray[np.complex128]) -> Array:
+    """(k, m, m) -> (k, m), largest first."""
+    return np.linalg.svd(G, compute_uv=False)
+
+
+def perceived(G: NDArray[np.complex128], hz: Array) -> Perceived:
+    """The diagonal of displacement-to-force responses (k, m, m) at `hz` (k,) > 0 as stiffness and damping."""
+    own = np.diagonal(G, axis1=1, axis2=2)
+    return Perceived(own.real, own.imag / (2 * np.pi * hz)[:, None])
+
+
+def _multiplier(loop: Loop, coupling: Coupling) -> Array | None:
+    """The least multiplier of Theorem 4 for an environment with delay inside, None where there is none."""
+    if coupling.compliance(loop.T) is None:
+        return None
+    from design.lmi import least_phi  # takes the solver
+
+    try:
+        return least_phi(loop)
+    except ValueError:
+        return None  # theorem4_of says why
+
+
+# ----------------------------------------------------------------------------------------------------
+# The main numbers of couplings over frequency, as two tables with one row per coupling.
+
+
+def tables(outcome: dict[str, Any]) -> tuple[Table, Table]:
+    """What `python -m design.plot` prints, from its JSON."""
+    return _promises(outcome), _feel(outcome)
+
+
+def _promises(outcome: dict[str, Any]) -> Table:
+    """Required damping [N s/m] where all devices have the same, else as a multiple of what each has."""
+    available = outcome["available_damping"]
+    alike = len(set(available)) == 1
+    damping = "required damping" if alike else "required share of the damping"
+    where = f"{outcome['scenario']}, case {outcome['case']}"
+    table = Table(title=f"{damping} of {_list(available)} N s/m · {where}")
+    table.add_column("coupling", overflow="fold")
+    for name in ("closed-loop", "at Hz", "theorem4", "at Hz", "M sup dB", "M rms dB"):
+        table.add_column(name, justify="right")
+    for coupling in outcome["couplings"]:
+        parts = [coupling[condition] for condition in ("closed-loop", "theorem4")]
+        scale = available[0] if alike else 1.0
+        asked = [cell for part in parts for cell in (_needs(part, scale), _hertz(part["binding_frequency_hz"]))]
+        errors = [_decibels(coupling["transparency"][f"{which}_mismatch_db"]) for which in ("relative", "rms")]
+        table.add_row(coupling["name"], *asked, *errors)
+    return table
+
+
+def _feel(outcome: dict[str, Any]) -> Table:
+    table = Table(title="perceived by each device's user, the other devices held still")
+    table.add_column("coupling", overflow="fold")
+    columns = [(what, unit, hz) for what, unit in (("stiffness", "N/m"), ("damping", "N s/m")) for hz in FEEL_HZ]
+    for what, unit, hz in columns:
+        table.add_column(f"{what}\n{unit}, {hz:g} Hz", justify="right")
+    named = {"ideal (E)": outcome["ideal"], **{c["name"]: c["perceived"] for c in outcome["couplings"]}}
+    for name, perceived in named.items():
+        table.add_row(name, *(_list(_at(hz, outcome["frequency_hz"], perceived[what])) for what, _, hz in columns))
+    return table
+
+
+def _needs(part: dict[str, Any], scale: float) -> str:
+    """The worst device's figure, green where it is certified."""
+    if part["ratio"] is None:
+        return "[red]infinite[/]"
+    return f"[{'green' if part['certified'] else 'red'}]{scale * part['ratio']:.5g}[/]"
+
+
+def _hertz(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}"
+
+
+def _decibels(value: float | None) -> str:
+    return "-inf" if value is None else f"{value:.2f}"
+
+
+def _at(hz: float, grid: Sequence[float], values: Sequence[Sequence[float]]) -> list[float]:
+    """Each channel's curve at `hz`, which is in the grid; nan above Nyquist's frequency."""
+    return [float(np.interp(hz, grid, column, right=np.nan)) for column in np.transpose(values)]
+
+
+def _list(values: Sequence[float]) -> str:
+    """'1, 2', or '1' where all would read the same."""
+    shown = [format(v, ".0f" if abs(v) >= 1000 else ".3g") for v in values]
+    return shown[0] if len(set(shown)) == 1 else ", ".join(shown)
+
+
+# ----------------------------------------------------------------------------------------------------
+# How good a coupling could be if the laboratory were another: the optimum along one axis of the loop or of the
+# design.
+#
+# Every point is a convex problem of its own (design.optimal), so what a curve shows is a limit, not what a search
+# found.
+
+
+Kept = Literal["samples", "seconds"]  # what stays of a delay when the period changes
+
+
+@dataclass(frozen=True)
+class Axis:
+    """What is varied: its label, its unit, and the range around what there is, unless another is asked for."""
+
+    label: str
+    unit: str
+    low: float  # times what there is; nan where it is not a factor
+    high: float
+    least: float  # what may be asked for
+    most: float
+
+
+AXES = {
+    "damping": Axis("damping of the devices (the least)", "N s/m", 0.5, 1.4, 1e-3, 1e3),
+    "delay": Axis("transmission delay (the largest)", "samples", math.nan, math.nan, 0, 100),
+    "period": Axis("sampling period", "s", 0.5, 2.5, 1e-5, 0.1),
+    "order": Axis("basis functions of each entry of Q", "functions", 0.2, 1.6, 1, 200),
+}
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One point of a curve: where it is drawn, and what is designed there."""
+
+    value: float
+    loop: Loop
+    wish: Wish
+
+
+def settings(
+    axis: str, loop: Loop, wish: Wish, points: int, span: tuple[float, float] | None = None, kept: Kept = "samples"
+) -> list[Setting]:
+    """The points of one axis, with what there is among them. Raises ValueError for a range that is none.
+
+    damping: all devices scaled alike. delay: the same number of samples more or less on every channel. period: `kept`
+    says what stays of the delays. Lambda keeps what it lacks of Theta Psi. `span` is in the axis' unit.
+    """
+    if axis not in AXES:
+        raise ValueError(f"axis is {axis!r}, allowed are {', '.join(AXES)}")
+    least, most, unit = AXES[axis].least, AXES[axis].most, AXES[axis].unit
+    if span and not least <= span[0] < span[1] <= most:
+        raise ValueError(f"the range {span[0]:g}:{span[1]:g} is none between {least:g} and {most:g} {unit}")
+    if axis == "damping":
+        least = min(loop.delta)
+        values = _spread(least, AXES[axis], points, span)
+        return [
+            Setting(v, msgspec.structs.replace(loop, delta=tuple(v / least * d for d in loop.delta)), wish)
+            for v in values.tolist()
+        ]
+    if axis == "delay":
+        longest, shortest = max(loop.theta), min(loop.theta)
+        low, high = span or (longest - min(shortest, points - 1), None)
+        steps = range(int(low), int(low) + points) if high is None else _whole(low, high, points)
+        if min(steps) < longest - shortest:
+            raise ValueError(f"delay starts at {min(steps)}, but the channels differ by {longest - shortest} samples")
+        return [Setting(float(n), _delayed(loop, n - longest), wish) for n in steps]
+    if axis == "period":
+        return [Setting(T, _sampled(loop, T, kept), wish) for T in _spread(loop.T, AXES[axis], points, span).tolist()]
+    counts = {max(1, round(n)) for n in _spread(wish.functions, AXES[axis], points, span).tolist()}
+    return [Setting(float(n), loop, replace(wish, functions=n)) for n in sorted(counts)]
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The best that was found at a point, or why there is nothing."""
+
+    value: float
+    delta: tuple[float, ...]  # [N s/m]
+    theta: tuple[int, ...]  # [samples]
+    T_s: float
+    functions: int | None  # None for a spring-damper
+    rms_mismatch_db: float | None
+    relative_mismatch_db: float | None
+    required_damping: tuple[float | None, ...] | None  # closed-loop, [N s/m]
+    dc_ratio: float | None  # share of the static stiffness that is felt
+    bare_damping: tuple[float | None, ...]  # what the loop without any coupling requires, closed-loop [N s/m]
+    wall_s: float
+    reason: str | None = None  # why there is no design
+    proof: str | None = None  # of the condition it was designed for: "rational" (exact) or "sampled"; None: no design
+    proof_reason: str | None = None  # why there is no exact proof
+
+
+Designer = Callable[[Setting], Limit]
+
+
+def optimum(setting: Setting) -> Limit:
+    """The optimal coupling of a setting."""
+    wish = setting.wish
+    names = ("functions", "filter", "diagonal", "objective", "high_gain", "margin")
+    return measured(setting, "optimal", None, {name: getattr(wish, name) for name in names})
+
+
+def spring_damper(condition: Condition) -> Designer:
+    """The designed spring-damper of a setting."""
+    return lambda setting: measured(setting, "spring-damper", condition, {})
+
+
+def measured(setting: Setting, kind: str, condition: Condition | None, options: dict[str, Any]) -> Limit:
+    """One design and its figures, from the coupling alone; a request without a solution gives its reason."""
+    loop, begin = setting.loop, time.perf_counter()
+    figures: dict[str, Any] = dict.fromkeys(("rms_mismatch_db", "relative_mismatch_db", "required_damping", "dc_ratio"))
+    bare: tuple[float | None, ...] = (None,) * len(loop.delta)
+    try:
+        bare = _damping(this_environment(loop.F(NoCoupling()), loop.delta))
+        design = design_by_kind(loop, kind, condition, **options)
+    except ValueError as error:  # no such design, or a loop that cannot be
+        figures["reason"] = str(error)
+    else:
+        F = loop.F(design.coupling)
+        transparent = transparency(F, loop.E(), loop.lam)
+        figures = {
+            "rms_mismatch_db": finite(decibels(transparent.rms_mismatch)),
+            "relative_mismatch_db": finite(decibels(transparent.relative_mismatch)),
+            "required_damping": _damping(this_environment(F, loop.delta)),
+            "dc_ratio": finite(transparent.dc_ratio),
+        } | _proof(loop, design)
+    functions = setting.wish.functions if kind == "optimal" else None
+    wall = time.perf_counter() - begin
+    place = (setting.value, loop.delta, loop.theta, loop.T, functions)
+    return Limit(*place, **figures, bare_damping=bare, wall_s=wall)
+
+
+def _proof(loop: Loop, design: Design) -> dict[str, str | None]:
+    """Whether the design's own condition was proved in exact arithmetic, and why not."""
+    phi = None if design.phi is None else design.phi.tolist()
+    # what is asked is the environment alone, as the figures are
+    alone = loop.at(loop.environment)
+    try:
+        certificate = prove(alone, design.coupling, design.condition, phi)
+    except NotProved as error:
+        return {"proof": "sampled", "proof_reason": str(error)}
+    return {"proof": certificate.proof, "proof_reason": None}
+
+
+def _damping(requirement: Requirement) -> tuple[float | None, ...]:
+    return tuple(finite(b) for b in requirement.required)
+
+
+def remembered(designer: Designer, whole: bool) -> Designer:
+    """The same, but what was designed once is not designed again; `whole` if the wish matters to it."""
+    known: dict[tuple[str, Wish | None], Limit] = {}
+
+    def recalled(setting: Setting) -> Limit:
+        key = (digest(setting.loop), setting.wish if whole else None)
+        if key not in known:
+            known[key] = designer(setting)
+        return replace(known[key], value=setting.value)
+
+    return recalled
+
+
+def _spread(base: float, axis: Axis, points: int, span: tuple[float, float] | None) -> Array:
+    """`points` values, even in their logarithm; the nearest to what there is becomes that, if it lies between."""
+    low, high = span or (axis.low * base, axis.high * base)
+    values = np.geomspace(low, high, points)
+    if low <= base <= high:
+        values[np.argmin(np.abs(np.log(values / base)))] = base
+    return np.array([float(f"{v:.6g}") if v != base else base for v in values])
+
+
+def _whole(low: float, high: float, points: int) -> Sequence[int]:
+    if low != int(low) or high != int(high):
+        raise ValueError(f"the range {low:g}:{high:g} is none, expected whole numbers of samples")
+    return sorted({round(n) for n in np.linspace(low, high, points)})
+
+
+def _delayed(loop: Loop, more: int) -> Loop:
+    """`more` samples on every channel; Lambda keeps what it lacks of Theta Psi, as far as it can."""
+    theta = tuple(t + more for t in loop.theta)
+    return msgspec.structs.replace(loop, theta=theta, lam=_reference(loop, theta, loop.psi))
+
+
+def _sampled(loop: Loop, T: float, kept: Kept) -> Loop:
+    """Another period. In seconds a delay is never shortened: it becomes the next whole number of samples."""
+    if kept == "samples":
+        return msgspec.structs.replace(loop, T=T)
+    theta, psi = (tuple(math.ceil(n * loop.T / T - 1e-9) for n in delays) for delays in (loop.theta, loop.psi))
+    return msgspec.structs.replace(loop, T=T, theta=theta, psi=psi, lam=_reference(loop, theta, psi))
+
+
+def _reference(loop: Loop, theta: tuple[int, ...], psi: tuple[int, ...]) -> tuple[int, ...]:
+    """Theta Psi where the reference is that, else what it was, but at most Theta Psi (7)."""
+    full = [t + p for t, p in zip(loop.theta, loop.psi, strict=True)]
+    new = [t + p for t, p in zip(theta, psi, strict=True)]
+    return tuple(b if n == a else min(n, b) for n, a, b in zip(loop.lam, full, new, strict=True))
+
+
+# ----------------------------------------------------------------------------------------------------
+# Every design side by side: what it requires, how close it comes to the environment, and what proves it.
+
+
+PRINTED = {"I": "(27)", "II": "(28)"}  # the paper's equations for its gains
+
+Progress = Callable[[int, int], None]  # (designs done, designs in all)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A design to be made: its name in the table, and the arguments of design.designs.design_by_kind."""
+
+    name: str
+    kind: str
+    condition: Condition = "closed-loop"
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One line of the table."""
+
+    design: str
+    case: str
+    required_damping: tuple[float, ...] | None  # by the closed-loop condition [N s/m]; None where infinite or no design
+    certified: bool  # by that condition
+    condition: str  # what the proof is of
+    relative_mismatch_db: float | None  # None: exact, or no design
+    rms_mismatch_db: float | None
+    proof: str | None
+    wall_s: float  # of the design, with its check
+    proof_s: float
+    reason: str | None = None
+
+
+def _optimal(functions: int, **options: Any) -> Entry:
+    """The optimal coupling of so many functions per entry of Q; `HF` is what devices may feel above 100 Hz."""
+    kind = "full" if options.get("diagonal") is False else "diagonal"
+    words = [f"optimal, {kind} {functions}"]
+    words += [options["objective"]] if "objective" in options else []
+    words += ["no HF limit"] if "high_gain" in options else []
+    return Entry(", ".join(words), "optimal", "closed-loop", {"functions": functions, **options})
+
+
+SHORT = (
+    Entry("none", "none"),
+    Entry("published", "published"),
+    Entry("spring-damper, theorem4", "spring-damper", "theorem4"),
+    Entry("spring-damper, closed-loop", "spring-damper"),
+    _optimal(4, high_gain=None),
+    _optimal(8),
+    _optimal(8, high_gain=None),
+)
+FULL = (
+    *SHORT[:4],
+    Entry("ccl, one state per channel, theorem4", "ccl", "theorem4"),
+    *SHORT[4:],
+    _optimal(16, high_gain=None),
+    _optimal(16, diagonal=False, filter="mixed", high_gain=None),
+    _optimal(37, diagonal=False, high_gain=None),
+    _optimal(37, diagonal=False, high_gain=None, objective="sup"),
+)
+LADDERS = {"short": SHORT, "full": FULL}
+
+
+def climb(loops: Mapping[str, Loop], entries: Sequence[Entry], progress: Progress) -> tuple[list[Rung], bool]:
+    """The rungs of every case, and whether the keyboard ended it; what was done before is kept."""
+    rungs: list[Rung] = []
+    total = len(loops) * len(entries)
+    try:
+        for case, loop in loops.items():
+            for entry in entries:
+                progress(len(rungs), total)
+                rungs.append(rung(case, loop, entry))
+    except KeyboardInterrupt:
+        return rungs, True
+    return rungs, False
+
+
+def rung(case: str, loop: Loop, entry: Entry) -> Rung:
+    """One design with its proof; a request without a solution gives its reason."""
+    begin = time.perf_counter()
+    try:
+        coupling, design = _made(loop, case, entry)
+    except DesignFailed as error:
+        wall = time.perf_counter() - begin
+        return Rung(_name(entry, case), case, None, False, entry.condition, None, None, None, wall, 0.0, str(error))
+    wall = time.perf_counter() - begin
+    F = loop.F(coupling)
+    requirement = this_environment(F, loop.delta)
+    figures = transparency(F, loop.E(), loop.lam)
+    begin, proof, reason = time.perf_counter(), None, requirement.reason
+    if design or requirement.certified:
+        try:
+            phi = None if design is None or design.phi is None else design.phi.tolist()
+            proof = prove(loop, coupling, entry.condition, phi).proof
+        except NotProved as error:
+            reason = str(error)
+    required = None if requirement.reason else requirement.required
+    mismatch = finite(decibels(figures.relative_mismatch)), finite(decibels(figures.rms_mismatch))
+    proof_s = time.perf_counter() - begin
+    certified = requirement.certified
+    return Rung(_name(entry, case), case, required, certified, entry.condition, *mismatch, proof, wall, proof_s, reason)
+
+
+def _name(entry: Entry, case: str) -> str:
+    return f"{entry.name} {PRINTED[case]}" if entry.kind == "published" else entry.name
+
+
+def _made(loop: Loop, case: str, entry: Entry) -> tuple[Coupling, Design | None]:
+    if entry.kind == "none":
+        return NoCoupling(), None
+    if entry.kind == "published":
+        if loop.channels != 2:
+            raise DesignFailed(None, (), f"the paper prints gains for 2 channels, not {loop.channels}")
+        return PUBLISHED[case], None
+    design = design_by_kind(loop, entry.kind, entry.condition, **entry.options)
+    return design.coupling, design
+
+
+Curves_report = dict[str, dict[str, list[Limit]]]  # sweep -> design -> its points
+EXACT_DB = -60.0  # below it the difference to the environment is the solver's
+
+
+def gains(plan: dict[str, list[Setting]], curves: Curves_report, loop: Loop, wish: Wish) -> list[str]:
+    """What there is to gain, in a line per sweep."""
+    lines = []
+    for name, rows in curves.items():
+        found = [(limit, _figure(limit, wish.objective)) for limit in rows["optimal"]]
+        known = [(limit, figure) for limit, figure in found if figure is not None]
+        if len(known) < 2:
+            continue
+        here = next((s.value for s in plan[name] if s.loop == loop and s.wish == wish), None)
+        words = [
+            f"{_decibels_report(figure)} at {limit.value:.4g}" + (" (here)" if limit.value == here else "")
+            for limit, figure in known
+            if limit in (known[0][0], known[-1][0]) or limit.value == here
+        ]
+        lines.append(f"{name} in {AXES[name].unit}: {', '.join(words)}")
+    bare = next((limit for rows in curves.values() for limit in rows["optimal"] if _is(limit, loop)), None)
+    needs = [b for b in bare.bare_damping if b is not None] if bare else []
+    if len(needs) == len(loop.delta):
+        need = ", ".join(f"{b:.4g}" for b in needs)
+        share = max(b / d for b, d in zip(needs, loop.delta, strict=True))
+        lines.append(f"without any coupling: needs {need} N s/m, {share:.3g} times what the devices have")
+    return lines
+
+
+def _is(limit: Limit, loop: Loop) -> bool:
+    return (limit.delta, limit.theta, limit.T_s) == (loop.delta, loop.theta, loop.T)
+
+
+def _figure(limit: Limit, objective: str) -> float | None:
+    return limit.rms_mismatch_db if objective == "rms" else limit.relative_mismatch_db
+
+
+def _decibels_report(value: float) -> str:
+    """In case I a loop that needs no coupling reaches minus infinity, of which a solver finds some -60 to -120 dB."""
+    return f"below {EXACT_DB:g} dB" if value < EXACT_DB else f"{value:.2f} dB"
+
+
+def print_curves(outcome: dict[str, Any], beside: Sequence[str], screen: Console) -> None:
+    """A table per sweep; reasons, gains and files below."""
+    reasons: list[str] = []
+    for name, sweep in outcome["sweeps"].items():
+        table = Table(
+            title=f"{outcome['objective']} mismatch over {name} · {outcome['scenario']}, case {outcome['case']}"
+        )
+        table.add_column(sweep["unit"], justify="right")
+        table.add_column("theta")
+        for column in ("optimal", *beside, "proof", "seconds"):
+            table.add_column(column, justify="right", no_wrap=True)
+        for i, row in enumerate(sweep["optimal"]):
+            others = [sweep[kind][i] if i < len(sweep[kind]) else None for kind in beside]
+            shown = [_shown(limit, outcome["objective"]) for limit in (row, *others)]
+            proof = _proofs(dict(zip(("optimal", *beside), (row, *others), strict=True)))
+            place = f"{row['value']:.4g}", ",".join(map(str, row["theta"]))
+            table.add_row(*place, *shown, proof, f"{row['wall_s']:.1f}")
+            reasons += [f"{name} {row['value']:.4g}: {row['reason']}"] if row["reason"] else []
+        screen.print(table)
+    if beside:
+        reasons = [f"beside the optimum: the designed spring-damper by {' and by '.join(beside)}", *reasons]
+    for line in (*reasons, *outcome["gains"]):
+        screen.print(f"[dim]·[/] {line}")
+    screen.print(f"{outcome['wall_s']:.1f} s; files: {', '.join(outcome['files'])}", soft_wrap=True)
+
+
+def _proofs(limits: dict[str, dict[str, Any] | None]) -> str:
+    """Rational where every design of a row is proved exactly, else which are only sampled."""
+    found = {name: limit["proof"] for name, limit in limits.items() if limit and limit["proof"]}
+    sampled = [name for name, proof in found.items() if proof != "rational"]
+    if not found:
+        return "-"
+    return f"sampled: {', '.join(sampled)}" if sampled else "rational"
+
+
+def _shown(limit: dict[str, Any] | None, objective: str) -> str:
+    if limit is None:
+        return ""
+    value = limit["rms_mismatch_db" if objective == "rms" else "relative_mismatch_db"]
+    return "infeasible" if value is None else _decibels_report(value)
+
+
+def print_ladder(outcome: dict[str, Any], cases: Sequence[str], screen: Console) -> None:
+    """A table per case, reasons and files below."""
+    for case in cases:
+        screen.print(_rungs(case, [row for row in outcome["rows"] if row["case"] == case], outcome["scenario"]))
+    for row in outcome["rows"]:
+        if row["reason"]:
+            screen.print(f"[dim]·[/] {row['design']}, case {row['case']}: {row['reason']}")
+    screen.print("[dim]·[/] no HF limit: without |F| <= 1.5 |E| above 100 Hz, which the default design keeps.")
+    screen.print(f"{outcome['wall_s']:.1f} s; files: {', '.join(outcome['files'])}", soft_wrap=True)
+
+
+def _rungs(case: str, rows: Sequence[dict[str, Any]], scenario: str) -> Table:
+    table = Table(title=f"the ladder · {scenario}, case {case}")
+    for i, column in enumerate(("design", "needs N s/m", "sup dB", "rms dB", "proof", "s")):
+        table.add_column(column, justify="left" if i in (0, 4) else "right", no_wrap=i > 0)
+    for row in rows:
+        need = "inf" if row["required_damping"] is None else f"{max(row['required_damping']):.4f}"
+        need += "" if row["certified"] else " (no)"
+        figures = ["exact" if v is None else f"{v:.2f}" for v in (row["relative_mismatch_db"], row["rms_mismatch_db"])]
+        if row["reason"] and row["required_damping"] is None:
+            need, figures = "-", ["-", "-"]
+        table.add_row(row["design"], need, *figures, row["proof"] or "-", f"{row['wall_s']:.2f}")
+    return table

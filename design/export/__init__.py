@@ -1,1 +1,0 @@
-"""python -m design.export: couplings for use elsewhere."""

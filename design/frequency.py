@@ -1,0 +1,184 @@
+"""Suprema over frequency, found on a grid that knows the poles and refined between its points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from controller.lti import Array, Lti
+
+# ----------------------------------------------------------------------------------------------------
+# Integrals over frequency, by Gauss's rule on intervals that are halved until it no longer matters.
+
+
+ERROR = 1e-6  # relative, of the sum
+ROUNDING = 1e-20  # of the mean: what is left of two responses that agree to ten digits, squared
+MOST_ROUNDS, MOST_INTERVALS = 20, 1000  # of halving; in one round
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
+
+
+def integral(response: Callable[[Array], Array], grid: Array, error: float = ERROR) -> float:
+    """The integral of `response`, (k,) -> (k,) and not negative, from grid[0] to grid[-1].
+
+    Three points of Gauss in each interval of the grid, against the same in its halves: an interval whose two figures
+    differ by more than its share of `error`, relative to the whole, gives way to its halves. What differs by rounding
+    alone would do so without end: hence the least mean that counts, and the worst intervals only where there are many.
+    """
+    left, right = grid[:-1], grid[1:]
+    length = grid[-1] - grid[0]
+    coarse, done = _gauss(response, left, right), 0.0
+    for _ in range(MOST_ROUNDS):
+        middle = (left + right) / 2
+        first, second = np.split(_gauss(response, np.append(left, middle), np.append(middle, right)), 2)
+        fine = first + second
+        share = max(error * (done + fine.sum()) / length, ROUNDING) * (right - left)
+        excess = np.abs(fine - coarse) - share
+        rough = excess > 0
+        if rough.sum() > MOST_INTERVALS:
+            rough &= excess > np.sort(excess)[-MOST_INTERVALS - 1]
+        done += fine[~rough].sum()
+        left, right = np.append(left[rough], middle[rough]), np.append(middle[rough], right[rough])
+        coarse = np.append(first[rough], second[rough])
+        if not left.size:
+            break
+    return float(done + coarse.sum())
+
+
+def _gauss(response: Callable[[Array], Array], left: Array, right: Array) -> Array:
+    """(k,): Gauss's rule in each interval."""
+    half = (right - left) / 2
+    points = (left + right) / 2 + half * _NODES[:, None]
+    return half * (_WEIGHTS @ response(points.ravel()).reshape(points.shape))
+
+
+# ----------------------------------------------------------------------------------------------------
+# sweep.supremum for many functions of frequency at once: one row each, refined between grid points together.
+
+
+PEAKS = 3  # highest local maxima of a row that are refined
+POINTS, ROUNDS = 17, 8  # a round narrows a bracket by (POINTS - 1)/2, so eight locate a smooth peak to rounding
+
+Responses = Callable[[Array], Array]  # w (n, k) [rad/sample] -> real values (n, k)
+
+
+def suprema(responses: Responses, grid: Array) -> Array:
+    """The largest value of each row over its frequencies, (n,); `grid` (n, k) is sorted along its last axis.
+
+    A row with a value that is not finite gives infinity.
+    """
+    values = responses(grid)
+    endless = ~np.isfinite(values).all(axis=1)
+    values = np.where(np.isfinite(values), values, -np.inf)
+    padded = np.pad(values, ((0, 0), (1, 1)), constant_values=-np.inf)
+    local = np.where((values > padded[:, :-2]) & (values >= padded[:, 2:]), values, -np.inf)  # once per plateau
+    peaks = np.argsort(local, axis=1)[:, -PEAKS:]
+    left, right = _neighbours(grid, np.take_along_axis(grid, peaks, axis=1))
+    top = values.max(axis=1)
+    for _ in range(ROUNDS):
+        trial = np.linspace(left, right, POINTS, axis=-1)  # (n, peaks, points)
+        found = responses(trial.reshape(trial.shape[0], -1)).reshape(trial.shape)
+        at = np.argmax(np.where(np.isfinite(found), found, -np.inf), axis=2)[..., None]
+        top = np.maximum(top, np.take_along_axis(found, at, axis=2)[..., 0].max(axis=1))
+        left = np.take_along_axis(trial, np.maximum(at - 1, 0), axis=2)[..., 0]
+        right = np.take_along_axis(trial, np.minimum(at + 1, POINTS - 1), axis=2)[..., 0]
+    return np.where(endless, np.inf, top)
+
+
+def _neighbours(grid: Array, at: Array) -> tuple[Array, Array]:
+    """The frequencies (n, peaks) of the grid below and above `at`; a grid may have some twice."""
+    room = 1e-12 * grid[:, -1:]
+    below = np.where(grid[:, None] < (at - room)[..., None], grid[:, None], grid[:, None, :1]).max(axis=2)
+    above = np.where(grid[:, None] > (at + room)[..., None], grid[:, None], grid[:, None, -1:]).min(axis=2)
+    return below, above
+
+
+Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)
+
+
+def frequencies(*systems: Lti, low: float = 1e-5, high: float = np.pi, points: int = 600) -> Array:
+    """Sorted frequencies [rad/sample] in [low, high]: even in w and in log w, dense around each pole.
+
+    A pole r exp(j phi) bends the response over a width of about 1 - r around phi, however sharp it is. One that
+    repeats counts once: of points that rounding alone holds apart the wrong one may be the higher, and hide the peak
+    beside the other.
+    """
+    even = np.linspace(low, high, points)
+    logarithmic = np.geomspace(low, high, points)
+    poles = _distinct(np.concatenate([g.poles() for g in systems])) if systems else np.zeros(0)
+    width = np.maximum(1 - np.abs(poles), 1e-9)
+    offsets = np.concatenate([[0.0], np.geomspace(0.05, 20, 12)])
+    offsets = np.concatenate([-offsets, offsets])
+    around = (np.abs(np.angle(poles))[:, None] + width[:, None] * offsets).ravel()
+    grid = np.unique(np.concatenate([even, logarithmic, around]))
+    return grid[(grid >= low) & (grid <= high)]
+
+
+def _distinct(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """One of each group of poles that lie within a hundredth of their distance to the circle."""
+    kept = np.zeros(0, dtype=np.complex128)
+    for pole in poles[poles.imag >= 0]:
+        if not (np.abs(kept - pole) < 0.01 * max(1 - abs(pole), 1e-9)).any():
+            kept = np.append(kept, pole)
+    return kept
+
+
+def supremum(response: Response, grid: Array) -> tuple[float, float]:
+    """(value, w): the largest `response` over [grid[0], grid[-1]], refined between grid points.
+
+    The highest local maxima of the grid (32 at most, within 20 % of the largest) are bracketed by their
+    neighbours, and the brackets narrowed by a factor of 8, ten times or until two rounds gain nothing: a smooth peak is
+    located to rounding.
+    """
+    values = response(grid)
+    if not np.isfinite(values).all():
+        worst = int(np.flatnonzero(~np.isfinite(values))[0])
+        return np.inf, float(grid[worst])
+    best = int(np.argmax(values))
+    top, where = float(values[best]), float(grid[best])
+    bracket = _brackets(values, grid, top - 0.2 * abs(top))
+    settled = 0
+    for _ in range(10):
+        value, w, bracket = _narrowed(response, *bracket)
+        settled = settled + 1 if value.max() <= top + 1e-13 * abs(top) else 0
+        if value.max() > top:
+            top, where = float(value.max()), float(w[np.argmax(value)])
+        if settled == 2:
+            break
+    return top, where
+
+
+def peaks(response: Response, grid: Array, above: float) -> Array:
+    """Where the 32 highest local maxima of `response` over [grid[0], grid[-1]] exceed `above`; (peaks,)."""
+    _, _, bracket = _narrowed(response, *_brackets(response(grid), grid, -np.inf))
+    value, w, _ = _narrowed(response, *bracket)
+    return w[value > above]
+
+
+def _brackets(values: Array, grid: Array, above: float) -> tuple[Array, Array]:
+    """The neighbours of the 32 highest local maxima of at least `above`."""
+    padded = np.concatenate([[-np.inf], values, [-np.inf]])
+    local = (values >= padded[:-2]) & (values >= padded[2:])
+    at = np.flatnonzero(local & (values >= above))
+    at = at[np.argsort(values[at])[-32:]]
+    return grid[np.maximum(at - 1, 0)], grid[np.minimum(at + 1, grid.size - 1)]
+
+
+def _narrowed(response: Response, left: Array, right: Array) -> tuple[Array, Array, tuple[Array, Array]]:
+    """The best of 17 points in each bracket, where it is, and the bracket of its neighbours."""
+    trial = np.linspace(left, right, 17)
+    found = response(trial.ravel()).reshape(trial.shape)
+    at, column = np.argmax(found, axis=0), np.arange(left.size)
+    closer = trial[np.maximum(at - 1, 0), column], trial[np.minimum(at + 1, 16), column]
+    return found[at, column], trial[at, column], closer
+
+
+def on_circle(w: Array) -> NDArray[np.complex128]:
+    """z = exp(j w)."""
+    return np.exp(1j * w)
+
+
+def hermitian(G: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """He G = (G + G*)/2 over the last two axes."""
+    return (G + np.conj(np.swapaxes(G, -1, -2))) / 2

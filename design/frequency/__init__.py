@@ -1,1 +1,0 @@
-"""What happens over frequency: sweeps that know the poles, suprema, integrals."""

@@ -1,1 +1,0 @@
-"""python -m design.limits: how good could a coupling be, with another device, delay, period or order?"""

@@ -1,1 +1,0 @@
-"""python -m design.plot: couplings side by side over frequency."""

@@ -1,1 +1,0 @@
-"""Problems over matrix inequalities: units, affine functions, samples; feasibility problems that are not designs."""

@@ -1,1 +1,0 @@
-"""python -m sim.accuracy: what each engine costs and how wrong it is."""

@@ -1,1 +1,0 @@
-"""python -m sim.suite: every check that a verdict rests on, in one report."""

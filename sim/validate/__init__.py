@@ -1,1 +1,0 @@
-"""python -m sim.validate: does a verdict hold for everyone?"""

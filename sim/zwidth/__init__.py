@@ -1,1 +1,0 @@
-"""python -m sim.zwidth: the K-B map."""

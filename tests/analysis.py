@@ -1,0 +1,92 @@
+"""Theorem 4 for a given coupling, as a feasibility problem with a signed margin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cvxpy as cp
+import numpy as np
+
+from controller.lti import Array, Lti
+from design.conditions import dampings
+from design.lmi import (
+    Ports,
+    balanced,
+    check_passive,
+    e_hat_regular,
+    lemma1,
+    lemma4,
+    solve,
+    solved,
+    theta_hat,
+    unit_coupling,
+    unit_environment,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis:
+    """The outcome; matrices are in units T = 1, Delta_D = I, None where no LMI was needed to refuse."""
+
+    margin: float  # > 0: Theorem 4 holds with this room in every inequality; < 0: it does not; -inf: no V-hat
+    Phi: Array | None = None  # (N, N) shortage of passivity of E-hat
+    Delta_V: Array | None = None  # (N, N) excess of passivity of V-hat
+    P_E: Array | None = None  # storage of E-hat, its regular part in balanced coordinates
+    P_V: Array | None = None  # storage of V-hat, likewise
+    reason: str | None = None
+
+    @property
+    def feasible(self) -> bool:
+        return self.margin > 0
+
+
+def analysis(V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int], delta: Sequence[float]) -> Analysis:
+    """Whether V satisfies Theorem 4 with this environment, with a signed margin.
+
+    Minimises s over E-hat + Phi passive, V-hat + s passive with excess Delta_V, (14) + s I >= 0 and
+    Delta_V + s >= 0; the margin is -s. Raises ValueError for an environment that is not passive.
+    """
+    check_passive(environment)
+    delta = dampings(delta, environment.inputs)
+    if not V.is_stable():
+        return Analysis(-np.inf, reason="the coupling V has a pole on or outside the unit circle")
+    V1 = V.dc()
+    if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
+        return Analysis(-np.inf, reason="the static compliance V(1) is not symmetric")
+    shortage = balanced(e_hat_regular(unit_environment(environment, delta), psi))
+    excess = balanced_ports(unit_coupling(V, delta), theta)
+    return _solve(shortage, excess)
+
+
+def balanced_ports(V: Lti, theta: Sequence[int]) -> Ports:
+    """`v_hat_regular` with both outputs balanced together (V in unit coordinates)."""
+    H = V - theta_hat(theta, V.T)
+    static = H.dc()
+    C2 = -H.quotient_at_one().C
+    both = balanced(Lti(H.A, H.B, np.vstack([C2, H.C]), np.vstack([static / 2, H.D]), H.T))
+    m = H.outputs
+    return Ports(both.A, both.B, both.C[:m], both.D[:m], both.C[m:], both.D[m:])
+
+
+def _solve(shortage: Lti, excess: Ports) -> Analysis:
+    m = shortage.inputs
+    s = cp.Variable()
+    Phi, Delta_V = (cp.Variable((m, m), symmetric=True) for _ in range(2))
+    P_E, P_V = _storage(shortage.A), _storage(excess.A)
+    zero = np.zeros((m, m))
+    constraints = [
+        lemma1(Ports.same(shortage), P_E, zero, -Phi) >> 0,
+        lemma1(excess, P_V, Delta_V, -s * np.eye(m)) >> 0,
+        lemma4(Delta_V, Phi) + s * np.eye(2 * m) >> 0,
+        Delta_V + s * np.eye(m) >> 0,
+        *(P >> 0 for P in (P_E, P_V) if isinstance(P, cp.Variable)),
+    ]
+    solve(cp.Problem(cp.Minimize(s), constraints), "the analysis by Theorem 4")
+    E_storage, V_storage = (solved(P) if isinstance(P, cp.Variable) else P for P in (P_E, P_V))
+    return Analysis(-float(solved(s)), solved(Phi), solved(Delta_V), E_storage, V_storage)
+
+
+def _storage(A: Array) -> cp.Variable | Array:
+    n = A.shape[0]
+    return cp.Variable((n, n), symmetric=True) if n else np.zeros((0, 0))

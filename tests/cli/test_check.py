@@ -1,0 +1,83 @@
+"""python -m design.check: exit codes, output, and that it needs no solver."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from cli.check import main
+from cli.options import execute
+from controller.coupling import SpringDamper
+from controller.environment import FIGURE_4
+from controller.loop import Loop
+from design.certificate import Stored, prove, save
+
+LOOP = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
+GAINS = SpringDamper((878.7, 551.8), (0.3865, 0.5220))
+
+
+def leave(monkeypatch, *argv: str) -> int:
+    """The exit code of the command."""
+    monkeypatch.setattr(sys, "argv", ["design.check", *argv])
+    with pytest.raises(SystemExit) as leaving:
+        execute(main)
+    return leaving.value.code
+
+
+@pytest.fixture
+def path(tmp_path):
+    file = tmp_path / "coupling.json"
+    save(Stored.of(LOOP, GAINS, prove(LOOP, GAINS, "theorem4")), file)
+    return file
+
+
+def test_a_proved_coupling_exits_with_0_and_prints_only_json_on_request(path, capsys):
+    assert main([str(path), "--json", "-"]) == 0
+    out, err = capsys.readouterr()
+    result = json.loads(out)
+    assert result["proved"]
+    assert result["promise"] == "any passive environment"
+    assert result["required_damping"][0] < 1.37
+    assert "proved, in exact arithmetic" in err
+
+
+def test_a_changed_gain_exits_with_1_and_says_why(path, tmp_path, capsys):
+    path.write_text(path.read_text().replace("878.7", "887.5"))
+    assert main([str(path), "--json", str(tmp_path / "result.json")]) == 1
+    assert "not proved" in capsys.readouterr().out
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert "digest differs" in result["reason"]
+    assert result["promise"] is None
+
+
+@pytest.mark.parametrize("content", [None, b"", b"{", b"[]", b"\xff", b'{"loop": {}}', b"[" * 100000])
+def test_bad_input_exits_with_2_and_one_line(tmp_path, capsys, monkeypatch, content):
+    file = tmp_path / "bad.json"
+    if content is not None:
+        file.write_bytes(content)
+    assert leave(monkeypatch, str(file)) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+
+
+def test_help_has_an_example(capsys):
+    with pytest.raises(SystemExit) as leaving:
+        main(["--help"])
+    assert leaving.value.code == 0
+    assert "python -m design.check coupling.json" in capsys.readouterr().out
+
+
+def test_checking_imports_no_solver(path):
+    code = f"import sys, cli.check as c; r = c.main([{str(path)!r}]); sys.exit(r or ('cvxpy' in sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
+def test_an_interruption_exits_with_130(path, monkeypatch):
+    def interrupted(stored):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("cli.check.verify", interrupted)
+    assert leave(monkeypatch, str(path)) == 130

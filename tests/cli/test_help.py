@@ -1,0 +1,96 @@
+"""Every command's --help ends with an example of that command, and its arguments are what the command takes."""
+
+import importlib
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cli.options import Parser
+
+ROOT = Path(__file__).parents[2]
+LAUNCH = re.compile(r"    execute\((\w+)\)")  # how a file says that it is a command
+
+
+class Parsed(Exception):
+    """Raised in place of the command's work once its arguments are understood."""
+
+
+def modules():
+    """Every command as python -m names it."""
+    files = [path for folder in ("design", "sim", "hw") for path in sorted((ROOT / folder).rglob("*.py"))]
+    found = [path.relative_to(ROOT).with_suffix("").parts for path in files if LAUNCH.search(path.read_text())]
+    return [".".join(parts).removesuffix(".__main__") for parts in found]
+
+
+def main_of(module):
+    path = ROOT / module.replace(".", "/")
+    text = (path / "__main__.py" if path.is_dir() else path.with_suffix(".py")).read_text()
+    name = LAUNCH.search(text).group(1)
+    door = re.search(rf"from (cli\.\w+) import {name}\b", text)
+    package = f"{module}.__main__" if path.is_dir() else module
+    return getattr(importlib.import_module(door.group(1) if door else package), name)
+
+
+def help_of(module, capsys):
+    with pytest.raises(SystemExit) as end:
+        main_of(module)(["--help"])
+    assert end.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_the_commands_are_found():
+    assert {"design", "design.audit", "sim.run", "sim.validate", "hw.bridge"} <= set(modules())
+
+
+@pytest.mark.parametrize("module", modules())
+def test_the_example_of_help_is_understood(module, capsys, monkeypatch):
+    text = help_of(module, capsys)
+    lines = text.partition("\nexample:\n")[2].splitlines()
+    assert lines, f"the help of {module} ends without an example"
+    parse = Parser.parse_args
+
+    def understood(self, *args, **kwargs):
+        raise Parsed(parse(self, *args, **kwargs))
+
+    monkeypatch.setattr(Parser, "parse_args", understood)
+    for line in lines:
+        words = shlex.split(line, comments=True)
+        assert words[:3] == ["python", "-m", module]
+        with pytest.raises(Parsed):
+            main_of(module)(words[3:])
+
+
+@pytest.mark.parametrize("module", modules())
+def test_help_says_what_every_option_is(module, capsys, monkeypatch):
+    """No option without a word on what it does."""
+    parse = Parser.parse_args
+    seen = []
+
+    def noted(self, *args, **kwargs):
+        seen.extend(self._actions)
+        return parse(self, *args, **kwargs)
+
+    monkeypatch.setattr(Parser, "parse_args", noted)
+    help_of(module, capsys)
+    silent = [action.option_strings or action.dest for action in seen if not action.help]
+    assert seen
+    assert not silent
+
+
+def test_commands_compute_with_one_blas_thread():
+    """The last digits of a result depend on how a sum is shared; an environment that asks for two changes nothing."""
+    script = (
+        "import sys, scipy.linalg; from threadpoolctl import threadpool_info; from sim.command import execute\n"
+        "count = lambda: {lib['num_threads'] for lib in threadpool_info() if lib['user_api'] == 'blas'}\n"
+        "print(count()); execute(lambda words: print(count()) or 0)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "2"}
+    done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=True)
+    if "{2}" not in done.stdout:
+        pytest.skip("no BLAS with threads of its own here")
+    assert done.stdout.split() == ["{2}", "{1}"]

@@ -1,0 +1,124 @@
+"""Ctrl-C at any time, and readers who stop reading: one line, the right exit code, no traceback."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from cli.options import execute
+from controller.coupling import SpringDamper
+from design.certificate import Stored, save
+from sim.files import check_file, out_file
+from sim.scenario import InputError, load
+
+ROOT = Path(__file__).parents[2]
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+
+
+def started(*words, **options):
+    return subprocess.Popen(
+        [sys.executable, *words], env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options
+    )
+
+
+def interrupted_after(module, command, cwd):
+    """SIGINT as soon as Python reports that `module` is imported: a time in the command's life, on any machine."""
+    process = started("-X", "importtime", "-m", *command, cwd=cwd)
+    for line in process.stderr:
+        if line.rpartition("|")[2].strip() == module:
+            break
+    process.send_signal(signal.SIGINT)
+    _, rest = process.communicate()
+    lines = [line for line in rest.splitlines() if not line.startswith("import time:")]
+    return process.returncode, lines
+
+
+def test_ctrl_c_while_the_solver_is_imported(tmp_path):
+    """After the command has begun: cvxpy is imported by the design."""
+    assert interrupted_after("cvxpy.atoms", ["design", "--coupling", "ccl"], tmp_path) == (130, ["interrupted"])
+
+
+def test_an_ignored_ctrl_c_stays_ignored(tmp_path):
+    """nohup, and `command &` in a script, have SIGINT ignored."""
+    words = ["-c", "import os, signal, sys; signal.signal(2, signal.SIG_IGN); os.execv(sys.executable, sys.argv[1:])"]
+    process = started(*words, sys.executable, "-X", "importtime", "-m", "sim.run", "--help", cwd=tmp_path)
+    for line in process.stderr:
+        if line.rpartition("|")[2].strip() == "numpy":
+            break
+    process.send_signal(signal.SIGINT)
+    assert "usage: python -m sim.run" in process.communicate()[0]
+    assert process.returncode == 0
+
+
+AUDIT = ["design.audit", "--K", "2870,2320", "--B", "5.47,5.55"]  # not certified: exit code 1
+
+
+@pytest.mark.parametrize(
+    ("command", "code"),
+    [
+        (["sim.run", "--duration", "0.3", "--no-plot"], 0),
+        (["sim.run", "--help"], 0),
+        ([*AUDIT, "--json", "-"], 1),
+    ],
+)
+def test_a_reader_that_leaves_does_not_change_the_exit_code(command, code, tmp_path):
+    """As `| head -1`, but leaving before the first line, so that every write finds nobody."""
+    with started("-m", *command, cwd=tmp_path) as process:
+        process.stdout.close()
+        errors = process.stderr.read()
+    assert process.returncode == code
+    assert "Broken" not in errors
+    assert "Traceback" not in errors
+    if "--help" not in command:
+        assert list(tmp_path.glob("out/*/report.json"))  # the work is done all the same
+
+
+def test_the_folder_of_a_file_that_is_named_must_exist(tmp_path):
+    with pytest.raises(InputError, match=r"--json .*nix/a.json: the folder .*nix does not exist"):
+        check_file("--json", tmp_path / "nix/a.json")
+    with pytest.raises(InputError, match=r"--out .*nix/a.json: the folder .*nix does not exist"):
+        out_file(str(tmp_path / "nix/a.json"), "out/a.json")
+    with pytest.raises(InputError, match="is a folder, expected the file of the coupling"):
+        out_file(str(tmp_path), "out/a.json", "the file of the coupling")
+    assert not (tmp_path / "nix").exists()
+    default = tmp_path / "out/deep/a.json"
+    assert out_file(None, str(default)) == default
+    assert default.parent.is_dir()
+    assert not default.exists()
+
+
+@pytest.mark.parametrize("command", [["design"], ["design.export", "coupling.json"]])
+def test_no_command_makes_the_folder_of_a_file(command, tmp_path, monkeypatch, capsys):
+    from cli.design import main as design
+    from cli.export import main as export
+
+    monkeypatch.chdir(tmp_path)
+    save(Stored.of(load().loop("I"), SpringDamper((878.7, 551.8), (0.3864, 0.5219))), "coupling.json")
+    monkeypatch.setattr(sys, "argv", ["x", *command[1:], "--out", "nix/a.c"])
+    with pytest.raises(SystemExit) as end:
+        execute(design if command == ["design"] else export)
+    assert end.value.code == 2
+    assert capsys.readouterr().err == "error: --out nix/a.c: the folder nix does not exist\n"
+    assert not Path("nix").exists()
+
+
+@pytest.mark.parametrize("asked", ["osmesa", "bogus"])
+def test_a_command_that_draws_nothing_does_not_need_what_mujoco_gl_names(asked, tmp_path):
+    command = [sys.executable, "-m", "sim.run", "--case", "none", "--duration", "0.05", "--no-plot"]
+    environment = ENVIRONMENT | {"MUJOCO_GL": asked}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_full_disk_behind_standard_output_is_one_line(tmp_path):
+    """And not exit code 1, which says that what was asked does not hold."""
+    if not os.path.exists("/dev/full"):
+        pytest.skip("there is no /dev/full here")
+    command = [sys.executable, "-m", "design.audit", "--rigid", "--K", "1000", "--B", "1", "--out", str(tmp_path)]
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(command, env=ENVIRONMENT, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == "error: standard output: No space left on device\n"

@@ -1,0 +1,210 @@
+"""sim.run as a user meets it: figures, files, exit codes, one line for bad input."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from cli.run import main
+from controller.coupling import SpringDamper
+from design.certificate import Stored, prove, save
+from sim import run as loop
+from sim.scenario import InputError, load
+from sim.trace import Result
+
+SECTIONS = {"case", "scenario", "coupling", "certificate", "certificates", "promise", "transparency", "stability"}
+SECTIONS |= {"run", "error", "files"}
+
+
+def run(tmp_path, *options):
+    code = main([*options, "--out", str(tmp_path / "out"), "--json", str(tmp_path / "r.json")])
+    return code, json.loads((tmp_path / "r.json").read_text())
+
+
+def test_case_none_is_figure_5(tmp_path):
+    code, report = run(tmp_path, "--case", "none")
+    stability = report["stability"]
+    assert code == 0
+    assert report["certificate"]["required_damping"] == pytest.approx([1.7229] * 2, rel=1e-4)
+    assert not report["certificate"]["certified"]
+    assert report["promise"] is None
+    assert stability["verdict"] == stability["exact_verdict"] == "unstable"
+    assert stability["exact_growth_rate_per_s"] == pytest.approx(1.481, abs=1e-3)
+    assert stability["growth_rate_per_s"] == pytest.approx(1.481, abs=1e-3)
+    assert stability["frequency_hz"] == pytest.approx(83.9, abs=0.2)
+    assert stability["clipped_ticks"] > 1000
+    assert report["error"]["position_relative_rms"] is None
+    assert "first clips" in report["error"]["reason"]
+    trace = Result.load_npz(tmp_path / "out" / "trace.npz")
+    assert np.abs(trace.f).max() == 12.0
+
+
+def test_case_i_is_designed_certified_and_proved(tmp_path):
+    code, report = run(tmp_path, "--case", "I")
+    assert code == 0
+    assert set(report) >= SECTIONS
+    assert report["coupling"]["kind"] == "spring-damper"
+    assert report["coupling"]["K"] == pytest.approx([878.77, 551.88], rel=1e-4)
+    assert report["certificate"]["condition"] == "theorem4"
+    assert report["certificate"]["certified"]
+    assert report["certificate"]["proof"] == "rational"
+    assert report["promise"] == "any passive environment"
+    assert report["stability"]["verdict"] == "stable"
+    assert report["stability"]["clipped_ticks"] == 0
+    assert report["error"]["position_relative_rms"] < 1e-7
+    assert all(Path(name).is_file() for name in report["files"])
+    assert [row["what"] for row in report["reproducibility"]][-1].startswith("Figure 6")
+
+
+def test_published_gains_are_refused_by_their_own_condition(tmp_path):
+    _, report = run(tmp_path, "--coupling", "published", "--no-plot", "--engine", "exact")
+    assert report["certificate"]["required_damping"] == pytest.approx([7.63, 7.84], abs=0.005)
+    assert report["certificates"]["closed-loop"]["required_damping"] == pytest.approx([1.3987] * 2, rel=1e-4)
+    assert report["stability"]["exact_growth_rate_per_s"] == pytest.approx(-0.939, abs=1e-3)
+    assert report["stability"]["exact_frequency_hz"] == pytest.approx(83.8, abs=0.1)
+    assert any("5.72 times the damping" in line for line in report["remarks"])
+
+
+def test_three_devices_of_ones_own(tmp_path):
+    code, report = run(tmp_path, "--scenario", "three-rigid", "--no-plot", "--duration", "2")
+    assert code == 0
+    assert len(report["coupling"]["K"]) == 3
+    assert report["certificate"]["certified"]
+    assert report["reproducibility"] == []
+
+
+def test_a_zero_damping_device_is_reported_not_certified(tmp_path):
+    _, report = run(tmp_path, "--coupling", "published", "--delta", "0", "--no-plot", "--duration", "1")
+    assert report["certificate"]["required_damping"] == [None, None]
+    assert "no damping" in report["certificate"]["reason"]
+
+
+def test_running_twice_gives_the_same_files(tmp_path):
+    for _ in range(2):
+        run(tmp_path, "--duration", "0.5", "--coupling", "published")
+    names = sorted(p.name for p in (tmp_path / "out").iterdir())
+    assert names == ["figure.png", "report.json", "scene.xml", "trace.csv", "trace.npz"]
+    table = np.genfromtxt(tmp_path / "out" / "trace.csv", delimiter=",", names=True)
+    trace = Result.load_npz(tmp_path / "out" / "trace.npz")
+    np.testing.assert_allclose(table["x1_m"], trace.x[:, 0], rtol=1e-8)
+    assert trace.meta["case"] == "I"
+
+
+def test_a_tampered_coupling_is_named(tmp_path):
+    """One gain changed by 1 %: judged anew, and the report says that the file's certificate does not hold."""
+    scenario = load()
+    data = SpringDamper((400.0, 300.0), (0.1, 0.1))
+    stored = Stored.of(scenario.loop("I"), data, prove(scenario.loop("I"), data, "theorem4"))
+    save(stored, tmp_path / "good.json")
+    changed = SpringDamper((404.0, 300.0), (0.1, 0.1))
+    save(msgspec.structs.replace(stored, coupling=changed.form()), tmp_path / "bad.json")
+    short = ("--no-plot", "--duration", "0.5")
+    for name, doubted in (("good.json", False), ("bad.json", True)):
+        _, report = run(tmp_path, "--coupling", str(tmp_path / name), *short)
+        assert any("certificate in the coupling's file does not hold" in r for r in report["remarks"]) == doubted
+    _, report = run(tmp_path, "--coupling", str(tmp_path / "good.json"), "--theta", "2", *short)
+    assert any("stored for another loop (different theta)" in r for r in report["remarks"])
+
+
+BAD = [
+    (["--case", "III"], "invalid choice: 'III'"),
+    (["--bogus"], "unrecognized arguments: --bogus"),
+    (["--theta", "1,x"], "--theta is '1,x', expected whole numbers separated by commas"),
+    (["--theta", "1,2,3"], "--theta has 3 entries, expected 2"),
+    (["--theta=-1"], "theta[0] is -1"),
+    (["--lam", "5"], "lam[0] is 5, allowed are 0 to theta + psi = 1"),
+    (["--T", "1.2"], "T is 1.2, allowed are 1e-06 to 0.1 s"),
+    (["--T", "nan"], "T is nan"),
+    (["--delta", "-1"], "--delta is -1, allowed are 0 to 10000 N s/m"),
+    (["--scenario", "nix.toml"], "scenario nix.toml: No such file"),
+    (["--substeps", "0"], "--substeps is 0, allowed are 1 to 10000"),
+    (["--duration", "inf"], "duration is inf"),
+    (["--seed", "-1"], "--seed is -1"),
+    (["--engine", "drake"], "invalid choice: 'drake'"),
+    (["--integrator", "RK5"], "invalid choice: 'RK5'"),
+    (["--case", "none", "--coupling", "published"], "--coupling published with --case none"),
+    (["--coupling", "magic"], "--coupling is 'magic', allowed are none, published, spring-damper"),
+    (["--coupling", "nix.json"], "nix.json: No such file"),
+    (["--scenario", "three-rigid", "--coupling", "published"], "gains for 2 channels, not 3"),
+    (["--json", "."], "--json .: is a folder, expected a file or -"),
+    (["--json", "/nowhere/r.json"], "--json /nowhere/r.json: the folder /nowhere does not exist"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), BAD, ids=[" ".join(o) for o, _ in BAD])
+def test_bad_options(options, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as caught:
+        main(options)
+    assert message in str(caught.value)
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def command(*options, **kwargs):
+    environment = {"PYTHONPATH": str(Path(__file__).parents[2]), "PATH": "/usr/bin:/bin"}
+    return subprocess.Popen(
+        [sys.executable, "-m", "sim.run", *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        **kwargs,
+    )
+
+
+def test_bad_input_is_one_line_on_stderr_and_exit_code_2(tmp_path):
+    process = command("--T", "7", cwd=tmp_path)
+    out, err = process.communicate()
+    assert process.returncode == 2
+    assert out == ""
+    assert err == "error: T is 7, allowed are 1e-06 to 0.1 s\n"
+
+
+def test_what_cannot_be_designed_is_exit_code_1(tmp_path):
+    process = command("--psi", "1", cwd=tmp_path)
+    _, err = process.communicate()
+    assert process.returncode == 1
+    assert "Theorem 4 admits no coupling" in err
+    assert err.count("\n") == 1
+
+
+def test_json_on_standard_output_is_only_json(tmp_path):
+    process = command("--coupling", "published", "--no-plot", "--json", "-", cwd=tmp_path)
+    out, err = process.communicate()
+    assert process.returncode == 0
+    assert json.loads(out)["case"] == "I"
+    assert "growth" in err
+
+
+def test_interrupting_keeps_what_was_simulated(tmp_path, monkeypatch):
+    """Ctrl-C in the third stretch: the first two are written, and the exit code says so."""
+    stretch, calls = loop.stretch, []
+
+    def interrupted(*args):
+        calls.append(args)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        stretch(*args)
+
+    monkeypatch.setattr(loop, "stretch", interrupted)
+    code, report = run(tmp_path, "--coupling", "published")
+    trace = Result.load_npz(tmp_path / "out" / "trace.npz")
+    assert code == 130
+    assert report["run"]["interrupted"]
+    assert trace.t.size == report["run"]["samples"] == 2 * loop.STRETCH
+    assert report["error"]["position_relative_rms"] < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("content", "message"), [(b"", "not a trace"), (b"PK\x03\x04rubbish", "not a trace"), (None, "No such file")]
+)
+def test_a_trace_that_is_none(tmp_path, content, message):
+    path = tmp_path / "trace.npz"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        Result.load_npz(path)

@@ -1,0 +1,71 @@
+"""Tables on narrow terminals: no number loses a digit."""
+
+import ast
+import io
+import re
+from pathlib import Path
+
+import pytest
+from rich.table import Table
+
+from cli.options import Screen
+
+ROOT = Path(__file__).parents[2]
+NUMBERS = ["7.8429", "18.895", "-11.19", "0.71449", "1.3699"]
+
+
+def printed(table: Table, width: int) -> str:
+    text = io.StringIO()
+    screen = Screen(file=text, width=width)
+    screen.print(table)
+    screen.print("x" * 10)
+    assert screen.width == width
+    return text.getvalue()
+
+
+@pytest.mark.parametrize("width", [10, 30, 45, 60, 100])
+@pytest.mark.parametrize("fold", [True, False])
+def test_numbers_are_whole(width, fold):
+    table = Table("a name of a few words", *(f"heading {n}" for n in "abcde"), title="what it is")
+    table.columns[0].overflow = "fold" if fold else "ellipsis"
+    table.add_row("spring-damper:closed-loop", *NUMBERS)
+    lines = printed(table, width).splitlines()
+    assert re.findall(r"-?\d+\.\d+", " ".join(lines)) == NUMBERS
+    assert "…" not in "".join(lines)
+
+
+def test_a_table_that_fits_is_as_it_was():
+    table = Table("a", "b")
+    table.add_row("1.5", "some words that wrap where the terminal ends")
+    assert max(map(len, printed(table, 40).splitlines())) == 40
+
+
+def test_every_report_is_printed_on_a_screen():
+    """A bare rich Console cuts: only the progress bar may use one."""
+    bare = set()
+    for path in (file for world in ("design", "sim", "hw", "cli") for file in (ROOT / world).rglob("*.py")):
+        calls = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
+        if any(isinstance(call.func, ast.Name) and call.func.id == "Console" for call in calls):
+            bare.add(path.name)
+    assert bare == {"options.py"}
+
+
+@pytest.mark.parametrize("name", ["[/]", "[/red]", "[b]out[/b]", "a[0", "[red", ":x:", "[K]", "[m/s]"])
+def test_a_name_is_no_markup(name):
+    """Names of files, scenarios and devices come from outside."""
+    table = Table("what", title=name)
+    table.add_row(f"cell {name} end")
+    lines = printed(table, 60).splitlines()
+    assert lines[0].strip() == name
+    assert f"cell {name} end" in "".join(lines)
+    text = io.StringIO()
+    Screen(file=text, width=60).print(f"files: {name}", soft_wrap=True)
+    assert text.getvalue() == f"files: {name}\n"
+
+
+def test_our_own_tags_are_colours():
+    text = io.StringIO()
+    Screen(file=text, width=60, force_terminal=True, color_system="standard", highlight=False).print(
+        "[red]not promised[/]: [m]"
+    )
+    assert text.getvalue() == "\x1b[31mnot promised\x1b[0m: [m]\n"

@@ -1,0 +1,116 @@
+"""The suite runs commands as a user would, and its report says what each found and how to repeat it."""
+
+import json
+import re
+import shlex
+
+import pytest
+
+from cli import hard, suite
+from cli import suite as suite_report
+from cli.options import Parser
+from cli.suite import CHECKS, Check, entry, main
+from sim.scenario import InputError
+
+QUICK = "sim.validate --case none --humans {humans} --links mixed --duration 0.3 --engine exact --seed {seed}"
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Two checks of a second."""
+    checks = (Check("none", "No coupling?", QUICK, suite_report.verdicts), CHECKS[-1])
+    assert checks[1].name == "hard"
+    monkeypatch.setattr(suite, "CHECKS", checks)
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.name)
+def test_every_check_is_a_command_with_its_options(check, monkeypatch):
+    module, *options = shlex.split(check.command.format(humans=3, seed=1))
+    parse = Parser.parse_args
+
+    class Parsed(Exception):
+        pass
+
+    def understood(self, *args, **kwargs):
+        raise Parsed(parse(self, *args, **kwargs).out)
+
+    monkeypatch.setattr(Parser, "parse_args", understood)
+    with pytest.raises(Parsed, match="x"):
+        entry(module)([*options, "--out", "x"])
+
+
+def test_names_of_checks_are_folders_of_their_own():
+    assert len({check.name for check in CHECKS}) == len(CHECKS)
+    assert {"I", "II", "none", "tightness", "accuracy", "hard"} <= {check.name for check in CHECKS}
+
+
+def test_the_report_begins_with_verdicts_and_every_number_has_its_command(tmp_path, quick):
+    assert main(["--humans", "20", "--seed", "3", "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 0
+    text, outcome = (tmp_path / "report.md").read_text(), json.loads((tmp_path / "r.json").read_text())
+    assert outcome["holds"]
+    assert [check["name"] for check in outcome["checks"]] == ["none", "hard"]
+    headings = re.findall(r"^## (.*)$", text, flags=re.MULTILINE)
+    assert headings == ["Verdicts", "No coupling?", "Numerically hard loops", "Where this was run"]
+    command = f"python -m {QUICK.format(humans=20, seed=3)}"
+    assert f"| `{command}` |" in text
+    assert f"```sh\n{command}\n```" in text
+    # the figures are those of the command itself
+    found = json.loads((tmp_path / "none" / "report.json").read_text())
+    assert outcome["checks"][0]["report"] == found
+    assert f"| unstable with | {found['unstable']['exact']} (exact), - (MuJoCo) |" in text
+    assert "| handle of 1 g, no human damping | -0.1670 | RK4 x 1: refused | RK4 x 48 |" in text
+    pictures = re.findall(r"!\[.*?\]\((.*?)\)", text)
+    assert pictures == ["none/population.png"]
+    assert all((tmp_path / picture).stat().st_size > 10_000 for picture in pictures)
+    anchors = re.findall(r"\]\(#(.*?)\)", text)
+    assert anchors == ["no-coupling", "numerically-hard-loops"]
+
+
+def test_a_check_that_fails_fails_the_suite_and_the_rest_is_done(tmp_path, quick, monkeypatch):
+    monkeypatch.setattr(hard, "CLOSE", 0.0)  # as if the rule were wrong
+    assert main(["--humans", "5", "--out", str(tmp_path)]) == 1
+    text = (tmp_path / "report.md").read_text()
+    assert "**1 of 2 checks hold; not: hard.**" in text
+    assert "| **does not hold** | [Numerically hard loops]" in text
+
+
+def test_a_check_that_cannot_run_is_no_success(tmp_path, monkeypatch, capsys):
+    broken = Check("broken", "Nothing there?", "sim.validate --scenario missing.toml", suite_report.verdicts)
+    monkeypatch.setattr(suite, "CHECKS", (broken,))
+    # what an earlier run left behind is not this one's
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "report.json").write_text('{"stale": true}')
+    assert main(["--out", str(tmp_path)]) == 1
+    assert "scenario missing.toml: No such file" in (tmp_path / "report.md").read_text()
+    assert "scenario missing.toml: No such file" in capsys.readouterr().out
+    assert json.loads((tmp_path / "report.json").read_text())["checks"][0]["report"] == {}
+
+
+def test_ctrl_c_keeps_the_checks_that_are_done(tmp_path, monkeypatch):
+    def interrupted(case):
+        raise KeyboardInterrupt
+
+    other = Check("other", "Never asked?", "sim.hard", suite_report.hard)
+    first = Check("none", "No coupling?", QUICK, suite_report.verdicts)
+    monkeypatch.setattr(suite, "CHECKS", (first, CHECKS[-1], other))
+    monkeypatch.setattr(hard, "measure", interrupted)
+    assert main(["--humans", "5", "--out", str(tmp_path)]) == 130
+    outcome = json.loads((tmp_path / "report.json").read_text())
+    assert outcome["interrupted"]
+    assert not outcome["holds"]
+    assert outcome["checks"][0]["holds"]
+    assert outcome["left_out"] == ["other"]
+    assert "Interrupted." in (tmp_path / "report.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--only", "all"], "--only has 'all', allowed are none, I, II"),
+        (["--humans", "0"], "--humans is 0, allowed are 1 to 1000000"),
+        (["--seed", "x"], "--seed is 'x', expected a whole number"),
+    ],
+)
+def test_bad_calls(options, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        main([*options, "--out", str(tmp_path)])

@@ -1,0 +1,304 @@
+"""Walls: the tick's complementarity problem, the energy of contact, and closed loops that bounce."""
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from cli.accuracy import main as accuracy
+from cli.run import main
+from cli.validate import main as validate
+from controller.coupling import NoCoupling, SpringDamper
+from controller.environment import FIGURE_4, GROUND, Network, Wall, environment, held
+from controller.loop import force_map
+from controller.lti import SingularLoop
+from controller.process import Complementarity, Process, Tape, contact
+from design.audit import Subject, report
+from design.certificate import FROZEN, NotProved, assess, prove
+from design.conditions import this_environment
+from models.device import CompliantDevice
+from models.human import Population
+from models.scene import variants
+from sim.crowds import crowds
+from sim.engines import ExactBatchEngine, MujocoBatchEngine, hold
+from sim.hunt import bounce
+from sim.run import assemble, simulate
+from sim.scenario import SCENARIOS, InputError, load, parse
+
+T = 1e-3
+SOFT = SpringDamper([878.0, 551.0], [0.386, 0.521])  # within theorem4's set for theta = (1, 2), T = 1.2 ms
+WALL = ("tip", GROUND)
+
+
+def one(stiffness=1000.0, damping=0.0, gap=0.0) -> Network:
+    return Network(("tip",), walls=(Wall(WALL, stiffness, damping, gap),))
+
+
+def walled(network: Network, coupling, theta, psi) -> Process:
+    walls = contact(network, coupling, theta, psi, T)
+    return Process(walls.open, np.full(walls.channels, np.inf), np.zeros(walls.channels), walls)
+
+
+def drive(process: Process, x: np.ndarray) -> Tape:
+    """The tape after displacements (ticks, m, nsim)."""
+    tape = Tape(process, len(x), x.shape[1], nsim=x.shape[2])
+    for k, row in enumerate(x):
+        tape.x[k] = row
+        tape.tick(k)
+    return tape
+
+
+def wander(ticks: int, channels: int, nsim: int, seed: int = 0) -> np.ndarray:
+    return np.cumsum(np.random.default_rng(seed).normal(size=(ticks, channels, nsim)), axis=0) * 1e-3
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3, 50.0])
+def test_a_wall_gives_back_no_more_than_it_has_stored(damping):
+    """f[k] (x[k] - x[k-1]) >= potential now less potential before, tick by tick; rounding of 1e-12 of the stiffness."""
+    x = wander(2000, 1, 20)
+    f = drive(walled(one(700.0, damping, 0.004), NoCoupling(), [0], [0]), x).f[:2000]
+    depth = np.maximum(x - 0.004, 0)
+    potential = 700.0 * depth**2 / 2
+    assert (f[1:] * np.diff(x, axis=0) >= np.diff(potential, axis=0) - 1e-12 * 700).all()
+    assert (f >= 0).all()  # it never pulls
+    touching = depth > 0
+    assert (touching[1:] & ~touching[:-1]).sum() > 100
+    assert ((f == 0) & touching).any() == (damping > 0)  # a strong damper lets go before the spring does
+
+
+@pytest.mark.parametrize("walls", [1, 2, 3, 4])
+def test_the_wall_forces_solve_the_complementarity_problem(walls):
+    """p >= 0, s = M p - q >= 0 and p's = 0 for passive, unsymmetric M: to 1e-12 of what is subtracted."""
+    rng = np.random.default_rng(walls)
+    for _ in range(20):
+        root, turn = rng.normal(size=(2, walls, walls))
+        M = np.diag(rng.uniform(1e-5, 1e-3, walls)) + 1e-3 * (root @ root.T + turn - turn.T)
+        q = 1e-3 * rng.normal(size=(walls, 50))
+        p = Complementarity(M).solve(q)
+        s = M @ p - q
+        scale = np.abs(M) @ p + np.abs(q)
+        assert (p >= 0).all()
+        assert (s >= -1e-12 * scale).all()
+        assert (np.minimum(p * np.diag(M)[:, None], s) <= 1e-12 * scale).all()
+        assert 0 < (p > 0).mean() < 1
+
+
+def test_wall_forces_that_are_not_determined_are_refused():
+    with pytest.raises(SingularLoop, match=r"forces of walls \[2\] are not determined"):
+        Complementarity(np.array([[1.0, 0.0], [0.0, -1.0]]))
+
+
+def test_a_wall_behind_a_coupling_against_a_root_finder():
+    """u = x - y, K y + B (y - y-)/T = wall(u) = f, one equation a tick, solved by bisection to 1e-13 m."""
+    K, B, stiffness, damping, gap = 900.0, 0.4, 3000.0, 2.0, 2e-3
+    x = wander(400, 1, 1)[:, 0, 0]
+    expected, y_old, h_old = [0.0], 0.0, 0.0  # theta = 1
+
+    def push(u):
+        h = max(0.0, u - gap)
+        return max(0.0, stiffness * h + damping * (h - h_old) / T)
+
+    for target in x:
+        u = brentq(lambda u, t=target, y=y_old: K * (t - u) + B * (t - u - y) / T - push(u), -1.0, 1.0, xtol=1e-16)
+        expected.append(push(u))
+        y_old, h_old = target - u, max(0.0, u - gap)
+    f = drive(walled(one(stiffness, damping, gap), SpringDamper([K], [B]), [1], [0]), x[:, None, None]).f[:400, 0, 0]
+    np.testing.assert_allclose(f, expected[:400], atol=1e-9)  # 1e-13 m times 5000 N/m
+    assert 0 < (f > 0).mean() < 1
+
+
+BOXED = Network(
+    FIGURE_4.contacts,
+    FIGURE_4.springs,
+    FIGURE_4.masses,
+    (
+        Wall(("mass", GROUND), 5000.0, 3.0, 1e-3),
+        Wall((GROUND, "mass"), 4000.0, 0.0, 2e-3),
+        Wall(("contact 1", "contact 2"), 2000.0, 1.0, -1.0),
+    ),
+)
+
+
+@pytest.mark.parametrize("coupling", [NoCoupling(), SpringDamper([2e4, 1e4], [1.0, 0.0])], ids=["none", "stiff"])
+@pytest.mark.parametrize("psi", [(0, 0), (0, 2)])
+def test_a_wall_that_always_touches_is_the_linear_spring_damper(coupling, psi):
+    """Walls a metre inside: differences of two runs follow the environment with springs in the walls' place."""
+    walls = (Wall(("contact 1", GROUND), 5000.0, 3.0, -1.0), Wall(FIGURE_4.contacts, 2000.0, 1.0, -1.0))
+    network = Network(BOXED.contacts, BOXED.springs, BOXED.masses, walls)
+    x = wander(300, 2, 2)
+    f = drive(walled(network, coupling, (1, 2), psi), x).f[:300]
+    F = force_map(environment(held(network), T), coupling, (1, 2), psi)
+    linear = drive(Process(F, np.full(2, np.inf), np.zeros(2)), x).f[:300]
+    assert np.abs(f - linear).max() > 100  # the gaps' constant forces
+    np.testing.assert_allclose(f[..., 0] - f[..., 1], linear[..., 0] - linear[..., 1], atol=1e-7)  # 1e-10 of the forces
+
+
+def test_frozen_states_are_the_environments_with_springs():
+    walls = contact(BOXED, SOFT, (1, 2), (0, 0), T)
+    z = np.exp(1j * np.array([0.02, 0.5, 3.0]))
+    states = walls.frozen()
+    assert len(states) == 8
+    for touching, F in states.items():
+        E = environment(held(BOXED, touching), T)
+        np.testing.assert_allclose(F.at(z), force_map(E, SOFT, (1, 2), (0, 0)).at(z), rtol=1e-8)
+    np.testing.assert_allclose(walls.open.at(z), states[(False,) * 3].at(z), rtol=1e-9)
+
+
+def test_walls_between_nodes_keep_the_whole_environment_passive():
+    """Two contacts, a mass between two walls, a wall between the contacts: sum f'dx never falls below what is stored.
+
+    From rest with walls open nothing is stored, so the sum is never negative.
+    """
+    network = Network(
+        BOXED.contacts, BOXED.springs, BOXED.masses, (*BOXED.walls[:2], Wall(FIGURE_4.contacts, 2e3, 1, 1e-3))
+    )
+    process = walled(network, NoCoupling(), (0, 0), (0, 0))
+    x = wander(3000, 2, 10)
+    x -= x[0]
+    tape = drive(process, x)
+    energy = np.cumsum((tape.f[1:3000] * np.diff(x, axis=0)).sum(axis=1), axis=0)
+    assert energy.min() > -1e-12 * energy.max()
+    depths = process.contact.depths(tape.z) > 0
+    assert ((depths[1:] & ~depths[:-1]).sum(axis=(0, 2)) > 50).all()  # every wall is hit
+
+
+def boxed(scenario):
+    walls = (Wall(("contact 1", GROUND), 20000.0, 0.0, 1e-3), Wall((GROUND, "contact 2"), 2000.0, 5.0))
+    network = Network(FIGURE_4.contacts, FIGURE_4.springs, FIGURE_4.masses, walls)
+    devices = tuple(CompliantDevice(force_limit=1e6) for _ in range(2))
+    return scenario.replace(environment=network, device=devices, tap=None)
+
+
+@pytest.mark.parametrize(("name", "humans", "seconds"), [("exact", 200, 6.0), ("mujoco", 20, 3.0)])
+def test_random_hands_on_walls_come_to_rest_under_theorem4(name, humans, seconds):
+    """Walls of 20000 and 2000 N/m hit at up to 0.3 m/s, a coupling certified for whatever is passive.
+
+    The speed falls from the first quarter to the last in every run, though contact is made thousands of times.
+    """
+    scenario = boxed(load())
+    assert assess(scenario.loop("I"), SOFT)["theorem4"].certified
+    loop = assemble(scenario, SOFT)
+    ((_, crowd),) = crowds(Population(damping=(0.3, 30.0)), 2, 0, range(humans), 1)
+    sets = variants(scenario.device, crowd)
+    if name == "exact":
+        engine = ExactBatchEngine(hold(sets.plants(), scenario.T), loop.process.force_limit)
+    else:
+        engine = MujocoBatchEngine(sets.scene, scenario.T, nsim=humans, fields=sets.fields)
+    n = sets.scene.model.nv
+    start = np.zeros((2 * n, humans))
+    start[n:] = np.random.default_rng(1).uniform(-0.3, 0.3, (n, humans))
+    seen = bounce(loop.process, engine, start, round(seconds / scenario.T), outside=sets.scene.outside)
+    print(f"{name}: {seen.made.sum():.0f} contacts made by {humans} pairs of hands")
+    assert seen.made.sum() > 10 * humans
+    assert (seen.made[0] > 0).mean() > 0.9
+    assert seen.clipped.sum() == 0
+    assert (seen.speed[-1] < 0.5 * seen.speed[0]).all()
+
+
+def test_both_engines_see_the_same_contacts():
+    """RK4 x 4 against the exact hold on a bouncing trace: 1e-6 of the motion, and the same number of contacts."""
+    loop = assemble(load("one-wall").replace(duration=2.0), SpringDamper([900.0], [0.4]))
+    exact, own = simulate(loop, "exact"), simulate(loop, "mujoco")
+    depths = [loop.process.contact.depths(record.z) > 0 for record in (exact, own)]
+    np.testing.assert_array_equal(*depths)
+    assert (depths[0][1:] & ~depths[0][:-1]).sum() >= 1
+    assert np.abs(exact.s[:, 0] - own.s[:, 0]).max() < 1e-6 * np.abs(exact.s[:, 0]).max()
+
+
+def test_a_run_reports_the_contact_and_who_covers_it(tmp_path):
+    def run(*options):
+        main(["--scenario", "one-wall", "--duration", "3", "--engine", "exact", "--no-plot", *options,
+              "--out", str(tmp_path), "--json", str(tmp_path / "r.json")])  # fmt: skip
+        return json.loads((tmp_path / "r.json").read_text())
+
+    soft, bare = run(), run("--case", "none")
+    assert soft["promise"] == "any passive environment"
+    assert any("theorem4 covers it" in line for line in soft["remarks"])
+    assert soft["stability"]["contact"]["made"] == 2
+    assert [state["touching"] for state in soft["stability"]["contact"]["frozen"]] == [[], [1]]
+    assert soft["stability"]["growth_rate_per_s"] is None
+    assert "contact was made 2 times" in soft["stability"]["reason"]
+    z = np.exp(1j * np.linspace(1e-4, np.pi, 20_000))
+    touching = (3000 + 2 * (1 - 1 / z) / 1e-3) / z  # closed-loop: -T He[F/(z - 1)] at most
+    assert bare["certificates"]["closed-loop"]["required_damping"][0] == pytest.approx(
+        (-1e-3 * touching / (z - 1)).real.max(), rel=1e-6
+    )
+    assert bare["promise"] is None
+    assert any("no certificate covers it" in line for line in bare["remarks"])
+
+
+def test_closed_loop_is_asked_of_every_frozen_state():
+    """Two walls make four linear loops: the requirement is the largest of the states', each recomputed here."""
+    loop = boxed(load()).loop("I")
+    requirement = assess(loop, SOFT)["closed-loop"]
+    singles = [
+        this_environment(
+            force_map(environment(held(loop.environment, state), loop.T), SOFT, (1, 2), (0, 0)), loop.delta
+        )
+        for state in [(False, False), (False, True), (True, False), (True, True)]
+    ]
+    assert requirement.ratio == max(single.ratio for single in singles)
+    assert len({single.ratio for single in singles}) == 4
+    assert requirement.proof == "sampled"
+    with pytest.raises(NotProved, match="of walls only theorem4"):
+        prove(loop, SOFT, "closed-loop")
+    assert prove(loop, SOFT, "theorem4").promise == "any passive environment"
+    late = boxed(load()).replace(psi=(1, 0)).loop("I")
+    assert "no walls" in (assess(late, SOFT)["theorem4"].reason or "")
+
+
+def test_a_stiffer_coupling_is_promised_for_frozen_states_only():
+    """K = 1772 N/m behind one sample of delay: closed-loop asks 1.3699 of 1.37 with the wall, theorem4 2.38."""
+    s = load("one-wall")
+    subject = Subject(SpringDamper([1772.0], [0.453]), s.environment, s.T, s.theta, s.psi, s.delta)
+    assert subject.requirement("closed-loop").certified
+    assert not subject.requirement("theorem4").certified
+    assert report(subject)["promise"] == FROZEN
+    open_only = Subject(subject.coupling, held(s.environment, [False]), s.T, s.theta, s.psi, s.delta)
+    assert open_only.requirement("closed-loop").ratio == 0
+
+
+def test_a_coupling_with_a_model_of_its_own_cannot_face_walls():
+    class Model:
+        def around(self, environment, further=0):
+            return environment
+
+    with pytest.raises(InputError, match="Model holds a linear model"):
+        assemble(load("one-wall"), Model())
+
+
+TEXT = (SCENARIOS / "one-wall.toml").read_text()
+BAD = [
+    ("stiffness = 3000.0", "stiffness = -1.0", "stiffness of the wall between tip and ground is -1.0"),
+    ("stiffness = 3000.0", "stiffness = 0.0", "stiffness of the wall between tip and ground is 0"),
+    ("gap = 0.005", "gap = inf", "gap of the wall between tip and ground is inf, expected a finite length"),
+    ("gap = 0.005", "gab = 0.005", "unknown field `gab` (did you mean `gap`?)"),
+    ('"ground"]', '"tip"]', "between joins 'tip' to itself"),
+    ('["tip", "ground"]', '["tap", "ground"]', "contact 'tip' has neither spring nor mass nor wall"),
+]
+
+
+@pytest.mark.parametrize(("old", "new", "message"), BAD, ids=[new for _, new, _ in BAD])
+def test_a_bad_wall_gets_one_line(old, new, message):
+    assert old in TEXT
+    with pytest.raises(InputError) as caught:
+        parse(TEXT.replace(old, new, 1))
+    assert message in str(caught.value)
+
+
+def test_at_most_six_walls():
+    with pytest.raises(InputError, match=r"environment.walls: expected `array` of length <= 6"):
+        parse(TEXT.replace("walls = [", "walls = [" + 6 * '{ between = ["tip", "ground"], stiffness = 1.0 }, '))
+
+
+@pytest.mark.parametrize("command", [validate, accuracy])
+def test_commands_that_decide_linear_loops_refuse_walls(command):
+    with pytest.raises(InputError, match="decides linear loops"):
+        command(["--scenario", "one-wall"])
+
+
+def test_files_without_walls_say_nothing_of_them():
+    assert b"walls" not in msgspec.json.encode(FIGURE_4)
+    assert load("one-wall").digest != load("one-wall").replace(theta=(2,)).digest

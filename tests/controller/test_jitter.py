@@ -1,0 +1,148 @@
+"""Delays that vary: the line that holds, patterns, and the switched loop."""
+
+import numpy as np
+import pytest
+
+from controller.coupling import SpringDamper
+from controller.delay import LOST, HeldLine, Jitter, ages, newest, packet_delays, realising
+from controller.environment import FIGURE_4, environment
+from controller.loop import force_map
+from controller.process import Process, Tape
+
+T = 1.2e-3
+COUPLING = SpringDamper([7806, 3137], [0.105, 1.68])
+IDEAL = np.zeros(2)
+NO_LIMIT = np.full(2, np.inf)
+
+
+def column(*delays):
+    return packet_delays(np.array(delays)[:, None, None])
+
+
+def carried(delays, forces):
+    """What the device applies, for one channel and one simulation."""
+    line, applied = HeldLine(delays, 1), []
+    for k, g in enumerate(forces):
+        force = np.array([[float(g)]])
+        line.carry(k, force)
+        applied.append(force[0, 0])
+    return applied
+
+
+def test_hold_last_by_hand():
+    """Packets sent at k with these delays; the newest that is there is applied.
+
+    k          0    1    2    3    4     5    6
+    force      10   11   12   13   14    15   16
+    delay      1    3    1    2    lost  1    0
+    arrives    1    4    3    5    -     6    6
+    in use     -    0    0    2    2     3    6     (packet 1 comes after packet 2: too late to be of use)
+    age        -    1    2    1    2     2    0
+    """
+    delays = column(1, 3, 1, 2, LOST, 1, 0)
+    assert newest(delays).ravel().tolist() == [-1, 0, 0, 2, 2, 3, 6]
+    assert ages(delays).ravel().tolist() == [-1, 1, 2, 1, 2, 2, 0]
+    assert carried(delays, range(10, 17)) == [0, 10, 10, 12, 12, 13, 16]
+
+
+def test_when_every_packet_is_lost_the_force_stays():
+    delays = column(0, 0, *[LOST] * 8)
+    assert carried(delays, range(5, 15)) == [5, 6, *[6] * 8]
+    assert carried(column(*[LOST] * 4), range(1, 5)) == [0, 0, 0, 0]
+
+
+def test_a_constant_delay_is_the_linear_block():
+    """The line behind G against Theta G, delays (1, 2): the same sums in another order, so equal to rounding."""
+    E, x = environment(FIGURE_4, T), np.random.default_rng(1).normal(size=(200, 2, 1))
+    G, F = (force_map(E, COUPLING, theta, (0, 0)) for theta in ((0, 0), (1, 2)))
+    constant = np.tile(np.array([1, 2])[None, :, None], (200, 1, 1))
+    forces = []
+    for process in (Process(G, NO_LIMIT, IDEAL, delays=constant), Process(F, NO_LIMIT, IDEAL)):
+        tape = Tape(process, 50, 2)
+        for first in range(0, 200, 50):  # stretches: the line goes on where it was
+            for k in range(50):
+                tape.x[k] = x[first + k]
+                tape.tick(k)
+            forces.append(tape.f[:50].copy())
+            tape.rewind(50)
+    np.testing.assert_allclose(np.concatenate(forces[:4]), np.concatenate(forces[4:]), rtol=1e-12, atol=1e-12)
+
+
+def test_the_age_stays_within_the_range_and_grows_by_one_at_most():
+    jitter = Jitter((1, 0), (4, 3))
+    delays = jitter.draw(np.random.default_rng(2), 5000)
+    age = ages(delays[:, :, None])[10:, :, 0]
+    assert age.min(axis=0).tolist() == [1, 0]
+    assert age.max(axis=0).tolist() == [4, 3]
+    assert np.diff(age, axis=0).max() == 1
+
+
+def test_wanted_ages_are_realised_by_delays_within_the_range():
+    rng = np.random.default_rng(3)
+    wanted = np.full((400, 2), 3)
+    for k in range(1, 400):
+        wanted[k] = rng.integers(1, np.minimum(wanted[k - 1] + 1, 4), endpoint=True)
+    delays = realising(wanted)
+    assert delays.min() >= 1
+    assert delays.max() <= 4
+    np.testing.assert_array_equal(ages(delays[:, :, None])[4:, :, 0], wanted[4:])
+    with pytest.raises(ValueError, match="does not return to an older force"):
+        realising(np.array([[1], [3]]))
+
+
+def test_patterns_are_what_they_are_called():
+    rng, ticks = np.random.default_rng(4), 40_000
+    assert (Jitter((1,), (3,), "constant").draw(rng, 9, [[2]]) == 2).all()
+    counts = np.bincount(Jitter((1,), (3,)).draw(rng, ticks).ravel())
+    # binomial: four standard deviations of a third of the packets
+    np.testing.assert_allclose(counts[1:], ticks / 3, atol=4 * np.sqrt(ticks * 2 / 9))
+    bursty = Jitter((1,), (2,), "bursty", calm=20, burst=5).draw(rng, ticks).ravel()
+    starts = int((np.diff(bursty) == 1).sum())
+    # a burst every 25 packets: about 1600, each stretch geometric, so 4 standard deviations are about 6 percent
+    assert starts == pytest.approx(ticks / 25, rel=0.1)
+    assert (bursty == 2).mean() == pytest.approx(0.2, rel=0.15)
+    recorded = Jitter((0,), (2,), "recorded", recorded=((0,), (2,), (LOST,)))
+    assert recorded.draw(rng, 5).ravel().tolist() == [0, 2, LOST, 0, 2]
+
+
+def test_loss_and_playout():
+    jitter = Jitter((1,), (3,), loss=0.25, playout=True)
+    delays = jitter.draw(np.random.default_rng(5), 10_000)
+    assert set(np.unique(delays)) == {LOST, 3}
+    assert (delays == LOST).mean() == pytest.approx(0.25, abs=4 * np.sqrt(0.25 * 0.75 / 10_000))  # 4 deviations
+    assert not jitter.steady
+    assert Jitter((1,), (3,), playout=True).steady
+    assert (Jitter((1,), (2,), loss=1.0).draw(np.random.default_rng(5), 50) == LOST).all()
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"lo": (1,), "hi": (2, 2)}, "one each per channel"),
+        ({"lo": (3,), "hi": (2,)}, "channel 1 is 3 to 2"),
+        ({"lo": (1,), "hi": (2,), "loss": 1.5}, "jitter.loss is 1.5"),
+        ({"lo": (1,), "hi": (2,), "burst": 0}, "jitter.burst is 0"),
+        ({"lo": (1,), "hi": (2,), "pattern": "recorded"}, "go together"),
+        ({"lo": (1,), "hi": (2,), "pattern": "recorded", "recorded": ((3,),)}, "packet 0, channel 1: delay 3"),
+        ({"lo": (1,), "hi": (2,), "pattern": "recorded", "recorded": ((1, 1),)}, "2 delays for 1 channels"),
+    ],
+)
+def test_impossible_ranges_are_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        Jitter(**fields)
+
+
+@pytest.mark.parametrize("pattern", ["constant", "adversarial"])
+def test_patterns_that_depend_on_the_loop_ask_for_its_delays(pattern):
+    with pytest.raises(ValueError, match="give its delays"):
+        Jitter((1,), (2,), pattern).draw(np.random.default_rng(0), 10)
+
+
+def test_a_process_refuses_delays_that_do_not_fit():
+    G = force_map(environment(FIGURE_4, T), COUPLING, (0, 0), (0, 0))
+    with pytest.raises(ValueError, match="1 channels, expected 2"):
+        Process(G, NO_LIMIT, IDEAL, delays=np.zeros((5, 1, 1)))
+    tape = Tape(Process(G, NO_LIMIT, IDEAL, delays=np.zeros((1, 2, 1))), 2, 2)
+    tape.tick(0)
+    with pytest.raises(ValueError, match="given for 1 ticks"):
+        tape.tick(1)

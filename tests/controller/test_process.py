@@ -1,0 +1,130 @@
+"""The timing convention, by hand and by its laws."""
+
+import numpy as np
+import pytest
+
+from controller.coupling import Compliance, NoCoupling, SpringDamper
+from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.loop import force_map
+from controller.lti import Lti
+from controller.process import Process, Tape
+
+T = 1e-3
+NONE = np.zeros(1)
+
+
+def drive(process: Process, x: np.ndarray) -> np.ndarray:
+    """Forces for given displacements (ticks, m), tick by tick."""
+    tape = Tape(process, len(x), x.shape[1])
+    for k, row in enumerate(x):
+        tape.x[k] = row[:, None]
+        tape.tick(k)
+    tape.saturate(len(x))
+    return tape.f[: len(x), :, 0]
+
+
+def wall(K: float, B: float = 0.0) -> Lti:
+    return environment(Network(("a",), (Spring(("a", GROUND), K, B),)), T)
+
+
+def process(F: Lti, limit=np.inf, step=0.0) -> Process:
+    return Process(F, np.full(F.inputs, limit), np.full(F.inputs, step))
+
+
+def test_three_ticks_by_hand():
+    """A wall of 1000 N/m and 2 N s/m behind a spring of 1000 N/m, one sample of delay, limit 5 N.
+
+    f_e = 1000 u + 2 (u - u-)/T = 3000 u - 2000 u-,  u = x - f_e/1000  =>  f_e = (3000 x - 2000 u-) / 4
+        k   x[mm]   u-[mm]   f_e[N]     u[mm]     f[N] = f_e one tick later, within 5 N
+        0   4       0        3          1         0
+        1   8       1        5.5        2.5       3
+        2   0       2.5     -1.25       1.25      5 (5.5 clipped)
+    """
+    F = force_map(wall(1000.0, 2.0), SpringDamper([1000.0], [0.0]), [1], [0])
+    f = drive(process(F, limit=5.0), np.array([[4e-3], [8e-3], [0.0], [0.0]]))
+    np.testing.assert_allclose(f[:, 0], [0.0, 3.0, 5.0, -1.25], atol=1e-12)
+
+
+@pytest.mark.parametrize(("theta", "psi"), [(0, 0), (2, 0), (0, 1), (3, 2)])
+def test_without_coupling_both_delays_only_shift(theta, psi):
+    x = np.random.default_rng(0).normal(size=(30, 1))
+    shifted = drive(process(force_map(wall(500.0, 1.0), NoCoupling(), [theta], [psi])), x)
+    direct = drive(process(wall(500.0, 1.0)), x)
+    n = theta + psi
+    np.testing.assert_allclose(shifted[n:], direct[: 30 - n], rtol=1e-12)
+    assert not shifted[:n].any()
+
+
+def test_psi_is_inside_the_loop_and_theta_is_not():
+    coupling = SpringDamper([900.0], [0.5])
+    E, z = wall(500.0, 1.0), np.exp(1j * np.array([0.1, 1.0, 2.0]))
+    V, e = coupling.compliance(T).at(z)[:, 0, 0], E.at(z)[:, 0, 0]
+    F = force_map(E, coupling, [2], [1]).at(z)[:, 0, 0]
+    np.testing.assert_allclose(F, z**-2 * (e / z) / (1 + e / z * V), rtol=1e-12)
+
+
+def test_the_coupling_is_spring_and_damper_in_parallel():
+    z = np.exp(1j * np.array([0.1, 1.0, 2.0]))
+    V = SpringDamper([900.0, 400.0], [0.5, 0.0]).compliance(T)
+    s = (z - 1) / (T * z)
+    np.testing.assert_allclose(V.at(z)[:, 0, 0], 1 / (900 + 0.5 * s), rtol=1e-12)
+    np.testing.assert_allclose(V.at(z)[:, 1, 1], 1 / 400, rtol=1e-12)
+    assert V.order == 1
+
+
+def test_many_simulations_are_each_one_alone():
+    F = force_map(environment(FIGURE_4, T), SpringDamper([900.0, 500.0], [0.4, 0.5]), [1, 2], [0, 1])
+    x = np.random.default_rng(1).normal(size=(20, 2, 5))
+    tape = Tape(process(F), 20, 2, nsim=5)
+    for k in range(20):
+        tape.x[k] = x[k]
+        tape.tick(k)
+    for i in range(5):
+        # the product's summation order may differ with the number of columns
+        np.testing.assert_allclose(tape.f[:20, :, i], drive(process(F), x[:, :, i]), rtol=1e-9, atol=1e-9)
+
+
+def test_rewinding_continues_the_run():
+    F = force_map(environment(FIGURE_4, T), SpringDamper([900.0, 500.0], [0.4, 0.5]), [1, 2], [0, 0])
+    x = np.random.default_rng(2).normal(size=(20, 2))
+    tape = Tape(process(F), 10, 2)
+    parts = []
+    for stretch in (x[:7], x[7:17], x[17:]):
+        for k, row in enumerate(stretch):
+            tape.x[k] = row[:, None]
+            tape.tick(k)
+        parts.append(tape.f[: len(stretch), :, 0].copy())
+        tape.rewind(len(stretch))
+    np.testing.assert_allclose(np.concatenate(parts), drive(process(F), x), rtol=1e-12)
+
+
+def test_encoders_round_to_whole_steps():
+    f = drive(process(wall(1000.0), step=1e-3), np.array([[0.4e-3], [0.6e-3], [-1.6e-3]]))
+    np.testing.assert_allclose(f[:, 0], [0.0, 1.0, -2.0], atol=1e-12)
+
+
+def test_encoders_do_not_move_the_device():
+    """What the loop sees is rounded, where the device is stays: else a free device would creep from step to step."""
+    tape = Tape(process(wall(1000.0), step=1e-3), 2, 2)
+    tape.x[0] = 0.6e-3
+    tape.tick(0)
+    assert tape.f[0, 0, 0] == pytest.approx(1.0)
+    assert tape.x[0, 0, 0] == 0.6e-3
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: SpringDamper([1.0, 2.0], [1.0]), "K has 2 channels and B has 1"),
+        (lambda: SpringDamper([0.0], [1.0]), "expected positive stiffnesses"),
+        (lambda: SpringDamper([1.0], [-1.0]), "expected dampings >= 0"),
+        (lambda: Compliance(Lti.constant([[1.0]], T)).around(environment(FIGURE_4, T)), "has 2 contacts"),
+        (lambda: Process(wall(1.0), np.array([0.0]), NONE), "expected positive forces"),
+        (lambda: Process(wall(1.0), np.array([1.0]), np.array([-1.0])), "expected steps >= 0"),
+        (lambda: Process(wall(1.0), np.array([1.0, 1.0]), NONE), "2 entries for 1 channels"),
+        (lambda: Tape(process(wall(1.0)), 1, 0), "must be the positions"),
+    ],
+)
+def test_what_cannot_be_built(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()

@@ -1,0 +1,312 @@
+"""python -m design.audit: closed forms, the paper's gains, edges that are edges, strict JSON, bad calls."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cli.audit import main
+from cli.options import execute
+from controller.coupling import Compliance, NoCoupling, SpringDamper
+from controller.environment import FIGURE_4, GROUND, Network, Spring
+from controller.lti import Lti
+from design import certificate as store
+from design.audit import MOST_EXTRA_SAMPLES, PRESETS, Subject, edge, remedies, report, stiffest, tolerance
+from design.certificate import CAVEATS, promise
+from design.result import CASE_I
+
+CONDITIONS = ("closed-loop", "theorem4")
+T = 1.2e-3
+SAFE = SpringDamper([870.0, 545.0], [0.38, 0.52])
+
+
+def pair(coupling, **changes) -> Subject:
+    """A coupling in the default scenario's loop."""
+    loop = {"network": FIGURE_4, "T": T, "theta": (1, 2), "psi": (0, 0), "delta": (1.37, 1.37)}
+    return Subject(coupling, **(loop | changes))
+
+
+def wall(K: float, B: float, theta: int = 0, delta: float = 1.37, T: float = 1e-3) -> Subject:
+    return Subject(SpringDamper([K], [B]), None, T, (theta,), (0,), (delta,))
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run the command as a shell would: (exit code, stdout, stderr)."""
+    monkeypatch.chdir(tmp_path)
+
+    def command(*argv: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["design.audit", *argv])
+        with pytest.raises(SystemExit) as leaving:
+            execute(main)
+        return leaving.value.code, *capsys.readouterr()
+
+    return command
+
+
+def strict(text: str) -> dict:
+    """JSON without the NaN and Infinity that Python would accept."""
+
+    def refuse(constant: str):
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+@pytest.mark.parametrize(
+    ("K", "B", "theta", "closed_loop", "theorem4"),
+    [(5000, 0, 0, 2.5, 2.5), (5000, 30, 0, 32.5, 32.5), (800, 0.7, 0, 1.1, 1.1), (5000, 0, 1, 7.5, 10.0)],
+)
+def test_closed_forms_of_a_rigid_wall(K, B, theta, closed_loop, theorem4):
+    """K T/2 + B without delay, 3 K T/2 with one sample; Theorem 4 asks (theta + 1)^2 K T/2 of a spring."""
+    subject = wall(K, B, theta)
+    assert subject.requirement("closed-loop").required[0] == pytest.approx(closed_loop, rel=1e-9)
+    assert subject.requirement("theorem4").required[0] == pytest.approx(theorem4, rel=1e-9)
+
+
+def test_a_wall_is_the_limit_of_a_stiff_environment():
+    ground = Network(("a",), (Spring(("a", GROUND), 1e9),))
+    soft, rigid = replace(wall(2000, 0.4, 1), network=ground), wall(2000, 0.4, 1)
+    ratio = soft.requirement("closed-loop").ratio
+    assert ratio == pytest.approx(rigid.requirement("closed-loop").ratio, rel=1e-5)
+
+
+@pytest.mark.parametrize(("condition", "theta", "K"), [("closed-loop", 0, 2340), ("theorem4", 0, 2340)])
+def test_the_stiffest_spring_before_a_wall_is_colgates(condition, theta, K):
+    """2 (delta - B)/T."""
+    assert stiffest(wall(100, 0.2, theta), condition).K[0] == pytest.approx(K, rel=1e-6)
+
+
+def test_the_largest_period_before_a_wall_is_colgates():
+    subject = wall(1000, 0.37)
+    for condition in CONDITIONS:
+        found = tolerance(subject, subject.requirement(condition))
+        assert found.largest_T == pytest.approx(2 * (1.37 - 0.37) / 1000, rel=1e-6)
+
+
+def test_the_papers_gains_and_their_figures():
+    outcome = report(pair(CASE_I))
+    assert outcome["closed-loop"]["required_damping"] == pytest.approx([1.39871] * 2, rel=1e-5)
+    assert outcome["theorem4"]["required_damping"] == pytest.approx([7.63, 7.84], abs=0.005)
+    assert not outcome["certified"]
+    assert outcome["promise"] is None
+    assert outcome["theorem4"]["stiffest"]["K"] == [None, None]
+    assert "B = 5.47 N s/m alone uses up delta = 1.37" in outcome["theorem4"]["stiffest"]["reason"]
+
+
+def test_the_theorem4_gains_as_the_literature_rounds_them():
+    """(879, 552) / (.39, .52) are 0.02 % beyond Theorem 4, and far inside the closed-loop condition."""
+    outcome = report(pair(SpringDamper([879.0, 552.0], [0.39, 0.52])))
+    assert outcome["closed-loop"]["required_damping"] == pytest.approx([0.714344] * 2, rel=1e-6)
+    assert outcome["theorem4"]["required_damping"] == pytest.approx([1.37026, 1.37015], abs=1e-5)
+    assert outcome["promise"] == "this environment"
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
+@pytest.mark.parametrize(
+    "subject", [pair(SAFE), wall(900, 0.3, 1), wall(300, 0.1, 2)], ids=["pair", "wall", "late wall"]
+)
+def test_just_inside_is_certified_and_just_outside_is_not(subject, condition):
+    requirement = subject.requirement(condition)
+    assert requirement.certified
+    found, coupling = tolerance(subject, requirement), subject.coupling
+    K = np.array(stiffest(subject, condition).K)
+    least = np.array(found.least_delta)
+    inside = [
+        subject.with_gains(K, coupling.B),
+        subject.with_period(found.largest_T),
+        replace(subject, theta=tuple(n + found.extra_samples for n in subject.theta)),
+        replace(subject, delta=tuple(least * (1 + 1e-6))),
+    ]
+    outside = [
+        subject.with_gains(K * (1 + 1e-5), coupling.B),
+        subject.with_period(found.largest_T * (1 + 1e-5)),
+        replace(subject, theta=tuple(n + found.extra_samples + 1 for n in subject.theta)),
+        replace(subject, delta=tuple(least * (1 - 1e-6))),
+    ]
+    assert [s.requirement(condition).certified for s in inside] == [True] * 4
+    assert [s.requirement(condition).certified for s in outside] == [False] * 4
+
+
+def test_figures_that_do_not_exist_say_why():
+    spring = wall(0.01, 0.0, delta=1.0)
+    found = tolerance(spring, spring.requirement("closed-loop"))
+    assert (found.largest_T, found.extra_samples) == (None, None)
+    assert f"{MOST_EXTRA_SAMPLES} samples more" in found.reason
+    assert "largest T tried" in found.reason
+    assert "no scale of K" in stiffest(wall(5000, 30), "closed-loop").reason
+    assert "stiffest K tried" in stiffest(pair(SAFE, delta=(3.0, 3.0)), "closed-loop").reason
+    assert "nothing to lose" in tolerance(pair(CASE_I), pair(CASE_I).requirement("closed-loop")).reason
+
+
+def test_remedies_are_tried_and_mild():
+    subject = wall(5000, 0.5, 1)
+    requirement = subject.requirement("closed-loop")
+    changes = {r.change.split(":")[0]: r for r in remedies(subject, requirement)}
+    assert changes["less delay"].requirement.required[0] == pytest.approx(3.0)
+    assert not changes["less delay"].requirement.certified
+    assert changes["faster"].requirement.certified
+    assert changes["faster"].requirement.required[0] > 0.98 * 1.37
+    assert remedies(wall(500, 0), wall(500, 0).requirement("closed-loop")) == []
+
+
+def test_a_delayed_environment_needs_a_multiplier_that_the_default_scenario_has_not():
+    requirement = pair(SAFE, psi=(1, 1)).requirement("theorem4")
+    assert not requirement.certified
+    assert "the environment alone uses up" in requirement.reason
+    softer = Network(("a",), (Spring(("a", GROUND), 100.0, 0.2),))
+    subject = Subject(SpringDamper([200.0], [0.2]), softer, T, (0,), (1,), (1.37,))
+    assert subject.requirement("theorem4").certified
+    assert "multiplier" in stiffest(subject, "theorem4").reason
+
+
+def test_any_coupling_can_be_audited():
+    V = SAFE.compliance(T)
+    general, structured = report(pair(Compliance(V))), report(pair(SAFE))
+    assert general["closed-loop"]["required_damping"] == pytest.approx(structured["closed-loop"]["required_damping"])
+    assert general["theorem4"]["margin"] == pytest.approx(structured["theorem4"]["margin"], rel=1e-6)
+    assert general["coupling"]["kind"] == "compliance"
+    assert "only a spring-damper" in general["theorem4"]["stiffest"]["reason"]
+    nothing = report(pair(NoCoupling()))
+    assert nothing["closed-loop"]["required_damping"] == pytest.approx([1.7229] * 2, rel=3e-5)
+    assert nothing["theorem4"]["required_damping"] == [None, None]
+    assert "without a coupling" in nothing["theorem4"]["reason"]
+
+
+def test_promises():
+    assert promise(True, True) == "any passive environment"
+    assert promise(False, True) == "this environment"
+    assert promise(False, True, rigid=True) == "a rigid wall only"
+    assert promise(False, False) is None
+    assert report(wall(900, 0.2, 1))["promise"] == "any passive environment"
+    assert report(wall(900, 0, 1))["promise"] == "a rigid wall only"
+
+
+def test_edge_takes_the_certified_side():
+    assert edge(lambda x: x, 0.5, 2.0) < 1
+    assert edge(lambda x: x, 0.5, 2.0) == pytest.approx(1, rel=1e-6)
+    assert edge(lambda x: 0.9, 0.5, 2.0) == 2.0
+    assert edge(lambda x: 0.5 if x < 1.3 else np.inf, 1.0, 2.0) == pytest.approx(1.3, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("argv", "code", "required"),
+    [
+        (["--case", "I", "--K", "2870,2320", "--B", "5.47,5.55"], 1, 1.39871),
+        (["--rigid", "--K", "5000", "--B", "0", "--T", "1e-3", "--theta", "0", "--delta", "1.37"], 1, 2.5),
+        (["--rigid", "--K", "2000", "--B", "0", "--T", "1e-3", "--theta", "1", "--delta", "3.1"], 0, 3.0),
+        (["--preset", "chai3d-omega3"], 1, 32.5),
+        (["--preset", "chai3d-omega3", "--B", "0"], 1, 2.5),
+        (["--preset", "chai3d-omega3", "--B", "0", "--K", "2000"], 0, 1.0),
+        (["--case", "none"], 1, 1.7229),
+        (["--K", "879,552", "--B", ".39,.52"], 0, 0.714344),
+        (["--scenario", "three-rigid", "--K", "300", "--B", "0.2"], 0, None),
+    ],
+)
+def test_the_command(run, argv, code, required):
+    exit_code, out, err = run(*argv, "--json", "-")
+    outcome = strict(out)
+    assert exit_code == code
+    assert outcome["certified"] == (code == 0)
+    if required:
+        assert outcome["closed-loop"]["required_damping"][0] == pytest.approx(required, rel=3e-5)
+    assert set(outcome) >= {"theorem4", "closed-loop", "promise", "helps", "not_covered", "wall_s"}
+    assert outcome["not_covered"] == CAVEATS
+    assert "certified" in err
+    assert "not for contacts that make and break" in " ".join(err.split())
+
+
+def test_the_report_is_kept(run, tmp_path):
+    assert run("--rigid", "--K", "100", "--B", "0", "--theta", "0", "--out", "here")[0] == 0
+    assert strict((tmp_path / "here" / "report.json").read_text())["promise"] == "any passive environment"
+
+
+def test_a_preset_names_its_source(run):
+    outcome = strict(run("--preset", "chai3d-omega3", "--json", "-")[1])
+    assert outcome["preset"] == {"name": "chai3d-omega3", "source": PRESETS["chai3d-omega3"].source}
+    assert (outcome["loop"]["T_s"], outcome["loop"]["theta"]) == (1e-3, [0])
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A spring-damper for the default scenario, the same as a state space, and a file that is none."""
+    loop = store.Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
+    store.save(store.Stored.of(loop, SAFE), tmp_path / "gains.json")
+    store.save(store.Stored(loop, Compliance(SAFE.compliance(T)).form()), tmp_path / "space.json")
+    unstable = Compliance(Lti(1.1 * np.eye(2), np.eye(2), np.eye(2), np.eye(2), T))
+    store.save(store.Stored.of(loop, unstable), tmp_path / "unstable.json")
+    (tmp_path / "broken.json").write_text("{")
+
+
+@pytest.mark.usefixtures("files")
+def test_stored_couplings(run):
+    for name in ("gains.json", "space.json"):
+        code, out, _ = run("--coupling", name, "--json", "-")
+        assert code == 0
+        assert strict(out)["promise"] == "any passive environment"
+    code, out, _ = run("--coupling", "unstable.json", "--json", "-")
+    assert code == 1
+    assert "unit circle" in strict(out)["theorem4"]["reason"]
+    assert run("--coupling", "gains.json", "--T", "1e-3")[0] == 0
+
+
+BAD = [
+    ("", "nothing to audit"),
+    ("--K 100", "--K without --B"),
+    ("--B 1", "--B without --K"),
+    ("--K nan --B 1", "--K is nan, allowed are 0.001 to 1e+09 N/m"),
+    ("--K=-1,5 --B 1", "--K is -1, allowed"),
+    ("--K 0 --B 1", "--K is 0, allowed"),
+    ("--K 1 --B inf", "--B is inf, allowed are 0 to 1e+06 N s/m"),
+    ("--K 1 --B=-0.1", "--B is -0.1, allowed"),
+    ("--K 1,2,3 --B 1", "--K has 3 entries, expected 2 (one per channel) or 1"),
+    ("--K x --B 1", "--K is 'x', expected numbers separated by commas"),
+    ("--rigid --K 1,2 --B 1", "--K has 2 entries, expected one"),
+    ("--rigid --K 1 --B 1 --theta 0,1", "--rigid is one channel: --theta has 2 entries"),
+    ("--rigid --K 1 --B 1 --psi 1", "no loop with a delayed environment is stable"),
+    ("--rigid --coupling gains.json", "gains.json couples 2 channels, the loop has 1"),
+    ("--rigid --case none", "--rigid with --case none"),
+    ("--case none --K 1 --B 1", "--K with --case none"),
+    ("--preset chai3d", "invalid choice: 'chai3d'"),
+    ("--preset chai3d-omega3 --coupling gains.json", "--preset with --coupling"),
+    ("--coupling gains.json --K 1", "--K with --coupling"),
+    ("--coupling gains.json --scenario three-rigid", "gains.json couples 2 channels, the loop has 3"),
+    ("--coupling space.json --T 1e-3", "its coefficients are for T = 0.0012 s, the loop has 0.001 s"),
+    ("--coupling nowhere.json", "nowhere.json: No such file"),
+    ("--coupling broken.json", "broken.json: "),
+    ("--K 1 --B 1 --delta 0", "delta is 0, 0, expected positive dampings"),
+    ("--K 1 --B 1 --delta=-1", "--delta is -1, allowed are 0 to 10000"),
+    ("--K 1 --B 1 --delta nan", "--delta is nan, allowed"),
+    ("--K 1 --B 1 --T 0", "T is 0, allowed"),
+    ("--K 1 --B 1 --theta=-1", "theta[0] is -1, allowed"),
+    ("--K 1 --B 1 --theta 101", "theta is 101, 101, allowed are 0 to 100 samples"),
+    ("--K 1 --B 1 --theta 0.5", "--theta is '0.5', expected whole numbers"),
+    ("--K 1 --B 1 --seed x", "--seed is 'x'"),
+    ("--K 1 --B 1 --json nowhere/x.json", "the folder nowhere does not exist"),
+    ("--K 1 --B 1 --sceanrio x", "unrecognized arguments"),
+]
+
+
+@pytest.mark.usefixtures("files")
+@pytest.mark.parametrize(("options", "message"), BAD, ids=[options or "nothing" for options, _ in BAD])
+def test_bad_calls_get_one_line_and_exit_code_2(run, options, message):
+    code, out, err = run(*options.split())
+    assert (code, out) == (2, "")
+    assert err.startswith("error: ")
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_help_has_an_example(run):
+    code, out, _ = run("--help")
+    assert code == 0
+    assert "python -m design.audit --case I --K 2870,2320 --B 5.47,5.55" in out
+
+
+def test_an_audit_without_environment_delay_imports_no_solver(tmp_path):
+    argv = ["--K", "879,552", "--B", ".39,.52", "--out", str(tmp_path)]
+    code = f"import sys, cli.audit as a; r = a.main({argv!r}); sys.exit(r or ('cvxpy' in sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0

@@ -1,0 +1,375 @@
+"""A box around the environment: its vertices, one Q for all of them, the proof at each, and what is said of the set."""
+
+import json
+from dataclasses import replace
+from itertools import pairwise, product
+
+import msgspec
+import numpy as np
+import pytest
+
+from cli.audit import main as audit_main
+from cli.check import main as check_main
+from cli.design import main as design_main
+from cli.run import main as run_main
+from cli.validate import main as validate_main
+from controller.coupling import SpringDamper
+from controller.coupling import SpringDamper as StoredSpringDamper
+from controller.environment import FIGURE_4, Box, Network, Spring, UncertainSpring, environment, inside, members
+from controller.loop import Loop, force_map
+from design import optimal
+from design.certificate import NotProved, Stored, digest, load, prove, sealed, verify
+from design.lmi import Specification
+from design.optimal import Wish
+from design.ranges import check_set, set_part
+from design.result import Infeasible
+from design.transparency import transparency
+from sim.scenario import SCENARIOS, InputError, parse
+
+T, THETA = 1.2e-3, (1, 2)
+#: the first spring softer or stiffer or lost: three vertices beside the environment
+SMALL = Box((UncertainSpring(("mass", "contact 1"), (640.0, 840.0), absent=True),))
+LOOP = Loop(T, THETA, (0, 0), THETA, (1.37, 1.37), FIGURE_4, SMALL)
+TEXT = (SCENARIOS / "omega-pair.toml").read_text()
+BOX_TEXT = """
+[[box.springs]]
+between = ["mass", "contact 1"]
+stiffness = [640.0, 840.0]
+absent = true
+"""
+change = msgspec.structs.replace
+
+
+@pytest.fixture(scope="module")
+def robust():
+    """The optimal coupling for the small box."""
+    return optimal.design(Specification.of(LOOP))
+
+
+@pytest.fixture(scope="module")
+def nominal_only():
+    return optimal.design(Specification.of(LOOP.at(FIGURE_4)))
+
+
+@pytest.fixture(scope="module")
+def stored(robust):
+    return Stored.of(LOOP, robust.coupling, prove(LOOP, robust.coupling, "closed-loop"))
+
+
+@pytest.fixture(scope="module")
+def scenario_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("box") / "small.toml"
+    path.write_text(TEXT + BOX_TEXT)
+    return path
+
+
+# the set
+
+
+def test_vertices_are_the_ends_of_every_range_and_what_may_be_absent():
+    box = Box(
+        (
+            UncertainSpring(("contact 1", "mass"), (640.0, 960.0), (0.5, 1.0), absent=True),
+            UncertainSpring(("mass", "contact 2"), (560.0, 840.0)),
+        ),
+        {"mass": (0.5, 2.0)},
+    )
+    nominal, *vertices = members(FIGURE_4, box)
+    assert nominal.network == FIGURE_4
+    found = {(v.network.springs[0], v.network.springs[1], v.network.masses["mass"]) for v in vertices}
+    first = [Spring(("contact 1", "mass"), k, b) for k, b in [*product((640, 960), (0.5, 1)), (0, 0)]]
+    second = [Spring(("mass", "contact 2"), k, 1.0) for k in (560, 840)]
+    assert found == set(product(first, second, (0.5, 2.0)))
+    assert len(vertices) == len(found) == 20
+    assert vertices[-1].name == "vertex 20 (contact 1-mass absent; mass-contact 2 840 N/m, 1 N s/m; mass 2 kg)"
+
+
+def test_a_contact_that_is_made():
+    """The environment has no spring to the ground, the vertices have one: that it may be absent is the environment."""
+    box = Box((UncertainSpring(("mass", "ground"), (300.0, 500.0), (2.0, 2.0), absent=True),))
+    nominal, *vertices = members(FIGURE_4, box)
+    assert len(nominal.network.springs) == 2
+    assert [v.network.springs[2] for v in vertices] == [
+        Spring(("mass", "ground"), 300.0, 2.0),
+        Spring(("mass", "ground"), 500.0, 2.0),
+    ]
+    drawn = [m.network.springs[2] for m in inside(FIGURE_4, box, 20, seed=0)]
+    assert Spring(("mass", "ground"), 0.0, 0.0) in drawn
+    assert any(300 < spring.stiffness < 500 for spring in drawn)
+
+
+def test_a_vertex_that_is_the_environment_is_not_listed_twice():
+    box = Box(masses={"mass": (1.0, 2.0)})
+    assert [m.network.masses["mass"] for m in members(FIGURE_4, box)] == [1.0, 2.0]
+
+
+def test_samples_lie_inside_and_do_not_depend_on_their_number():
+    drawn = inside(FIGURE_4, SMALL, 40, seed=3)
+    assert [m.network for m in inside(FIGURE_4, SMALL, 7, seed=3)] == [m.network for m in drawn[:7]]
+    stiffness = np.array([m.network.springs[0].stiffness for m in drawn])
+    present = stiffness > 0
+    assert 5 < present.sum() < 35  # a fair coin leaves this with a probability of 1e-6
+    assert ((stiffness[present] > 640) & (stiffness[present] < 840)).all()
+    assert all(m.network.springs[1] == FIGURE_4.springs[1] for m in drawn)
+
+
+def test_the_number_of_vertices_is_limited():
+    nodes = [f"n{i}" for i in range(7)]
+    springs = [Spring((a, b), 100.0, 1.0) for a, b in pairwise(nodes)]
+    network = Network(("n0",), tuple(springs), dict.fromkeys(nodes[1:], 1.0))
+    box = Box(tuple(UncertainSpring(s.between, (50.0, 200.0)) for s in springs), {"n1": (0.5, 2.0)})
+    with pytest.raises(
+        ValueError, match="box has 128 vertices, allowed are 64: leave out the ranges that matter least"
+    ):
+        members(network, box)
+
+
+@pytest.mark.parametrize(
+    ("box", "message"),
+    [
+        ("[box]", "box is empty"),
+        ("[box]\nmass = 1", "unknown field `mass`"),
+        ("[box]\nmasses = { mas = [0.5, 2.0] }", "box.masses names 'mas', which no spring reaches"),
+        (
+            "[box]\nmasses = { mass = [2.0, 3.0] }",
+            "box.masses.mass is 2 to 3 kg, which leaves out the environment's own 1",
+        ),
+        ("[box]\nmasses = { mass = [2.0, 0.5] }", "expected \\[least, most\\] in kg"),
+        ("[box]\nmasses = { mass = [1.0, 1.0] }", "nothing is uncertain"),
+        ("[box]\nmasses = { mass = [0.5, inf] }", "expected \\[least, most\\] in kg"),
+        ("[box]\nsprings = [{ between = ['contact 1', 'mass'] }]", "nothing is uncertain"),
+        ("[box]\nsprings = [{ between = ['contact 1', 'mass'], stiffness = [900, 950] }]", "the environment's own 800"),
+        ("[box]\nsprings = [{ between = ['contact 1', 'mass'], stiffness = [-1, 950] }]", "0 <= least"),
+        ("[box]\nsprings = [{ between = ['contact 1', 'wall'], absent = true }]", "there is no node 'wall'"),
+        ("[box]\nsprings = [{ between = ['contact 1', 'ground'], stiffness = [1, 2] }]", "absent = true"),
+        ("[box]\nsprings = [{ between = ['contact 1', 'mass'], stifness = [1, 2] }]", "did you mean `stiffness`"),
+        ("[box]\nspring = 1", "did you mean `springs`"),
+    ],
+)
+def test_a_box_that_makes_no_sense_is_refused_by_name(box, message):
+    with pytest.raises(InputError, match=message):
+        parse(f"{TEXT}\n{box}")
+
+
+def test_a_vertex_that_cannot_be_simulated_is_refused():
+    """A node without mass must be held by something at every vertex."""
+    springs = (Spring(("tip", "node"), 100.0, 1.0), Spring(("node", "ground"), 50.0, 1.0))
+    box = Box(tuple(UncertainSpring(s.between, absent=True) for s in springs))
+    with pytest.raises(ValueError, match=r"vertex 3 .*no mass and nothing that holds it"):
+        Loop(T, (0,), (0,), (0,), (1.0,), Network(("tip",), springs), box)
+
+
+# one Q for all
+
+
+def by_hand(network: Network, coupling, w):
+    """F = Theta (E - E Q E) from the network's own matrices and the definition of the basis, shape (k, 2, 2)."""
+    M, D, K = network.matrices()
+    z = np.exp(1j * w)
+    s = ((z - 1) / (T * z))[:, None, None]
+    Z = M * s**2 + D * s + K
+    E = Z[:, :2, :2] - Z[:, :2, 2:] @ Z[:, 2:, :2] / Z[:, 2:, 2:]
+    Q, through = coupling.Q[0].astype(complex), np.ones_like(z)
+    for a, coefficient in zip(coupling.poles, coupling.Q[1:], strict=True):
+        Q = Q + coefficient * (through * (1 - a) / (z - a))[:, None, None]
+        through = through * (1 - a * z) / (z - a)
+    late = np.stack([z ** -THETA[0], z ** -THETA[1]], axis=1)[:, :, None]
+    return late * (E - E @ Q @ E)
+
+
+def least_room(network: Network, coupling, points: int = 2000) -> float:
+    """min over frequency of the least eigenvalue of T/delta He[F/(z-1)] + I: positive where the condition holds."""
+    w = np.concatenate([np.geomspace(1e-4, np.pi, points), np.linspace(1e-3, np.pi, points)])
+    H = by_hand(network, coupling, w) / (np.exp(1j * w) - 1)[:, None, None]
+    return float(np.linalg.eigvalsh(T / 1.37 * (H + np.conj(np.swapaxes(H, 1, 2))) / 2 + np.eye(2)).min())
+
+
+def test_the_force_map_of_each_vertex_is_that_of_its_raw_matrices(robust):
+    w = np.array([1e-3, 0.04, 0.3, 2.0])
+    for member in LOOP.members():
+        F = force_map(environment(member.network, T), robust.coupling, THETA, (0, 0)).at(np.exp(1j * w))
+        expected = by_hand(member.network, robust.coupling, w)
+        # near z = 1 both routes lose digits to z - 1 = 1e-3, squared, and to the resonance
+        np.testing.assert_allclose(F, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
+
+
+def test_one_q_holds_at_every_vertex_where_that_of_the_environment_alone_does_not(robust, nominal_only):
+    rooms = [least_room(m.network, robust.coupling) for m in LOOP.members()]
+    alone = [least_room(m.network, nominal_only.coupling) for m in LOOP.members()]
+    # half a percent of the damping is the design's own margin
+    assert min(rooms) > 0.004
+    assert alone[0] > 0.004
+    assert min(alone) < -0.01
+
+
+def test_the_sweep_agrees_with_the_condition_by_hand(robust):
+    check = check_set(LOOP, robust.coupling, samples=0)
+    for member, requirement in zip(check.members, check.at_members, strict=True):
+        # a dense grid may miss the very peak of the 6 Hz resonance
+        assert 1 - least_room(member.network, robust.coupling) == pytest.approx(requirement.ratio, abs=2e-3)
+
+
+def test_the_mismatch_is_the_mean_square_over_the_set(robust):
+    squares = []
+    for member in LOOP.members():
+        E = environment(member.network, T)
+        squares.append(transparency(force_map(E, robust.coupling, THETA, (0, 0)), E, THETA).rms_mismatch ** 2)
+    assert robust.objective == pytest.approx(np.sqrt(np.mean(squares)), rel=1e-9)
+
+
+def test_environments_of_the_box_that_violate_the_condition_join_the_design():
+    """Without its vertices: the search finds the stiff one, and the design with it is certified there."""
+    spec = replace(Specification.of(LOOP), others={})
+    coupling, grown, _ = optimal.searched(spec, Wish(filter="mixed"))
+    assert any("840 N/m" in name for name in grown.others)
+    assert optimal.violators(spec, coupling, 1.0) == []
+    assert all(least_room(m.network, coupling) > 0 for m in LOOP.members())
+
+
+def test_an_environment_that_no_device_feels_asks_nothing():
+    """Both springs lost: the forces are zero, and so is their mismatch."""
+    both = Box(tuple(UncertainSpring(s.between, absent=True) for s in FIGURE_4.springs))
+    loop = change(LOOP, box=both)
+    found = optimal.design(Specification.of(loop), Wish(functions=6))
+    check = check_set(loop, found.coupling, samples=4)
+    assert check.proved
+    nothing = check.at_members[[m.name for m in check.members].index(check.members[-1].name)]
+    assert nothing.ratio == 0
+
+
+def test_vertices_that_contradict_are_named_with_a_remedy():
+    box = Box((UncertainSpring(("contact 1", "mass"), (700.0, 4000.0)),))
+    with pytest.raises(Infeasible, match=r"none with vertex 2 \(contact 1-mass 4000 N/m.*binds.*of their width"):
+        optimal.design(Specification.of(change(LOOP, box=box)), Wish(filter="mixed"))
+
+
+# the proof
+
+
+def test_every_vertex_is_proved_and_the_file_says_a_set(stored):
+    assert stored.certificate.promise == "a set"
+    assert set(stored.certificate.matrices) == {"P", "P1", "P2", "P3"}
+    assert verify(stored).proved
+
+
+def test_a_broken_proof_of_one_vertex_is_rejected_by_name(stored, tmp_path):
+    matrices = dict(stored.certificate.matrices)
+    rows = [list(row) for row in matrices["P2"]]
+    rows[0][0] = f"-{rows[0][0]}".replace("--", "")
+    forged = sealed(change(stored.certificate, matrices=matrices | {"P2": tuple(map(tuple, rows))}))
+    verdict = verify(change(stored, certificate=forged))
+    assert not verdict.proved
+    assert verdict.reason.startswith("vertex 2 (mass-contact 1 840 N/m")
+    missing = {name: rows for name, rows in matrices.items() if name != "P3"}
+    verdict = verify(change(stored, certificate=sealed(change(stored.certificate, matrices=missing))))
+    assert "expected P, P1, P2, P3" in verdict.reason
+
+
+def test_a_wider_box_is_another_claim(stored):
+    wider = change(LOOP, box=Box((UncertainSpring(("mass", "contact 1"), (640.0, 850.0), absent=True),)))
+    assert "digest differs" in verify(change(stored, loop=wider)).reason
+    smuggled = change(stored, loop=LOOP.at(FIGURE_4))
+    assert not verify(smuggled).proved
+
+
+def test_a_coupling_for_one_environment_is_not_proved_for_the_set(nominal_only):
+    with pytest.raises(NotProved, match=r"^vertex 2 .*needs 1\.39"):
+        prove(LOOP, nominal_only.coupling, "closed-loop")
+    part = set_part(check_set(LOOP, nominal_only.coupling, samples=8))
+    assert not part["certified"]
+    assert part["vertices_certified"] == 2
+
+
+def test_nothing_is_promised_where_a_sample_inside_violates(robust):
+    """The vertices alone would be proved: what is found inside is not passed over."""
+    check = check_set(LOOP, robust.coupling, samples=6)
+    assert check.proved
+    broken = replace(check, at_samples=(*check.at_samples[:-1], replace(check.at_samples[-1], required=(1.4, 1.4))))
+    assert not broken.proved
+
+
+def test_a_fixed_coupling_may_be_promised_a_set_or_any_environment():
+    for gains, any_environment in (((878.7, 551.8), True), ((2000.0, 1500.0), False)):
+        check = check_set(LOOP, SpringDamper(gains, (0.3865, 0.522)), samples=8)
+        assert check.proved
+        data = StoredSpringDamper(gains, (0.3865, 0.522))
+        if any_environment:
+            assert prove(LOOP, data, "theorem4").promise == "any passive environment"
+        assert prove(LOOP, data, "closed-loop").promise == "a set"
+
+
+def test_files_without_a_box_have_the_digest_that_they_always_had():
+    """Made before there were boxes, for this loop and coupling."""
+    plain = LOOP.at(FIGURE_4)
+    expected = "b8cae9c8ced7f5c0abcd4246af3ea609fa292b47b365d074618a2702234f644a"
+    assert digest(plain, StoredSpringDamper((7806.0, 3137.0), (0.105, 1.68)).form()) == expected
+    assert digest(LOOP, StoredSpringDamper((7806.0, 3137.0), (0.105, 1.68)).form()) != expected
+
+
+# the commands
+
+
+def test_design_check_run_audit_and_validate_speak_of_the_set(scenario_file, tmp_path, capsys):
+    file, report = tmp_path / "c.json", tmp_path / "r.json"
+    common = ["--scenario", str(scenario_file), "--json", str(report)]
+
+    def told(main, *options) -> tuple[int, dict]:
+        code = main([*options])
+        capsys.readouterr()
+        return code, json.loads(report.read_text())
+
+    code, design = told(design_main, "--coupling", "optimal", "--samples", "8", "--out", str(file), *common)
+    assert (code, design["promise"], design["set"]["vertices"]) == (0, "a set", 3)
+    alone, whole = design["price"]
+    assert (alone["coupling"], whole["coupling"], whole["violated"]) == ("nominal only", "whole set", 0)
+    assert alone["violated"] >= 1
+    assert alone["rms_mismatch_db"]["nominal"] < whole["rms_mismatch_db"]["nominal"]
+    assert load(file).certificate.promise == "a set"
+
+    code, checked = told(check_main, str(file), "--json", str(report))
+    assert (code, checked["promise"], checked["vertices"]) == (0, "a set", 3)
+
+    out = ["--out", str(tmp_path / "out"), *common]
+    code, run = told(
+        run_main, "--coupling", str(file), "--vertex", "3", "--engine", "exact", "--duration", "1", "--no-plot", *out
+    )
+    assert (code, run["promise"]) == (0, "a set")
+    assert run["run"]["environment"].startswith("vertex 3 (mass-contact 1 absent")
+    assert np.abs(np.load(tmp_path / "out" / "trace.npz")["f"][:, 0]).max() == 0  # the lost contact renders nothing
+
+    code, audit = told(audit_main, "--coupling", str(file), *out)
+    assert (code, audit["promise"], audit["certified"]) == (0, "a set", True)
+
+    quick = ["--humans", "24", "--engine", "exact", "--duration", "0", "--no-plot"]
+    code, validated = told(validate_main, "--coupling", str(file), "--environments", "box", *quick, *out)
+    assert (code, validated["certified"], validated["environments"]["count"]) == (0, True, 8)
+    assert validated["unstable"]["exact"] == 0
+    assert validated["worst"]["environment"] in validated["environments"]["names"]
+
+
+def test_a_violated_vertex_leaves_the_commands_with_1(scenario_file, tmp_path, capsys):
+    stiff = ["--condition", "closed-loop", "--scenario", str(scenario_file), "--samples", "4"]
+    assert design_main([*stiff, "--out", str(tmp_path / "s.json"), "--json", "-"]) == 1
+    outcome = json.loads(capsys.readouterr().out)
+    assert outcome["promise"] == "this environment"
+    assert outcome["certificate"]["certified"]
+    assert load(tmp_path / "s.json").loop.box is None
+    assert verify(load(tmp_path / "s.json")).proved
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--vertex", "4"], "--vertex is 4, allowed are 0 to 3"),
+        (["--vertex", "x"], "--vertex is 'x', expected a whole number"),
+        (["--vertex", "1", "--scenario", "omega-pair"], "the scenario has no box"),
+    ],
+)
+def test_a_vertex_that_does_not_exist(scenario_file, tmp_path, options, message):
+    with pytest.raises(InputError, match=message):
+        run_main(["--scenario", str(scenario_file), "--out", str(tmp_path), *options])
+
+
+def test_a_box_that_is_not_there_cannot_be_drawn_from(tmp_path):
+    with pytest.raises(InputError, match="--environments box: the scenario has no box"):
+        validate_main(["--environments", "box", "--out", str(tmp_path)])

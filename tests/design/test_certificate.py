@@ -1,0 +1,286 @@
+"""A certificate is a proof, agrees with the sweep, survives the file, and does not survive tampering."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from controller import coupling as controller_coupling
+from controller.coupling import Compliance, ComplianceForm, InternalModelForm, NoCoupling, SpringDamper
+from controller.environment import FIGURE_4, Network, Spring
+from controller.loop import Loop
+from controller.lti import Lti
+from design import spring_damper
+from design.certificate import (
+    BadFile,
+    NotProved,
+    Stored,
+    Verdict,
+    digest,
+    load,
+    prove,
+    required_damping,
+    save,
+    sealed,
+    verify,
+)
+from design.lmi import Specification
+from design.result import PUBLISHED
+
+DEFAULT = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
+STIFF = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
+THEOREM_4 = SpringDamper((878.77, 551.88), (0.3865, 0.5220))
+change = msgspec.structs.replace
+
+
+def wall(stiffness: float, damping: float, delta: float, T: float = 1e-3) -> Loop:
+    """One device against a spring and a damper to the ground, without delay."""
+    network = Network(contacts=("tip",), springs=(Spring(("tip", "ground"), stiffness, damping),))
+    return Loop(T, (0,), (0,), (0,), (delta,), network)
+
+
+SOFT = Network(
+    ("contact 1", "contact 2"),
+    (Spring(("contact 1", "mass"), 200.0, 0.25), Spring(("mass", "contact 2"), 175.0, 0.25)),
+    {"mass": 1.0},
+)
+
+
+@pytest.mark.parametrize("psi", [(1, 1), (1, 0)])
+def test_delay_inside_the_environment_is_proved_with_its_multiplier(psi):
+    """Theorem 4 with psi >= 1: the design's Phi is stored, and only for this environment is anything promised."""
+    loop = change(DEFAULT, psi=psi, environment=SOFT)
+    found = spring_damper.design(Specification.of(loop))
+    stored = Stored.of(loop, found.coupling, prove(loop, found.coupling, "theorem4", found.phi))
+    assert stored.certificate.promise == "this environment"
+    assert set(stored.certificate.matrices) == {"P", "P_E", "Phi"}
+    assert verify(stored) == Verdict(True)
+    with pytest.raises(NotProved, match="needs a multiplier Phi"):
+        prove(loop, found.coupling, "theorem4")
+    with pytest.raises(NotProved, match="E-hat \\+ Phi is not passive"):
+        prove(loop, found.coupling, "theorem4", 0.9 * found.phi)
+    forged = sealed(change(stored.certificate, matrices=stored.certificate.matrices | {"Phi": (("1/100", "1/100"),)}))
+    assert not verify(change(stored, certificate=forged)).proved
+
+
+def test_a_model_too_large_to_prove_in_seconds_is_said_so():
+    loop = change(DEFAULT, theta=(100, 100), delta=(400.0, 400.0))
+    with pytest.raises(NotProved, match="over 206 states takes long: up to 200 are tried"):
+        prove(loop, SpringDamper((4.0, 4.0), (0.5, 0.5)), "closed-loop")
+
+
+def test_a_model_of_a_hundred_states_is_proved():
+    loop = change(DEFAULT, theta=(45, 46), delta=(400.0, 400.0))
+    stored = certified(loop, SpringDamper((300.0, 200.0), (0.1, 0.1)), "closed-loop")
+    assert len(stored.certificate.matrices["P"]) == 97
+    assert verify(stored) == Verdict(True)
+
+
+def certified(loop: Loop, coupling, condition: str) -> Stored:
+    return Stored.of(loop, coupling, prove(loop, coupling, condition))
+
+
+@pytest.mark.parametrize(
+    ("coupling", "condition", "ratio"),
+    [
+        (STIFF, "closed-loop", 1.363 / 1.37),
+        (SpringDamper((879, 552), (0.39, 0.52)), "closed-loop", 0.714344 / 1.37),
+        (THEOREM_4, "closed-loop", 0.714 / 1.37),
+        (THEOREM_4, "theorem4", 0.9999),
+        (SpringDamper((400.0, 300.0), (0.0, 0.5)), "theorem4", None),
+    ],
+)
+def test_safe_gains_are_proved_and_proved_again_from_the_file(tmp_path, coupling, condition, ratio):
+    stored = certified(DEFAULT, coupling, condition)
+    assert stored.certificate.proof == "rational"
+    if ratio:  # the figures of the design notes, to the digits that they have
+        assert stored.certificate.required[0] / 1.37 == pytest.approx(ratio, abs=1e-3)
+    save(stored, tmp_path / "coupling.json")
+    assert load(tmp_path / "coupling.json") == stored
+    assert verify(load(tmp_path / "coupling.json")) == Verdict(True)
+    assert [p.name for p in tmp_path.iterdir()] == ["coupling.json"]
+
+
+@pytest.mark.parametrize(
+    ("coupling", "condition"),
+    [
+        (PUBLISHED["I"], "closed-loop"),
+        (PUBLISHED["I"], "theorem4"),
+        (NoCoupling(), "closed-loop"),
+        (NoCoupling(), "theorem4"),
+        (SpringDamper((879, 552), (0.39, 0.52)), "theorem4"),  # the optimal gains, rounded up
+    ],
+)
+def test_unsafe_gains_are_refused(coupling, condition):
+    with pytest.raises(NotProved) as refusal:
+        prove(DEFAULT, coupling, condition)
+    assert refusal.value.requirement.ratio > 1
+
+
+def test_no_coupling_is_proved_where_the_damping_suffices():
+    assert verify(certified(change(DEFAULT, delta=(1.7232, 1.7232)), NoCoupling(), "closed-loop")).proved
+
+
+@pytest.mark.parametrize(("K", "B"), [(1000.0, 0.0), (500.0, 0.3), (30.0, 2.0)])
+def test_one_channel_without_delay_is_colgates_condition_to_one_part_in_a_million(K, B):
+    needed = K * 1e-3 / 2 + B
+    assert verify(certified(wall(K, B, needed * (1 + 1e-6)), NoCoupling(), "closed-loop")).proved
+    with pytest.raises(NotProved, match="needs"):
+        prove(wall(K, B, needed * (1 - 1e-6)), NoCoupling(), "closed-loop")
+
+
+def test_three_channels_with_unequal_delays_and_dampings():
+    springs = tuple(Spring((tip, "hub"), k, 0.5) for tip, k in (("a", 400.0), ("b", 300.0), ("c", 350.0)))
+    network = Network(contacts=("a", "b", "c"), springs=springs, masses={"hub": 0.4})
+    loop = Loop(1e-3, (0, 3, 1), (0, 0, 0), (0, 3, 1), (2.0, 0.8, 1.37), network)
+    coupling = SpringDamper((1500.0, 250.0, 500.0), (0.5, 0.2, 0.3))
+    for condition in ("closed-loop", "theorem4"):
+        assert verify(certified(loop, coupling, condition)).proved
+
+
+def test_a_general_compliance_is_proved_under_both_conditions():
+    V = controller_coupling.SpringDamper([800.0, 500.0], [0.39, 0.52]).compliance(1.2e-3)
+    crossed = Lti(V.A, V.B, V.C, V.D + 1e-5, V.T)  # full, and symmetric at z = 1
+    rounded = Compliance(Lti(*(np.round(getattr(crossed, n), 12) for n in "ABCD"), V.T))
+    for condition in ("closed-loop", "theorem4"):
+        assert verify(certified(DEFAULT, rounded, condition)).proved
+
+
+def test_a_static_asymmetry_is_refused():
+    anchored = change(FIGURE_4, springs=(*FIGURE_4.springs, Spring(("mass", "ground"), 50.0)))
+    V = Compliance(Lti.constant([[2e-3, 1e-4], [2e-4, 2e-3]], 1.2e-3))
+    for condition in ("closed-loop", "theorem4"):
+        with pytest.raises(NotProved, match="symmetric"):
+            prove(change(DEFAULT, environment=anchored), V, condition)
+
+
+def test_environment_delay_is_proved_by_the_closed_loop_condition_only():
+    loop = change(DEFAULT, psi=(1, 1), delta=(2.5, 2.5))
+    damped = SpringDamper((2000.0, 2000.0), (3.0, 3.0))
+    assert verify(certified(loop, damped, "closed-loop")).proved
+    with pytest.raises(NotProved, match="psi >= 1 needs a multiplier"):
+        prove(loop, damped, "theorem4")
+
+
+def test_the_proof_succeeds_exactly_where_the_sweep_says_so():
+    """60 random loops; between 1 - 1e-4 and 1 either outcome is fair."""
+    rng = np.random.default_rng(7)
+    outcomes = []
+    for _ in range(60):
+        loop, coupling = random_case(rng)
+        ratio = required_damping(loop, coupling, "closed-loop").ratio
+        try:
+            proved = verify(certified(loop, coupling, "closed-loop")).proved
+        except NotProved:
+            proved = False
+        outcomes.append(proved)
+        assert proved == (ratio < 1) or 1 - 1e-4 <= ratio <= 1
+    assert 15 < sum(outcomes) < 45
+
+
+def random_case(rng: np.random.Generator) -> tuple[Loop, SpringDamper]:
+    """A star of one to three contacts whose devices have 0.5 to 2 times the damping that is needed."""
+    m = int(rng.integers(1, 4))
+    tips = tuple(f"tip {i}" for i in range(m))
+    spokes = [Spring((tip, "hub"), *np.round([rng.uniform(50, 2000), rng.uniform(0, 2)], 3).tolist()) for tip in tips]
+    anchor = Spring(("hub", "ground"), round(float(rng.uniform(0, 500)), 3), 0.1)
+    network = Network(contacts=tips, springs=(*spokes, anchor), masses={"hub": round(float(rng.uniform(0.1, 2)), 3)})
+    theta = tuple(rng.integers(0, 4, m).tolist())
+    psi = tuple(rng.integers(0, 2, m).tolist())
+    loop = Loop(1e-3, theta, psi, theta, (1.0,) * m, network)
+    coupling = SpringDamper(tuple(rng.uniform(300, 9000, m).tolist()), tuple(rng.uniform(0, 3, m).tolist()))
+    ratio = required_damping(loop, coupling, "closed-loop").ratio
+    delta = float(min(ratio, 100.0) * rng.uniform(0.5, 1.5))
+    return change(loop, delta=(max(delta, 1e-3),) * m), coupling
+
+
+def test_tampering_is_rejected_with_the_reason():
+    good = certified(DEFAULT, STIFF, "closed-loop")
+    stiffer = SpringDamper((7806.0 * 1.01, 3137.0), STIFF.B)
+    P = [list(row) for row in good.certificate.matrices["P"]]
+    P[0][0] = "7" + P[0][0]
+    wrong = change(good.certificate, matrices={"P": tuple(map(tuple, P))})
+    cases = {
+        "scenario digest differs": change(good, coupling=stiffer.form()),
+        "seal differs": change(good, certificate=wrong),
+        "P is not symmetric|negative direction|not positive definite": change(good, certificate=sealed(wrong)),
+        "no certificate": change(good, certificate=None),
+    }
+    for reason, stored in cases.items():
+        verdict = verify(stored)
+        assert not verdict.proved
+        assert any(part in verdict.reason for part in reason.split("|")), verdict.reason
+
+
+def test_a_forger_who_repairs_the_digests_still_has_to_prove():
+    good = certified(DEFAULT, STIFF, "closed-loop")
+    starved = change(DEFAULT, delta=(1.36, 1.36))
+    forged = change(prove(change(DEFAULT, delta=(1.38, 1.38)), STIFF, "closed-loop"), available=(1.36, 1.36))
+    honest_digest = digest(starved, STIFF.form())
+    requirement = required_damping(starved, STIFF, "closed-loop")
+    forged = change(forged, scenario=honest_digest, required=requirement.required, margin=1 / requirement.ratio)
+    verdict = verify(Stored.of(starved, STIFF, sealed(forged)))
+    assert not verdict.proved
+    assert "KYP matrix" in verdict.reason
+    claims = {
+        "margin is": change(good.certificate, margin=2.0),
+        "required is": change(good.certificate, required=(0.1, 0.1)),
+        "available is": change(good.certificate, available=(2.0, 2.0)),
+        "does not promise": change(good.certificate, promise="any passive environment"),
+        "carries no exact proof": change(good.certificate, proof="sampled"),
+        "expected P": change(good.certificate, matrices={}),
+        "the model has 9 states": change(good.certificate, matrices={"P": (("1",),)}),
+    }
+    for reason, certificate in claims.items():
+        assert reason in verify(change(good, certificate=sealed(certificate))).reason
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "names"),
+    [
+        (b'"T": 0.0012', b'"T": -1', "$.loop.T"),
+        (b'"T": 0.0012', b'"T": "0.0012"', "$.loop.T"),
+        (b'"kind": "spring-damper"', b'"kind": "magic"', "$.coupling.kind"),
+        (b'"version": 1', b'"version": 2', "$.version"),
+        (b'"version": 1', b'"version": 1, "extra": 0', "extra"),
+        (b"7806.0", b"-7806.0", "K is [-7806.0, 3137.0]"),
+        (b'"theta": [', b'"theta": [0, ', "theta has 3 entries"),
+        (b'"proof": "rational"', b'"proof": "faith"', "$.certificate.proof"),
+        (b"7806.0", b"1e400", "$.coupling.K[0]"),
+        (b"7806.0", b"NaN", ", 'NaN,': JSON is malformed"),
+    ],
+)
+def test_a_bad_file_is_one_line_that_names_the_field(tmp_path, old, new, names):
+    path = tmp_path / "coupling.json"
+    save(certified(DEFAULT, STIFF, "closed-loop"), path)
+    text = path.read_bytes()
+    assert old in text
+    path.write_bytes(text.replace(old, new, 1))
+    with pytest.raises(BadFile) as error:
+        load(path)
+    assert names in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"), [(b" \n", "is empty"), (b"[]", "is no stored coupling"), (b"{", "truncated")]
+)
+def test_a_file_of_something_else_is_one_line(tmp_path, content, said):
+    path = tmp_path / "coupling.json"
+    path.write_bytes(content)
+    with pytest.raises(BadFile, match=f"coupling.json: .*{said}"):
+        load(path)
+
+
+def test_coefficients_that_no_coupling_has_are_refused():
+    with pytest.raises(ValueError, match=r"Q has an entry 1e\+80, allowed are up to 1e\+12"):
+        InternalModelForm((), (((1e80, 0.0), (0.0, 1e80)),))
+    with pytest.raises(ValueError, match=r"D has an entry -1e\+13"):
+        ComplianceForm((), (), ((),), ((-1e13,),))
+
+
+def test_an_entry_of_a_proof_beyond_floating_point_is_no_proof():
+    good = certified(DEFAULT, STIFF, "closed-loop")
+    rows = [list(row) for row in good.certificate.matrices["P"]]
+    rows[0][0] = "1" + "0" * 400
+    forged = sealed(change(good.certificate, matrices={"P": tuple(map(tuple, rows))}))
+    assert "beyond the range of floating point" in verify(change(good, certificate=forged)).reason

@@ -1,0 +1,180 @@
+"""design.plot: curves against formulas evaluated by hand, their maxima against the conditions' figures."""
+
+import json
+
+import numpy as np
+import pytest
+
+from cli.compare import main_plot
+from controller.coupling import Compliance, NoCoupling, SpringDamper
+from controller.environment import FIGURE_4, GROUND, Network, Spring
+from controller.loop import Loop
+from design.compare import curves, grid, ideal, judge
+from design.result import CASE_I, DesignFailed
+from sim.scenario import InputError
+
+T, DELTA = 1.2e-3, 1.37
+LOOP = Loop(T, (1, 2), (0, 0), (1, 2), (DELTA, DELTA), FIGURE_4)
+SOFT = SpringDamper([878.7, 551.8], [0.3865, 0.5220])
+HZ = np.array([0.3, 6.17, 40.0, 133.0, 400.0])
+
+#: rounding of a state-space response against a formula, with poles 1e-3 from the circle
+ROUNDING = 1e-9
+
+
+def by_hand(hz):
+    """E and F of the default scenario with the paper's gains, from Figure 4's formula and (6)."""
+    for f in hz:
+        z = np.exp(2j * np.pi * f * T)
+        s = (z - 1) / (T * z)
+        Z = np.diag([800 + s, 700 + s])
+        one = np.ones((2, 1))
+        E = Z - Z @ one @ one.T @ Z / (s**2 + (one.T @ Z @ one))
+        V = np.diag(1 / (CASE_I.K + CASE_I.B * s))
+        theta = np.diag([1 / z, 1 / z**2])
+        yield E, theta @ np.linalg.inv(np.eye(2) + E @ V) @ E, theta
+
+
+def wall(K, B=0.0, theta=0):
+    """A grounded spring-damper as the environment of one device."""
+    network = Network(("tip",), (Spring(("tip", GROUND), K, B),))
+    return Loop(T, (theta,), (0,), (theta,), (DELTA,), network)
+
+
+def test_singular_values_and_effective_impedance_by_hand():
+    lines = curves(LOOP, judge(LOOP, CASE_I), HZ)
+    sigma_E, undelayed = ideal(LOOP, HZ)
+    for k, (E, F, theta) in enumerate(by_hand(HZ)):
+        np.testing.assert_allclose(sigma_E[k], np.linalg.svd(E)[1], rtol=ROUNDING)
+        np.testing.assert_allclose(lines.sigma_F[k], np.linalg.svd(F)[1], rtol=ROUNDING)
+        np.testing.assert_allclose(lines.sigma_M[k], np.linalg.svd(F - theta @ E)[1], rtol=ROUNDING)
+        for part, G in ((lines.perceived, F), (undelayed, E)):
+            size = np.abs(G).max()
+            np.testing.assert_allclose(part.stiffness[k], np.diag(G).real, atol=ROUNDING * size)
+            omega = 2 * np.pi * HZ[k]
+            np.testing.assert_allclose(part.damping[k], np.diag(G).imag / omega, atol=ROUNDING * size / omega)
+
+
+def test_a_wall_without_delay_is_perceived_as_its_spring():
+    felt = curves(wall(1000.0), judge(wall(1000.0), NoCoupling()), HZ).perceived
+    np.testing.assert_allclose(felt.stiffness[:, 0], 1000.0, rtol=1e-12)
+    np.testing.assert_allclose(felt.damping[:, 0], 0.0, atol=1e-12)
+
+
+def test_a_delayed_spring_feeds_and_a_damper_dissipates():
+    """z^-1 K is K cos(wT) and -K sin(wT)/w; backward Euler's B is B sin(wT)/(wT), and stiffens by B (1 - cos wT)/T."""
+    omega = 2 * np.pi * HZ
+    late = wall(1000.0, theta=1)
+    felt = curves(late, judge(late, NoCoupling()), HZ).perceived
+    np.testing.assert_allclose(felt.stiffness[:, 0], 1000 * np.cos(omega * T), rtol=1e-9)
+    np.testing.assert_allclose(felt.damping[:, 0], -1000 * np.sin(omega * T) / omega, rtol=1e-9)
+    damped = wall(1000.0, 2.0)
+    felt = curves(damped, judge(damped, NoCoupling()), HZ).perceived
+    np.testing.assert_allclose(felt.stiffness[:, 0], 1000 + 2 * (1 - np.cos(omega * T)) / T, rtol=1e-9)
+    np.testing.assert_allclose(felt.damping[:, 0], 2 * np.sin(omega * T) / (omega * T), rtol=1e-9)
+
+
+def test_demand_by_hand():
+    """closed-loop: -T He[F/(z-1)] / delta; theorem4, by channel: (1 - cos n w) / (2 delta Re[(z-1) V/(Tz)])."""
+    demands = curves(LOOP, judge(LOOP, CASE_I), HZ).demands
+    for k, (_, F, _) in enumerate(by_hand(HZ)):
+        z = np.exp(2j * np.pi * HZ[k] * T)
+        H = F / (z - 1)
+        worst = -np.linalg.eigvalsh(H + H.conj().T)[0] * T / (2 * DELTA)
+        assert demands["closed-loop"][k] == pytest.approx(worst, rel=1e-7)  # H loses digits near z = 1
+        s = (z - 1) / (T * z)
+        V = 1 / (CASE_I.K + CASE_I.B * s)
+        window = 1 - np.cos(np.array([2, 3]) * np.angle(z))
+        assert demands["theorem4"][k] == pytest.approx((window / (2 * DELTA * (s * V).real)).max(), rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    "coupling", [NoCoupling(), CASE_I, SOFT, Compliance(SOFT.compliance(T))], ids=lambda c: str(c)[:9]
+)
+def test_the_curve_reaches_the_required_damping_and_no_more(coupling):
+    judged = judge(LOOP, coupling)
+    hz = grid(LOOP, [judged])
+    for condition, demand in curves(LOOP, judged, hz).demands.items():
+        ratio = judged.requirements[condition].ratio
+        if demand is None:
+            assert ratio == np.inf
+        else:
+            assert demand.max() == pytest.approx(ratio, rel=1e-12)  # the binding frequency is in the grid
+
+
+def test_the_curve_with_delay_in_the_environment():
+    """psi >= 1: theorem4 has a multiplier, and a floor under its curve."""
+    soft = Network(
+        FIGURE_4.contacts,
+        tuple(Spring(s.between, s.stiffness / 8, s.damping / 8) for s in FIGURE_4.springs),
+        FIGURE_4.masses,
+    )
+    loop = Loop(T, (0, 0), (1, 1), (1, 1), (DELTA, DELTA), soft)
+    judged = judge(loop, SpringDamper([200.0, 200.0], [0.2, 0.2]))
+    demand = curves(loop, judged, grid(loop, [judged])).demands["theorem4"]
+    assert 0 < demand.max() == pytest.approx(judged.requirements["theorem4"].ratio, rel=1e-9)
+
+
+def test_required_damping_is_what_is_perceived_with_the_hold():
+    """One channel: T Im[F e^-jw/2] / (2 sin(w/2)), the damping half a sample later, is lowest at -required."""
+    loop = wall(900.0, 0.4, theta=2)
+    judged = judge(loop, SpringDamper([2000.0], [0.3]))
+    w = np.linspace(1e-4, np.pi, 200_001)
+    late = (judged.F.at(np.exp(1j * w))[:, 0, 0] * np.exp(-0.5j * w)).imag * T / (2 * np.sin(w / 2))
+    required = judged.requirements["closed-loop"].required[0]
+    assert -late.min() == pytest.approx(required, rel=1e-6)  # a grid of 1.6e-5 rad misses a smooth peak by its square
+
+
+def test_the_command_writes_pictures_and_curves(tmp_path, capsys):
+    out = tmp_path / "o"
+    assert main_plot(["--coupling", "none,published", "--out", str(out), "--json", "-"]) == 0
+    stdout, stderr = capsys.readouterr()
+    outcome = json.loads(stdout)
+    assert "published" in stderr
+    assert [c["name"] for c in outcome["couplings"]] == ["none", "published"]
+    published = outcome["couplings"][1]
+    assert published["closed-loop"]["required_damping"][0] == pytest.approx(1.398716, abs=2e-6)
+    assert published["closed-loop"]["demand"][0] < published["closed-loop"]["ratio"]
+    assert len(published["sigma_M"]) == len(outcome["frequency_hz"]) == len(published["perceived"]["damping"])
+    assert outcome["couplings"][0]["theorem4"]["demand"] is None
+    assert outcome["couplings"][0]["theorem4"]["reason"]
+    assert json.loads((out / "curves.json").read_text())["couplings"] == outcome["couplings"]
+    for name in ("singular-values", "required-damping", "perceived"):
+        assert (out / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_other_devices_other_delays_and_no_pictures(tmp_path):
+    """Three unequal devices, one of them delayed by option."""
+    args = ["--scenario", "three-rigid", "--theta", "0,1,2", "--coupling", "none", "--no-plot", "--out", str(tmp_path)]
+    assert main_plot([*args, "--json", str(tmp_path / "r.json")]) == 0
+    assert not list(tmp_path.glob("*.png"))
+    outcome = json.loads((tmp_path / "r.json").read_text())
+    assert outcome["available_damping"] == [2.0, 0.8, 1.37]
+    assert np.shape(outcome["ideal"]["stiffness"])[1] == 3
+
+
+def test_a_design_that_does_not_exist_leaves_the_others(tmp_path, capsys):
+    base = ["--psi", "1,1", "--no-plot", "--out", str(tmp_path)]
+    assert main_plot(["--coupling", "none,spring-damper", *base]) == 1
+    assert "spring-damper: not possible" in capsys.readouterr().out
+    with pytest.raises(DesignFailed):
+        main_plot(["--coupling", "spring-damper", *base])
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["--coupling", "none,none"], "twice"),
+        (["--coupling", "none,,published"], "separated by commas"),
+        (["--coupling", "a.json,b.json,c.json,d.json,e.json,f.json,g.json"], "allowed are 1 to 6"),
+        (["--coupling", "stiff"], "allowed are none, published"),
+        (["--coupling", ""], "expected names separated by commas"),
+        (["--coupling", "spring-damper:foo"], "the condition is 'foo', allowed are"),
+        (["--coupling", "published:"], "the condition is '', allowed are"),
+        (["--case", "none", "--coupling", "published"], "without coupling"),
+        (["--coupling", "missing.json"], "No such file"),
+    ],
+)
+def test_bad_input_is_one_line(argv, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        main_plot([*argv, "--out", str(tmp_path)])

@@ -1,0 +1,162 @@
+"""Laws of the exact arithmetic: against numpy, against the floating-point blocks, and symmetry at z = 1."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from controller.coupling import Compliance, NoCoupling, SpringDamper
+from controller.delay import delay, moving_sum
+from controller.environment import FIGURE_4, Network, Spring, environment
+from controller.loop import force_map
+from controller.lti import Lti, SingularLoop, inverse, numbers, rational
+from design.exact import Matrix, block_diag, definiteness, prove_positive_real, strictly_positive
+
+T = 1.2e-3
+STAR = Network(
+    contacts=("a", "b", "c"),
+    springs=(
+        Spring(("a", "hub"), 613.7, 0.31),
+        Spring(("b", "hub"), 402.1, 1.7),
+        Spring(("c", "hub"), 877.3),
+        Spring(("hub", "ground"), 55.0, 0.2),
+        Spring(("a", "ground"), 12.5),
+    ),
+    masses={"hub": 0.7, "b": 0.05},
+)
+COUPLINGS = [
+    NoCoupling(),
+    SpringDamper([7806.0, 3137.0], [0.105, 0.0]),
+    Compliance(
+        Lti([[0.3, 0.1], [0.0, -0.2]], [[1.0, 0.2], [0.3, 1.0]], [[1e-4, 0.0], [0.0, 2e-4]], 1e-4 * np.eye(2), T)
+    ),
+]
+
+
+def at(G: Lti, z: complex) -> np.ndarray:
+    return G.floats().at(z)
+
+
+def symmetric_integers(rng: np.random.Generator, n: int) -> np.ndarray:
+    S = rng.integers(-3, 4, (n, n))
+    return S + S.T + rng.integers(0, 4 * n) * np.eye(n, dtype=int)
+
+
+def test_a_stored_float_is_its_shortest_decimal():
+    assert rational(0.0012) == Fraction(12, 10000)
+    assert rational(np.float64(0.1)) == Fraction(1, 10)
+
+
+def test_definiteness_agrees_with_the_eigenvalues_of_random_integer_matrices():
+    rng = np.random.default_rng(1)
+    seen = set()
+    for _ in range(300):
+        S = symmetric_integers(rng, int(rng.integers(1, 7)))
+        least = np.linalg.eigvalsh(S)[0]
+        outcome = definiteness(Matrix.of(S.tolist()))
+        if abs(least) > 1e-9:  # a zero eigenvalue has a rounded sign
+            assert outcome.definite == (least > 0)
+            assert strictly_positive(Matrix.of(S.tolist())) == (least > 0)
+        assert outcome.semidefinite == (least > -1e-9)
+        seen.add(outcome.definite)
+        if not outcome.definite:
+            minor = round(np.linalg.det(S[: outcome.minor, : outcome.minor]))
+            assert np.sign(minor) == outcome.sign
+    assert seen == {True, False}
+
+
+def test_singular_matrices_are_semidefinite_only_without_a_negative_direction():
+    rng = np.random.default_rng(2)
+    for rank in range(1, 5):
+        half = rng.integers(-5, 6, (6, rank))
+        gram = Matrix.of((half @ half.T).tolist())
+        outcome = definiteness(gram)
+        assert outcome.semidefinite
+        assert not outcome.definite
+        assert not strictly_positive(gram)
+    assert not definiteness(Matrix.of([[0, 1], [1, 5]])).semidefinite
+    with pytest.raises(ValueError, match="not exactly symmetric"):
+        definiteness(Matrix.of([[1, 2], [3, 9]]))
+
+
+def test_a_matrix_definite_by_less_than_the_rounding_is_not_proved():
+    tiny = Fraction(1, 2**400)
+    S = Matrix.of([[Fraction(1), 1 - tiny], [1 - tiny, Fraction(1)]])
+    assert definiteness(S).definite
+    assert not strictly_positive(S)
+
+
+def test_entries_beyond_all_proportion_prove_nothing_and_say_so_quietly(recwarn):
+    for size in (10**200, 10**400, 10**4000):
+        assert not strictly_positive(Matrix.of([[1, size], [size, 1]]))
+        assert not strictly_positive(Matrix.of([[Fraction(1, size), 1], [1, 1]]))
+        assert strictly_positive(Matrix.of([[size, 1], [1, Fraction(2, size)]]))
+    assert not recwarn.list
+
+
+def hilbert(n: int, shift: Fraction = Fraction(0)) -> Matrix:
+    return Matrix.of([[Fraction(1, i + j + 1) - (shift if i == j else 0) for j in range(n)] for i in range(n)])
+
+
+def test_definiteness_is_proved_beyond_the_reach_of_double_precision():
+    """Hilbert's matrices, condition 5e5 to 2e28: against elimination, on both sides of the least eigenvalue."""
+    for n in (5, 12, 20):
+        low, high = Fraction(0), Fraction(1, n)
+        while high - low > high / 1000:
+            middle = (low + high) / 2
+            low, high = (middle, high) if definiteness(hilbert(n, middle)).definite else (low, middle)
+        assert strictly_positive(hilbert(n))
+        assert strictly_positive(hilbert(n, low))
+        assert not strictly_positive(hilbert(n, high))
+
+
+def test_the_exact_inverse_is_an_inverse():
+    rng = np.random.default_rng(3)
+    for n in range(1, 8):
+        S = numbers(rng.integers(-9, 10, (n, n)), Fraction(1)) / 7
+        assert (S @ inverse(S) == np.eye(n, dtype=int)).all()
+    with pytest.raises(SingularLoop):
+        inverse(numbers([[1, 2], [2, 4]], Fraction(1)))
+    assert block_diag(Matrix.zeros(0, 0), Matrix.eye(2)).equals(Matrix.eye(2))
+
+
+@pytest.mark.parametrize("coupling", COUPLINGS, ids=lambda c: type(c).__name__)
+@pytest.mark.parametrize(("theta", "psi"), [((1, 2), (0, 0)), ((0, 3), (1, 0))])
+def test_the_exact_force_map_is_the_one_that_runs(coupling, theta, psi):
+    F = force_map(environment(FIGURE_4, rational(T)), coupling, theta, psi)
+    running = force_map(environment(FIGURE_4, T), coupling, theta, psi)
+    rng = np.random.default_rng(4)
+    for z in rng.uniform(0.7, 1.5, 5) * np.exp(1j * rng.uniform(0, np.pi, 5)):
+        # the frequency response of either block is good to 1e-9 near its resonance
+        np.testing.assert_allclose(at(F, z), running.at(z), rtol=1e-8, atol=1e-8)
+
+
+def test_the_static_stiffness_is_exactly_symmetric_and_semidefinite():
+    T = rational(0.001)
+    for coupling in (SpringDamper([901.3, 512.9, 3000.1], [0.3, 0.0, 1.1]), NoCoupling()):
+        F1, _ = force_map(environment(STAR, T), coupling, (0, 3, 1), (0, 0, 0)).split_at_one()
+        assert (F1 == F1.T).all()
+        assert definiteness(Matrix.of(F1)).definite
+    F1, _ = environment(FIGURE_4, rational(T)).split_at_one()
+    assert F1[0, 0] == Fraction(800 * 700, 1500)
+    assert str(definiteness(Matrix.of(F1))) == "the leading minor of order 2 is zero"
+
+
+def test_exact_delays_and_moving_sums_are_those_that_run():
+    z = 1.1 * np.exp(0.4j)
+    window = [sum(z**-k for k in range(n + 1)) for n in (0, 3)]
+    np.testing.assert_allclose(at(moving_sum((0, 3), rational(T)), z), np.diag(window), rtol=1e-12)
+    np.testing.assert_allclose(at(delay((0, 3), rational(T)), z), delay((0, 3), T).at(z), rtol=1e-12)
+
+
+def test_a_wrong_storage_matrix_proves_nothing():
+    # G = 1 + 0.5/(z - 0.5): He G >= 2/3 on the circle
+    G = Lti(*([[v]] for v in (0.5, 1.0, 0.5, 1.0)), Fraction(1))
+    assert prove_positive_real(G, Matrix.of([["1/2"]])) is None
+    assert "negative direction" in prove_positive_real(G, Matrix.of([[5]]))
+    # unstable: P < 0 may satisfy the second inequality alone, and only P > 0 refuses it
+    unstable = Lti(*([[v]] for v in (2, 1, 0, 5)), Fraction(1))
+    assert prove_positive_real(unstable, Matrix.of([[-1]])) == (
+        "P is not positive definite, or by so little that it is not proved"
+    )
+    assert prove_positive_real(G, Matrix.eye(2)) == "P has shape (2, 2), the model has 1 states"

@@ -1,0 +1,271 @@
+"""design.export: every format against the loop's formulas; the C file compiled, run, and called from other code."""
+
+import importlib.util
+import json
+import re
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from cli.export import main
+from controller.coupling import Compliance, NoCoupling, SpringDamper
+from controller.coupling import SpringDamper as Gains
+from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.loop import Loop, force_map
+from controller.lti import Lti
+from controller.process import Process, Tape
+from design.certificate import Stored, prove, save
+from design.export import process_block, sequential, trial
+from sim.scenario import InputError
+
+T = 1.2e-3
+LOOP = Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
+GAINS = SpringDamper((878.7, 551.8), (0.3865, 0.5220))
+SPRINGS = SpringDamper((300.0, 200.0), (0.0, 0.0))  # no state at all
+FULL = Compliance(
+    Lti([[0.5, 0.1], [-0.2, 0.3]], [[1e-3, 0], [2e-4, 1e-3]], [[0.4, 0], [0.1, 0.5]], [[1e-3, 1e-4], [1e-4, 2e-3]], T)
+)
+COUPLINGS = {"gains": GAINS, "springs": SPRINGS, "full": FULL}
+
+CC = shutil.which("gcc") or shutil.which("cc")
+needs_cc = pytest.mark.skipif(CC is None, reason="neither gcc nor cc is here: exported C files are not compiled")
+STRICT = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-ffp-contract=off"]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A folder with the stored couplings; the first is certified."""
+    folder = tmp_path_factory.mktemp("export")
+    for name, data in COUPLINGS.items():
+        certificate = prove(LOOP, GAINS, "theorem4") if name == "gains" else None
+        save(Stored.of(LOOP, data, certificate), folder / f"{name}.json")
+    return folder
+
+
+def export(place, name, kind, *options):
+    path = place / f"{name}{'-process' if '--process' in options else ''}.{kind}"
+    path = path.with_suffix({"control": ".py", "json": ".plain.json"}.get(kind, f".{kind}"))
+    assert main([str(place / f"{name}.json"), "--format", kind, "--out", str(path), *options]) == 0
+    return path
+
+
+def compiled(sources, *flags):
+    program = sources[0].with_suffix(".out")
+    subprocess.run([CC, *STRICT, *flags, *map(str, sources), "-o", str(program), "-lm"], check=True)
+    return program
+
+
+def run(program):
+    return subprocess.run([program], capture_output=True, text=True, check=False)
+
+
+def test_the_order_of_the_sums_in_plain_python():
+    """Floats of Python, one rounding per operation: equal to the last bit."""
+    block = process_block(Stored.of(LOOP, GAINS))
+    test, G = trial(block), block.system
+    z = [0.0] * G.order
+    for u, y in zip(test.inputs.tolist(), test.outputs.tolist(), strict=True):
+        sums = []
+        for row in np.block([[G.C, G.D], [G.A, G.B]]).tolist():
+            total = 0.0
+            for entry, value in zip(row, z + u, strict=True):
+                total += entry * value
+            sums.append(total)
+        assert sums[: G.outputs] == y
+        z = sums[G.outputs :]
+
+
+@pytest.mark.parametrize("data", COUPLINGS.values(), ids=COUPLINGS)
+def test_the_process_of_the_simulator_differs_by_rounding_alone(data):
+    """It sums by BLAS, in any order: each tick each side is wrong by at most gamma_N |row| |v|, carried on by A."""
+    block = process_block(Stored.of(LOOP, data))
+    test, G = trial(block), block.system
+    limits = np.full(2, np.inf)
+    tape = Tape(Process(G, limits, np.zeros(2)), len(test.inputs), plant_states=2)
+    for k, x in enumerate(test.inputs):
+        tape.x[k, :, 0] = x
+        tape.tick(k)
+    z = sequential(Lti(G.A, G.B, np.eye(G.order), np.zeros_like(G.B), T), test.inputs)  # states before each tick
+    terms = G.order + G.inputs
+    gamma = terms * 2.0**-53 / (1 - terms * 2.0**-53)
+    local = 2 * gamma * (np.abs(z) @ np.abs(G.A).T + np.abs(test.inputs) @ np.abs(G.B).T)
+    carried = [np.abs(G.C @ np.linalg.matrix_power(G.A, n)) for n in range(len(z))]
+    for k in range(len(z)):
+        own = 2 * gamma * (np.abs(G.C) @ np.abs(z[k]) + np.abs(G.D) @ np.abs(test.inputs[k]))
+        bound = own + sum(carried[k - 1 - i] @ local[i] for i in range(k))
+        assert (np.abs(tape.f[k, :, 0] - test.outputs[k]) <= 1.01 * bound).all()  # 1.01: products of two roundings
+    largest = np.abs(test.outputs).max()
+    difference = np.abs(tape.f[: len(z), :, 0] - test.outputs).max()
+    print(f"largest difference {difference:.1e} of {largest:.2g} N: {difference / np.spacing(largest):.1f} ulp")
+
+
+@needs_cc
+@pytest.mark.parametrize("what", [[], ["--process"]], ids=["coupling", "process"])
+@pytest.mark.parametrize("name", COUPLINGS)
+def test_the_c_file_repeats_its_test_vector_to_the_last_bit(place, name, what):
+    source = export(place, name, "c", *what)
+    for flags in (["-O2"], ["-O3", "-march=native"]):  # sums may not be reordered, so vector units change nothing
+        done = run(compiled([source], *flags, "-DHAPTIC_LOOP_TEST"))
+        assert (done.returncode, done.stderr) == (0, "")
+        assert "repeat to the last bit" in done.stdout
+
+
+@needs_cc
+def test_the_c_files_own_test_can_fail(place):
+    source = export(place, "gains", "c", "--process", "--seed", "3")
+    text = source.read_text()
+    begin = text.index("process_C[2]")
+    old = re.search(r"-?0x1\.\w+p[+-]\d+", text[begin:])[0]  # the first entry that is not zero
+    new = float(np.nextafter(float.fromhex(old), np.inf)).hex()
+    source.write_text(text[:begin] + text[begin:].replace(old, new, 1))
+    done = run(compiled([source], "-DHAPTIC_LOOP_TEST"))
+    assert done.returncode == 1
+    assert "expected" in done.stderr
+
+
+DRIVER = """
+#define HAPTIC_LOOP_DECLARATIONS_ONLY
+#include "SOURCE"
+#include <stdio.h>
+int main(void)
+{
+    coupling_state state;
+    double x[COUPLING_CHANNELS], f[COUPLING_CHANNELS], d[COUPLING_CHANNELS];
+    int k, i;
+    coupling_reset(&state);
+    for (k = 0; k < 40; k++) {
+        coupling_free(&state, d);
+        for (i = 0; i < COUPLING_CHANNELS; i++) {
+            x[i] = 0.001 * (k % (5 + i));
+            f[i] = 900.0 * (x[i] - d[i]) / (1.0 + 900.0 * coupling_D[i][i]);
+            printf("%a\\n", f[i]);
+        }
+        coupling_step(&state, f, d);
+    }
+    return 0;
+}
+"""
+
+
+@needs_cc
+def test_other_code_closes_the_loop_around_springs_of_its_own(place):
+    """u = x - d, f = 900 u with V from the C file, against F = (I + E V)^-1 E with E = 900 I."""
+    source = export(place, "gains", "c")
+    driver = place / "driver.c"
+    driver.write_text(DRIVER.replace("SOURCE", source.name))
+    out = subprocess.run([compiled([driver, source])], capture_output=True, text=True, check=True).stdout
+    f = np.array([float.fromhex(line) for line in out.split()]).reshape(40, 2)
+    x = 1e-3 * np.stack([np.arange(40) % 5, np.arange(40) % 6], axis=1)
+    F = Gains(GAINS.K, GAINS.B).around(Lti.constant(900 * np.eye(2), T))
+    np.testing.assert_allclose(f, sequential(F, x), atol=1e-13)  # a few roundings of forces up to 1 N
+
+
+@pytest.mark.parametrize("kind", ["json", "npz"])
+def test_plain_data_is_the_force_map_of_the_paper(place, kind):
+    """C (zI - A)^-1 B + D at three frequencies is Theta (I + E V)^-1 E, by the formulas of (6) and (26)."""
+    path = export(place, "gains", kind, "--process")
+    if kind == "json":
+        raw = json.loads(path.read_text())
+        plain = {name: np.array(raw[name]) for name in (*"ABCD", "T_s", "test_input", "test_output")}
+    else:
+        with np.load(path, allow_pickle=False) as stored:
+            plain = dict(stored)
+    E = environment(FIGURE_4, T)
+    for hz in (1.0, 30.0, 300.0):
+        z = np.exp(2j * np.pi * hz * T)
+        found = plain["C"] @ np.linalg.solve(z * np.eye(len(plain["A"])) - plain["A"], plain["B"]) + plain["D"]
+        V = np.diag(1 / (np.array(GAINS.K) + np.array(GAINS.B) * (z - 1) / (T * z)))
+        expected = np.diag([1 / z, 1 / z**2]) @ np.linalg.inv(np.eye(2) + E.at(z) @ V) @ E.at(z)
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+    assert plain["T_s"] == T
+    system = Lti(*(plain[name] for name in "ABCD"), T)
+    np.testing.assert_array_equal(sequential(system, plain["test_input"]), plain["test_output"])
+
+
+def test_the_control_script_builds_the_same_block_and_tests_itself(place):
+    pytest.importorskip("control", reason="python-control is not installed: the exported script is not run")
+    path = export(place, "gains", "control", "--process")
+    spec = importlib.util.spec_from_file_location("exported_process", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    system = module.statespace()
+    z = np.exp(2j * np.pi * 30.0 * T)
+    F = force_map(environment(FIGURE_4, T), Gains(GAINS.K, GAINS.B), LOOP.theta, LOOP.psi)
+    np.testing.assert_allclose(system(z), F.at(z), rtol=1e-9)
+    assert (system.dt, system.input_labels, system.output_labels) == (T, ["x1", "x2"], ["f1", "f2"])
+    assert module.main() == 0
+    module.D[0][0] += 1.0
+    assert module.main() == 1
+
+
+def test_without_theta_the_link_is_the_delay():
+    stored = Stored.of(LOOP, GAINS)
+    with_it, without = (process_block(stored, flag) for flag in (True, False))
+    z = np.exp(0.3j)
+    theta = np.diag([1 / z, 1 / z**2])
+    np.testing.assert_allclose(with_it.system.at(z), theta @ without.system.at(z), rtol=1e-12)
+    assert "NOT included" in " ".join(without.about)
+
+
+def test_a_file_says_what_it_is_and_repeats_byte_for_byte(place):
+    first = export(place, "gains", "c", "--process").read_text()
+    assert "Certified for any passive environment" in first
+    assert export(place, "gains", "c", "--process").read_text() == first
+    assert export(place, "gains", "c", "--process", "--seed", "1").read_text() != first
+    assert "NOT CERTIFIED: the file carries no certificate" in export(place, "full", "c").read_text()
+
+
+def test_a_certificate_that_does_not_hold_is_said_and_exits_with_1(place, tmp_path, capsys):
+    changed = tmp_path / "changed.json"
+    changed.write_text((place / "gains.json").read_text().replace("878.7", "1878.7"))
+    out = tmp_path / "changed.c"
+    assert main([str(changed), "--out", str(out), "--json", "-"]) == 1
+    outcome = json.loads(capsys.readouterr().out)
+    assert not outcome["certificate"]["proved"]
+    assert outcome["file"] == str(out)
+    assert "NOT CERTIFIED: scenario digest differs" in out.read_text()
+
+
+def test_a_hostile_name_stays_inside_the_comments(tmp_path):
+    path = tmp_path / "a\nimport os; #.json"
+    save(Stored.of(LOOP, GAINS), path)
+    assert main([str(path), "--format", "control", "--out", str(tmp_path / "out.py")]) == 0
+    code = [line for line in (tmp_path / "out.py").read_text().splitlines() if not line.startswith("#")]
+    assert code[0] == "import sys"
+    assert "import os" not in "".join(code)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["{gains}", "--without-theta"], "without --process"),
+        (["{gains}", "--out", "{gains}"], "name another file"),
+        (["{gains}", "--out", "{place}"], "is a folder"),
+        (["{gains}", "--seed", "-1"], "from 0"),
+        (["{gains}", "--format", "matlab"], "invalid choice"),
+        (["{place}/missing.json"], "No such file"),
+        (["{place}/none.json"], r"\(--process\)"),
+    ],
+)
+def test_bad_input_is_one_line(place, options, message):
+    save(Stored.of(LOOP, NoCoupling()), place / "none.json")
+    with pytest.raises(InputError, match=message):
+        main([option.format(gains=place / "gains.json", place=place) for option in options])
+
+
+def test_one_channel(tmp_path):
+    """A single device before a wall, as the command would be used for a first device."""
+    wall = Network(("tip",), (Spring(("tip", GROUND), 2000.0),))
+    save(Stored.of(Loop(T, (1,), (0,), (1,), (1.37,), wall), SpringDamper((500.0,), (0.1,))), tmp_path / "one.json")
+    assert main([str(tmp_path / "one.json"), "--process", "--format", "json", "--out", str(tmp_path / "o.json")]) == 0
+    plain = json.loads((tmp_path / "o.json").read_text())
+    static = np.array(plain["C"]) @ np.linalg.inv(np.eye(len(plain["A"])) - plain["A"]) @ plain["B"] + plain["D"]
+    assert static == pytest.approx(2000 * 500 / 2500)  # two springs in series
+
+
+def test_the_export_needs_no_solver():
+    code = "import sys, design.export; sys.exit('cvxpy' in sys.modules or 'control' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

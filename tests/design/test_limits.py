@@ -1,0 +1,264 @@
+"""The limit curve and the ladder as a user meets them, and what varies along each axis."""
+
+import json
+
+import numpy as np
+import pytest
+
+from cli import compare as limits
+from cli.compare import main
+from controller.environment import environment
+from controller.loop import force_map
+from design import compare as limit_curve
+from design import compare as limits_report
+from design.compare import AXES, LADDERS, SHORT, Setting, measured, optimum, remembered, rung, settings
+from design.conditions import this_environment
+from design.optimal import Wish
+from design.result import CASE_I
+from sim.plots import plot_limits
+from sim.scenario import InputError, load
+
+LOOP = load().loop("I")
+SMALL = Wish(functions=4, diagonal=True, high_gain=None)
+
+
+def run(tmp_path, *options):
+    file = tmp_path / "r.json"
+    code = main([*options, "--out", str(tmp_path / "out"), "--json", str(file)])
+    return code, json.loads(file.read_text())
+
+
+# what varies ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axis", AXES)
+@pytest.mark.parametrize("points", [1, 2, 5])
+def test_what_there_is_lies_among_the_points(axis, points):
+    """Values grow, nothing but the axis' own quantity changes, and one setting is the loop as it is."""
+    along = settings(axis, LOOP, SMALL, points)
+    values = [s.value for s in along]
+    assert values == sorted(set(values))
+    assert len(values) <= points
+    assert any(s.loop == LOOP and s.wish == SMALL for s in along)
+    for s in along:
+        changed = {name for name in LOOP.__struct_fields__ if getattr(s.loop, name) != getattr(LOOP, name)}
+        assert changed <= {"damping": {"delta"}, "delay": {"theta", "lam"}, "period": {"T"}, "order": set()}[axis]
+
+
+def test_unequal_devices_are_scaled_alike():
+    loop = load("three-rigid").loop("I")
+    for s in settings("damping", loop, SMALL, 3, (0.4, 1.6)):
+        assert min(s.loop.delta) == pytest.approx(s.value, rel=1e-12)
+        np.testing.assert_allclose(np.array(s.loop.delta) / loop.delta, s.value / 0.8, rtol=1e-12)
+
+
+def test_the_reference_keeps_what_it_lacks():
+    """Case I stays delay-matched; case II stays ahead."""
+    for case, expected in (("I", [(0, 1), (1, 2), (2, 3)]), ("II", [(0, 0)] * 3)):
+        along = settings("delay", load().loop(case), SMALL, 3)
+        assert [s.loop.lam for s in along] == expected
+        assert [s.loop.theta for s in along] == [(0, 1), (1, 2), (2, 3)]
+
+
+def test_delays_in_seconds_are_never_shortened():
+    along = settings("period", LOOP, SMALL, 6, (0.3e-3, 2.4e-3), "seconds")
+    for s in along:
+        for samples, before in zip(s.loop.theta, LOOP.theta, strict=True):
+            assert samples * s.loop.T >= before * LOOP.T * (1 - 1e-9)
+            assert (samples - 1) * s.loop.T < before * LOOP.T
+        assert s.loop.lam == s.loop.theta
+    assert along[0].loop.theta == (4, 8)
+
+
+# what is designed -------------------------------------------------------------------------------------------------
+
+
+def test_more_damping_is_never_worse_and_the_figures_are_the_designs_own():
+    """The feasible set grows with the damping."""
+    limits_ = [optimum(s) for s in settings("damping", LOOP, SMALL, 3, (1.3, 1.5))]
+    rms = [limit.rms_mismatch_db for limit in limits_]
+    assert rms[0] > rms[1] > rms[2]
+    for limit in limits_:
+        assert max(limit.required_damping) < limit.delta[0]
+        np.testing.assert_allclose(limit.bare_damping, 1.7229, rtol=1e-4)
+
+
+def test_more_functions_are_never_worse():
+    along = [Setting(n, LOOP, Wish(functions=n, high_gain=None)) for n in (4, 5, 8)]
+    rms = [optimum(s).rms_mismatch_db for s in along]
+    assert rms == sorted(rms, reverse=True)
+
+
+def test_a_point_without_a_solution_keeps_its_reason():
+    limit = optimum(Setting(1.0, LOOP, Wish(functions=1)))
+    assert limit.rms_mismatch_db is None
+    assert "no diagonal Q of 1 functions is certified" in limit.reason
+    assert limit.wall_s > 0
+
+
+def test_nothing_is_designed_twice():
+    calls = []
+
+    def counted(setting):
+        calls.append(setting)
+        return measured(setting, "spring-damper", "theorem4", {})
+
+    recall = remembered(counted, False)
+    first, again = (recall(s) for s in settings("order", LOOP, SMALL, 2))
+    assert len(calls) == 1
+    assert first.rms_mismatch_db == again.rms_mismatch_db
+    assert (first.value, again.value) == tuple(s.value for s in settings("order", LOOP, SMALL, 2))
+
+
+# the command --------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_draws_and_reports(tmp_path):
+    wish = ("--functions", "4", "--diagonal", "--filter", "fir", "--beside", "theorem4")
+    code, report = run(tmp_path, "--over", "damping=1:2,order=4:5", "--points", "3", *wish)
+    assert code == 0
+    assert set(report["sweeps"]) == {"damping", "order"}
+    damping = report["sweeps"]["damping"]
+    assert damping["values"] == [row["value"] for row in damping["optimal"]] == [1.0, 1.37, 2.0]
+    first, here, free = damping["optimal"]
+    assert first["reason"] is not None  # four taps with the limit above 100 Hz: shown, not dropped
+    assert here["rms_mismatch_db"] == pytest.approx(-21.75, abs=0.1)
+    assert free["rms_mismatch_db"] < -60
+    assert len(damping["theorem4"]) == 3
+    assert "closed-loop" not in damping
+    assert any("(here)" in line for line in report["gains"])
+    assert any("without any coupling: needs 1.723, 1.723 N s/m, 1.26 times" in line for line in report["gains"])
+    assert (tmp_path / "out" / "limits.png").read_bytes().startswith(b"\x89PNG")
+    assert not report["interrupted"]
+
+
+def test_nothing_found_is_exit_code_1(tmp_path):
+    code, report = run(
+        tmp_path, "--over", "order=1:2", "--points", "2", "--diagonal", "--filter", "fir", "--beside", "none"
+    )
+    assert code == 1
+    assert all(row["reason"] for row in report["sweeps"]["order"]["optimal"])
+    assert (tmp_path / "out" / "limits.png").is_file()
+
+
+def test_interrupting_keeps_the_points_that_are_done(tmp_path, monkeypatch):
+    calls = []
+
+    def interrupted(setting):
+        calls.append(setting)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return measured(setting, "spring-damper", "theorem4", {})  # what is designed does not matter here
+
+    monkeypatch.setattr(limits, "optimum", interrupted)
+    wish = ("--functions", "4", "--diagonal", "--filter", "fir", "--beside", "none")
+    code, report = run(tmp_path, "--over", "damping=1.3:1.5", "--points", "4", *wish)
+    assert code == 130
+    assert report["interrupted"]
+    assert len(report["sweeps"]["damping"]["optimal"]) == 2
+    assert len(report["sweeps"]["damping"]["values"]) == 4
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--over", "mass"], "--over has 'mass', allowed are damping, delay, period, order"),
+        (["--over", "damping=2:1"], "--over damping=2:1: the range 2:1 is none between 0.001 and 1000 N s/m"),
+        (["--over", "damping=2"], "--over damping=2: expected LOW:HIGH in N s/m"),
+        (["--over", "damping=a:2"], "--over damping is 'a', expected a number"),
+        (["--over", "delay=0:3"], "--over delay=0:3: delay starts at 0, but the channels differ by 1 samples"),
+        (["--over", "delay=1.5:3"], "expected whole numbers of samples"),
+        (["--points", "0"], "--points is 0, allowed are 1 to 100"),
+        (["--functions", "0"], "--functions is 0, allowed are 1 to 200"),
+        (["--margin", "2"], "--margin is 2.0, allowed are shares"),
+        (["--case", "none"], "--case none has no coupling to design"),
+        (["--ladder", "--over", "order"], "--over is for the curve, not for --ladder"),
+        (["--ladder", "--diagonal"], "--diagonal is for the curve, not for --ladder"),
+        (["--ladder", "--case", "II"], "--ladder shows both cases"),
+        (["--ladder", "long"], "argument --ladder: invalid choice: 'long'"),
+        (["--over", "order=1:500"], "--over order=1:500: the range 1:500 is none between 1 and 200 functions"),
+        (["--over", "period=1e-9:1"], "--over period=1e-9:1: the range"),
+        (["--delta", "0"], "expected positive dampings"),
+    ],
+)
+def test_bad_options(options, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as caught:
+        main(options)
+    assert message in str(caught.value)
+    assert not list(tmp_path.rglob("*.json"))
+
+
+def test_a_picture_of_every_number_of_panels(tmp_path):
+    row = {"value": 1.0, "rms_mismatch_db": -10.0, "relative_mismatch_db": -5.0}
+    sweep = {"label": "x", "unit": "s", "values": [1.0], "optimal": [row, row | {"rms_mismatch_db": None}]}
+    here = {"delta": [1.37], "theta": [1], "T_s": 1e-3}
+    outcome = {"objective": "rms", "scenario": "s", "case": "I", "here": here, "wish": {"functions": 8}}
+    for n in range(1, 5):
+        chosen = dict.fromkeys(list(AXES)[:n], sweep)
+        assert plot_limits(outcome | {"sweeps": chosen}, tmp_path / f"{n}.png").stat().st_size > 5000
+
+
+# the ladder ---------------------------------------------------------------------------------------------------------
+
+
+def test_rungs_are_the_designs_that_they_name():
+    """Against figures of their own: required damping and mismatch of the other commands."""
+    by_name = {entry.name: entry for entry in SHORT}
+    published = rung("I", LOOP, by_name["published"])
+    E = environment(LOOP.environment, LOOP.T)
+    expected = this_environment(force_map(E, CASE_I, LOOP.theta, LOOP.psi), LOOP.delta)
+    assert published.design == "published (27)"
+    assert published.required_damping == expected.required
+    assert not published.certified
+    assert published.proof is None
+    assert published.relative_mismatch_db == pytest.approx(7.70, abs=0.005)
+    theorem4 = rung("I", LOOP, by_name["spring-damper, theorem4"])
+    assert theorem4.required_damping == pytest.approx([0.7145] * 2, abs=1e-4)
+    assert theorem4.condition == "theorem4"
+    assert theorem4.proof == "rational"
+    optimal = rung("I", LOOP, by_name["optimal, diagonal 4, no HF limit"])
+    assert optimal.relative_mismatch_db <= -16.9
+    assert optimal.proof == "rational"
+    assert optimal.certified
+
+
+def test_a_rung_that_does_not_exist_says_so():
+    loop = load("three-rigid").loop("I")
+    missing = rung("I", loop, next(entry for entry in SHORT if entry.kind == "published"))
+    assert missing.required_damping is None
+    assert missing.reason == "the paper prints gains for 2 channels, not 3"
+
+
+def test_the_ladder_is_a_command(tmp_path, monkeypatch):
+    monkeypatch.setitem(LADDERS, "short", SHORT[:3])
+    code, report = run(tmp_path, "--ladder")
+    assert code == 0
+    assert [(row["case"], row["design"]) for row in report["rows"]] == [
+        (case, name)
+        for case, printed in (("I", "(27)"), ("II", "(28)"))
+        for name in ("none", f"published {printed}", "spring-damper, theorem4")
+    ]
+    assert report["rows"][0]["rms_mismatch_db"] is None
+    assert report["rows"][3]["relative_mismatch_db"] == pytest.approx(0.34, abs=0.005)
+
+
+# what is proved ---------------------------------------------------------------------------------------------------
+
+
+def test_a_point_says_what_is_proved_of_it(monkeypatch):
+    """Each design's own condition; a proof that fails leaves the point sampled, with the reason."""
+    setting = settings("order", LOOP, SMALL, 1)[0]
+    assert (optimum(setting).proof, optimum(setting).proof_reason) == ("rational", None)
+    infeasible = Setting(0.0, LOOP, Wish(functions=1, diagonal=True, filter="fir", high_gain=1.0))
+    assert optimum(infeasible).proof is None
+
+    def hopeless(*arguments):
+        raise limit_curve.NotProved("too many states")
+
+    monkeypatch.setattr(limit_curve, "prove", hopeless)
+    limit = measured(setting, "spring-damper", "theorem4", {})
+    assert (limit.proof, limit.proof_reason) == ("sampled", "too many states")
+    row = {"optimal": {"proof": "rational"}, "theorem4": {"proof": limit.proof}, "closed-loop": None}
+    assert limits_report._proofs(row) == "sampled: theorem4"
+    assert limits_report._proofs({"optimal": {"proof": None}}) == "-"

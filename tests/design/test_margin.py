@@ -1,0 +1,154 @@
+"""Required damping: the agreed figures, closed forms, and a pencil that needs no frequency grid."""
+
+import numpy as np
+import pytest
+from scipy.linalg import eig
+
+from controller.coupling import NoCoupling, SpringDamper
+from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.loop import force_map
+from controller.lti import Lti
+from design.conditions import any_environment, any_environment_per_channel, this_environment
+from design.frequency import frequencies, supremum
+from design.result import CASE_I, CASE_II
+
+T, THETA, DELTA = 1.2e-3, (1, 2), (1.37, 1.37)
+E = environment(FIGURE_4, T)
+RNG = np.random.default_rng(5)
+
+
+def default(coupling) -> Lti:
+    return force_map(E, coupling, THETA, (0, 0))
+
+
+@pytest.mark.parametrize(
+    ("coupling", "required"),
+    [
+        (NoCoupling(), 1.7229),
+        (CASE_I, 1.39871),
+        (CASE_II, 1.29778),
+        (SpringDamper([879.0, 552.0], [0.39, 0.52]), 0.714344),
+        (SpringDamper([7806.0, 3137.0], [0.105, 1.68]), 1.36326),
+    ],
+)
+def test_closed_loop_figures(coupling, required):
+    result = this_environment(default(coupling), DELTA)
+    assert result.required == pytest.approx((required, required), rel=3e-5)
+    assert result.certified == (required < 1.37)
+
+
+def test_theorem4_figures():
+    assert any_environment_per_channel(CASE_I.channels(T), THETA, DELTA).required == pytest.approx(
+        (7.63, 7.84), abs=0.005
+    )
+    assert any_environment_per_channel(CASE_II.channels(T), THETA, DELTA).required == pytest.approx(
+        (7.04, 3.89), abs=0.005
+    )
+    best = SpringDamper([878.86, 551.94], [0.3865, 0.5220])
+    assert any_environment_per_channel(best.channels(T), THETA, DELTA).required == pytest.approx((1.37, 1.37), rel=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_theorem4_of_a_spring_damper_is_the_trigonometric_maximum(seed):
+    """max |K T vt + B (1 - z^-n)|^2 / (4 (K T/2 + B)), on a grid of a million points."""
+    rng = np.random.default_rng(seed)
+    theta, K, B = int(rng.integers(0, 6)), np.exp(rng.uniform(4, 9)), np.exp(rng.uniform(-3, 2))
+    z = np.exp(1j * np.linspace(0, np.pi, 1_000_001))
+    window = sum(z**-n for n in range(theta + 1))
+    expected = np.max(np.abs(K * T * window + B * (1 - z ** -(theta + 1))) ** 2) / (4 * (K * T / 2 + B))
+    V = SpringDamper([K], [B]).compliance(T)
+    assert any_environment(V, [theta], [1.0]).required[0] == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize(("K", "B", "theta", "factor"), [(5000, 0, 0, 0.5), (5000, 30, 0, 0.5), (2000, 0, 1, 1.5)])
+def test_rigid_wall_closed_forms(K, B, theta, factor):
+    """Colgate's K T/2 + B without delay, and 3 K T/2 for a spring with one sample of it."""
+    wall = environment(Network(("a",), (Spring(("a", GROUND), float(K), float(B)),)), 1e-3)
+    F = force_map(wall, NoCoupling(), [theta], [0])
+    assert this_environment(F, [1.0]).required[0] == pytest.approx(factor * K * 1e-3 + B, rel=1e-9)
+
+
+def crossings(F: Lti, level: float) -> np.ndarray:
+    """Frequencies where det(level/T I - F(1)/2 + He R) = 0 on the circle: an extended symplectic pencil."""
+    R, n, m = F.quotient_at_one(), F.order, F.inputs
+    direct = 2 * (level / F.T * np.eye(m) - F.dc() / 2)
+    zero = np.zeros
+    right = np.block(
+        [[R.A, zero((n, n)), R.B], [zero((n, n)), np.eye(n), zero((n, m))], [R.C, R.B.T, direct]],
+    )
+    left = np.block(
+        [[np.eye(n), zero((n, n + m))], [zero((n, n)), R.A.T, R.C.T], [zero((m, 2 * n + m))]],
+    )
+    z = eig(right, left, right=False)
+    z = z[np.isfinite(z)]
+    return np.angle(z[np.abs(np.abs(z) - 1) < 1e-7])
+
+
+def random_loop(seed) -> Lti:
+    rng = np.random.default_rng(seed)
+    theta, psi = rng.integers(0, 4, size=(2, 2)) // [[1], [3]]
+    coupling = SpringDamper(np.exp(rng.uniform(5, 9, 2)), np.exp(rng.uniform(-2, 2, 2)))
+    return force_map(E, coupling, theta.tolist(), psi.tolist())
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_sweep_misses_no_peak(seed):
+    """Just above the required damping no frequency violates the condition, just below some does: good to 1e-4."""
+    F = random_loop(seed)
+    if not F.is_stable():
+        assert this_environment(F, (1.0, 1.0)).required == (np.inf, np.inf)
+        return
+    required = this_environment(F, (1.0, 1.0)).required[0]
+    assert crossings(F, required * (1 + 1e-4)).size == 0
+    assert crossings(F, required * (1 - 1e-4)).size > 0
+
+
+def test_unequal_devices_need_a_common_factor():
+    """Scaling delta scales the ratio: required damping is along the direction of what is available."""
+    F = default(CASE_I)
+    one, two = this_environment(F, (1.0, 2.0)), this_environment(F, (2.0, 4.0))
+    assert one.required == pytest.approx(two.required, rel=1e-9)
+    assert one.ratio == pytest.approx(2 * two.ratio, rel=1e-9)
+
+
+@pytest.mark.parametrize("mass", [0.3, 1.0, 3.0, 30.0, 300.0, 1000.0])
+def test_a_free_mass_is_not_refused_by_rounding(mass):
+    """Its F(1) is exactly 0; a heavy one asks what a rigid wall asks."""
+    free = environment(Network(("a",), masses={"a": mass}), T)
+    F = force_map(free, SpringDamper([610.0], [0.545]), [2], [0])
+    assert this_environment(F, [1.37]).required[0] == pytest.approx(1.3659, rel=3e-3)
+
+
+def test_moving_a_delay_between_force_and_measurement_changes_nothing():
+    """Remark 3 of the paper, for stability: only the sum of the two delays of a channel matters."""
+    from controller.delay import delay
+
+    inner = CASE_I.around(E)
+    split = delay((1, 0), T) @ inner @ delay((0, 2), T)
+    assert this_environment(split, DELTA).ratio == pytest.approx(
+        this_environment(default(CASE_I), DELTA).ratio, rel=1e-9
+    )
+
+
+def test_refusals_say_why():
+    unstable = Lti([[1.01]], [[1.0]], [[1.0]], [[0.0]], T)
+    assert "outside the unit circle" in this_environment(unstable, [1.0]).reason
+    twisted = Lti.constant([[1.0, 0.5], [0.0, 1.0]], T)
+    assert "not symmetric" in this_environment(twisted, (1.0, 1.0)).reason
+    assert "pushes outwards" in this_environment(Lti.constant([[-1.0]], T), [1.0]).reason
+    assert "no damping" in this_environment(default(CASE_I), (0.0, 1.0)).reason
+    assert "not passive enough" in any_environment(Lti.constant([[0.0]], T), [0], [1.0]).reason
+    with pytest.raises(ValueError, match="delta has 1 entries for 2 channels"):
+        this_environment(default(CASE_I), [1.0])
+    with pytest.raises(ValueError, match="expected dampings >= 0"):
+        this_environment(default(CASE_I), (-1.0, 1.0))
+
+
+def test_supremum_finds_a_needle():
+    """A peak of width 1e-7 that an even grid would miss, known to the grid through its pole."""
+    pole = (1 - 1e-7) * np.exp(1j * 1.2345)
+    A = np.array([[pole.real, pole.imag], [-pole.imag, pole.real]])
+    needle = Lti(A, [[1.0], [0.0]], [[1.0, 0.0]], [[0.0]], T)
+    height, w = supremum(lambda w: np.abs(needle.at(np.exp(1j * w))[:, 0, 0]), frequencies(needle))
+    assert height == pytest.approx(0.5e7, rel=1e-4)
+    assert w == pytest.approx(1.2345, abs=1e-6)

@@ -1,0 +1,375 @@
+"""A coupling's file that proves any switching of its delays: made, proved again, tampered with, used elsewhere."""
+
+import json
+from itertools import product
+
+import msgspec
+import numpy as np
+import pytest
+
+from cli.audit import main as audit_main
+from cli.check import main as check_main
+from cli.design import main as design_main
+from cli.run import main as run_main
+from cli.validate import main as validate_main
+from controller import coupling as built
+from controller.coupling import SpringDamper
+from controller.delay import LOST, Jitter, ages
+from controller.environment import FIGURE_4, Box, UncertainSpring, environment
+from controller.loop import DelayRange, Loop, force_map
+from design import certify
+from design import exact as positive_real
+from design.certificate import (
+    BadFile,
+    Certificate,
+    NotProved,
+    Stored,
+    condition_block,
+    digest,
+    load,
+    prove,
+    refuted,
+    save,
+    sealed,
+    verify,
+)
+from design.conditions import jitter_proof, this_environment
+from design.exact import Matrix
+from design.maps import blocks
+from hw.control import certified_couplings
+from sim.scenario import load as scenario_of
+
+T, DELTA = 1.2e-3, (1.37, 1.37)
+RANGE = DelayRange((1, 1), (2, 2))
+CONSTANT = Loop(T, (1, 2), (0, 0), (1, 2), DELTA, FIGURE_4)
+LOOP = CONSTANT.switching(RANGE)
+SOFT = SpringDamper((878.767, 551.883), (0.386476, 0.521984))  # any switching within [1, 2] needs 1.078 of its 1.37
+STIFF = SpringDamper((7806.0, 3137.0), (0.105, 1.68))  # proved for the constants (1, 2), not for switching
+change = msgspec.structs.replace
+
+
+@pytest.fixture(scope="module")
+def stored() -> Stored:
+    return Stored.of(LOOP, SOFT, prove(LOOP, SOFT, "closed-loop"))
+
+
+@pytest.fixture
+def file(stored, tmp_path) -> str:
+    save(stored, tmp_path / "proof.json")
+    return str(tmp_path / "proof.json")
+
+
+@pytest.fixture
+def constant_file(tmp_path) -> str:
+    save(Stored.of(CONSTANT, STIFF, prove(CONSTANT, STIFF, "closed-loop")), tmp_path / "constant.json")
+    return str(tmp_path / "constant.json")
+
+
+def sent(coupling: SpringDamper):
+    return force_map(environment(FIGURE_4, T), coupling, (0, 0), (0, 0))
+
+
+# the proof
+
+
+def test_the_proof_survives_the_file(stored, file):
+    read = load(file)
+    assert read == stored
+    assert verify(read).proved
+    proof = read.certificate.switching
+    assert proof.required == pytest.approx(jitter_proof(sent(SOFT), *[(1, 1), (2, 2)], DELTA).requirement.required)
+    assert 1.07 < proof.required[0] < 1.08
+    assert proof.margin == pytest.approx(1.37 / proof.required[0])
+
+
+def test_what_is_on_file_is_a_witness_on_a_dense_sweep(stored):
+    """From the numbers of the file alone, without the code that proves: the condition at 20000 frequencies, and
+    the KYP inequality in floating point."""
+    proof = stored.certificate.switching
+    z = np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
+    assert np.linalg.eigvalsh(blocks(z, sent(SOFT).at(z), np.array(proof.alpha), (1, 1), (2, 2), DELTA, T)).min() > 0
+    G = condition_block(LOOP, SOFT, proof.alpha)
+    F, S = G.floats(), Matrix.of(proof.P).floats()
+    A, B, C, D = F.A, F.B, F.C, F.D
+    kyp = np.block([[S - A.T @ S @ A, (C - B.T @ S @ A).T], [C - B.T @ S @ A, D + D.T - B.T @ S @ B]])
+    scale = 1 / np.sqrt(np.diag(kyp))
+    assert np.linalg.eigvalsh(scale[:, None] * kyp * scale).min() > 0
+
+
+@pytest.mark.parametrize(("lo", "hi"), [((1, 2), (1, 2)), ((0, 1), (2, 4)), ((1, 2), (3, 2))])
+def test_other_ranges_are_proved_too(lo, hi):
+    soft = SpringDamper((300.0, 250.0), (0.3, 0.3))
+    loop = CONSTANT.switching(DelayRange(lo, hi))
+    made = Stored.of(loop, soft, prove(loop, soft, "theorem4"))
+    assert verify(made).proved
+    assert [a > 0 for a in made.certificate.switching.alpha] == [a < b for a, b in zip(lo, hi, strict=True)]
+
+
+@pytest.mark.parametrize("coupling", [SOFT, STIFF])
+def test_every_constant_delay_of_the_range_asks_no_more(coupling):
+    """Why a file that is proved for switching covers constants: by the energy, which knows no z."""
+    switching = jitter_proof(sent(coupling), (1, 0), (2, 3), DELTA).requirement.ratio
+    for theta in product((1, 2), (0, 1, 2, 3)):
+        F = force_map(environment(FIGURE_4, T), coupling, theta, (0, 0))
+        assert this_environment(F, DELTA).ratio <= switching * (1 + 1e-9)
+
+
+def test_what_is_not_jitter_proof_is_not_certified_as_such():
+    assert prove(CONSTANT, STIFF, "closed-loop").switching is msgspec.UNSET
+    with pytest.raises(NotProved, match=r"^delays switching within \[1, 2\] samples: needs 2\.04"):
+        prove(LOOP, STIFF, "closed-loop")
+
+
+def test_files_without_a_range_keep_their_digests():
+    """Made before there were ranges."""
+    expected = "b8cae9c8ced7f5c0abcd4246af3ea609fa292b47b365d074618a2702234f644a"
+    assert digest(CONSTANT, STIFF.form()) == expected
+    assert digest(LOOP, STIFF.form()) != expected
+    matrices, figures = {"P": (("1/2", "0"), ("0", "3"))}, ((1.25, 1.25), (1.37, 1.37), 1.096)
+    old = Certificate("closed-loop", *figures, "this environment", "rational", matrices, "ab" * 32, {"numpy": "2.0.0"})
+    assert sealed(old).seal == "5a8b5bd2efbe574d18642debfb79affac9fb654f3de659112e3642ac37d39691"
+
+
+# tampering
+
+
+def test_a_changed_file_is_refused(stored):
+    wider = change(LOOP, jitter=DelayRange((1, 1), (2, 3)))
+    assert "digest differs" in verify(change(stored, loop=wider)).reason
+    proof = change(stored.certificate.switching, alpha=(100.0, 100.0))
+    forged = change(stored, certificate=change(stored.certificate, switching=proof))
+    assert "seal differs" in verify(forged).reason
+
+
+def forged(stored: Stored, loop: Loop = LOOP, **fields) -> str:
+    """Why a file is refused whose forger repairs digests and seals."""
+    switching = change(stored.certificate.switching, **fields)
+    certificate = change(stored.certificate, scenario=digest(loop, SOFT.form()), switching=switching)
+    verdict = verify(Stored.of(loop, SOFT, sealed(certificate)))
+    assert not verdict.proved
+    return verdict.reason
+
+
+def test_a_forger_who_repairs_the_digests_still_has_to_prove(stored):
+    proof = stored.certificate.switching
+    begins = "delays switching within [1, 2] samples: "
+    assert forged(stored, required=(1.0, 1.0)).startswith(f"{begins}required is [1.0, 1.0], the sweep finds [1.07")
+    assert forged(stored, margin=2.0).startswith(f"{begins}margin is 2, the sweep finds 1.27")
+    assert forged(stored, alpha=(0.0, proof.alpha[1])).startswith(f"{begins}alpha is [0.0")
+    assert "the sweep finds" in forged(stored, alpha=(proof.alpha[0] * 3, proof.alpha[1]))
+    assert forged(stored, P=proof.P[:-1]).startswith(f"{begins}P has ")
+    assert "not a rational number" in forged(stored, P=(("1/0", *proof.P[0][1:]), *proof.P[1:]))
+    negated = tuple(tuple(f"-{v}".replace("--", "") for v in row) for row in proof.P)
+    assert forged(stored, P=negated).startswith(begins)
+    other = forged(stored, LOOP.switching(DelayRange((1, 1), (2, 3))))
+    assert other.startswith("delays switching within [1, 2], [1, 3] samples: required is")
+    narrow = forged(stored, LOOP.switching(DelayRange((1, 2), (2, 2))))
+    assert "positive number where the delay varies and 0 elsewhere" in narrow
+
+
+def test_a_proof_goes_with_its_range(stored):
+    bare = sealed(change(stored.certificate, switching=msgspec.UNSET))
+    assert verify(change(stored, certificate=bare)).reason.endswith("no proof is on file")
+    smuggled = sealed(change(stored.certificate, scenario=digest(CONSTANT, SOFT.form())))
+    assert "delays are constant" in verify(Stored.of(CONSTANT, SOFT, smuggled)).reason
+
+
+def test_a_multiplier_below_zero_lends_no_damping():
+    """On a channel whose delay is constant alpha stands in no second row: a negative one would add damping for free."""
+    loop = CONSTANT.switching(DelayRange((1, 2), (2, 2)))
+    found = jitter_proof(sent(STIFF), (1, 2), (2, 2), DELTA)
+    with pytest.raises(ValueError, match="expected a positive number where the delay varies and 0 elsewhere"):
+        condition_block(loop, STIFF, (found.alpha[0], -1e6))
+    assert refuted(loop, STIFF, msgspec.UNSET).endswith("no proof is on file")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"lo": [2, 2], "hi": [1, 1]}, "expected 0 <= lo <= hi on every channel - at `$.loop.jitter`"),
+        ({"lo": [1, 1, 1], "hi": [2, 2, 2]}, "jitter has 3 ranges for 2 channels"),
+        ({"lo": [2, 2], "hi": [3, 3]}, "theta is [1, 2], outside of its jitter, [2, 3] samples"),
+        ({"lo": [1, 1], "high": [2, 2]}, "unknown field `high`"),
+    ],
+)
+def test_a_range_that_makes_no_sense_is_no_file(file, tmp_path, fields, message):
+    text = json.loads((tmp_path / "proof.json").read_text())
+    text["loop"]["jitter"] = fields
+    (tmp_path / "bad.json").write_text(json.dumps(text))
+    with pytest.raises(BadFile) as error:
+        load(tmp_path / "bad.json")
+    assert message in str(error.value)
+
+
+def test_a_loop_has_a_range_or_a_box():
+    box = Box((UncertainSpring(("mass", "contact 1"), (640.0, 840.0)),))
+    with pytest.raises(ValueError, match="jitter and box: switching delays are judged in one linear environment"):
+        change(LOOP, box=box)
+
+
+# the commands
+
+
+def told(capsys, main, *options) -> tuple[int, dict]:
+    capsys.readouterr()
+    code = main([*options, "--json", "-"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_check_names_the_promise_and_the_proof(stored, file, tmp_path, capsys):
+    code, report = told(capsys, check_main, file)
+    assert (code, report["proved"]) == (0, True)
+    assert report["switching"]["promise"] == "delays switching within [1, 2] samples, in this environment"
+    assert report["switching"]["proof"] == "rational"
+    broken = change(stored.certificate.switching, required=(1.0, 1.0))
+    save(change(stored, certificate=sealed(change(stored.certificate, switching=broken))), tmp_path / "broken.json")
+    code, report = told(capsys, check_main, str(tmp_path / "broken.json"))
+    assert (code, report["proved"]) == (1, False)
+    assert report["switching"]["promise"] is report["switching"]["proof"] is report["proof"] is None
+    assert report["reason"].startswith("delays switching within [1, 2] samples: required is")
+
+
+@pytest.fixture
+def run(tmp_path, capsys):
+    quick = ["--engine", "exact", "--duration", "0.1", "--no-plot", "--out", str(tmp_path / "out")]
+
+    def report(coupling: str, *options: str) -> dict:
+        code, outcome = told(capsys, run_main, "--coupling", coupling, *options, *quick)
+        assert code == 0
+        return outcome
+
+    return report
+
+
+def test_a_run_says_what_the_file_covers(run, file):
+    remark = "the file proves delays switching within [1, 2] samples, which covers "
+    assert not any("file" in line for line in run(file)["remarks"])
+    for theta in ("2,2", "1,1", "2,1"):
+        outcome = run(file, "--theta", theta)
+        assert remark + f"the constant theta = [{theta[0]}, {theta[2]}]" in outcome["remarks"]
+        assert outcome["certificates"]["closed-loop"]["certified"]
+    outcome = run(file, "--jitter", "1,2", "--playout")
+    assert remark + "the constant theta = [2, 2]" in outcome["remarks"]
+    assert outcome["jitter"]["covered"]
+    same = run(file, "--jitter", "1,2")["jitter"]
+    assert same["covered"]
+    assert "proved in the coupling's file for delays switching within [1, 2] samples" in same["covers"]
+    narrow = run(file, "--jitter", "1-2,2-2")
+    assert remark + "delays switching within [1, 2], [2, 2] samples" in narrow["remarks"]
+    assert narrow["jitter"]["on_file"] == {"lo": [1, 1], "hi": [2, 2]}
+
+
+def test_what_the_file_does_not_cover_is_judged_anew(run, file, constant_file):
+    wide = run(file, "--jitter", "0,3")
+    line = (
+        "the file proves delays switching within [1, 2] samples: delays switching within [0, 3] samples are judged anew"
+    )
+    assert any(remark.startswith(line) for remark in wide["remarks"])
+    assert wide["jitter"]["on_file"] is None
+    late = run(file, "--theta", "3,2")
+    assert any("another loop (different theta)" in remark for remark in late["remarks"])
+    other = run(file, "--jitter", "1,2", "--delta", "1.5")
+    assert any("another loop (different delta)" in remark for remark in other["remarks"])
+    assert "proved exactly" in other["jitter"]["covers"]
+    plain = run(constant_file, "--jitter", "1,2")
+    line = "the file proves constant delays: delays switching within [1, 2] samples are judged anew here"
+    assert line in plain["remarks"]
+    assert not plain["jitter"]["covered"]
+    # the buffer's constant (2, 2) needs 1.70 of 1.37 N s/m: it is no way out for these gains
+    assert "the constant [2, 2], for which it is not certified either" in plain["jitter"]["covers"]
+    lossy = run(file, "--jitter", "1,2", "--loss", "0.1")["jitter"]
+    assert not lossy["covered"]
+
+
+def test_a_tampered_file_covers_nothing(run, stored, tmp_path):
+    broken = sealed(change(stored.certificate, switching=change(stored.certificate.switching, margin=9.0)))
+    save(change(stored, certificate=broken), tmp_path / "broken.json")
+    outcome = run(str(tmp_path / "broken.json"), "--jitter", "1,2")
+    assert any("does not hold: delays switching within" in remark for remark in outcome["remarks"])
+    assert outcome["jitter"]["on_file"] is None
+    assert outcome["jitter"]["covered"]  # by the proof that the run finds itself
+    assert "proved exactly" in outcome["jitter"]["covers"]
+
+
+def test_validate_and_audit_say_the_same(file, constant_file, tmp_path, capsys):
+    quick = ["--humans", "3", "--engine", "exact", "--duration", "0", "--no-plot", "--out", str(tmp_path / "v")]
+    _, outcome = told(capsys, validate_main, "--coupling", file, "--jitter", "1,2", *quick)
+    assert "proved in the coupling's file" in outcome["switching"]["covers"]
+    code, outcome = told(capsys, audit_main, "--coupling", constant_file, "--jitter", "1,2", "--out", str(tmp_path))
+    assert code == 1
+    assert any("judged anew" in note for note in outcome["notes"])
+
+
+def test_without_an_exact_proof_the_file_keeps_the_constants(tmp_path, capsys, monkeypatch):
+    """A limit on states between the two models: said in the report, and the file claims no switching."""
+    monkeypatch.setattr(positive_real, "LARGEST", condition_block(LOOP, SOFT, (1.0, 1.0)).order - 1)
+    out = str(tmp_path / "c.json")
+    options = ["--condition", "closed-loop", "--jitter", "1,2", "--out", out]
+    code, outcome = told(capsys, design_main, *options)
+    assert code == 0
+    assert outcome["jitter_proof"]["proof"] == "sampled"
+    assert outcome["stored"]["proof"] == "rational"
+    assert outcome["stored"]["switching"]["proof"] is None
+    assert "states takes long" in outcome["stored"]["switching"]["reason"]
+    assert load(out).loop == CONSTANT
+    assert verify(load(out)).proved
+
+
+def test_a_design_for_a_range_without_its_theta_is_refused(tmp_path):
+    options = ["--condition", "closed-loop", "--jitter", "2,3", "--out", str(tmp_path / "c.json")]
+    with pytest.raises(
+        ValueError, match=r"--jitter is '2,3': theta is \[1, 2\], outside of its jitter, \[2, 3\] samples"
+    ):
+        design_main(options)
+
+
+# scripts and the bridge
+
+
+def test_the_scenarios_range_is_the_loops():
+    scenario = scenario_of().replace(jitter=Jitter((1, 1), (2, 2)))
+    assert scenario.loop("I") == LOOP
+    for steady in (Jitter((1, 1), (2, 2), "constant"), Jitter((1, 2), (1, 2)), Jitter((1, 2), (1, 2), loss=0.1)):
+        assert scenario.replace(jitter=steady).loop("I") == CONSTANT
+
+
+def test_certify_judges_any_switching():
+    coupling = built.SpringDamper(SOFT.K, SOFT.B)
+    found = certify(LOOP, coupling)
+    assert found["jitter-proof"].certified
+    assert found["jitter-proof"].proof == "rational"
+    assert found["closed-loop"] == certify(CONSTANT, coupling)["closed-loop"]
+    assert "jitter-proof" not in certify(CONSTANT, coupling)
+
+
+@pytest.mark.parametrize(("K", "certified"), [((2000.0, 1500.0), True), ((7806.0, 3137.0), False)])
+def test_certify_judges_every_vertex_of_a_box(K, certified):
+    """The nominal environment alone would certify both."""
+    loop = change(CONSTANT, box=Box((UncertainSpring(("mass", "contact 1"), (640.0, 960.0), absent=True),)))
+    coupling = built.SpringDamper(K, (0.105, 1.68))
+    found, nominal = certify(loop, coupling)["closed-loop"], certify(CONSTANT, coupling)["closed-loop"]
+    at = [
+        this_environment(force_map(environment(m.network, T), coupling, (1, 2), (0, 0)), DELTA) for m in loop.members()
+    ]
+    assert len(at) == 4
+    assert found.ratio == max(requirement.ratio for requirement in at)
+    assert nominal.certified
+    assert found.ratio > nominal.ratio
+    assert found.certified == certified
+    assert found.proof == ("rational" if certified else "sampled")
+
+
+def test_the_bridge_says_how_long_a_force_may_be_held(tmp_path):
+    """Ages under isolated missed answers, from the line itself, lie within what the file proves."""
+    loop = change(LOOP, theta=(1, 1), lam=(1, 1))
+    save(Stored.of(loop, SOFT, prove(loop, SOFT, "closed-loop")), tmp_path / "one.json")
+    first, second = certified_couplings(scenario_of().replace(theta=(1, 1)), "I", str(tmp_path / "one.json"), None, 1, spare=1)
+    assert first.remarks() == ["a force that is held through 1 missed answer is covered by the file's proof"]
+    missed = np.ones((40, 2, 1), dtype=np.int64)
+    missed[5::3] = LOST
+    met = ages(missed)[1:]
+    assert RANGE.contains(DelayRange(tuple(met.min(axis=(0, 2))), tuple(met.max(axis=(0, 2)))))
+    assert second.scenario.theta == (2, 2)
+    assert second.remarks() == [
+        "the file proves delays switching within [1, 2] samples, which covers the constant theta = [2, 2]"
+    ]

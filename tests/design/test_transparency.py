@@ -1,0 +1,122 @@
+"""The figures of the mismatch, against the agreed table and dense sweeps."""
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from controller.coupling import NoCoupling, SpringDamper
+from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.loop import force_map
+from controller.lti import Lti
+from design.frequency import integral
+from design.result import CASE_I
+from design.transparency import decibels, transparency
+
+T, THETA = 1.2e-3, (1, 2)
+E = environment(FIGURE_4, T)
+
+
+@pytest.mark.parametrize(
+    ("coupling", "lam", "sup", "rms"),
+    [
+        (CASE_I, (1, 2), 7.70, -7.24),
+        (CASE_I, (0, 0), 7.91, -5.97),
+        (NoCoupling(), (0, 0), 0.34, -10.98),
+        (SpringDamper([878.86, 551.94], [0.3865, 0.5220]), (1, 2), 18.55, -0.08),
+        (SpringDamper([878.86, 551.94], [0.3865, 0.5220]), (0, 0), 18.60, 0.15),
+    ],
+)
+def test_agreed_figures(coupling, lam, sup, rms):
+    figures = transparency(force_map(E, coupling, THETA, (0, 0)), E, lam)
+    assert decibels(figures.relative_mismatch) == pytest.approx(sup, abs=0.006)
+    assert decibels(figures.rms_mismatch) == pytest.approx(rms, abs=0.006)
+
+
+def test_against_a_dense_sweep():
+    F = force_map(E, CASE_I, THETA, (0, 0))
+    hz = np.geomspace(0.5, 80, 400_001)
+    z = np.exp(2j * np.pi * hz * T)
+    target = z[:, None, None] ** -np.array([1.0, 2.0])[None, :, None] * E.at(z)
+    M = F.at(z) - target
+    figures = transparency(F, E, THETA)
+    ratio = np.linalg.norm(M, 2, axis=(1, 2)) / np.linalg.norm(E.at(z), 2, axis=(1, 2))
+    assert figures.relative_mismatch == pytest.approx(ratio.max(), rel=1e-6)
+    square = np.sum(np.abs(M) ** 2, axis=(1, 2)) / np.sum(np.abs(E.at(z)) ** 2, axis=(1, 2))
+    assert figures.rms_mismatch == pytest.approx(np.sqrt(square.mean()), rel=1e-6)
+
+
+DAMPED = SpringDamper([878.86, 551.94], [0.3865, 0.5220])
+STIFF = SpringDamper([7806.0, 3137.0], [0.105, 1.68])
+
+
+@pytest.mark.parametrize("lam", [(1, 2), (0, 0)])
+@pytest.mark.parametrize("coupling", [DAMPED, STIFF, NoCoupling()])
+def test_rms_against_a_dense_grid(coupling, lam):
+    """The trapezoidal rule on 100 001 points errs by 1e-8 here: against 200 001, by the square of the step."""
+    F = force_map(E, coupling, THETA, (0, 0))
+    hz = np.geomspace(0.5, 80, 100_001)
+    z = np.exp(2j * np.pi * hz * T)
+    felt = E.at(z)
+    M = F.at(z) - z[:, None, None] ** -np.array(lam, dtype=float)[None, :, None] * felt
+    square = np.sum(np.abs(M) ** 2, axis=(1, 2)) / np.sum(np.abs(felt) ** 2, axis=(1, 2))
+    expected = np.sqrt(np.trapezoid(square, np.log(hz)) / np.log(80 / 0.5))
+    assert transparency(F, E, lam).rms_mismatch == pytest.approx(expected, rel=1e-6, abs=1e-12)
+
+
+def test_integral_of_a_sharp_peak():
+    """A resonance of width 1e-4 that no point of the grid knows of, in closed form and by scipy's adaptive rule."""
+    width = 1e-4
+
+    def peak(x):
+        return 1 / ((x - 0.3) ** 2 + width**2) + np.exp(x)
+
+    closed = (np.arctan(0.7 / width) + np.arctan(0.3 / width)) / width + np.e - 1
+    found = integral(peak, np.linspace(0, 1, 60))
+    assert found == pytest.approx(closed, rel=1e-6)
+    assert found == pytest.approx(quad(peak, 0, 1, points=[0.3], epsrel=1e-10)[0], rel=1e-6)
+
+
+def test_integral_of_nothing():
+    assert integral(np.zeros_like, np.linspace(0, 1, 5)) == 0
+
+
+def test_integral_of_what_is_only_rounding():
+    """Halving gains nothing in noise, whatever its size: the work stays bounded, and the sum near the mean."""
+    noise, asked = np.random.default_rng(1), []
+
+    def rounding(x):
+        asked.append(x.size)
+        return size * noise.random(x.size)
+
+    for size in (1e-32, 1e-6, 1.0):
+        assert integral(rounding, np.linspace(0, 1, 60)) == pytest.approx(size / 2, rel=0.3)
+    assert sum(asked) < 500_000
+
+
+def test_a_map_that_is_the_environment_itself_has_no_mismatch():
+    """What is left of F - Lambda E in other coordinates is rounding, which no halving makes smaller."""
+    assert transparency(E, E, (0, 0)).rms_mismatch < 1e-10
+    state = np.eye(E.order) + np.triu(np.ones((E.order, E.order)), 1)
+    same = Lti(state @ E.A @ np.linalg.inv(state), state @ E.B, E.C @ np.linalg.inv(state), E.D, E.T)
+    assert transparency(same, E, (0, 0)).rms_mismatch < 1e-9
+
+
+def test_what_needs_no_force_makes_tau_infinite():
+    """E(1) of Figure 4 has rank one, so (25) divides by zero."""
+    assert transparency(force_map(E, CASE_I, THETA, (0, 0)), E, THETA).tau == np.inf
+
+
+def test_tau_of_a_spring_is_its_relative_error():
+    """A wall of 1000 N/m behind a coupling of 4000 N/m: F = 800, so tau = 200/1000 and the dc ratio 0.8."""
+    wall = environment(Network(("a",), (Spring(("a", GROUND), 1000.0),)), T)
+    figures = transparency(force_map(wall, SpringDamper([4000.0], [0.0]), [0], [0]), wall, [0])
+    assert figures.tau == pytest.approx(0.2)
+    assert figures.relative_mismatch == pytest.approx(0.2)
+    assert figures.dc_ratio == pytest.approx(0.8)
+    assert figures.high_frequency_gain == pytest.approx(0.8)
+
+
+def test_an_exact_match_is_minus_infinity():
+    figures = transparency(force_map(E, NoCoupling(), THETA, (0, 0)), E, THETA)
+    assert figures.relative_mismatch == 0
+    assert decibels(figures.relative_mismatch) == -np.inf

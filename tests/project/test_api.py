@@ -1,0 +1,244 @@
+"""`from sim import ..` and `from design import ..`: the functions for scripts do what the commands do."""
+
+import json
+import pydoc
+import subprocess
+import sys
+from dataclasses import fields
+from inspect import signature
+
+import numpy as np
+import pytest
+
+import design
+import hw
+import sim
+from cli.run import main as run_command
+from cli.validate import main as validate_command
+from controller.coupling import NoCoupling, SpringDamper
+from design import Options, certify, design_coupling, promise, transparency_of
+from design.designs import KINDS, OPTIONS
+from hw import rehearse
+from models.device import RigidDevice
+from sim import InputError, Result, Scenario, load, parse, simulate, validate
+from sim.scenario import SCENARIOS
+
+SHORT = load().replace(duration=0.3)
+GAINS = SpringDamper([878.7, 551.8], [0.3864, 0.5219])
+
+
+def test_every_name_that_is_exported_is_there():
+    for package in (sim, design, hw):
+        assert all(getattr(package, name) is not None for name in package.__all__)
+        with pytest.raises(AttributeError, match="no_such_name"):
+            package.no_such_name  # noqa: B018
+
+
+def test_a_file_of_the_same_name_does_not_take_the_functions_place():
+    """In whatever order: this file has imported sim.validate already, a fresh process does so first."""
+    assert callable(validate)
+    assert callable(simulate)
+    code = "import sim.crowds; from sim import simulate, validate; print(simulate.__module__)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "sim.api"
+
+
+def test_importing_the_packages_loads_nothing():
+    code = "import sys, sim, design, hw; print(len({'numpy', 'mujoco', 'cvxpy', 'msgspec'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "0"
+
+
+@pytest.mark.parametrize("package", [sim, design, hw])
+def test_help_and_completion_show_what_is_for_scripts(package):
+    text = pydoc.render_doc(package, renderer=pydoc.plaintext)
+    public = {name for name in dir(package) if not name.startswith("_")}
+    assert public == set(package.__all__)
+    for name in public:
+        kind = "class " if isinstance(getattr(package, name), type) else f"{name}("
+        assert f"{kind}{name}" in text or f"\n    {kind}" in text, name
+    calls = {name for name in public if not isinstance(getattr(package, name), type)}
+    assert all(f"{name}(" in package.__doc__ for name in calls)  # the docstring lists every function
+
+
+def test_the_options_are_those_that_the_designs_take():
+    """One table, the types of the arguments, and the designs' own signatures say the same."""
+    from design import fixed_order as ccl
+    from design import spring_damper
+    from design.optimal import Wish
+
+    assert set(OPTIONS) == set(KINDS)
+    assert set(OPTIONS["ccl"]) < set(signature(ccl.design).parameters)
+    assert set(OPTIONS["spring-damper"]) < set(signature(spring_damper.design).parameters)
+    assert set(OPTIONS["optimal"]) == {field.name for field in fields(Wish)}
+    assert set(Options.__annotations__) == {name for names in OPTIONS.values() for name in names}
+
+
+def test_promise_and_transparency_are_those_of_the_commands(tmp_path):
+    from cli.design import main as design_command
+
+    loop = load().loop("I")
+    found = design_coupling(loop)
+    assert design_command(["--out", str(tmp_path / "c.json"), "--json", str(tmp_path / "r.json")]) == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert promise(loop, certify(loop, found)) == report["promise"] == "any passive environment"
+    figures = transparency_of(loop, found)
+    assert figures.mismatch_db == report["transparency"]["relative_mismatch_db"]
+    assert figures == transparency_of(loop, found.coupling)
+    assert transparency_of(loop, NoCoupling()).mismatch_db == -np.inf  # F = Theta Psi E = Lambda E in case I
+    assert promise(loop, certify(loop, SpringDamper([2870, 2320], [5.47, 5.55]))) is None
+    box = load("omega-pair-box").loop("I")
+    assert promise(box, certify(box, SpringDamper([300, 300], [0.1, 0.1]))) == "any passive environment"
+
+
+def test_a_session_is_rehearsed():
+    """The link takes 130 us from a sample to its force, which one tick of 1 ms covers."""
+    scenario = load().replace(T=1e-3, theta=(1, 1))
+    session = rehearse(scenario, seconds=0.5)
+    assert (session.stage, session.theta, session.promise) == ("finished", (1, 1), "any passive environment")
+    assert session.delay == pytest.approx(130e-6, abs=2e-6)  # the clock ticks in us, and each way is rounded
+    designed = design_coupling(scenario.loop("I")).coupling
+    np.testing.assert_array_equal(session.coupling.K, designed.K)
+    assert 0.1 <= session.zero_after <= 0.25  # planned stops ramp the gain over 100 to 250 ms
+    assert session.result.x.shape == session.result.f.shape == (len(session.result.t), 2)
+    force = np.abs(session.result.f).max(axis=1)
+    assert force[-1] < 0.05 * force.max()  # the last tick of a ramp of 100 to 250
+    given = rehearse(scenario, GAINS, seconds=0.5)
+    assert given.coupling is GAINS
+    assert given.requirements["closed-loop"].certified
+
+
+def test_a_session_that_is_refused_says_why():
+    session = rehearse(load().replace(T=1e-3, theta=(1, 1)), SpringDamper([2e4, 2e4], [1.0, 1.0]), seconds=0.5)
+    assert session.stage == "refused"
+    assert "the coupling given is not certified for theta = [1, 1]: " in session.cause
+    assert session.result is session.zero_after is session.coupling is None
+
+
+def test_simulate_is_the_commands_run(tmp_path):
+    result = simulate(SHORT)
+    assert isinstance(result, Result)
+    assert isinstance(SHORT, Scenario)
+    options = ["--case", "none", "--duration", "0.3", "--no-plot", "--out", str(tmp_path)]
+    assert run_command([*options, "--json", str(tmp_path / "r.json")]) == 0
+    command = Result.load_npz(tmp_path / "trace.npz")
+    for name in ("t", "x", "f", "x_handle", "v_handle", "w"):
+        np.testing.assert_array_equal(getattr(result, name), getattr(command, name))
+    assert result.meta["stability"] == json.loads((tmp_path / "r.json").read_text())["stability"]
+    assert result.meta["substeps"] == 4
+
+
+def test_engines_agree_on_a_run():
+    mujoco, exact = simulate(SHORT, GAINS), simulate(SHORT, GAINS, engine="exact")
+    assert exact.meta["substeps"] is None
+    difference = np.abs(mujoco.x - exact.x).max()
+    assert difference <= 1e-6 * np.abs(exact.x).max()  # RK4 x 4: docs/accuracy.md has 1.2e-8 rms
+
+
+def test_validate_is_the_commands_verdict(tmp_path):
+    findings = validate(load(), humans=20, engine="exact", duration=0, seed=3)
+    options = ["--case", "none", "--humans", "20", "--engine", "exact", "--duration", "0", "--seed", "3", "--no-plot"]
+    assert validate_command([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["unstable"]["exact"] == int((findings.exact > 0).sum()) > 0
+    assert report["worst"]["spectral_radius"] == findings.radius.max()
+
+
+def test_a_design_is_certified_and_goes_where_a_coupling_goes():
+    loop = load().loop("I")
+    found = design_coupling(loop)
+    requirements = certify(loop, found)
+    assert requirements["theorem4"].certified
+    assert requirements["theorem4"].proof == "rational"
+    assert requirements["theorem4"].required == pytest.approx((1.3699, 1.3699), abs=1e-4)  # (1 - 1e-4) of 1.37
+    assert certify(loop, found.coupling)["closed-loop"].required == requirements["closed-loop"].required
+    assert (validate(load(), found, humans=10, engine="exact", duration=0).exact < 0).all()
+
+
+def test_delays_that_vary_are_simulated():
+    text = (SCENARIOS / "omega-pair.toml").read_text()
+    scenario = parse(text + "\n[jitter]\nlo = [0, 1]\nhi = [2, 3]\n").replace(duration=0.3)
+    first, again, other = (simulate(scenario, GAINS, seed=seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first.f, again.f)
+    assert np.any(first.f != other.f)
+    assert first.meta["stability"] is None
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: simulate(SHORT, engine="magic"), "engine is 'magic', allowed are mujoco, exact"),
+        (lambda: simulate(SHORT, substeps=0), "substeps is 0, allowed are 1 to 10000"),
+        (lambda: simulate(SHORT, integrator="Euler3"), "Euler3"),
+        (lambda: validate(SHORT, humans=0), "humans is 0, allowed are 1 to 1000000"),
+        (lambda: validate(SHORT, engine="magic"), "engine is 'magic', allowed are exact, mujoco, both"),
+        (lambda: validate(SHORT, duration=1e-3), "duration is 0.001, allowed are 0 and 0.0048 s or more"),
+        (lambda: validate(SHORT, shards=0), "shards is 0"),
+        (lambda: validate(SHORT.replace(device=(RigidDevice(friction=0.2),) * 2)), r"device\[0\].friction is 0.2 N"),
+        (lambda: design_coupling(SHORT.loop("I"), "rubber"), "kind is 'rubber', allowed are spring-damper"),
+        (lambda: rehearse(SHORT.replace(delta=(0.0, 0.0))), r"delta is \[0.0, 0.0\]: a device without damping"),
+        (lambda: rehearse(SHORT, case="none"), "case is 'none', allowed are I, II"),
+        (lambda: rehearse(SHORT, seconds=0), "seconds is 0, allowed are 0.1 to 3600"),
+        (lambda: simulate(SHORT, seed=-1), "seed is -1, allowed are 0 or more"),
+        (lambda: validate(SHORT, seed=-1), "seed is -1, allowed are 0 or more"),
+        (lambda: SpringDamper(800, 0.4), r"K is 800, expected a list of numbers, got shape \(\)"),
+        (lambda: SpringDamper([800], 0.4), r"B is 0.4, expected a list of numbers, got shape \(\)"),
+        (lambda: SpringDamper(["a"], [0.4]), r"K is \['a'\], expected a list of numbers"),
+        (lambda: certify(SHORT.loop("I"), SpringDamper([1.0], [0.0])), "K has 1 entries, .* has 2 contacts"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(call, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        call()
+    assert isinstance(caught.value, InputError | ValueError)
+
+
+LOOP = SHORT.loop("I")
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: design_coupling(SHORT), 'loop is a Scenario, expected a Loop, as scenario.loop("I") gives it'),
+        (lambda: design_coupling("omega-pair"), "loop is 'omega-pair' (str), expected a Loop"),
+        (
+            lambda: design_coupling(LOOP, "optimal", funtions=3),
+            "funtions is no option of kind 'optimal' (did you mean",
+        ),
+        (lambda: design_coupling(LOOP, order=3), "order is no option of kind 'spring-damper', allowed are switching"),
+        (
+            lambda: design_coupling(LOOP, "optimal", functions=2.5),
+            "functions is 2.5 (float), allowed are whole",
+        ),
+        (lambda: design_coupling(LOOP, "optimal", margin="x"), "margin is 'x' (str), expected a number"),
+        (lambda: design_coupling(LOOP, "optimal", diagonal=1), "diagonal is 1 (int), expected True or False"),
+        (lambda: design_coupling(LOOP, "ccl", order=1.5), "order is 1.5 (float), allowed are whole numbers, 1 or more"),
+        (lambda: certify(SHORT, GAINS), "loop is a Scenario, expected a Loop"),
+        (lambda: certify(LOOP, None), "coupling is None, expected a coupling (controller.coupling), or a Design"),
+        (lambda: certify(LOOP, SpringDamper), "expected a coupling (controller.coupling), or a Design"),
+        (lambda: transparency_of(LOOP, "spring-damper"), "coupling is 'spring-damper' (str), expected a coupling"),
+        (lambda: promise(LOOP, GAINS), "expected what certify returned"),
+        (lambda: simulate(LOOP), 'scenario is a Loop, expected a Scenario, as load("omega-pair") gives it'),
+        (lambda: simulate(SHORT, "spring-damper"), "coupling is 'spring-damper' (str), expected a coupling"),
+        (lambda: simulate(SHORT, substeps=1.5), "substeps is 1.5 (float), allowed are whole numbers, 1 to 10000"),
+        (lambda: simulate(SHORT, substeps=True), "substeps is True (bool), allowed are whole numbers"),
+        (lambda: simulate(SHORT, seed="x"), "seed is 'x' (str), allowed are whole numbers, 0 or more"),
+        (lambda: validate("omega-pair"), "scenario is 'omega-pair' (str), expected a Scenario"),
+        (lambda: validate(SHORT, {"K": 1}), "coupling is {'K': 1} (dict), expected a coupling"),
+        (lambda: validate(SHORT, humans=1.5), "humans is 1.5 (float), allowed are whole numbers, 1 to 1000000"),
+        (lambda: validate(SHORT, duration="1"), "duration is '1' (str), expected a number of seconds"),
+        (lambda: validate(SHORT, shards=2.0), "shards is 2.0 (float), allowed are whole numbers, 1 or more"),
+        (lambda: rehearse(LOOP), "scenario is a Loop, expected a Scenario"),
+        (lambda: rehearse(SHORT, "ccl"), "coupling is 'ccl' (str), expected a coupling"),
+        (lambda: RigidDevice(damping="x"), "damping is 'x', expected a number"),
+    ],
+)
+def test_an_argument_of_another_type_is_named(call, message):
+    with pytest.raises(TypeError) as caught:
+        call()
+    assert message in str(caught.value)
+
+
+def test_numbers_of_numpy_are_numbers():
+    findings = validate(SHORT, GAINS, humans=np.int64(2), seed=np.int64(1), engine="exact", duration=np.float64(0))
+    assert findings.index.size == 2

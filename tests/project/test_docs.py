@@ -1,0 +1,136 @@
+"""What README and docs say can be done is done: commands and snippets run, output shown is real, files named exist."""
+
+import contextlib
+import importlib.util
+import io
+import math
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+_spec = importlib.util.spec_from_file_location("regenerate", ROOT / "docs/regenerate.py")
+regenerate = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(regenerate)
+
+PAGES = [*regenerate.PAGES, ROOT / "CHANGELOG.md", ROOT / "NOTATION.md"]
+TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
+#: a command that several pages have runs once
+COMMANDS = {s.text: page.name for page in reversed(PAGES) for s in regenerate.steps(TEXTS[page]) if s.kind == "command"}
+IN_ORDER = list(dict.fromkeys(s.text for page in PAGES for s in regenerate.steps(TEXTS[page]) if s.kind == "command"))
+SNIPPETS = {p: [s.text for s in regenerate.steps(TEXTS[p]) if s.kind == "python"] for p in PAGES}
+SHOWN = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.SHOWN.finditer(TEXTS[page])]
+MEASURED = [(page, *match.group(3, 2, 4)) for page in PAGES for match in regenerate.MEASURED.finditer(TEXTS[page])]
+#: within a sentence; those of other modules need a port, a display or minutes
+IN_TEXT = sorted(
+    {c for text in TEXTS.values() for c in re.findall(r"`(python -m design -[^`]*)`", text) if "FILE" not in c}
+)
+NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]\d+)?(?![\w])")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """One folder for all, since some commands use what others have written; with the files that pages give."""
+    folder = tmp_path_factory.mktemp("docs")
+    for step in (s for page in PAGES for s in regenerate.steps(TEXTS[page]) if s.kind == "file"):
+        assert not (folder / step.name).exists(), f"two pages give a file {step.name}"
+        (folder / step.name).write_text(step.text, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def printed():
+    """What each command wrote to standard output."""
+    return {}
+
+
+@pytest.mark.parametrize("command", IN_ORDER)
+def test_every_command_runs(command, place, printed):
+    """0 or 1 (done, and it holds or does not): never bad input, never a traceback."""
+    done = regenerate.run(command, place)
+    assert done.returncode in (0, 1), f"{COMMANDS[command]}: {done.stderr}"
+    assert "Traceback" not in done.stderr
+    printed[command] = done.stdout
+
+
+def same_line(shown: str, line: str) -> bool:
+    """The same words, and numbers that differ by two units in the last place shown, or two thousandths, at most."""
+    shown, line = " ".join(shown.split()), " ".join(line.split())  # a column is as wide as its widest number
+    if NUMBER.sub("#", shown) != NUMBER.sub("#", line):
+        return False
+    pairs = zip(NUMBER.findall(shown), NUMBER.findall(line), strict=True)
+    return all(math.isclose(float(a), float(b), rel_tol=2e-3, abs_tol=2 * last_place(a)) for a, b in pairs)
+
+
+def last_place(number: str) -> float:
+    mantissa, _, exponent = number.partition("e")
+    return 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
+
+
+@pytest.mark.parametrize(("page", "command", "pattern", "shown"), SHOWN, ids=[block[1] for block in SHOWN])
+def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown, place, printed):
+    """`python docs/regenerate.py` writes it anew."""
+    output = printed.get(command) or regenerate.run(command, place).stdout
+    fresh = regenerate.kept(output, pattern).splitlines()
+    assert shown.splitlines()
+    assert len(fresh) == len(shown.splitlines()), f"{page.name}: {output}"
+    assert [a for a, b in zip(shown.splitlines(), fresh, strict=True) if not same_line(a, b)] == []
+
+
+@pytest.mark.parametrize("command", IN_TEXT)
+def test_a_design_that_a_sentence_names_can_be_had(command, place):
+    done = regenerate.run(command, place)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(("page", "command", "pattern", "shown"), MEASURED, ids=[block[1] for block in MEASURED])
+def test_measured_output_is_of_a_command_that_exists(page, command, pattern, shown):
+    """Minutes, and times: not run here, `python docs/regenerate.py` does."""
+    module = command.split()[2]
+    assert importlib.util.find_spec(module) is not None
+    assert shown
+    assert shown == regenerate.kept(shown, pattern)
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if SNIPPETS[page]], ids=lambda page: page.name)
+def test_every_snippet_runs(page, place, monkeypatch):
+    """All Python blocks of a page, in order, in one namespace."""
+    monkeypatch.chdir(place)
+    namespace = {"__name__": "snippet"}
+    with contextlib.redirect_stdout(io.StringIO()):
+        for number, snippet in enumerate(SNIPPETS[page], start=1):
+            exec(compile(snippet, f"{page.name}, Python block {number}", "exec"), namespace)
+
+
+def test_a_page_gets_the_lines_that_it_asks_for():
+    page = "<!-- output: certified -->\n```console\n$ python -m x\nold\n```\nafter\n```console\n$ python -m x\n```\n"
+    fresh = regenerate.renewed(page, {"python -m x": "noise\nis certified  \nmore noise\n"})
+    assert fresh == page.replace("old", "is certified")
+
+
+def test_what_counts_as_the_same_line():
+    assert same_line("needs 1.370 of 1.37 N s/m", "needs 1.372 of 1.37 N s/m")
+    assert not same_line("needs 1.370 of 1.37 N s/m", "needs 1.375 of 1.37 N s/m")
+    assert not same_line("0 unstable", "3 unstable")
+    assert not same_line("case I", "case II")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_links_and_pictures_exist(page):
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", TEXTS[page]):
+        assert target.startswith("https://") or (page.parent / target).exists(), f"{page.name} names {target}"
+
+
+def test_make_targets_exist():
+    targets = re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
+    blocks = re.findall(r"```(?:sh|console)\n(.*?)```", "".join(TEXTS.values()), flags=re.DOTALL)
+    named = [line.split()[1] for block in blocks for line in block.splitlines() if line.startswith("make ")]
+    named += re.findall(r"`make ([a-z]+)`", "".join(TEXTS.values()))
+    assert named
+    assert set(named) <= set(targets)
+
+
+def test_there_are_commands_to_run():
+    assert len(IN_ORDER) >= 20
+    assert len(SHOWN) >= 5

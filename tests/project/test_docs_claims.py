@@ -1,0 +1,70 @@
+"""Every claim in the documentation names a test, and every test that it names exists."""
+
+import ast
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+MENTION = re.compile(r"tests/(test_\w+\.py)::(\w+)")
+DOCS = ("theory.md", "reproducibility.md")
+#: Sections that introduce words and claim nothing
+DEFINITIONS = ("The loop and its symbols",)
+
+
+def defined_in(name: str) -> set[str]:
+    """Names of the test functions that a file defines, without importing it."""
+    path = ROOT / "tests" / name
+    if not path.exists():
+        return set()
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    return {node.name for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")}
+
+
+def sections(text: str) -> dict[str, str]:
+    """Second-level headings with what stands below each."""
+    parts = re.split(r"^## (.+)$", text, flags=re.MULTILINE)
+    return dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+@pytest.mark.parametrize("name", DOCS)
+def test_every_test_that_the_documentation_names_exists(name):
+    mentions = MENTION.findall((ROOT / "docs" / name).read_text(encoding="utf-8"))
+    assert mentions
+    missing = [f"tests/{file}::{test}" for file, test in mentions if test not in defined_in(file)]
+    assert not missing
+
+
+def test_every_section_of_the_theory_points_to_a_test():
+    found = sections((ROOT / "docs" / "theory.md").read_text(encoding="utf-8"))
+    bare = [title for title, body in found.items() if not MENTION.search(body) and title not in DEFINITIONS]
+    assert not bare
+    assert set(DEFINITIONS) <= set(found)
+
+
+def test_every_row_of_the_reproducibility_table_shows_its_evidence():
+    text = (ROOT / "docs" / "reproducibility.md").read_text(encoding="utf-8")
+    rows = [line for line in text.splitlines() if line.startswith("| ") and not re.match(r"\|[ |-]+$", line)]
+    assert len(rows) > 8
+    assert [row for row in rows[1:] if not MENTION.search(row)] == []
+
+
+def test_every_claim_test_is_used_by_the_documentation():
+    used = {test for name in DOCS for _, test in MENTION.findall((ROOT / "docs" / name).read_text(encoding="utf-8"))}
+    assert sorted(defined_in("test_claims.py") - used) == []
+
+
+def test_documented_commands_leave_the_repository_clean():
+    """What they write into the folder that they are run in is ignored by git."""
+    if shutil.which("git") is None or not (ROOT / ".git").exists():
+        pytest.skip("no git, or no clone")
+    texts = [page.read_text(encoding="utf-8") for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))]
+    blocks = re.findall(r"^```(?:sh|console)\n(.*?)^```", "".join(texts), flags=re.DOTALL | re.MULTILINE)
+    written = {name for block in blocks for name in re.findall(r"--(?:out|video|json) ([\w./-]+)", block)}
+    files = sorted(name for name in written if not name.startswith(("/", "out/")))
+    assert len(files) >= 5
+    done = subprocess.run(["git", "check-ignore", *files], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stdout.split() == files

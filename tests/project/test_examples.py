@@ -1,0 +1,57 @@
+"""The five examples run as a newcomer would run them, and say what they should."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+
+#: what each must print; figures are those that docs and other tests have
+SAYS = {
+    "audit": ["closed-loop: needs 1.3987, 1.3987 of 1.37 N s/m: not certified", "the gains times 0.8995"],
+    "compare_couplings": ["any passive environment", "closed-loop +1.36.. ", r"-16.6. .*-29.5. .*this environment"],
+    "simulate_and_plot": [r"no coupling: growth \+1.48. 1/s at 84.0 Hz", "designed coupling: growth -1.726 1/s"],
+    "monte_carlo": [r"no coupling: 4\d\d of 500 unstable", "designed coupling: 0 of 500 unstable; .* 0.6 %"],
+    "your_own_device": ["certified = True", "ended finished", r"zero force 10\d.. ms after the stop"],
+}
+
+
+def test_a_device_without_damping_ends_the_example_with_one_line(tmp_path):
+    text = (ROOT / "examples/your_own_device.py").read_text()
+    assert '"damping": 0.9' in text
+    (tmp_path / "mine.py").write_text(text.replace('"damping": 0.9', '"damping": 0.0'))
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        [sys.executable, "mine.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert done.stderr == "error: delta is [0.0, 0.0]: a device without damping can promise no human anything\n"
+
+
+def test_examples_import_only_what_is_for_scripts():
+    ours = {"sim", "design", "hw", "controller.coupling", "models.device"}
+    for path in EXAMPLES:
+        imported = set(re.findall(r"^(?:from|import) ((?:sim|design|hw|controller|models)\S*)", path.read_text(), re.M))
+        assert imported <= ours, path.name
+        assert "sim" in imported
+
+
+def test_every_example_is_tested_and_short():
+    assert {path.stem for path in EXAMPLES} == set(SAYS)
+    assert all(len(path.read_text().splitlines()) < 60 for path in EXAMPLES)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_an_example_runs(path, tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, str(path)], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    missing = [words for words in SAYS[path.stem] if not re.search(words, done.stdout)]
+    assert not missing, done.stdout

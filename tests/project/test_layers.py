@@ -1,0 +1,124 @@
+"""Who may import whom, without circles of files or of folders, and which package lives where."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+WORLDS = ("models", "controller", "design", "sim", "hw", "cli")
+
+#: arrows of the architecture: a package may import itself and these
+MAY_IMPORT = {
+    "models": set(),
+    "controller": set(),
+    "design": {"controller"},
+    "sim": {"models", "controller", "design"},
+    "hw": {"models", "controller", "design", "sim"},
+    "cli": {"models", "controller", "design", "sim", "hw"},
+}
+
+#: the only files that may import a package
+HOMES = {
+    # the view only shows what runs without it: shapes and arrows, the window, pictures without a window
+    "mujoco": {"models/scene.py", "sim/engines.py", "sim/view/"},
+    "cvxpy": {"design/lmi.py", "design/fixed_order.py", "design/spring_damper.py"},
+    "distributed": {"sim/crowds.py"},
+    "serial": {"hw/transport.py", "hw/port.py"},
+    "matplotlib": {"sim/plots.py"},
+    "PIL": {"sim/view/"},
+}
+
+FILES = [path for world in WORLDS for path in sorted((ROOT / world).rglob("*.py"))]
+
+
+def is_door(node: ast.stmt) -> bool:
+    """The `if __name__ == "__main__":` tail of a file: what it imports is no arrow."""
+    return isinstance(node, ast.If) and "__main__" in ast.unparse(node.test)
+
+
+def imported(path: Path) -> set[str]:
+    """Every module that a file imports, at its head or later; names of modules in full."""
+    names = set()
+    for top in ast.parse(path.read_text()).body:
+        for node in () if is_door(top) else ast.walk(top):
+            if isinstance(node, ast.Import):
+                names |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                assert node.level == 0, f"{path}: relative import"
+                inside = {f"{node.module}.{alias.name}" for alias in node.names}
+                modules = {name for name in inside if file_of(name)}
+                names |= modules or {node.module or ""}
+    return names
+
+
+def file_of(name: str) -> Path | None:
+    base = ROOT / name.replace(".", "/")
+    return next((path for path in (base.with_suffix(".py"), base / "__init__.py") if path.is_file()), None)
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_arrows_point_one_way(path):
+    world = path.relative_to(ROOT).parts[0]
+    for name in imported(path):
+        package = name.split(".")[0]
+        if package in WORLDS and package != world:
+            assert package in MAY_IMPORT[world], f"{path.relative_to(ROOT)} imports {name}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_packages_live_where_they_belong(path):
+    place = path.relative_to(ROOT).as_posix()
+    for name in imported(path):
+        homes = HOMES.get(name.split(".")[0])
+        if homes:
+            assert any(place.startswith(home) for home in homes), f"{place} imports {name}"
+
+
+def circle(arrows: dict[str, set[str]]) -> list[str] | None:
+    """A circle of arrows, or None."""
+    done, way = set(), []
+
+    def visit(node: str) -> list[str] | None:
+        if node in way:
+            return [*way[way.index(node) :], node]
+        if node in done:
+            return None
+        way.append(node)
+        for after in sorted(arrows.get(node, ())):
+            if found := visit(after):
+                return found
+        way.pop()
+        done.add(node)
+        return None
+
+    return next((found for node in sorted(arrows) if (found := visit(node))), None)
+
+
+def between_files() -> dict[str, set[str]]:
+    arrows = {}
+    for path in FILES:
+        targets = {file_of(name) for name in imported(path) if name.split(".")[0] in WORLDS} - {None, path}
+        # the front of a package names its functions for type checkers only
+        arrows[str(path.relative_to(ROOT))] = {str(t.relative_to(ROOT)) for t in targets if t.name != "__init__.py"}
+    return {name: after for name, after in arrows.items() if not name.endswith("__init__.py")}
+
+
+def test_files_have_no_circle():
+    assert circle(between_files()) is None
+
+
+def test_folders_have_no_circle():
+    folders: dict[str, set[str]] = {}
+    for name, after in between_files().items():
+        place = Path(name).parent.as_posix()
+        folders.setdefault(place, set()).update({Path(a).parent.as_posix() for a in after} - {place})
+    assert circle(folders) is None
+
+
+def test_the_check_sees_forbidden_arrows_and_circles(tmp_path):
+    wrong = tmp_path / "wrong.py"
+    wrong.write_text("import numpy\nfrom sim.run import run\nif __name__ == '__main__':\n    import cli.run\n")
+    assert imported(wrong) == {"numpy", "sim.run"}
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}}) == ["a", "b", "c", "a"]
+    assert circle({"a": {"b"}, "b": {"c"}}) is None

@@ -1,0 +1,156 @@
+"""The search for the worst passive human finds one where the closed-loop condition fails, and none where it holds."""
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cli import run as run_command
+from cli.suite import run_tightness as tightness
+from cli.validate import main
+from controller.coupling import NoCoupling, SpringDamper
+from design.conditions import this_environment as real
+from design.result import CASE_I
+from models.device import RigidDevice
+from models.scene import build, plant
+from sim import adversary
+from sim.adversary import DESTABILISED, attempts, search
+from sim.engines import hold
+from sim.run import assemble
+from sim.scenario import InputError, load
+from sim.stability import close, dominant_mode
+
+SCENARIO = load()
+DESIGNED = SpringDamper([878.7, 551.8], [0.3864, 0.5219])
+LOOPS = {"none": (SCENARIO, NoCoupling()), "published": (SCENARIO, CASE_I), "designed": (SCENARIO, DESIGNED)}
+
+
+def test_it_finds_what_random_humans_do_not():
+    """The published gains pass random humans; with 5 % less damping than they need, a lossless hand is found."""
+    rows = attempts(LOOPS, np.array([0.05, 0.1, 0.2]), generations=60)
+    assert all(row.worst.destabilises for row in rows)
+
+
+def test_nobody_destabilises_a_loop_with_the_damping_it_requires():
+    rows = attempts(LOOPS, np.array([-1e-3]), generations=12)
+    assert not any(row.worst.destabilises for row in rows)
+    # lossless hands come to the edge: 0 from below, to the rounding of the eigenvalues
+    assert all(abs(row.worst.growth) < DESTABILISED for row in rows)
+
+
+def test_where_the_condition_binds_slowly_it_is_tight():
+    """Without coupling and with delays of 4 and 9 samples it binds at 8 Hz: half a per cent short, a hand is found."""
+    delayed = {"none": (SCENARIO.replace(theta=(4, 9)), NoCoupling())}
+    rows = attempts(delayed, np.array([-1e-3, 0.005, 0.02]), generations=15)
+    print([(row.short, row.worst.growth) for row in rows])
+    assert [row.worst.destabilises for row in rows] == [False, True, True]
+    assert all(6 < row.worst.frequency_hz < 10 for row in rows[1:])
+
+
+def both_hands(monkeypatch):
+    monkeypatch.setattr(adversary, "PASSES", tuple(kind for kind in adversary.PASSES if kind.held))
+    assert adversary.PASSES
+
+
+def test_one_person_in_both_hands_is_found_too(monkeypatch):
+    """A lossless two-port, concrete and passive: what the search says of it, the scene built for it repeats."""
+    both_hands(monkeypatch)
+    worst = search(SCENARIO, assemble(SCENARIO, NoCoupling()).F, generations=15)
+    assert worst.destabilises
+    (person,) = worst.persons
+    assert person.holds == (1, 2)
+    assert person.damping == person.cross.damping == 0
+    assert all(link.damping == 0 for human in worst.humans for link in human.links)
+    F = assemble(SCENARIO, NoCoupling()).F
+    mode = dominant_mode(close(hold(plant(build(SCENARIO.device, worst.humans, worst.persons).model), SCENARIO.T), F))
+    assert mode.growth == pytest.approx(worst.growth, rel=1e-9)
+
+
+def test_one_person_in_both_hands_fails_against_the_required_damping(monkeypatch):
+    """The condition asks nothing of how humans hang together."""
+    both_hands(monkeypatch)
+    light = SCENARIO.replace(device=(RigidDevice(mass=0.02),) * 2)
+    rows = attempts({"designed": (light, DESIGNED)}, np.array([-1e-3, 0.05]), generations=30)
+    print([(row.short, row.worst.growth) for row in rows])
+    assert [row.worst.destabilises for row in rows] == [False, True]
+
+
+def test_the_person_found_is_kept_for_a_replay(tmp_path, monkeypatch):
+    both_hands(monkeypatch)
+    file, out = tmp_path / "r.json", tmp_path / "out"
+    base = ["--case", "none", "--engine", "exact", "--no-plot", "--out", str(out), "--json", str(file)]
+    assert main([*base, "--humans", "5", "--duration", "0", "--adversary", "--generations", "8"]) == 0
+    found = json.loads(file.read_text())["adversary"]
+    assert found["person"][0]["holds"] == [1, 2]
+    assert run_command.main([*base, "--human", str(out / "adversary.toml"), "--duration", "0.5"]) == 0
+    stability = json.loads(file.read_text())["stability"]
+    assert stability["spectral_radius"] == pytest.approx(found["spectral_radius"], abs=1e-12)
+
+
+def test_the_human_found_is_concrete_and_the_search_repeatable():
+    F = assemble(SCENARIO, NoCoupling()).F
+    worst, again = (search(SCENARIO, F, seed=4, generations=5) for _ in range(2))
+    assert worst == again
+    assert worst.destabilises
+    assert all(link.damping == 0 for human in worst.humans for link in human.links)
+    scene = build(SCENARIO.device, worst.humans)
+    mode = dominant_mode(close(hold(plant(scene.model), SCENARIO.T), F))
+    assert mode.growth == pytest.approx(worst.growth, rel=1e-9)
+
+
+def test_the_command_keeps_the_human_for_a_replay(tmp_path):
+    file, out = tmp_path / "r.json", tmp_path / "out"
+    options = ["--case", "none", "--humans", "5", "--engine", "exact", "--duration", "0", "--no-plot", "--adversary"]
+    options += ["--generations", "8"]
+    assert main([*options, "--out", str(out), "--json", str(file)]) == 0
+    adversary = json.loads(file.read_text())["adversary"]
+    assert adversary["found"]
+    assert adversary["required_over_available_damping"] == pytest.approx(1.7229 / 1.37, rel=1e-4)
+    replay = ["--case", "none", "--human", str(out / "adversary.toml"), "--duration", "0.5", "--engine", "exact"]
+    assert run_command.main([*replay, "--no-plot", "--out", str(out), "--json", str(file)]) == 0
+    stability = json.loads(file.read_text())["stability"]
+    assert stability["spectral_radius"] == pytest.approx(adversary["spectral_radius"], abs=1e-12)
+
+
+def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypatch):
+    """Were a certificate wrong, the command would say so: here the search is told of another loop."""
+    F = assemble(SCENARIO, NoCoupling()).F
+    command = sys.modules[main.__module__]
+    monkeypatch.setattr(
+        command, "search", lambda scenario, certified, seed, generations, progress: search(scenario, F, seed, 4)
+    )
+    options = ["--humans", "5", "--engine", "exact", "--duration", "0", "--no-plot", "--adversary"]
+    assert main([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 1
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["certified"]
+    assert not report["holds"]
+
+
+def test_the_tightness_command_reports_the_rate_by_shortage(tmp_path):
+    options = ["--short", "0,20", "--generations", "10", "--seed", "1", "--json", str(tmp_path / "r.json")]
+    assert tightness([*options, "--out", str(tmp_path)]) == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["rates"] == [{"short": 0.0, "attempts": 2, "rate": 0.0}, {"short": 0.2, "attempts": 2, "rate": 1.0}]
+    assert {row["loop"] for row in report["rows"]} == {"no coupling", "spring-damper, case I"}
+    assert (tmp_path / "tightness.png").stat().st_size > 10_000
+
+
+def test_somebody_who_destabilises_a_loop_with_enough_damping_fails_the_command(tmp_path, monkeypatch):
+    """Were the condition wrong, the command would say so: here it is told that a third of the damping is enough."""
+    monkeypatch.setattr("sim.adversary.closed_loop", lambda F, delta: replace(real(F, delta), required=(0.5, 0.5)))
+    assert tightness(["--case", "none", "--short", "0", "--generations", "5", "--out", str(tmp_path)]) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--short", "-1"], "--short is -1, allowed are 0 to below 100"),
+        (["--short", "5,many"], "--short is '5,many', expected numbers"),
+        (["--generations", "0"], "--generations is 0, allowed are 1 to 10000"),
+    ],
+)
+def test_bad_calls_of_tightness(options, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        tightness([*options, "--out", str(tmp_path)])

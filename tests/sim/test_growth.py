@@ -1,0 +1,128 @@
+"""Growth told from displacements alone: known rates come back, people and encoders are not taken for oscillations."""
+
+import json
+
+import numpy as np
+import pytest
+
+from cli import run, trace
+from controller.coupling import NoCoupling
+from sim.run import assemble, simulate
+from sim.scenario import InputError, load
+from sim.stability import before_clipping, close, dominant_mode
+from sim.trace import Result, growth, growths
+
+T, STEP = 1.2e-3, np.full(2, 1e-6)
+
+
+def motion(seconds, *modes):
+    """A person's 15 mm at 0.6 Hz, with modes (amplitude at the end [m], frequency [Hz], growth [1/s]), rounded."""
+    t = T * np.arange(round(seconds / T))
+    x = 15e-3 * np.sin(2 * np.pi * 0.6 * t + 0.3)
+    for size, frequency, rate in modes:
+        x = x + size * np.exp(rate * (t - t[-1])) * np.sin(2 * np.pi * frequency * t)
+    return np.round(np.column_stack([x, 0.5 * x]) / STEP) * STEP
+
+
+@pytest.mark.parametrize(
+    ("frequency", "rate"), [(f, g) for f in (6.2, 84.0) for g in (-3.0, -0.5, 0.4, 1.5)] + [(84.0, 6.0)]
+)
+def test_a_known_rate_comes_back(frequency, rate):
+    """To four standard errors, and 0.02 1/s for what is left of the person's motion in the slowest octave."""
+    found = growth(motion(6.0, (4e-4, frequency, rate)), T, STEP)
+    assert found.growth_rate_per_s == pytest.approx(rate, abs=4 * found.error_per_s + 0.02)
+    assert found.error_per_s < 0.2
+    assert found.frequency_hz == pytest.approx(frequency, abs=1.5)  # a line is 1 Hz wide
+    assert found.trend == ("grows" if rate > 0 else "decays")
+
+
+def test_a_person_and_an_encoder_are_no_oscillation():
+    found = growth(motion(6.0), T, STEP)
+    assert found.growth_rate_per_s is None
+    assert found.reason == "nothing oscillates above 1.1 um"
+
+
+def test_what_shows_at_the_very_end_only_is_told_of():
+    found = growth(motion(6.0, (2e-5, 84.0, 60.0)), T, STEP)
+    assert found.growth_rate_per_s is None
+    assert found.reason.startswith("something oscillates, too briefly for a rate, above")
+
+
+def test_a_strong_mode_that_decays_does_not_hide_a_weak_one_that_grows():
+    found = growth(motion(6.0, (3e-4, 20.0, -0.8), (2e-5, 90.0, 1.0)), T, STEP)
+    assert found.trend == "grows"
+    assert found.frequency_hz == pytest.approx(90.0, abs=1.5)
+
+
+def test_a_limit_cycle_neither_grows_nor_decays():
+    found = growth(motion(6.0, (2e-3, 60.0, 0.0)), T, STEP)
+    assert abs(found.growth_rate_per_s) < 1e-3
+    assert found.amplitude_m == pytest.approx(2e-3 * np.hypot(1, 0.5), rel=0.01)  # both channels together
+
+
+def test_the_exact_engines_growth_without_its_states():
+    """The loop without coupling, people moving: its eigenvalue, to the 1e-3 1/s that sim.stability is held to."""
+    assembly = assemble(load().replace(duration=6.0), NoCoupling())
+    exact = dominant_mode(close(assembly.plant, assembly.F)).growth
+    record = simulate(assembly, "exact")
+    ticks = before_clipping(record, assembly.process.force_limit)
+    found = growth(record.s[:ticks, :2, 0], T, STEP)
+    assert found.growth_rate_per_s == pytest.approx(exact, abs=1e-3)
+
+
+def test_too_few_ticks_say_so():
+    assert growth(motion(0.2), T, STEP).reason == "only 167 ticks; a growth rate needs 200"
+
+
+def test_the_command_reads_what_sim_run_writes(tmp_path, capsys):
+    options = ["--case", "none", "--engine", "exact", "--duration", "9", "--no-plot", "--out", str(tmp_path)]
+    assert run.main(options) == 0
+    capsys.readouterr()
+    path = tmp_path / "trace.npz"
+    assert trace.main([str(path), "--plot", str(tmp_path / "again.png"), "--json", "-"]) == 0
+    (part,) = json.loads(capsys.readouterr().out)["growth"]
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert part["growth_rate_per_s"] == pytest.approx(report["stability"]["exact_growth_rate_per_s"], abs=1e-3)
+    assert part["stop"] == report["run"]["steady_ticks"][0][1] < report["run"]["samples"]  # it clips at last
+    assert (tmp_path / "again.png").stat().st_size > 10_000
+    assert trace.main([str(path)]) == 0
+    assert "1/s at 84" in capsys.readouterr().out
+
+
+def made(x, meta):
+    n = len(x)
+    unknown = np.full((n, 2), np.nan)
+    return Result(T * np.arange(n), x, np.zeros((n, 2)), unknown, unknown, np.zeros((n, 0)), meta)
+
+
+@pytest.mark.parametrize(
+    ("run_part", "words"),
+    [
+        ({"steady_ticks": [[0, 5000]]}, "it has 500 ticks"),
+        ({"steady_ticks": [[30, 20]]}, r"run.steady_ticks are \[\[30, 20\]\]"),
+        ({"steady_ticks": "all"}, "are no numbers"),
+        ({"steady_ticks": 3}, "are no numbers"),
+        ({"encoder_step_m": [1e-6]}, "are no numbers"),
+        ({"encoder_step_m": [1e-6, float("nan")]}, "not finite"),
+    ],
+)
+def test_a_trace_that_says_nonsense_is_bad_input(run_part, words):
+    with pytest.raises(InputError, match=words):
+        growths(made(motion(0.6), {"run": run_part}))
+
+
+def test_a_trace_that_names_no_stretch_is_one():
+    (found,) = growths(made(motion(4.0, (2e-3, 84.0, 1.0)), {"run": None}))
+    assert found.growth_rate_per_s == pytest.approx(1.0, abs=1e-2)
+
+
+def test_an_empty_trace_or_none_is_one_line(tmp_path):
+    made(motion(0.0), {}).save_npz(tmp_path / "empty.npz")
+    with pytest.raises(InputError, match="has no ticks"):
+        trace.main([str(tmp_path / "empty.npz")])
+    made(motion(1.0), {}).save_npz(tmp_path / "whole.npz")
+    with pytest.raises(InputError, match=r"cannot write .*: Is a directory"):
+        trace.main([str(tmp_path / "whole.npz"), "--plot", str(tmp_path)])
+    (tmp_path / "text.npz").write_text("no trace")
+    with pytest.raises(InputError, match="not a trace of this program"):
+        trace.main([str(tmp_path / "text.npz")])

@@ -1,0 +1,97 @@
+"""The force of the ideal environment for a run's own motion, against a convolution written out here."""
+
+import json
+
+import numpy as np
+import pytest
+
+from cli.run import main
+from controller.coupling import NoCoupling, SpringDamper
+from design.result import CASE_I
+from sim.run import Assembly, Record, assemble, simulate
+from sim.scenario import load
+from sim.trace import Likeness, Result, likeness, response
+
+SCENARIO = load()
+
+
+def by_hand(T: float, x: np.ndarray, late: tuple[int, ...]) -> np.ndarray:
+    """Figure 4's network by backward Euler, in the unknowns of mechanics: no state space, no Lti.
+
+    The mass M (1 kg) between spring-dampers (800, 1) and (700, 1): (M/T^2 + D/T + K) q = M (2 q- - q--)/T^2 + the
+    pull of both contacts; the force of contact i is what its spring-damper pulls, `late` samples later.
+    """
+    k, b, M = np.array([800.0, 700.0]), np.array([1.0, 1.0]), 1.0
+    q, before, x_old, forces = 0.0, 0.0, np.zeros(2), []
+    for now in x:
+        pull = k @ now + b @ (now - x_old) / T + b.sum() * q / T
+        new = (M * (2 * q - before) / T**2 + pull) / (M / T**2 + b.sum() / T + k.sum())
+        forces.append(k * (now - new) + b * ((now - x_old) - (new - q)) / T)
+        q, before, x_old = new, q, now
+    shifted = np.zeros_like(x)
+    for i, n in enumerate(late):
+        shifted[n:, i] = np.array(forces)[: len(x) - n, i]
+    return shifted
+
+
+def record_of(assembly: Assembly, seconds: float) -> Record:
+    return simulate(assembly, "exact", samples=round(seconds / SCENARIO.T))
+
+
+@pytest.mark.parametrize(("case", "late"), [("I", (1, 2)), ("II", (0, 0))])
+def test_the_ideal_force_is_the_networks_for_the_measured_motion(case, late):
+    assembly = assemble(SCENARIO, CASE_I)
+    record = record_of(assembly, 2.0)
+    alike = likeness(assembly, record, SCENARIO.loop(case).lam)
+    expected = by_hand(SCENARIO.T, record.s[:, :2, 0], late)
+    # 1700 ticks of a lightly damped mass in another order of operations
+    np.testing.assert_allclose(alike.ideal, expected, atol=1e-9 * np.abs(expected).max())
+    part, asked = alike.part(), record.f[:, :, 0]
+    np.testing.assert_allclose(alike.asked, asked, atol=1e-12)  # nothing is clipped here
+    error = np.sqrt(((asked - expected) ** 2).sum() / (expected**2).sum())
+    assert part["error_percent"] == pytest.approx(100 * error, rel=1e-6)
+
+
+def test_the_response_is_the_convolution_with_the_impulse_response():
+    G = assemble(SCENARIO, SpringDamper([900.0, 500.0], [0.4, 0.5])).F
+    x = np.random.default_rng(0).normal(size=(120, 2))
+    impulse = [G.D, *(G.C @ np.linalg.matrix_power(G.A, n) @ G.B for n in range(119))]
+    y = np.array([sum(impulse[n] @ x[k - n] for n in range(k + 1)) for k in range(120)])
+    np.testing.assert_allclose(response(G, x), y, atol=1e-9 * np.abs(y).max())
+
+
+def test_a_loop_without_coupling_is_ideal_even_where_its_motors_clip():
+    """F = Theta E = Lambda E: what it asks for is exactly right, and it is unstable."""
+    assembly = assemble(SCENARIO.replace(theta=(2, 3)), NoCoupling())
+    record = record_of(assembly, 6.0)
+    assert np.abs(record.f).max() == 12.0
+    part = likeness(assembly, record, (2, 3)).part()
+    assert part["asked_rms_n"] > np.sqrt(np.mean(record.f**2))
+    assert part["error_percent"] < 1e-8
+
+
+def test_undefined_errors_have_a_reason():
+    still = np.zeros((5, 2))
+    assert Likeness(still, still).part()["reason"] == "the ideal environment would have rendered no force"
+    assert Likeness(still[:0], still[:0]).part()["error_percent"] is None
+    lost = Likeness(still + 1, np.full((5, 2), 1e200)).part()
+    assert lost["error_percent"] is None
+    assert lost["asked_rms_n"] is None
+    json.dumps(lost, allow_nan=False)
+
+
+def test_the_command_ranks_the_designs(tmp_path):
+    """The optimum renders case I to half a percent; theorem4's spring-damper is about half of the force off."""
+    errors = {}
+    for name, condition in (("optimal", None), ("spring-damper", "theorem4"), ("spring-damper", "closed-loop")):
+        file = tmp_path / "r.json"
+        options = ["--coupling", name, *(["--condition", condition] if condition else []), "--engine", "exact"]
+        assert main([*options, "--no-plot", "--duration", "4", "--out", str(tmp_path), "--json", str(file)]) == 0
+        errors[name, condition] = json.loads(file.read_text())["ideal_force"]["error_percent"]
+    assert errors["optimal", None] < 2
+    assert errors["optimal", None] < errors["spring-damper", "closed-loop"] / 5
+    assert errors["spring-damper", "closed-loop"] < errors["spring-damper", "theorem4"] / 2
+    trace = Result.load_npz(tmp_path / "trace.npz")
+    expected = by_hand(SCENARIO.T, trace.x, (1, 2))
+    error = np.sqrt(((trace.f - expected) ** 2).sum() / (expected**2).sum())
+    assert errors["spring-damper", "closed-loop"] == pytest.approx(100 * error, rel=1e-6)

@@ -1,0 +1,96 @@
+"""Nobody destabilises the optimal coupling: random and lossless hands, compliant and rigid devices, both engines."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from controller.coupling import Coupling, NoCoupling
+from models.scene import Crowd, Variants, variants
+from sim.adversary import DESTABILISED, search
+from sim.couplings import choose
+from sim.crowds import draw
+from sim.run import assemble
+from sim.scenario import load
+from sim.stability import disagree, dominant_modes, exact_loops, mujoco_loops, unstable
+
+DEVICES = ("omega-pair", "omega-pair-rigid")
+HUMANS = 1000
+
+
+@cache
+def optimal() -> Coupling:
+    """One coupling for both scenarios: the design sees of a device only its damping, which is the same."""
+    return choose(load(), "I", "optimal").coupling
+
+
+@cache
+def hands(lossless: bool) -> Crowd:
+    population = load().population
+    links = np.stack([draw(population, 2, 11, i, 2) for i in range(HUMANS)])
+    if lossless:
+        links[..., 1] = 0.0
+        # modes up to some 2000 rad/s: beyond, MuJoCo's step would decide and not the hand
+        rng = np.random.default_rng(12)
+        links[..., 0] = np.exp(rng.uniform(np.log(0.01), np.log(3.0), links.shape[:-1]))
+        links[..., 2] = np.exp(rng.uniform(np.log(0.1), np.log(1e4), links.shape[:-1]))
+    return Crowd(links)
+
+
+@cache
+def held(scenario: str, lossless: bool) -> Variants:
+    return variants(load(scenario).device, hands(lossless))
+
+
+@cache
+def exact_growth(scenario: str, lossless: bool) -> np.ndarray:
+    """(HUMANS,) [1/s], with the optimal coupling."""
+    return dominant_modes(exact_loops(held(scenario, lossless), assemble(load(scenario), optimal()).F)).growth
+
+
+def test_the_same_coupling_is_designed_for_both():
+    one, other = (load(name).loop("I") for name in DEVICES)
+    assert one == other
+
+
+@pytest.mark.parametrize("scenario", DEVICES)
+@pytest.mark.parametrize("lossless", [False, True], ids=["random", "lossless"])
+def test_a_thousand_hands_are_stable(scenario, lossless):
+    """Exact eigenvalues. A lossless hand's own slow modes stand on the circle, to the rounding of the eigenvalues."""
+    growth = exact_growth(scenario, lossless)
+    assert growth.size == HUMANS
+    assert growth.max() < DESTABILISED
+    if not lossless:
+        assert growth.max() < 0
+        assert not unstable(growth).any()
+
+
+@pytest.mark.parametrize("scenario", DEVICES)
+def test_the_same_hands_upset_the_loop_without_coupling(scenario):
+    """Else the tests above would show nothing. Rigid devices take a lossless hand: no random one is enough for them."""
+    F = assemble(load(scenario), NoCoupling()).F
+    upset = {}
+    for lossless in (False, True):
+        growth = dominant_modes(exact_loops(held(scenario, lossless), F)).growth
+        upset[lossless] = int((growth > DESTABILISED).sum())
+    compliant = scenario == "omega-pair"
+    assert upset[False] > 800 if compliant else upset[False] == 0
+    assert upset[True] > (900 if compliant else 20)
+
+
+@pytest.mark.parametrize("scenario", DEVICES)
+@pytest.mark.parametrize("lossless", [False, True], ids=["random", "lossless"])
+def test_mujoco_says_the_same(scenario, lossless):
+    """The eigenvalues of MuJoCo's own one-period map, for all of them."""
+    assembly = assemble(load(scenario), optimal())
+    mujoco = dominant_modes(mujoco_loops(held(scenario, lossless), assembly.process)).growth
+    assert mujoco.max() < DESTABILISED
+    assert not disagree(exact_growth(scenario, lossless), mujoco).any()
+
+
+@pytest.mark.parametrize("scenario", DEVICES)
+def test_no_adversary_succeeds(scenario):
+    """A short search; `python -m sim.validate --coupling optimal --adversary` makes the long one."""
+    place = load(scenario)
+    worst = search(place, assemble(place, optimal()).F, seed=3, generations=8)
+    assert not worst.destabilises

@@ -1,0 +1,146 @@
+"""The substep rule, the engine's own one-period map that checks it, and the second-order reading of Euler."""
+
+import json
+
+import numpy as np
+import pytest
+
+from cli.run import main
+from controller.coupling import NoCoupling
+from design.result import CASE_I
+from models.device import CompliantDevice
+from models.human import Human, Link
+from models.scene import plant
+from sim.engines import INTEGRATORS, LEAPFROG
+from sim.run import assemble, simulate
+from sim.scenario import SCENARIOS, InputError, load
+from sim.stability import (
+    Pace,
+    check_substeps,
+    default_substeps,
+    exact_growth,
+    measured_hold,
+    pace,
+    simulated_growth,
+    step_radius,
+)
+
+SCENARIO = load()
+STIFF = SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=1e6),) * 2)
+
+
+@pytest.fixture(scope="module")
+def assembly():
+    return assemble(SCENARIO, CASE_I)
+
+
+def test_pace_of_known_matrices():
+    """An oscillator of 3 rad/s with 10 % damping, beside a decay of 50 1/s and a free mass."""
+    A = np.zeros((5, 5))
+    A[:2, :2] = [[0, 1], [-9, -0.6]]
+    A[2, 2] = -50
+    A[3, 4] = 1
+    assert pace(A).mode == pytest.approx(3.0)
+    assert pace(A).rate == pytest.approx(50.0)
+    assert pace(np.zeros((2, 2))) == Pace(0.0, 0.0)
+
+
+def test_the_default_scenario_needs_no_more_than_four(assembly):
+    assert pace(plant(assembly.scene.model).A).mode == pytest.approx(520.8, abs=0.1)
+    assert default_substeps(assembly) == 4
+
+
+def test_the_exact_engine_is_its_own_map(assembly):
+    held = measured_hold(assembly, "exact")
+    np.testing.assert_allclose(held.A, assembly.plant.A, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(held.B, assembly.plant.B, rtol=1e-9, atol=1e-12)
+
+
+# `discrete` keeps a memory of its own from step to step, so no map of position and velocity is all of it
+@pytest.mark.parametrize("integrator", [*sorted(set(INTEGRATORS) - {"discrete"}), LEAPFROG])
+def test_the_map_is_what_a_run_does(assembly, integrator):
+    """Stepping the map closed with the process gives the simulated trace."""
+    record = simulate(assembly, "mujoco", integrator, 4, samples=300)
+    held = measured_hold(assembly, "mujoco", integrator, 4)
+    for k in range(299):
+        follows = held.A @ record.s[k, :, 0] + held.B @ np.concatenate([record.w[k, :, 0], record.f[k, :, 0]])
+        np.testing.assert_allclose(follows, record.s[k + 1, :, 0], rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize(("substeps", "wrong"), [(1, True), (4, False)])
+def test_euler_once_per_period_hides_the_instability(substeps, wrong):
+    loop = assemble(SCENARIO, NoCoupling())
+    assert (simulated_growth(loop, "Euler", substeps) < 0 < exact_growth(loop)) == wrong
+    assert any("WRONG VERDICT" in remark for remark in check_substeps(loop, "Euler", substeps)) == wrong
+
+
+def test_a_default_that_would_be_wrong_is_doubled_or_refused():
+    loop = assemble(SCENARIO, NoCoupling())
+    assert default_substeps(loop, "Euler") == 4
+    with pytest.raises(InputError, match="discrete gives no verdict to rely on"):
+        default_substeps(loop, "discrete")
+    # just unstable: Euler's bias towards stable hides it at 4 substeps
+    near = assemble(SCENARIO.replace(delta=(1.55, 1.55)), NoCoupling())
+    assert 0 < exact_growth(near) < 0.4
+    assert default_substeps(near, "Euler") > 4
+    assert simulated_growth(near, "Euler", default_substeps(near, "Euler")) > 0
+
+
+def test_outside_the_stable_region_is_refused_with_what_to_use():
+    loop = assemble(STIFF, CASE_I)
+    with pytest.raises(InputError, match=r"the mode at 688.* outside the stable region of RK4; use --substeps 26"):
+        check_substeps(loop, "RK4", 1)
+    (remark,) = check_substeps(loop, "RK4", 4)
+    assert "stable but coarse; use --substeps 26" in remark
+    assert check_substeps(loop, "RK4", 26) == []
+
+
+@pytest.mark.parametrize(("integrator", "edge"), [("RK4", 2.828), ("Euler", 2.0), ("implicitfast", 2.0)])
+def test_edges_of_the_stable_regions(integrator, edge):
+    """An almost undamped 1 kg oscillator: the textbook edges, mode times step."""
+    device = CompliantDevice(transmission_stiffness=1e4, motor_mass=1.0, handle_mass=1.0, damping=0.0, delta=None)
+    human = Human((Link(0.0, 0.0, 0.0),))
+    loop = assemble(SCENARIO.replace(device=(device,) * 2, human=(human,) * 2, T=0.02), CASE_I)
+    mode = np.sqrt(2e4)
+    for factor, stable in ((0.99, True), (1.01, False)):
+        h = factor * edge / mode
+        shorter = assemble(loop.scenario.replace(T=h), CASE_I)
+        assert (step_radius(shorter, integrator, 1) <= 1 + 1e-6) == stable
+
+
+def test_euler2_is_second_order(assembly):
+    """Halving the step divides the error by four."""
+    exact = simulate(assembly, "exact", samples=500).s
+    errors = [np.abs(simulate(assembly, "mujoco", LEAPFROG, n, samples=500).s - exact)[:, :2].max() for n in (8, 16)]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.2)
+
+
+def test_euler2_decays_exactly():
+    """A free body with damping: MuJoCo's implicit step becomes exp(-D h/M)."""
+    free = Human((Link(0.3, 3.0, 0.0),))
+    scenario = load("three-rigid").replace(human=(free,) * 3)
+    loop = assemble(scenario, NoCoupling())
+    held = measured_hold(loop, "mujoco", LEAPFROG, 3)
+    n = held.A.shape[0] // 2
+    np.testing.assert_allclose(held.A[n : n + 2, n : n + 2], loop.plant.A[n : n + 2, n : n + 2], rtol=1e-9, atol=1e-12)
+
+
+def test_euler2_refuses_damping_across_springs(tmp_path):
+    with pytest.raises(InputError, match=r"--integrator Euler2: .* across a spring"):
+        main(["--scenario", "three-rigid", "--integrator", "Euler2", "--out", str(tmp_path / "o")])
+
+
+def test_run_uses_and_reports_the_rule(tmp_path):
+    path = tmp_path / "stiff.toml"
+    text = (SCENARIOS / "omega-pair.toml").read_text()
+    path.write_text(text.replace("transmission_stiffness = 14500", "transmission_stiffness = 1e6"))
+    options = ["--scenario", str(path), "--coupling", "published", "--duration", "0.3", "--no-plot"]
+    options += ["--out", str(tmp_path / "o"), "--json", str(tmp_path / "r.json")]
+    assert main(options) == 0
+    assert json.loads((tmp_path / "r.json").read_text())["run"]["substeps"] == 26
+    assert main([*options, "--substeps", "8"]) == 0
+    assert "coarse" in json.loads((tmp_path / "r.json").read_text())["remarks"][0]
+    with pytest.raises(InputError, match="--substeps 1: RK4 x 1: the mode at"):
+        main([*options, "--substeps", "1"])
+    assert main([*options, "--engine", "exact"]) == 0
+    assert json.loads((tmp_path / "r.json").read_text())["run"]["substeps"] is None

@@ -1,0 +1,181 @@
+"""The K-B map of a fixed coupling: figures against closed forms and dense sweeps, and what the command says of them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from cli import zwidth
+from cli.options import BAD_INPUT, DONE, execute
+from controller.coupling import NoCoupling, SpringDamper
+from controller.environment import GROUND, Network, Spring
+from design.frequency import on_circle
+from design.maps import Environments
+from models.scene import variants
+from sim.couplings import choose
+from sim.crowds import crowds
+from sim.scenario import load
+from sim.stability import dominant_modes, exact_loops
+from sim.zwidth import MODEL_KEPT, Surroundings, holders
+
+PAIR, STAR = load("omega-pair"), load("three-rigid")
+WALL = Network(("tip",), (Spring(("tip", GROUND), 2000.0, 0.2),))
+
+
+def around(scenario, coupling):
+    return Surroundings(
+        scenario.device,
+        scenario.population,
+        scenario.environment,
+        scenario.T,
+        scenario.theta,
+        scenario.psi,
+        coupling,
+    )
+
+
+@pytest.fixture(scope="module")
+def optimal():
+    return {scenario.name: choose(scenario, "I", "optimal").coupling for scenario in (PAIR, STAR)}
+
+
+def densely(ground, coupling_force, K, B):
+    """Required over available damping at 60000 frequencies, from the network's equations alone."""
+    w = np.linspace(1e-5, np.pi, 60_000)
+    z = on_circle(w)
+    T, (M, D, S) = ground.T, ground.network.matrices()
+    for spring, row in zip(ground.network.springs, ground.network.across(ground.network.springs), strict=True):
+        if set(spring.between) & set(ground.network.contacts):
+            pattern = np.outer(row, row)
+            D, S = D + (B - spring.damping) * pattern, S + (K - spring.stiffness) * pattern
+    m, s = ground.channels, ((z - 1) / (T * z))[:, None, None]
+    E = np.linalg.inv(np.linalg.inv(M * s**2 + D * s + S)[:, :m, :m])
+    G = coupling_force(z, z[:, None, None] ** -np.array(ground.psi)[:, None] * E)
+    F = z[:, None, None] ** -np.array(ground.theta)[:, None] * G / (z - 1)[:, None, None]
+    root = np.sqrt(T / np.array(ground.delta))
+    return np.linalg.eigvalsh(-(root[:, None] * root) * (F + np.conj(np.swapaxes(F, 1, 2))) / 2)[:, -1].max()
+
+
+@pytest.mark.parametrize("scenario", [PAIR, STAR], ids=lambda s: s.name)
+def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
+    """1e-5: between points of the sweep 5e-5 apart a peak of width 0.01 rises by (2.5e-5/0.01)^2."""
+    coupling = optimal[scenario.name]
+    ground = around(scenario, coupling)
+    Q = coupling.parameter(scenario.T)
+
+    def pair(z, E):
+        return E - E @ Q.at(z) @ E
+
+    for K, B in ((90.0, 0.3), (350.0, 2.0), (1213.2, 2.54)):
+        found = ground.ratios("closed-loop", ground.gains(np.array([K]), np.array([B])))[0]
+        assert found == pytest.approx(densely(ground, pair, K, B), rel=1e-5)
+        assert ground.requirement("closed-loop", K, B).ratio == pytest.approx(found, rel=1e-7)
+
+
+def test_the_model_may_stay_behind(optimal):
+    """With V = Q (I - E0 Q)^-1 from the network of the scenario, in the pair's own environment the two are one loop."""
+    coupling = optimal["omega-pair"]
+    ground = around(PAIR, coupling)
+    nominal = Environments(PAIR.environment, np.array([800.0]), np.array([1.0]), PAIR.T)
+
+    def kept(z, E):
+        M, D, S = PAIR.environment.matrices()
+        s = ((z - 1) / (PAIR.T * z))[:, None, None]
+        E0, Q = np.linalg.inv(np.linalg.inv(M * s**2 + D * s + S)[:, :2, :2]), coupling.parameter(PAIR.T).at(z)
+        V = Q @ np.linalg.inv(np.eye(2) - E0 @ Q)
+        return np.linalg.solve(np.eye(2) + E @ V, E)
+
+    found = [ground.ratios(name, ground.gains(np.array([300.0]), np.array([0.5])))[0] for name in ground.conditions]
+    assert found[2] == pytest.approx(densely(ground, kept, 300.0, 0.5), rel=1e-5)
+    assert found[2] != pytest.approx(found[1], rel=1e-4)
+    assert np.isinf(found[0])
+    assert "knows none" in ground.refusals["theorem4"]
+    assert nominal[0].order == 4  # as many states as Figure 4 itself has
+
+
+def test_a_wall_without_coupling_and_delay_needs_half_the_stiffness_times_T_plus_the_damping():
+    scenario = load("one-wall").replace(environment=WALL, theta=(0,))
+    ground = around(scenario, NoCoupling())
+    K, B = np.array([100.0, 900.0, 3000.0]), np.array([0.1, 0.9, 0.0])
+    needed = ground.ratios("closed-loop", ground.gains(K, B)) * ground.delta[0]
+    # near w = 0, at 1e-5 rad/sample, 1e-16 of rounding is 1e-11 of F/(z-1), and that is K T/w large
+    np.testing.assert_allclose(needed, K * scenario.T / 2 + B, rtol=1e-6)
+
+
+def test_what_no_environment_changes_is_the_same_in_all():
+    ground = around(PAIR, SpringDamper([800.0, 500.0], [0.4, 0.5]))
+    assert ground.conditions == ("theorem4", "closed-loop")
+    ratios = ground.ratios("theorem4", ground.gains(np.array([50.0, 5e3]), np.array([0.1, 3.0])))
+    assert ratios[0] == ratios[1] == ground.requirement("theorem4", 1.0, 1.0).ratio < 1
+
+
+def test_the_population_meets_the_pair_of_the_cell(optimal):
+    """Eigenvalues of the loops one by one, with the force map that `sim.run` closes."""
+    ground = around(PAIR, optimal["omega-pair"])
+    crowd = holders(ground.devices, ground.population, 1, 12, 1, ground.T)
+    F = ground.force_maps(ground.gains(np.array([300.0, 3000.0]), np.array([0.5, 0.5])))[0]
+    for i, stable in ((0, True), (1, False)):
+        growth = crowd.growth(F[i])[0]
+        for index, some in crowds(ground.population, 2, 1, range(12), 1):
+            modes = dominant_modes(exact_loops(variants(ground.devices, some), F[i]))
+            np.testing.assert_allclose(growth[index], modes.growth, atol=1e-6)
+        assert (growth < 0).all() == stable
+
+
+OPTIONS = ["--coupling", "optimal", "--grid", "8", "--humans", "20", "--points", "3", "--duration", "1.5"]
+
+
+def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
+    assert zwidth.main([*OPTIONS, "--out", str(tmp_path)]) == DONE
+    report, text = json.loads((tmp_path / "report.json").read_text()), capsys.readouterr().out
+    assert report["axes"] == "environment"
+    assert report["coupling"]["kind"] == "optimal"
+    assert report["designed_for"]["promise"] == "this environment"
+    assert report["designed_for"]["certificates"]["closed-loop"]["proof"] == "rational"
+    assert report["conditions"] == ["theorem4", "closed-loop", MODEL_KEPT]
+    assert report["closed-loop"]["contradicted_cells"] == 0
+    assert 0 < report["closed-loop"]["certified_cells"] < 64
+    assert report["simulation"]["differ_from_linear"] == 0
+    for name in report["conditions"]:
+        missing = any(value is None for row in report[name]["required_over_available"] for value in row)
+        assert missing == ("reason" in report[name])
+    for words in ("promise: this environment", "for its environment alone", "model set to the cell's environment"):
+        assert words in " ".join(text.split())
+    assert (tmp_path / "zwidth.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_null_cells_say_why_and_what_pushes_outwards_runs_away(tmp_path):
+    """A coupling made for 2000 N/m that believes in 30000 pushes: no oscillation, and no rest."""
+    text = (
+        'name = "w"\nT = 1e-3\ntheta = [1]\npsi = [0]\n[[device]]\nkind = "compliant"\ndamping = 1.37\n'
+        "[[human]]\nlinks = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]\n[environment]\n"
+        'contacts = ["tip"]\nsprings = [{ between = ["tip", "ground"], stiffness = 2000.0, damping = 0.2 }]\n'
+    )
+    (tmp_path / "w.toml").write_text(text)
+    options = ["--scenario", str(tmp_path / "w.toml"), "--K-range", "1000,14000", "--B-range", "0.2,0.9", "--no-plot"]
+    assert zwidth.main([*OPTIONS, *options, "--out", str(tmp_path)]) == DONE
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert "pushes outwards" in report["closed-loop"]["reason"]
+    assert report["simulation"]["differ_from_linear"] == 0
+    assert any(p["amplitude_m"] is None for p in report["simulation"]["points"])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--coupling", "optimal", "--rigid"], "--rigid with --coupling optimal: it is about a map of spring-dampers"),
+        (["--coupling", "none", "--velocity-filter", "50"], "--velocity-filter with --coupling none"),
+        (["--coupling", "optimal", "--condition", "theorem4"], "for optimal allowed are closed-loop"),
+        (["--condition", "theorem4"], "--condition theorem4: without --coupling nothing is designed"),
+        (["--coupling", "optimal", "--scenario", "one-wall"], "an optimal coupling holds a linear model"),
+        (["--coupling", "published", "--scenario", "one-wall"], "the paper prints gains for 2 channels"),
+    ],
+)
+def test_bad_input_is_one_line(options, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["zwidth", *options, "--out", str(tmp_path)])
+    with pytest.raises(SystemExit) as leaving:
+        execute(zwidth.main)
+    error = capsys.readouterr().err
+    assert leaving.value.code == BAD_INPUT
+    assert message in error
+    assert error.count("\n") == 1

@@ -1,0 +1,258 @@
+"""The loop that switches: mode matrices against the simulated loop, the worst switching, sim.run with jitter."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from cli.run import main
+from cli.validate import main as validate
+from controller.coupling import SpringDamper
+from controller.delay import Jitter, ages, realising
+from controller.process import Tape
+from design import certificate as store
+from models.scene import Crowd, plant, variants
+from sim.crowds import draw
+from sim.engines import ExactBatchEngine, ExactEngine, HeldPlant
+from sim.run import assemble, simulate
+from sim.scenario import SCENARIOS, InputError, load, parse
+from sim.switching import (
+    adversary,
+    greedy_ages,
+    knocked,
+    mode_matrix,
+    switched_crowd,
+    switching,
+    unlimited,
+    with_delays,
+    without_theta,
+)
+
+STIFF = SpringDamper([7806, 3137], [0.105, 1.68])  # certified for the constants (1, 2) in the default environment
+ASSEMBLY = assemble(load(), STIFF)
+
+
+def one(held: HeldPlant) -> HeldPlant:
+    return HeldPlant(held.A[None], held.B[None], held.C, held.T)
+
+
+def own_hold() -> HeldPlant:
+    """The plant under a zero-order hold, from expm here: not the code under test."""
+    continuous, T = plant(ASSEMBLY.scene.model), ASSEMBLY.scenario.T
+    n, inputs = continuous.B.shape
+    step = expm(np.block([[continuous.A, continuous.B], [np.zeros((inputs, n + inputs))]]) * T)
+    return HeldPlant(step[:n, :n], step[:n, n:], continuous.C, T)
+
+
+def test_the_product_of_mode_matrices_is_the_simulated_map():
+    """60 ticks of random ages on both channels, from a random state: the loop tick by tick against one product."""
+    rng, ticks, depth = np.random.default_rng(0), 60, (3, 2)
+    wanted = np.tile(depth, (ticks, 1))
+    for k in range(4, ticks):
+        wanted[k] = rng.integers([1, 0], np.minimum(wanted[k - 1] + 1, depth), endpoint=True)
+    G = without_theta(ASSEMBLY, STIFF)
+    moved = with_delays(ASSEMBLY, STIFF, realising(wanted)[:, :, None])
+    states = moved.plant.A.shape[0]
+    tape = Tape(unlimited(moved.process), ticks, states, moved.scene.outside)
+    tape.s[0, :, 0] = rng.normal(size=states)
+    engine = ExactEngine(moved.plant, np.full(2, np.inf))
+    engine.start(tape)
+    for k in range(ticks):
+        tape.tick(k)
+        engine.advance(k)
+
+    xi = np.zeros(states + G.order + sum(depth))
+    xi[:states] = tape.s[0, :, 0]
+    held = own_hold()
+    for row in wanted:
+        xi = mode_matrix(held, G, depth, row) @ xi
+    size = np.abs(tape.s[:, :, 0]).max()
+    # both are products of the same 60 matrices up to rounding, 1e-16 each, of numbers up to `size`
+    np.testing.assert_allclose(xi[:states], tape.s[ticks, :, 0], atol=1e-11 * size)
+    np.testing.assert_allclose(xi[states:][: G.order], tape.z[ticks, :, 0], atol=1e-11 * size)
+
+
+def test_constant_delays_give_the_trace_of_the_constant_loop():
+    delays = np.tile(np.array([1, 2])[None, :, None], (300, 1, 1))
+    varying = simulate(with_delays(ASSEMBLY, STIFF, delays), "exact", samples=300)
+    constant = simulate(ASSEMBLY, "exact", samples=300)
+    np.testing.assert_allclose(varying.s, constant.s, rtol=0, atol=1e-12 * np.abs(constant.s).max())
+
+
+def test_the_worst_period_grows_more_than_any_constant_delay():
+    """(1, 2) is certified; switching within 1 to 2 makes the loop with its ordinary humans grow, exactly."""
+    worst = adversary(ASSEMBLY, STIFF, Jitter((1, 1), (2, 2), "adversarial"))
+    assert worst.growth > 1.5  # found by a search: 2.05 1/s at the time of writing
+    assert set(np.unique(worst.ages)) <= {1, 2}
+    period, held = len(worst.ages), own_hold()
+    G, product = without_theta(ASSEMBLY, STIFF), None
+    for row in worst.ages:
+        A = mode_matrix(held, G, (2, 2), row)
+        product = A if product is None else A @ product
+    radius = np.abs(np.linalg.eigvals(product)).max()
+    # eigenvalues of a product of 134 matrices: their rounding adds up
+    assert radius == pytest.approx(worst.spectral_radius, rel=1e-8)
+    met = ages(np.tile(worst.delays, (3, 1))[:, :, None])[2 * period :, :, 0]
+    np.testing.assert_array_equal(met, worst.ages)
+    growth = {
+        ages: np.log(np.abs(np.linalg.eigvals(mode_matrix(held, G, (2, 2), ages))).max()) / G.T
+        for ages in ((1, 1), (1, 2), (2, 1), (2, 2))
+    }
+    assert growth[1, 2] < 0
+    assert worst.growth > max(growth.values())  # a delay of 2 on channel 1 is bad (+1.68 1/s), switching is worse
+
+
+def test_greedy_ages_repeat_the_trajectory_that_chose_them():
+    """The growth under the packet delays of greedy ages is positive, and random delays do not reach it."""
+    G, jitter, ticks = without_theta(ASSEMBLY, STIFF), Jitter((1, 1), (2, 2)), 1600
+    process, held = replace(ASSEMBLY.process, F=G), one(ASSEMBLY.plant)
+    delays = realising(greedy_ages(process, held, ASSEMBLY.scene, jitter, ticks))
+    drawn = jitter.draw(np.random.default_rng(0), ticks)[:, :, None]
+    rates = []
+    for each in (delays, drawn):
+        free = replace(unlimited(process), delays=each)
+        engine = ExactBatchEngine(held, free.force_limit)
+        rates.append(knocked(free, engine, ASSEMBLY.scene, held.A.shape[1], ticks, 1).rate[0])
+    assert rates[0] > 0 > rates[1]
+
+
+def test_switching_depends_on_the_seed_only():
+    scenario = load().replace(jitter=Jitter((1, 1), (2, 2)))
+    loop = assemble(scenario, STIFF)
+    first, again, other = (switching(loop, STIFF, seed, 50)[0].process.delays for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+def run(tmp_path, *options):
+    options = [*options, "--no-plot", "--out", str(tmp_path / "out"), "--json", str(tmp_path / "r.json")]
+    assert main(options) == 0
+    return json.loads((tmp_path / "r.json").read_text())
+
+
+def test_both_engines_meet_the_same_delays(tmp_path):
+    report = run(tmp_path, "--jitter", "1,2", "--pattern", "bursty", "--loss", "0.05", "--duration", "1")
+    # RK4 in four substeps per period: 1e-7 is what the constant loop reaches too
+    assert report["error"]["position_relative_rms"] < 1e-7
+    jitter = report["jitter"]
+    assert not jitter["covered"]
+    assert jitter["age"]["least"] == [1, 1]
+    assert max(jitter["age"]["largest"]) > 2  # losses
+    assert min(jitter["lost_packets"]) > 0
+    assert report["reproducibility"] == []
+
+
+def test_the_adversarial_pattern_shows_growth(tmp_path):
+    store.save(store.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
+    options = ["--coupling", str(tmp_path / "stiff.json"), "--jitter", "1,2", "--pattern", "adversarial"]
+    report = run(tmp_path, *options, "--duration", "1", "--engine", "exact")
+    assert report["stability"]["verdict"] == "unstable"
+    assert report["stability"]["exact_verdict"] == "stable"
+    assert report["jitter"]["period"]["growth_rate_per_s"] > 1.5
+    assert any("not covered" in remark for remark in report["remarks"])
+
+
+def test_a_playout_buffer_is_the_constant_largest_delay(tmp_path):
+    report = run(tmp_path, "--jitter", "1-2,2-3", "--playout", "--duration", "1", "--engine", "exact")
+    assert report["run"]["theta"] == [2, 3]
+    assert report["jitter"]["constant"]
+    assert report["jitter"]["covered"]
+    assert report["certificate"]["certified"]
+
+
+def test_recorded_delays_and_total_loss(tmp_path):
+    (tmp_path / "delays.csv").write_text("# of one afternoon\n1, 2\n2 2\n1,-1\n")
+    quick = ["--coupling", "published", "--engine", "exact", "--duration", "0.3"]
+    report = run(tmp_path, "--pattern", str(tmp_path / "delays.csv"), *quick)
+    assert (report["jitter"]["lo"], report["jitter"]["hi"]) == ([1, 2], [2, 2])
+    assert report["jitter"]["lost_packets"] == [0, 83]  # of 250 ticks every third
+    report = run(tmp_path, "--loss", "1", *quick)
+    assert report["jitter"]["age"] is None
+    assert np.load(tmp_path / "out" / "trace.npz")["f"].any() == np.False_  # no force ever arrives
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--jitter", "2,1"], "jitter on channel 1 is 2 to 1"),
+        (["--jitter", "1-2,1-2,1-2"], "--jitter has 3 ranges, expected 2"),
+        (["--jitter", "a"], "--jitter is 'a', expected LO,HI"),
+        (["--jitter", "3,4"], "theta[0] is 1, outside of its jitter, 3 to 4"),
+        (["--playout"], "--playout without a range of delays"),
+        (["--pattern", "random"], "--pattern without a range of delays"),
+        (["--jitter", "1,2", "--loss", "2"], "jitter.loss is 2"),
+        (["--jitter", "1,2", "--pattern", "wild"], "No such file"),
+        (["--jitter", "1,2", "--playout", "--theta", "1"], "jitter.playout makes it the largest delay"),
+    ],
+)
+def test_bad_ranges_are_refused_in_one_line(options, message):
+    with pytest.raises(InputError) as error:
+        main(options)
+    assert message in str(error.value)
+
+
+def test_a_scenario_file_may_have_jitter():
+    text = (SCENARIOS / "omega-pair.toml").read_text()
+    scenario = parse(text + '\n[jitter]\nlo = [1, 1]\nhi = [2, 3]\npattern = "bursty"\nloss = 0.01\n')
+    assert scenario.jitter == Jitter((1, 1), (2, 3), "bursty", 0.01)
+    assert scenario.switches
+    with pytest.raises(InputError, match=r"jitter.*did you mean `loss`"):
+        parse(text + "\n[jitter]\nlo = [1, 1]\nhi = [2, 3]\nlos = 0.01\n")
+    with pytest.raises(InputError, match="theta"):
+        parse(text + "\n[jitter]\nlo = [2, 2]\nhi = [3, 3]\n")
+
+
+def validated(tmp_path, *options):
+    out = tmp_path / "v"
+    fixed = ["--engine", "exact", "--humans", "20", "--no-plot", "--jitter", "1,2"]
+    code = validate([*fixed, *options, "--out", str(out), "--json", str(tmp_path / "v.json")])
+    return code, json.loads((tmp_path / "v.json").read_text())["switching"]
+
+
+def test_random_humans_under_the_worst_switching(tmp_path):
+    """The constants' design fails for most humans, the jitter-proof one for none; 0 and 1 are what is claimed."""
+    store.save(store.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
+    code, stiff = validated(tmp_path, "--pattern", "adversarial", "--coupling", str(tmp_path / "stiff.json"))
+    assert stiff["unstable"]["exact"] >= 10
+    assert not stiff["covered"]
+    assert code == 0  # nothing that was certified is contradicted
+    code, soft = validated(tmp_path, "--pattern", "adversarial")
+    assert soft["unstable"]["exact"] == 0
+    assert soft["covered"]
+    assert soft["jitter_proof"]["proof"] == "rational"
+    assert code == 0
+
+
+def test_the_population_meets_lost_packets(tmp_path):
+    code, part = validated(tmp_path, "--pattern", "bursty", "--loss", "0.1", "--duration", "0")
+    assert code == 0
+    assert not part["covered"]
+    assert "lost packet" in part["covers"]
+    assert part["humans"] == 20
+    assert part["unstable"] == {"exact": 0, "mujoco": None}
+    code, part = validated(tmp_path, "--playout")
+    assert part["constant"]
+    assert part["covered"]
+    assert part["humans"] == 0
+
+
+def test_both_engines_see_the_population_grow_alike():
+    """Four humans, adversarial delays: MuJoCo's growth within 0.01 1/s of the exact one, as of its constant loops."""
+    scenario = load().replace(jitter=Jitter((1, 1), (2, 2), "adversarial"))
+    loop = assemble(scenario, STIFF)
+    links = np.stack([draw(scenario.population, 2, 0, i, 1) for i in range(4)])
+    held_by = variants(scenario.device, Crowd(links))
+    seen = switched_crowd(loop, STIFF, held_by, np.arange(4), 0, 2.0, mujoco=True, threads=1)
+    kept = ~np.isnan(seen.mujoco)
+    assert kept.any()
+    np.testing.assert_allclose(seen.mujoco[kept], seen.exact[kept], atol=1e-2)
+
+
+def test_the_mismatch_that_a_run_reports_is_that_of_the_constant_delays():
+    """The process of a loop that switches holds G without Theta; what is felt is still F."""
+    moved = with_delays(ASSEMBLY, STIFF, np.ones((5, 2, 1), dtype=int))
+    z = np.exp(1j * np.linspace(0.001, 3, 50))
+    theta = z[:, None, None] ** -np.array(ASSEMBLY.scenario.theta, dtype=float)[:, None]
+    np.testing.assert_allclose(moved.felt.at(z), theta * without_theta(ASSEMBLY, STIFF).at(z), rtol=1e-9)

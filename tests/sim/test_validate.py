@@ -1,0 +1,350 @@
+"""A thousand humans at once give what each alone gives, in both engines, however the work is split."""
+
+import json
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from cli import run as run_command
+from cli import validate as verdict_report
+from cli.validate import main
+from controller.coupling import NoCoupling, SpringDamper
+from design.result import CASE_I
+from models.device import RigidDevice
+from models.human import Person
+from models.scene import Crowd, build, plant, variants
+from sim import crowds as examine_module
+from sim import crowds as shards
+from sim.couplings import choose
+from sim.crowds import BATCH, MIXED, Findings, Question, crowds, crowds_of, draw, validate
+from sim.engines import ExactBatchEngine, ExactEngine, hold
+from sim.run import assemble, run, simulate
+from sim.scenario import InputError, load
+from sim.stability import (
+    close,
+    disagree,
+    dominant_mode,
+    dominant_modes,
+    exact_loops,
+    knock_forces,
+    mujoco_loops,
+    unstable,
+)
+
+SCENARIO = load()
+TWO = "[[human]]\nlinks = [{mass = 1.0, damping = 0, stiffness = 0}]\n" * 2
+DEVICES = {
+    "compliant": SCENARIO.device,
+    "rigid": (RigidDevice(), RigidDevice(mass=0.05)),
+    "one of each": (SCENARIO.device[0], RigidDevice()),
+}
+
+
+def crowd(n: int, links: int = 1) -> Crowd:
+    return Crowd(np.stack([draw(SCENARIO.population, 2, 3, i, links) for i in range(n)]))
+
+
+@pytest.mark.parametrize("links", [1, 2, 3])
+@pytest.mark.parametrize("devices", DEVICES.values(), ids=DEVICES)
+def test_stacked_plants_are_those_of_each_model(devices, links):
+    people = crowd(5, links)
+    held_by = variants(devices, people)
+    stacked = held_by.plants()
+    for i in range(len(people)):
+        scene = build(devices, people.humans(i))
+        alone = plant(scene.model)
+        for name, rows in held_by.fields.items():
+            np.testing.assert_array_equal(rows[i], getattr(scene.model, name), err_msg=name)
+        # the inverse of a diagonal matrix and a division by its diagonal round differently
+        np.testing.assert_allclose(stacked.A[i], alone.A, rtol=1e-13, atol=0)
+        np.testing.assert_allclose(stacked.B[i], alone.B, rtol=1e-13, atol=0)
+        np.testing.assert_array_equal(stacked.C, alone.C)
+
+
+HELD = SCENARIO.replace(person=(Person((2, 1), 20.0, 1.0, 100.0),))
+
+
+@pytest.mark.parametrize("devices", DEVICES.values(), ids=DEVICES)
+def test_people_in_both_hands_are_stacked_and_simulated_alike(devices):
+    """Each row of the crowd is the scene built for it, and MuJoCo's map agrees with the exact one as for others."""
+    scenario = HELD.replace(device=devices)
+    ((_, people),) = crowds_of(scenario, 7, range(20), 2)
+    held_by = variants(devices, people)
+    stacked = held_by.plants()
+    for i in range(5):
+        alone = plant(build(devices, people.humans(i), people.persons(i)).model)
+        np.testing.assert_allclose(stacked.A[i], alone.A, rtol=1e-12, atol=1e-12 * np.abs(alone.A).max())
+        np.testing.assert_allclose(stacked.B[i], alone.B, rtol=1e-13, atol=0)
+    assembly = assemble(scenario, CASE_I)
+    exact = dominant_modes(exact_loops(held_by, assembly.F)).growth
+    np.testing.assert_allclose(dominant_modes(mujoco_loops(held_by, assembly.process)).growth, exact, atol=1e-3)
+    # the arms are the same as of people who hold one device each
+    np.testing.assert_array_equal(people.links, next(crowds_of(SCENARIO, 7, range(20), 2))[1].links)
+
+
+def test_both_engines_simulate_a_person_who_moves_both_hands():
+    """RK4 x 4 against the exact solution, voluntary motion and its reaction on the body included."""
+    scenario = HELD.replace(duration=1.5)
+    assembly = assemble(scenario, CASE_I)
+    mujoco, exact = simulate(assembly), simulate(assembly, "exact")
+    assert np.abs(exact.s[:, :2]).max() > 1e-3
+    positions, n = slice(assembly.scene.model.nq), assembly.scene.model.nq
+    np.testing.assert_allclose(mujoco.s[:, positions], exact.s[:, positions], atol=1e-7)
+    # speeds ring at the transmissions' 90 Hz after the tap, where RK4 x 4 errs by 1.3e-5 of the fastest one
+    np.testing.assert_allclose(mujoco.s[:, n:], exact.s[:, n:], atol=1e-4 * np.abs(exact.s).max())
+
+
+def test_a_scenario_with_a_person_is_validated_with_random_people(tmp_path):
+    text = (load.__globals__["SCENARIOS"] / "omega-pair.toml").read_text()
+    text += (
+        "\n[[person]]\nholds = [1, 2]\nmass = 30.0\ndamping = 80.0\nstiffness = 900.0\ncross = { stiffness = 40.0 }\n"
+    )
+    (tmp_path / "s.toml").write_text(text)
+    base = ["--scenario", str(tmp_path / "s.toml"), "--engine", "exact", "--duration", "0.5", "--no-plot"]
+    options = [*base, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]
+    assert main([*options, "--humans", "30"]) == 0
+    worst = json.loads((tmp_path / "r.json").read_text())["worst"]
+    assert worst["person"][0]["holds"] == [1, 2]
+    assert run_command.main([*options, "--human", str(tmp_path / "worst-human.toml")]) == 0
+    stability = json.loads((tmp_path / "r.json").read_text())["stability"]
+    assert stability["spectral_radius"] == pytest.approx(worst["spectral_radius"], abs=1e-12)
+
+
+@pytest.mark.parametrize("links", [1, 2])
+@pytest.mark.parametrize("coupling", [CASE_I, NoCoupling()], ids=["published", "none"])
+def test_batched_eigenvalues_are_those_of_each_loop(coupling, links):
+    people = crowd(20, links)
+    F = assemble(SCENARIO, coupling).F
+    modes = dominant_modes(exact_loops(variants(SCENARIO.device, people), F))
+    for i in range(len(people)):
+        scene = build(SCENARIO.device, people.humans(i))
+        mode = dominant_mode(close(hold(plant(scene.model), SCENARIO.T), F))
+        # the eigenvalues of a nearly defective pair lose half the digits, others none
+        assert modes.spectral_radius[i] == pytest.approx(mode.spectral_radius, abs=1e-10)
+        assert modes.growth[i] == pytest.approx(mode.growth, abs=1e-7)
+
+
+@pytest.mark.parametrize("devices", DEVICES.values(), ids=DEVICES)
+def test_mujoco_maps_are_the_exact_maps(devices):
+    """RK4 x 4 is within 1e-3 1/s of the exact growth for every human: a verdict cannot change but at zero."""
+    scenario = SCENARIO.replace(device=devices)
+    assembly = assemble(scenario, CASE_I)
+    held_by = variants(devices, crowd(40, 2))
+    exact = dominant_modes(exact_loops(held_by, assembly.F)).growth
+    mujoco = dominant_modes(mujoco_loops(held_by, assembly.process)).growth
+    np.testing.assert_allclose(mujoco, exact, atol=1e-3)
+
+
+@pytest.mark.parametrize("devices", DEVICES.values(), ids=DEVICES)
+def test_batch_engine_is_the_exact_engine(devices):
+    people = crowd(4, 2)
+    held_by = variants(devices, people)
+    plants = hold(held_by.plants(), SCENARIO.T)
+    process = replace(assemble(SCENARIO, NoCoupling()).process, force_limit=np.array([0.3, 0.2]))
+    rest = np.zeros((plants.A.shape[1], len(people)))
+
+    def outside(first, ticks):
+        return knock_forces(held_by.scene, SCENARIO.T, first, ticks)
+
+    together = run(process, ExactBatchEngine(plants, process.force_limit), outside, 400, rest)
+    assert (np.abs(together.f) == 0.2).any()
+    for i in range(len(people)):
+        one = hold(plant(build(devices, people.humans(i)).model), SCENARIO.T)
+        alone = run(process, ExactEngine(one, process.force_limit), outside, 400, rest[:, :1])
+        # sums in another order, and a clipped unstable loop multiplies rounding
+        np.testing.assert_allclose(together.s[:, :, i], alone.s[:, :, 0], rtol=1e-6, atol=1e-11)
+
+
+def test_a_human_depends_on_seed_and_index_only():
+    few = dict(zip([7, 3], next(crowds(SCENARIO.population, 2, 5, [7, 3], 1))[1].links, strict=True))
+    many = next(crowds(SCENARIO.population, 2, 5, range(20), 1))[1].links
+    np.testing.assert_array_equal(few[7], many[7])
+    np.testing.assert_array_equal(few[3], many[3])
+    assert not np.array_equal(many[3], draw(SCENARIO.population, 2, 6, 3, 1))
+    assert {c.links.shape[2]: len(i) for i, c in crowds(SCENARIO.population, 2, 5, range(20), MIXED)}.keys() == {1, 2}
+
+
+def test_shards_repeat_the_single_run_bit_for_bit():
+    """Verdicts and MuJoCo's traces, long enough for a growth rate on each."""
+    question = Question(SCENARIO, CASE_I, 0, 2 * BATCH + 10, MIXED, "both", 0.3)
+    assert len(question.batches()) > 2
+    alone, shared = validate(question), validate(question, shards=2)
+    for field in fields(Findings):
+        np.testing.assert_array_equal(getattr(alone, field.name), getattr(shared, field.name), err_msg=field.name)
+    np.testing.assert_array_equal(alone.index, np.arange(question.humans))
+    assert np.isfinite(alone.mujoco).all()
+    assert np.isfinite(alone.trace).mean() > 0.9
+    # the trace is MuJoCo's own, not the exact engine's again
+    assert not np.array_equal(alone.trace[:20], validate(replace(question, humans=20, engine="exact")).trace)
+
+
+def test_designed_coupling_holds_for_everyone():
+    coupling = choose(SCENARIO, "I").coupling
+    findings = validate(Question(SCENARIO, coupling, 0, 200, 1, "both", 0.0))
+    assert not unstable(findings.exact).any()
+    assert not unstable(findings.mujoco).any()
+    assert not findings.disagreements.any()
+    traced = validate(Question(SCENARIO, coupling, 0, 12, MIXED, "both", 1.0))
+    np.testing.assert_allclose(traced.trace, traced.exact, atol=1e-3)
+    assert not traced.clipped.any()
+    assert (traced.energy >= 0).all()
+    # Definition 3: these humans are damped, and a second shows it
+    assert (traced.settling < 1).all()
+
+
+def test_without_coupling_most_are_unstable_and_the_energy_audit_sees_it():
+    findings = validate(Question(SCENARIO, NoCoupling(), 0, 200, 1, "exact", 2.0))
+    assert unstable(findings.exact).mean() > 0.6
+    assert findings.energy.min() < 0
+    np.testing.assert_allclose(findings.trace, findings.exact, atol=1e-6)
+
+
+def test_what_a_disagreement_is():
+    exact, other = np.array([1.0, -1.0, 5e-4, 1.0]), np.array([-1.0, 1.0, -1.0, np.nan])
+    assert disagree(exact, other).tolist() == [True, True, False, False]
+
+
+def test_the_command_and_the_replay_of_its_worst_human(tmp_path):
+    out, file = tmp_path / "out", tmp_path / "r.json"
+    options = ["--case", "none", "--humans", "30", "--engine", "exact", "--duration", "0.5"]
+    assert main([*options, "--out", str(out), "--json", str(file)]) == 0
+    report = json.loads(file.read_text())
+    assert report["humans"] == 30
+    assert report["unstable"]["exact"] > 15
+    assert report["unstable"]["mujoco"] is None
+    assert report["disagreements"] == 0
+    assert not report["certified"]
+    assert (out / "population.png").is_file()
+    replay = ["--case", "none", "--engine", "exact", "--duration", "0.5", "--no-plot", "--out", str(out)]
+    assert run_command.main([*replay, "--human", str(out / "worst-human.toml"), "--json", str(file)]) == 0
+    stability = json.loads(file.read_text())["stability"]
+    assert stability["spectral_radius"] == pytest.approx(report["worst"]["spectral_radius"], abs=1e-12)
+    assert stability["exact_verdict"] == "unstable"
+
+
+def test_a_wrong_engine_is_found_out(tmp_path, monkeypatch):
+    """MuJoCo's explicit Euler calls loops stable that are not: the suite must fail, and say with whom."""
+    monkeypatch.setattr(
+        examine_module, "mujoco_loops", lambda held_by, process, nthread: mujoco_loops(held_by, process, "Euler", 1)
+    )
+    file = tmp_path / "r.json"
+    options = ["--case", "none", "--humans", "20", "--duration", "0", "--no-plot"]
+    assert main([*options, "--out", str(tmp_path), "--json", str(file)]) == 1
+    report = json.loads(file.read_text())
+    assert not report["holds"]
+    assert report["disagreements"] == len(report["disagreeing"]) > 0
+    assert (tmp_path / f"disagreement-{report['disagreeing'][0]['index']}.toml").is_file()
+
+
+def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
+    calls, real = [], examine_module.examine
+
+    def interrupted(question, batch, ticked):
+        calls.append(batch)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return real(question, batch, ticked)
+
+    monkeypatch.setattr(shards, "examine", interrupted)
+    options = ["--humans", "300", "--engine", "exact", "--duration", "0", "--no-plot"]
+    assert main([*options, "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]) == 130
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["interrupted"]
+    assert report["humans"] == examine_module.BATCH
+
+
+def test_ctrl_c_ends_the_batches_that_run_in_other_processes():
+    """A batch of an hour and a half of simulated time each would otherwise be waited for."""
+    scenario = load("omega-pair")
+    question = Question(scenario, SpringDamper([500, 500], [0.4, 0.4]), 0, 250, 1, "mujoco", 50_000.0)
+    before = set(multiprocessing.active_children())
+    timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    found = validate(question, shards=2)
+    timer.join()
+    assert found.interrupted
+    assert found.index.size == 0
+    assert set(multiprocessing.active_children()) <= before
+
+
+@pytest.mark.parametrize("duration", [0.5, 60.0])
+def test_hands_that_had_no_time_to_rest_are_no_verdict(duration):
+    """Against the slowest eigenvalue of the same humans, by the exact engine."""
+    question = Question(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", duration)
+    found = validate(question)
+    traces = verdict_report.outcome(question, found, True, 1.0)["traces"]
+    assert traces["slowest_decay_s"] == pytest.approx(-1 / found.exact.max())
+    assert traces["settling_decides"] == (duration > 30)
+    assert ("reason" in traces) == (duration < 30)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--humans", "0"], "--humans is 0, allowed are 1 to 1000000"),
+        (["--humans", "many"], "--humans is 'many', expected a whole number"),
+        (["--engine", "drake"], "--engine: invalid choice: 'drake'"),
+        (["--links", "9"], "--links: invalid choice: '9'"),
+        (["--shards", "2", "--dask", "here:8786"], "--shards 2 with --dask: the cluster decides"),
+        (["--shards", "0"], "--shards is 0, allowed are 1 to 256"),
+        (["--generations", "0"], "--generations is 0, allowed are 1 to 10000"),
+        (["--duration", "-1"], "--duration is -1, allowed are 0 and 0.0048 to 100000 s"),
+        (["--seed", "-1"], "--seed is -1"),
+        (["--case", "none", "--coupling", "published"], "with --case none"),
+    ],
+)
+def test_bad_calls(options, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        main([*options, "--out", str(tmp_path)])
+
+
+def test_a_negative_range_is_refused(tmp_path):
+    text = (load.__globals__["SCENARIOS"] / "omega-pair.toml").read_text() + "\n[population]\nmass = [-1.0, 3.0]\n"
+    (tmp_path / "s.toml").write_text(text)
+    with pytest.raises(InputError, match=r"mass\[0\] is -1, allowed are"):
+        main(["--scenario", str(tmp_path / "s.toml")])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[[human]]\nlinks = [{mass = -1.0, damping = 0, stiffness = 0}]\n", "mass is -1, allowed are"),
+        ("[[human]]\nlinks = [{mass = 1.0, damping = 0, stiffness = 0}]\n", "has 1 .* tables, expected 2"),
+        ("[[human]]\nlinks = []\n", "length >= 1"),
+        (
+            TWO + "[[person]]\nholds = [1, 3]\nmass = 1.0\ndamping = 0\nstiffness = 0\n",
+            "has channel 3, allowed are 1 to 2",
+        ),
+        (TWO + "[[person]]\nholds = [1]\nmass = 1.0\ndamping = 0\nstiffness = 0\n", "two or more different channels"),
+        (TWO + "[[person]]\nholds = [1, 2]\nmass = 0\ndamping = 0\nstiffness = 0\n", "mass is 0, allowed are"),
+        ("[[people]]\n", "unknown field `people`"),
+        ("[[human", "not valid TOML"),
+    ],
+)
+def test_bad_human_files(text, message, tmp_path):
+    (tmp_path / "h.toml").write_text(text)
+    with pytest.raises(InputError, match=message):
+        run_command.main(["--human", str(tmp_path / "h.toml"), "--out", str(tmp_path)])
+
+
+def test_impossible_crowds_cannot_be_built():
+    with pytest.raises(ValueError, match="not passive"):
+        Crowd(-np.ones((1, 2, 1, 3)))
+    with pytest.raises(ValueError, match="expected \\(sets, devices, links, 3\\)"):
+        Crowd(np.ones((2, 3)))
+    with pytest.raises(ValueError, match="bodies has the shape"):
+        Crowd(np.ones((1, 2, 1, 3)), ((1, 2),))
+    with pytest.raises(ValueError, match="massless"):
+        Crowd(np.ones((1, 2, 1, 3)), ((1, 2),), np.zeros((1, 1, 5)))
+
+
+def test_without_dask_the_command_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match="--dask needs Dask: pip install 'distributed"):
+        main(["--dask", "127.0.0.1:9", "--humans", "5", "--out", str(tmp_path)])

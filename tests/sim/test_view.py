@@ -1,0 +1,601 @@
+"""The running loop behind the window, without a window: clock, keys and mouse are given by the test."""
+
+import contextlib
+import json
+import sys
+import threading
+from concurrent.futures import Executor, Future
+from dataclasses import replace
+
+import mujoco
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from cli import view as command
+from controller.coupling import SpringDamper
+from models.human import Human, Link
+from models.scene import build, plant
+from sim.couplings import Chosen
+from sim.engines import hold
+from sim.run import simulate
+from sim.scenario import InputError, load
+from sim.stability import close, dominant_mode
+from sim.view import film, offscreen
+from sim.view.events import GIVEN, KEYS, Delay, Push, Restart, parse_script, words
+from sim.view.flat import Flat
+from sim.view.grip import DAMPING, STIFFNESS, Grip, gripped
+from sim.view.layout import COLUMNS, channels, envelope, places, scale
+from sim.view.live import loop, typed
+from sim.view.overlay import apart, keys_help, overlay
+from sim.view.pace import Pace
+from sim.view.session import Session, rest
+from sim.view.setting import Menu, changed, first_setting
+from sim.view.stage import Stage, dressed
+
+SCENARIO = load()
+
+
+class Inline(Executor):
+    """Does at once what is submitted."""
+
+    def submit(self, fn, /, *args, **kwargs):
+        future = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+class Later(Executor):
+    """Does what is submitted when the test says so, in order."""
+
+    def __init__(self):
+        self.tasks = []
+
+    def submit(self, fn, /, *args, **kwargs):
+        self.tasks.append((Future(), lambda: fn(*args, **kwargs)))
+        return self.tasks[-1][0]
+
+    def work(self):
+        future, task = self.tasks.pop(0)
+        future.set_result(task())
+
+
+@pytest.fixture(scope="module")
+def none():
+    return first_setting(Menu("I"), SCENARIO, "none")
+
+
+@pytest.fixture(scope="module")
+def published():
+    return first_setting(Menu("I"), SCENARIO, "published")
+
+
+def session(setting, script="", patience=np.inf):
+    return Session(setting, Inline(), parse_script(script, 2) if script else (), patience)
+
+
+def press(running, *names):
+    codes = {name: code for code, (name, _) in KEYS.items()}
+    for name in names:
+        typed(running)(codes[name])
+
+
+# the loop itself
+
+
+def test_the_session_is_the_simulation(none):
+    """Bit for bit, whatever the times at which it is looked at."""
+    running = session(none)
+    for now in np.cumsum(np.random.default_rng(1).uniform(0.001, 0.2, 12)):
+        frame = running.frame(now)
+    ticks = round(frame.t / SCENARIO.T)
+    record = simulate(none.assembly, "exact", samples=ticks + 1)
+    assert np.array_equal(running.state, record.s[ticks, :, 0])
+    assert np.array_equal(frame.history, record.f[:ticks, :, 0])
+    assert np.array_equal(frame.q, record.s[ticks, : frame.q.size, 0])
+
+
+def test_frames_tell_the_forces_since_the_last_one(none):
+    running = session(none)
+    running.frame(0.3)
+    frame = running.frame(0.35)
+    recent = frame.history[-(round(frame.t / SCENARIO.T) - 250) :]  # 0.3 s are 250 ticks
+    assert np.array_equal(frame.low, recent.min(axis=0))
+    assert np.array_equal(frame.high, recent.max(axis=0))
+    assert np.array_equal(frame.mean, recent.mean(axis=0))
+    again = running.frame(0.35)  # no tick was due: the last force still acts
+    assert np.array_equal(again.mean, frame.history[-1])
+
+
+def test_rest_is_where_a_held_position_leads(published):
+    """z = A z + B x, and the force is F(1) x; F(1) from the transfer function itself."""
+    F, x = published.assembly.F, np.array([0.01, -0.004])
+    z = rest(F, x)
+    assert np.allclose(F.A @ z + F.B @ x, z, atol=1e-12)
+    # rounding: forces of 10 N as differences of numbers about 1e4 larger
+    assert np.allclose(F.C @ z + F.D @ x, F.at(1.0 + 0j).real @ x, atol=1e-8)
+
+
+def test_a_switch_keeps_the_plant_and_starts_the_process_at_rest(none):
+    running, alone = session(none), session(none)
+    before = running.frame(0.5)
+    press(running, "7")
+    assert running.frame(0.5).setting.label == "published"
+    alone.frame(0.5)
+    assert np.array_equal(running.state, alone.state)  # position and velocity, although it moves
+    F, x = running.setting.assembly.F, before.q[:2]
+    force = running.frame(0.5 + 1.01 * SCENARIO.T).history[-1]
+    assert np.allclose(force, F.at(1.0 + 0j).real @ x, atol=1e-8)
+
+
+def test_the_oscillation_starts_and_dies(none):
+    """Without coupling and with more delay it grows to the limits; with the published gains and less it decays."""
+    running = session(none, "0:theta+2 2.5:theta-3 2.5:published")
+    grown = running.frame(2.5 - 1e-3)
+    assert grown.setting.mode.growth > 3
+    assert grown.clipped > 100
+    calm = running.frame(5.0)
+    assert calm.setting.mode.growth < 0
+    assert np.abs(calm.history[-200:]).max() < 2  # the voluntary motion is still felt
+    assert [what for _, what, _ in running.log] == ["start", "theta+2", "theta-3", "published"]
+
+
+def replace_theta(setting, theta):
+    return first_setting(setting.menu, SCENARIO.replace(theta=theta), setting.label)
+
+
+def test_a_process_that_runs_away_starts_again():
+    """Soft springs and dampers against an environment with delay are unstable by themselves: radius 1.63."""
+    soft = SpringDamper(np.array([879.0, 552.0]), np.array([0.39, 0.52]))  # the design for psi = 0
+    before = first_setting(Menu("I"), SCENARIO, "published")
+    setting = changed(replace(before, chosen=Chosen("spring-damper", soft, "theorem4")), Delay("psi", 1))
+    assert np.abs(setting.assembly.F.poles()).max() > 1.6
+    running = session(setting)
+    noted = [running.frame(t).note for t in (1.0, 2.0, 3.0)]  # 1.63^k passes 1e308 at k = 1450, 1.7 s
+    assert "ran away, beyond all numbers: restarted from rest" in noted[1]
+    assert np.isfinite(running.state).all()
+
+
+# keys, scripts and pushes
+
+
+def test_keys_leave_the_viewer_its_own():
+    """0 to 5 and the letters show and hide parts of MuJoCo's scene."""
+    own = {ord(c) for c in "012345ABCDEFGHIJKLMNOPQRSTUVWXYZ [],-=`/;'\\"} | {256, 258, 262, 263, 266}
+    assert not own & set(KEYS)
+    assert {"none", "published", "designed", "optimal", "theta+1", "theta-1"} <= {words(e) for _, e in KEYS.values()}
+
+
+def test_events_are_spelt_as_they_are_read():
+    for _, event in KEYS.values():
+        assert parse_script(f"2.5:{words(event)}", 2) == ((2.5, event),)
+    assert parse_script("3:push2=-1.5 1:restart", 2) == ((1.0, Restart()), (3.0, Push(2, -1.5)))
+
+
+def test_keys_that_cannot_be_met_leave_the_loop_running(none):
+    running = session(none)
+    press(running, "Down", "Down")  # theta is 1 and 2
+    frame = running.frame(0.1)
+    assert frame.setting.scenario.theta == (0, 1)
+    assert frame.note == "theta-1: theta would be [-1, 0], allowed are 0 to 1000 samples"
+    press(running, "Insert")
+    assert "no coupling from a file" in running.frame(0.2).note
+    assert running.setting.label == "none"
+
+
+def test_the_loop_goes_on_while_a_coupling_is_made(none):
+    later = Later()
+    running = Session(none, later)
+    press(running, "7", "Up")
+    frame = running.frame(0.1)
+    assert (frame.t > 0.09, frame.setting.label, frame.note) == (True, "none", "theta+1: being made")
+    later.work()
+    made = running.frame(0.2).setting
+    assert (made.label, made.scenario.theta) == ("published", (1, 2))
+    later.work()
+    delayed = running.frame(0.3).setting
+    assert delayed.scenario.theta == (2, 3)
+    assert delayed.coupling is made.coupling  # a delay changes under a coupling, not with it
+
+
+def test_a_push_is_felt_until_the_next(none):
+    quiet, pushed = session(none), session(none, "0.5:push1=3 1:push1=0")
+    assert np.array_equal(pushed.frame(0.5 - 1e-3).q, quiet.frame(0.5 - 1e-3).q)
+    frame = pushed.frame(0.9)
+    assert np.array_equal(frame.push, [3, 0])
+    assert frame.q[0] > quiet.frame(0.9).q[0] + 1e-3
+    assert np.array_equal(pushed.frame(1.1).push, [0, 0])
+
+
+def test_restart_begins_from_rest(none):
+    running = session(none)
+    running.frame(1.0)
+    press(running, "Backspace")
+    assert not running.frame(1.0).q.any()
+
+
+# time
+
+
+@given(st.lists(st.floats(0, 0.5), min_size=1, max_size=30))
+def test_every_tick_is_made_or_counted_as_lost(steps):
+    pace, now = Pace(1e-3, patience=0.1), 0.0
+    for step in steps:
+        now += step
+        assert 0 <= pace.due(now) <= 100
+        # less than a tick is left over after each look
+        assert -1e-6 <= now - pace.lost - pace.done * pace.T <= pace.T * (1 + 1e-6)
+    assert pace.overruns <= sum(step > 0.098 for step in steps)
+
+
+def test_what_is_too_late_is_lost_and_said():
+    pace = Pace(1e-3, patience=0.1)
+    assert pace.due(0.05) == 50
+    assert pace.due(1.05) == 100
+    assert (pace.overruns, pace.lost) == (1, pytest.approx(0.9))
+    assert pace.factor(1.05) == pytest.approx(0.15 / 1.05)
+
+
+# the mouse
+
+
+def test_the_mouse_is_one_more_passive_hand(none):
+    """A hand of one mass, spring and damper, with the mouse's spring and damper added to its own."""
+    human = SCENARIO.human[0].links[0]
+    firmer = Human((Link(human.mass, human.damping + DAMPING, human.stiffness + STIFFNESS),))
+    scene = build(SCENARIO.device, (firmer, SCENARIO.human[1]))
+    expected, held = hold(plant(scene.model), SCENARIO.T), gripped(none.assembly.scene, 0, SCENARIO.T)
+    # both are one matrix exponential of the same matrix, whose entries reach 1e5
+    assert np.allclose(held.A, expected.A, rtol=0, atol=1e-10)
+    assert np.allclose(held.B, expected.B, rtol=0, atol=1e-12)
+
+
+def test_the_mouse_draws_the_handle_and_lets_it_go():
+    soft = replace_theta(first_setting(Menu("I"), SCENARIO, "published"), (0, 0))
+    assert dominant_mode(close(gripped(soft.assembly.scene, 1, SCENARIO.T), soft.assembly.F)).growth < 0
+    running, quiet = session(soft), session(soft)
+    handle = soft.assembly.scene.handles[1]
+    for k in range(1, 30):
+        drawn = running.frame(k / 20, Grip(1, 0.03))
+        still = quiet.frame(k / 20)
+    assert drawn.q[handle] > still.q[handle] + 0.005
+    assert drawn.push[1] == pytest.approx(Grip(1, 0.03).force(soft.assembly.scene, running.state))
+    assert not running.frame(1.5).push.any()
+
+
+def test_the_viewer_s_selection_is_a_grip(none):
+    stage = Stage(none.assembly.scene, none.assembly.process.force_limit)
+    q = np.array([0.001, 0.002, 0.003, 0.004])
+    stage.show(q)
+    perturb = mujoco.MjvPerturb()
+    assert stage.grip(perturb) is None
+    motor, handle = stage.model.body("motor_2").id, none.assembly.scene.handles[1]
+    perturb.select, perturb.active = motor, int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
+    perturb.refselpos[:] = stage.data.xpos[motor] + (0.02, 0.5, 0.1)  # dragged 20 mm along the device
+    assert stage.grip(perturb) == Grip(1, pytest.approx(q[handle] + 0.02))
+    perturb.active = int(mujoco.mjtPertBit.mjPERT_ROTATE)
+    assert stage.grip(perturb) is None
+
+
+# what is shown
+
+
+@pytest.mark.parametrize("name", ["omega-pair", "three-rigid"])
+def test_shapes_change_nothing_that_moves(name):
+    scenario = load(name)
+    arms = [Human((*human.links, Link(0.5, 2.0, 300.0))) for human in scenario.human]
+    scene = build(scenario.device, arms)
+    bare, shown = scene.model, dressed(scene)
+    assert bare.ngeom == 0
+    assert shown.ngeom == bare.njnt + scene.channels  # a shape per body, a rail per device
+    assert [shown.joint(j).name for j in range(shown.njnt)] == [bare.joint(j).name for j in range(bare.njnt)]
+    assert not shown.geom_contype.any()
+    assert not shown.geom_conaffinity.any()
+    assert np.array_equal(shown.body_mass, bare.body_mass)
+    assert np.array_equal(plant(shown).A, plant(bare).A)
+    assert np.array_equal(plant(shown).B, plant(bare).B)
+
+
+def test_every_body_has_its_place():
+    scene = build(SCENARIO.device, [Human((Link(0.3, 3, 200), Link(1, 2, 300))), SCENARIO.human[1]])
+    names = [scene.model.joint(j).name for j in range(scene.model.njnt)]
+    found = dict(zip(names, zip(channels(scene), places(scene), strict=True), strict=True))
+    assert found == {
+        "motor_1": (0, -1),
+        "motor_2": (1, -1),
+        "handle_1": (0, 0),
+        "handle_2": (1, 0),
+        "human_1_2": (0, 1),
+    }
+
+
+def test_the_overlay_says_growth_and_certificates(none, published):
+    said = dict(overlay(session(none).frame(0.1), live=True))
+    assert said["growth"] == "+1.48 1/s at 84.0 Hz: unstable"
+    assert said["this environment"] == "needs 1.723 of 1.37 N s/m: NOT certified"
+    assert said["any environment"] == "no certificate"
+    assert "0 overruns" in said["clock"]
+    said = dict(overlay(session(published).frame(0.1), live=False))
+    assert said["this environment"] == "needs 1.399 of 1.37 N s/m: NOT certified"
+    assert said["any environment"] == "needs 7.843 of 1.37 N s/m: NOT certified"
+    assert said["time"] == "0.1 s"
+    assert (GIVEN in dict(keys_help(True)).values(), GIVEN in dict(keys_help(False)).values()) == (True, False)
+
+
+def test_a_refusal_is_said_whole_and_once(none):
+    """However long; in a window it stands by itself, where no bodies are."""
+    running = session(none)
+    press(running, "Insert")
+    frame = running.frame(0.1)
+    assert frame.note == "given: there is no coupling from a file (start with --coupling FILE.json)"
+    long = replace(frame, note=" ".join(["reason"] * 60))
+    rest_of_it, refused = apart(overlay(long, live=True))
+    assert " ".join(value for _, value in refused) == long.note
+    assert "last" not in dict(rest_of_it)
+    short = overlay(replace(frame, note="theta+1"), live=True)
+    assert apart(short) == (short, [])
+
+
+@pytest.mark.parametrize("ticks", [0, 1, 700, 3333])
+def test_the_envelope_holds_every_force(ticks):
+    history = np.random.default_rng(2).normal(size=(ticks, 2))
+    low, high = envelope(history, COLUMNS, 3333)
+    assert low.shape == high.shape == (COLUMNS, 2)
+    if ticks:
+        assert np.array_equal(np.nanmin(low, axis=0), history.min(axis=0))
+        assert np.array_equal(np.nanmax(high, axis=0), history.max(axis=0))
+    assert np.isnan(low).any() == (ticks < 3333 - 3333 // COLUMNS)
+    assert scale(history) >= np.abs(history).max(initial=0)
+
+
+class FakeWindow:
+    """What the loop asks of the viewer."""
+
+    def __init__(self, frames, stage):
+        self.left, self.said, self.figures, self.synced = frames, [], [], 0
+        self.perturb, self.user_scn = mujoco.MjvPerturb(), mujoco.MjvScene(stage.model, 50)
+        self.viewport = mujoco.MjrRect(0, 0, 800, 600)
+
+    def is_running(self):
+        self.left -= 1
+        return self.left >= 0
+
+    def lock(self):
+        return contextlib.nullcontext()
+
+    def sync(self):
+        self.synced += 1
+
+    def set_texts(self, texts):
+        self.said.append(texts)
+
+    def set_figures(self, figures):
+        self.figures.append(figures)
+
+
+def test_the_window_s_loop_without_the_window(none):
+    """Frames come at 60 Hz of an injected clock, the mouse reaches the session, the words reach the window."""
+    running = Session(none, Inline())
+    stage = Stage(none.assembly.scene, none.assembly.process.force_limit)
+    window, time = FakeWindow(40, stage), [100.0]
+
+    def sleep(seconds):
+        assert 0 <= seconds <= 1 / 60
+        time[0] += 1 / 60
+        if time[0] > 100.3:
+            window.perturb.select = stage.model.body("handle_1").id
+            window.perturb.active = int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
+            window.perturb.refselpos[:] = stage.data.xpos[window.perturb.select] + (0.05, 0, 0)
+
+    loop(running, stage, window, lambda: time[0], sleep)
+    assert window.synced == len(window.said) == 40
+    assert running.t == pytest.approx(39 / 60, abs=SCENARIO.T)
+    assert running.pace.overruns == 0
+    assert "coupling\ndelays\ngrowth" in window.said[-1][0][2]
+    assert "push" in window.said[-1][0][2]
+    assert "push" not in window.said[5][0][2]
+    assert len(window.figures[-1]) == 2
+    assert window.user_scn.ngeom >= 3  # a force each, and the push
+    figure = window.figures[-1][0][1]
+    drawn = figure.linedata[0, 1 : 2 * figure.linepnt[0] : 2]
+    assert drawn.max() == pytest.approx(running.frame(0).history[:, 0].max(), rel=1e-6)  # single precision
+
+
+def test_the_window_s_loop_ends_when_it_should(none):
+    stage = Stage(none.assembly.scene, none.assembly.process.force_limit)
+    window, time = FakeWindow(1000, stage), [0.0]
+
+    def sleep(seconds):
+        time[0] += 0.1
+
+    loop(Session(none, Inline()), stage, window, lambda: time[0], sleep, until=0.55)
+    assert window.synced == 7
+
+
+def test_keys_come_from_another_thread(none):
+    running = session(none)
+    thread = threading.Thread(target=press, args=(running, "Up"))
+    thread.start()
+    thread.join()
+    assert running.frame(0.1).setting.scenario.theta == (2, 3)
+
+
+# films
+
+
+def run(*words, code=0):
+    assert command.main(list(words)) == code
+
+
+def test_a_film_is_the_same_every_time(tmp_path, capsys):
+    words = ("--script", "0:none 0.3:theta+1 0.5:published", "--duration", "1", "--draw", "flat")
+    for name in ("a", "b"):
+        run("--video", str(tmp_path / f"{name}.gif"), *words, "--json", str(tmp_path / f"{name}.json"))
+    assert (tmp_path / "a.gif").read_bytes() == (tmp_path / "b.gif").read_bytes()
+    with Image.open(tmp_path / "a.gif") as image:
+        assert (image.size, image.n_frames, image.info["duration"]) == ((640, 640), 11, 100)
+    told = json.loads((tmp_path / "a.json").read_text())
+    assert [(e["event"], e["coupling"], e["theta"]) for e in told["events"]] == [
+        ("start", "none", [1, 2]),
+        ("theta+1", "none", [2, 3]),
+        ("published", "published", [2, 3]),
+    ]
+    assert [round(e["exact_growth_rate_per_s"], 2) for e in told["events"]] == [1.48, 3.13, 0.69]
+    assert [round(e["t_s"], 2) for e in told["events"]] == [0, 0.3, 0.5]
+    assert told["simulated_s"] == pytest.approx(1.0, abs=SCENARIO.T)
+    assert told["video"] == {"file": str(tmp_path / "a.gif"), "pictures": 11, "fps": 10, "drawn": "flat"}
+    assert "NOT certified" in capsys.readouterr().out
+
+
+def test_flat_pictures_show_where_things_are(none):
+    """The first device's handle, by its colour: it moves as many pixels as its position says."""
+    painter = Flat(none.assembly.scene, none.assembly.process.force_limit)
+    frame = session(none).frame(0.05)
+
+    def middle(q):
+        picture = painter.picture(replace(frame, q=np.array([0, 0, q, 0.0])))[
+            256:480
+        ]  # between the words and the plots
+        return np.flatnonzero((picture == (0, 115, 178)).all(axis=2).any(axis=0)).mean()
+
+    # in pixels, each end rounded; 520 of them are two steps and two arrows, 0.42 m
+    assert middle(0.05) - middle(0.0) == pytest.approx(0.05 * 520 / 0.42, abs=1.0)
+
+
+@pytest.fixture(scope="module")
+def backend():
+    try:
+        return offscreen.backend()
+    except offscreen.NoOffscreen as error:
+        pytest.skip(str(error))
+
+
+def test_pictures_by_opengl(backend, none):
+    """The scene above, the forces below; the handles move with the positions."""
+    stage = Stage(none.assembly.scene, none.assembly.process.force_limit)
+    painter = offscreen.Offscreen(stage, backend)
+    try:
+        frame = session(none).frame(0.05)
+        one, again = painter.picture(frame), painter.picture(frame)
+        moved = painter.picture(replace(frame, q=frame.q + 0.05))
+    finally:
+        painter.close()
+    assert one.shape == (640, 640, 3)
+    assert np.array_equal(one, again)
+    changed = (one != moved).any(axis=2)
+    assert changed[256:480].sum() > 1000
+    assert not changed[:256].any()  # no body reaches into the words,
+    assert not changed[480:].any()  # nor into the plots
+
+
+def test_without_opengl_there_are_flat_pictures_and_a_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(offscreen, "_failure", lambda name: "absent")
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    where = str(tmp_path / "a.gif")
+    run("--coupling", "none", "--video", where, "--duration", "0.2")
+    said = "no OpenGL without a display here (egl: absent; osmesa: absent)"
+    assert f"{said}: the bodies are drawn flat" in capsys.readouterr().out
+    with pytest.raises(InputError, match=r"--draw gl: no OpenGL without a display here \(egl: absent"):
+        run("--coupling", "none", "--video", where, "--duration", "0.2", "--draw", "gl")
+
+
+def test_a_driver_that_fails_says_why(monkeypatch):
+    monkeypatch.setattr(offscreen, "_PROBE", "import sys; sys.exit('no such driver: {}')")
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")  # asked for: nothing else is tried
+    with pytest.raises(offscreen.NoOffscreen, match=r"here \(osmesa: no such driver: osmesa\)"):
+        offscreen.backend()
+
+
+def test_an_interrupted_film_is_as_long_as_it_got(tmp_path, monkeypatch):
+    made, picture = [], Flat.picture
+
+    def interrupted(self, frame):
+        if len(made) == 4:
+            raise KeyboardInterrupt
+        made.append(frame)
+        return picture(self, frame)
+
+    monkeypatch.setattr(Flat, "picture", interrupted)
+    where = tmp_path / "a.gif"
+    run("--coupling", "none", "--video", str(where), "--duration", "2", "--draw", "flat", code=130)
+    with Image.open(where) as image:
+        assert image.n_frames == 4
+
+
+def test_mp4_is_what_ffmpeg_makes_of_the_pictures(tmp_path, monkeypatch):
+    """A stand-in for ffmpeg, which keeps what it was given: every picture, in order."""
+    tool = tmp_path / "ffmpeg"
+    tool.write_text(
+        f"#!{sys.executable}\nimport shutil, sys\nshutil.copy(sys.argv[sys.argv.index('-i') + 1], sys.argv[-1])\n"
+    )
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    pictures = np.random.default_rng(3).integers(0, 255, (3, 480, 640, 3), dtype=np.uint8)
+    film.check_film(tmp_path / "a.mp4")
+    assert film.save_film(tmp_path / "a.mp4", iter(pictures), 10) == 3
+    assert (tmp_path / "a.mp4").read_bytes() == pictures.tobytes()
+    tool.write_text(f"#!{sys.executable}\nimport sys\nsys.exit('no codec')\n")
+    with pytest.raises(InputError, match="ffmpeg: no codec"):
+        film.save_film(tmp_path / "b.mp4", iter(pictures), 10)
+
+
+def test_case_none_begins_without_a_coupling_and_takes_one_later(tmp_path):
+    """Nothing designed for "none" exists: what is asked for later is designed for case I."""
+    where, told = str(tmp_path / "a.gif"), tmp_path / "a.json"
+    words = ("--case", "none", "--script", "0.1:designed", "--duration", "0.3", "--draw", "flat", "--fps", "5")
+    run(*words, "--video", where, "--json", str(told))
+    assert [e["coupling"] for e in json.loads(told.read_text())["events"]] == ["none", "designed"]
+
+
+# bad input
+
+BAD = [
+    (("--video", "a.png"), "--video a.png: the name must end in .gif or .mp4"),
+    (("--video", "nowhere/a.gif"), "the folder nowhere does not exist"),
+    (("--video", "/proc/a.gif"), "--video /proc/a.gif: cannot write to /proc"),
+    (("--video", "a.gif", "--fps", "12"), "--fps is 12, allowed are 1 to 100, and for a .gif only what divides 100"),
+    (("--video", "a.gif", "--duration", "0"), "--duration is 0, allowed are more than 0 and up to 3600 s"),
+    (("--video", "a.gif", "--duration", "-1"), "--duration is -1, allowed are more than 0 and up to 3600 s"),
+    (
+        ("--coupling", "soft"),
+        "'soft', allowed are none, published, spring-damper, optimal, ccl, designed or a FILE.json",
+    ),
+    (("--coupling", "absent.json"), "absent.json: No such file"),
+    (("--case", "none", "--coupling", "designed"), "that case is the loop without coupling"),
+    (("--script", "none"), "--script: 'none', expected SECONDS:EVENT"),
+    (("--script=-1:none",), "--script: '-1:none', expected SECONDS:EVENT with 0 to 3600 s"),
+    (("--script", ""), "--script is empty"),
+    (
+        ("--script", "0:soft"),
+        "'0:soft' is no event, allowed are none, published, designed, optimal, ccl, given, theta+1",
+    ),
+    (("--script", "0:push3=1"), "'0:push3=1', allowed are push1 to push2 with up to 100 N"),
+    (("--script", "0:push1=1..2"), "allowed are push1 to push2"),
+    (("--coupling", "none", "--script", "1:theta-2"), "theta would be [-1, 0]"),
+    (("--coupling", "none", "--script", "1:given"), "there is no coupling from a file"),
+]
+
+
+@pytest.mark.parametrize(("words", "said"), BAD, ids=lambda part: " ".join(part) if isinstance(part, tuple) else "")
+def test_bad_input_is_named(words, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as error:
+        command.main(list(words))
+    assert said in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_mp4_without_ffmpeg_is_refused(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(InputError, match="MP4 needs ffmpeg"):
+        run("--video", str(tmp_path / "a.mp4"))
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="elsewhere a display is not told by the environment")
+def test_without_a_display_there_is_a_line(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(InputError, match=r"no window can be opened: .*; --video FILE\.gif needs no window"):
+        run("--coupling", "none")

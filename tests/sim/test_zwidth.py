@@ -1,0 +1,487 @@
+"""The K-B map: its figures against closed forms and design.margin, its verdicts against loops one by one."""
+
+import csv
+import json
+
+import mujoco
+import numpy as np
+import pytest
+
+from cli import zwidth
+from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
+from controller.coupling import NoCoupling, SpringDamper
+from controller.environment import GROUND, Network, Spring, Wall, environment
+from controller.gains import Gains, force_maps
+from controller.loop import force_map
+from controller.process import Process, Tape, contact
+from design.frequency import on_circle, suprema
+from design.maps import closed_loop_ratios, theorem4_ratios
+from models.device import CompliantDevice, RigidDevice
+from models.human import Human, Link
+from models.scene import build, variants
+from sim import zwidth as gain_map
+from sim.crowds import crowds
+from sim.engines import discretised
+from sim.scenario import InputError, load
+from sim.stability import dominant_modes, exact_loops, oscillation, slowest_seen
+from sim.zwidth import Effects, Grid, Ground, ManyProcesses, Plan, draw_map, holders, in_slices, make_grid, one_sided
+
+DELTA, T = 1.37, 1e-3
+PAIR, STAR = load("omega-pair"), load("three-rigid")
+
+
+def rigid(theta=0, **changes):
+    return Ground(PAIR.device[:1], PAIR.population, None, T, (theta,), (0,), **changes)
+
+
+def of(scenario, theta, psi=None, network=None, **changes):
+    psi = psi or (0,) * scenario.channels
+    network = network or scenario.environment
+    return Ground(scenario.device, scenario.population, network, scenario.T, theta, psi, **changes)
+
+
+def softer(network, share):
+    springs = tuple(Spring(s.between, share * s.stiffness, share * s.damping) for s in network.springs)
+    return Network(network.contacts, springs, network.masses)
+
+
+def gains(K, B, cutoff=None, T=T):
+    return Gains(np.atleast_1d(np.asarray(K, float)), np.atleast_1d(np.asarray(B, float)), T, cutoff)
+
+
+# --- the figures ---------------------------------------------------------------------------------------------------
+
+GROUNDS = {
+    "wall, no delay": rigid(0),
+    "wall, one sample": rigid(1),
+    "wall, seven samples": rigid(7),
+    "wall, filtered velocity": rigid(1, cutoff=40.0),
+    "pair": of(PAIR, (1, 2)),
+    "pair, filtered velocity": of(PAIR, (1, 1), cutoff=100.0),
+    "pair, delay in a soft environment": of(PAIR, (1, 2), (1, 0), softer(PAIR.environment, 0.25)),
+    "pair, delay inside": of(PAIR, (1, 2), (1, 0)),
+    "star of three": of(STAR, (0, 3, 1)),
+    "walls": of(PAIR, (1, 1), network=one_sided(PAIR.environment)),
+}
+
+
+@pytest.mark.parametrize("name", GROUNDS)
+def test_the_map_is_that_of_design_margin(name):
+    """1e-7: near w = 0 the map stops at 1e-4 rad/sample, where truncation grows with the square of the delay."""
+    ground = GROUNDS[name]
+    rng = np.random.default_rng(1)
+    K, B = np.exp(rng.uniform(np.log(30), np.log(8e3), 8)), np.append(0.0, rng.uniform(0, 3, 7))
+    for condition in ("theorem4", "closed-loop"):
+        drawn = ground.ratios(condition, ground.gains(K, B))
+        true = np.array([ground.requirement(condition, k, b).ratio for k, b in zip(K, B, strict=True)])
+        assert (np.isfinite(drawn) == np.isfinite(true)).all()
+        finite = np.isfinite(true)
+        np.testing.assert_allclose(drawn[finite], true[finite], rtol=1e-7)
+    if name == "pair, delay inside":
+        assert ground.multiplier[1] is not None
+
+
+def test_a_wall_without_delay_needs_half_the_stiffness_times_T_plus_the_damping():
+    some = gains(*np.random.default_rng(0).uniform([[1], [0]], [[6000], [3]], (2, 50)))
+    for drawn in (
+        closed_loop_ratios(some, None, (0,), (0,), (DELTA,)),
+        theorem4_ratios(some, (0,), (DELTA,)),
+    ):
+        np.testing.assert_allclose(DELTA * drawn, some.K * T / 2 + some.B, rtol=3e-8)
+
+
+def test_a_spring_one_sample_late_needs_one_and_a_half_KT_and_against_anything_two():
+    some = gains(np.geomspace(10, 5000, 9), np.zeros(9))
+    # the supremum is at w -> 0, of which the map sees 1e-4 rad/sample
+    np.testing.assert_allclose(
+        DELTA * closed_loop_ratios(some, None, (1,), (0,), (DELTA,)), 1.5 * some.K * T, rtol=1e-7
+    )
+    np.testing.assert_allclose(DELTA * theorem4_ratios(some, (1,), (DELTA,)), 2 * some.K * T, rtol=1e-7)
+
+
+def test_the_stiffest_spring_dampers():
+    """2740 without delay (= 2 delta/T). With one sample 1135 against a wall, of the 1370 that any linear law may, and
+    against every passive environment 878.86 at T = 1.2 ms: K T is what counts."""
+    K, B = (
+        axis.ravel()
+        for axis in np.meshgrid([*np.arange(1050.0, 1060), *np.arange(1130.0, 1140)], np.linspace(0.32, 0.4, 41))
+    )
+    for ratio, stiffest in (
+        (closed_loop_ratios(gains(K, B), None, (1,), (0,), (DELTA,)), 1135),
+        (theorem4_ratios(gains(K, B), (1,), (DELTA,)), np.floor(878.86 * 1.2)),
+    ):
+        # DESIGN's figure is rounded, and the grid's step is 1 N/m
+        assert K[ratio < 1].max() == pytest.approx(stiffest, abs=1)
+    assert theorem4_ratios(gains([2739.9, 2740.1], [0, 0]), (0,), (DELTA,)) == pytest.approx(1, abs=1e-4)
+
+
+def test_the_force_maps_are_those_of_single_couplings():
+    E, z = environment(PAIR.environment, PAIR.T), on_circle(np.linspace(0.01, 3, 40))
+    some = gains([800, 50], [0.5, 0.0], T=PAIR.T)
+    stack = force_maps(some, E, (1, 2), (0, 1))
+    for i in range(2):
+        F = force_map(E, SpringDamper([some.K[i]] * 2, [some.B[i]] * 2), (1, 2), (0, 1))
+        # the free mass has two poles near z = 1, which cost seven digits
+        np.testing.assert_allclose(stack[i].at(z), F.at(z), rtol=1e-8)
+        with_general_coupling = force_map(E, some.compliance(i, 2), (1, 2), (0, 1))
+        np.testing.assert_allclose(stack[i].at(z), with_general_coupling.at(z), rtol=1e-8)
+
+
+def test_a_velocity_filter_is_a_spring_in_series_with_the_damper():
+    """Backward Euler of that network is another derivation of the filtered coupling."""
+    cutoff, K, B = 30.0, 900.0, 1.3
+    tau = 1 / (2 * np.pi * cutoff)
+    springs = (Spring(("tip", GROUND), K), Spring(("tip", "inner"), B / tau), Spring(("inner", GROUND), 0.0, B))
+    F = force_map(environment(Network(("tip",), springs), T), NoCoupling(), (1,), (0,))
+    some, z = gains(K, B, cutoff), on_circle(np.linspace(0.01, 3.1, 60))
+    np.testing.assert_allclose(force_maps(some, None, (1,), (0,))[0].at(z), F.at(z), rtol=1e-9)
+    np.testing.assert_allclose(some.stiffness(z[None])[0], F.at(z)[:, 0, 0] * z, rtol=1e-9)
+
+
+def test_suprema_find_what_a_dense_sweep_finds():
+    centre, width = np.array([0.3, 1.7, 2.9]), np.array([0.05, 0.4, 1.0])
+
+    def peaks(w):
+        return 1 / (1 + ((w - centre[:, None]) / width[:, None]) ** 2) + 0.3 * np.cos(3 * w)
+
+    dense = peaks(np.broadcast_to(np.linspace(0, np.pi, 400_001), (3, 400_001))).max(axis=1)
+    # every point twice, as the grid around a pair of poles has them
+    grid = np.broadcast_to(np.repeat(np.linspace(0, np.pi, 60), 2), (3, 120))
+    found = suprema(peaks, grid)
+    # the sweep's points are 8e-6 apart, a peak bends by at most 800 per rad^2: 1e-8 between them
+    np.testing.assert_allclose(found, dense, atol=2e-8)
+    assert suprema(lambda w: np.where(w > 3, np.nan, w), grid).tolist() == [np.inf] * 3
+
+
+def test_the_grid_says_what_is_wrong_with_it():
+    ground = rigid(1)
+    for arguments, message in (
+        ((8, (10, 5), None, None), "--K-range is 10,5, expected the lower end first"),
+        ((8, None, (0, 2), "log"), "--B-range begins at 0"),
+        ((8, (1, 1e12), None, None), "allowed are 0.001 to 1e+09 N/m"),
+        ((8, (1, 10), None, None, ((20, 0.5),)), "--mark has K = 20, outside"),
+    ):
+        with pytest.raises(InputError, match=message.replace("+", r"\+")):
+            make_grid(ground, *arguments)
+    wide = make_grid(ground, 8, None, None, None, ((1e5, 9.0),))
+    assert wide.K[-1] > 1e5
+    assert wide.B[-1] > 9
+    assert wide.scale == "linear"
+    assert make_grid(of(PAIR, (1, 1)), 8, None, None, None).scale == "log"
+
+
+# --- the population ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("links", [1, 0], ids=["simple", "mixed"])
+def test_the_population_is_decided_as_one_by_one(links):
+    """The same eigenvalues from sim.verdicts, human by human; 1e-7 1/s is rounding of eigenvalues over T."""
+    ground = rigid(1)
+    crowd = holders(ground.devices, ground.population, 3, 30, links, T)
+    F = ground.force_maps(ground.gains([1500.0], [0.4]))[0][0]
+    growth, audible = crowd.growth(F)
+    for index, some in crowds(ground.population, 1, 3, range(30), links):
+        modes = dominant_modes(exact_loops(variants(ground.devices, some), F))
+        np.testing.assert_allclose(growth[index], modes.growth, atol=1e-7)
+    assert (audible <= growth + 1e-9).all()
+    assert (growth > 0).any()
+    half = np.arange(30) < 15
+    np.testing.assert_array_equal(crowd.growth(F, half)[0][:15], growth[:15])
+    assert np.isneginf(crowd.growth(F, half)[0][15:]).all()
+
+
+def test_a_cell_that_the_leading_humans_leave_stable_is_asked_of_all():
+    """One unstable human outside the leading ones must still be found."""
+    ground = rigid(1)
+    crowd = holders(ground.devices, ground.population, 0, 40, 1, T)
+    F = ground.force_maps(ground.gains([1300.0], [0.0]))[0][0]
+    growth, _ = crowd.growth(F)
+    unstable = growth > 0
+    assert 0 < unstable.sum() < 40
+    worst, count = gain_map._population(crowd, [F], ~unstable)
+    assert count == unstable.sum()
+    assert worst == pytest.approx(growth.max())
+
+
+# --- the simulated points ------------------------------------------------------------------------------------------
+
+
+def wave(amplitude, growth, hz, seconds=1.5):
+    t = np.arange(round(seconds / T)) * T
+    return (amplitude * np.exp(growth * t) * np.sin(2 * np.pi * hz * t + 0.3))[:, None, None]
+
+
+def test_what_counts_as_an_oscillation():
+    t = (np.arange(1500) * T)[:, None, None]
+    cases = [
+        (wave(1e-4, 0.0, 40), True),  # a limit cycle
+        (wave(1e-4, 0.5, 40), True),
+        (wave(1e-4, -0.5, 40), False),  # large still, but on its way out
+        (wave(5e-6, 0.0, 40), False),  # below the threshold
+        (0.5 * (1 - np.exp(-t / 30)), False),  # a slow hand that gives way
+        (wave(1e-2, -2.0, 7) + wave(2e-5, 0.3, 80), True),  # a slow decay does not hide a fast growth
+        (wave(1e-3, 50.0, 80), True),  # far beyond 1 km
+    ]
+    found = oscillation(np.concatenate([x for x, _ in cases], axis=2), T, 1e-5)
+    assert found.sustained.tolist() == [verdict for _, verdict in cases]
+    # Hann and octaves leave the amplitude of a line; 2 % is what falls into the neighbouring octave
+    assert found.amplitude[0] == pytest.approx(1e-4, rel=0.02)
+    assert found.frequency_hz[0] == pytest.approx(40, abs=1)
+    assert np.isinf(found.amplitude[-1])
+    assert slowest_seen(4.0) == 4.0
+
+
+def walled(count):
+    walls = tuple(Wall(("tip", GROUND), 900.0 * (i + 1), 0.7, 1e-4 * i) for i in range(count))
+    network = Network(("tip",), (Spring(("tip", GROUND), 1.0),), walls=walls)
+    return contact(network, SpringDamper([2000.0], [0.5]), (1,), (0,), T)
+
+
+@pytest.mark.parametrize("walls", [0, 1, 2])
+def test_many_processes_are_each_as_alone(walls):
+    """Rounding apart, since the sums are in another order."""
+    rng, limit, step = np.random.default_rng(2), np.array([5.0]), np.array([1e-5])
+    if walls:
+        contacts = [walled(walls), walled(walls)]
+        processes = [Process(c.open, limit, step, c) for c in contacts]
+    else:
+        stack = force_maps(gains([500, 900], [0.2, 1.0]), None, (1,), (0,))
+        processes = [Process(stack[i], limit, step) for i in range(2)]
+    x = rng.normal(scale=1e-3, size=(20, 2))
+    together = ManyProcesses(processes, 20, 2, 0)
+    alone = [Tape(process, 20, 2) for process in processes]
+    for k in range(20):
+        together.s[k, 0] = x[k]
+        together.tick(k)
+        for i, tape in enumerate(alone):
+            tape.s[k, 0] = x[k, i]
+            tape.tick(k)
+            np.testing.assert_allclose(together.f[k, :, i], tape.f[k, :, 0], rtol=1e-9, atol=1e-12)
+    assert np.abs(together.f).max() > 0.1
+
+
+def test_coulomb_friction_stops_a_device_where_coulomb_says():
+    """m v' = -b v - F stops after m/b log(1 + b v0/F); MuJoCo's constraint, 1.5e-6 m off when measured, may be 3e-6."""
+    device, force, v0 = RigidDevice(friction=0.3), 0.3, 0.2
+    scene = build([device], [Human((Link(0, 0, 0),))])
+    model = discretised(scene, T, "RK4", 4)
+    data = mujoco.MjData(model)
+    data.qvel[0] = v0
+    mujoco.mj_step(model, data, 4 * 500)
+    b, m = device.damping, device.mass
+    stop = m / b * np.log(1 + b * v0 / force)
+    assert data.qpos[0] == pytest.approx(
+        (v0 + force / b) * m / b * (1 - np.exp(-b * stop / m)) - force / b * stop, abs=3e-6
+    )
+    held = float(data.qpos[0])
+    data.ctrl[:] = 0.5 * force, 0.0
+    mujoco.mj_step(model, data, 4 * 500)
+    assert data.qpos[0] == pytest.approx(held, abs=1e-6)  # half its force does not move it
+
+
+def points(ground, K, B, effects=None, **changes):
+    """The simulated points of a 2 x 2 map whose corners they are."""
+    settings = {"points": 2, "trials": 1, "start": 1e-3, "press": 3.0, "duration": 2.0, "threshold": 2e-5} | changes
+    grid = Grid(np.array(K), np.array(B), "linear")
+    crowd = holders(ground.devices, ground.population, 0, 40, 1, ground.T)
+    return draw_map(ground, grid, crowd, Plan(effects or Effects(), **settings), lambda *stage: None).points
+
+
+def test_the_linear_points_agree_with_the_eigenvalues():
+    found = points(rigid(1), [400.0, 2500.0], [0.0, 1.0])
+    assert found.verdicts[0] == "rests"
+    assert found.verdicts[2:] == ["oscillates", "oscillates"]
+    assert not found.differ.any()
+
+
+def test_the_effects_are_simulated():
+    """Enough friction stops what grows from 1 mm; a motor of 12 N turns growth without end into a limit cycle."""
+    free = points(rigid(1), [1500.0, 2500.0], [0.0, 0.2])
+    assert free.oscillates.all()
+    assert (free.growth > 1).all()
+    held = points(rigid(1), [1500.0, 2500.0], [0.0, 0.2], Effects(friction=5.0))
+    assert not held.oscillates.any()
+    assert held.differ.all()
+    limited = points(rigid(1), [1500.0, 2500.0], [0.0, 0.2], Effects(saturation=True), duration=4.0)
+    assert limited.oscillates.all()
+    assert (limited.amplitude < 0.1).all()
+    assert (limited.amplitude < 0.2 * points(rigid(1), [1500.0, 2500.0], [0.0, 0.2], duration=4.0).amplitude).all()
+
+
+def test_a_coarse_encoder_makes_a_stable_loop_oscillate_by_its_steps():
+    calm = points(rigid(1), [300.0, 800.0], [0.0, 0.05], threshold=1e-5)
+    coarse = points(rigid(1), [300.0, 800.0], [0.0, 0.05], Effects(quantisation=2e-4), threshold=1e-5)
+    assert not calm.oscillates.any()
+    assert coarse.verdicts[2:] == ["oscillates", "oscillates"]
+    assert (coarse.frequency_hz[2:] > 50).all()
+    assert (coarse.amplitude[2:] < 2e-4).all()
+
+
+def test_a_one_sided_wall_is_simulated_with_the_coupling_in_front_of_it():
+    """Under theorem4 contact made and broken comes to rest: an unstable pulling spring is what oscillates."""
+    ground = rigid(0, one_sided=True)
+    process = ground.process(ground.gains([2000.0], [0.3]), 0, ground.devices)
+    assert process.contact is not None
+    pulled, pushed = (np.zeros((process.F.order + 1, 1)) for _ in range(2))
+    pulled[-1], pushed[-1] = -1e-3, 1e-3
+    after = np.empty((process.F.order + 1, 1))
+    process.transition()(pulled, after)
+    assert after[0, 0] == 0
+    process.transition()(pushed, after)
+    # from rest K x + B x/T, with the wall's 1e10 N/m in series
+    assert after[0, 0] == pytest.approx((2000 + 0.3 / T) * 1e-3, rel=1e-6)
+    found = points(ground, [500.0, 1500.0], [0.0, 0.6])
+    assert not found.oscillates.any()
+
+
+def test_one_sided_contacts_keep_their_stiffness_and_direction():
+    network = one_sided(PAIR.environment)
+    assert [(w.between, w.stiffness, w.damping) for w in network.walls] == [
+        (("contact 1", "mass"), 800.0, 1.0),
+        (("mass", "contact 2"), 700.0, 1.0),
+    ]
+    with pytest.raises(ValueError, match="no spring ends at a contact"):
+        one_sided(Network(("tip",), masses={"tip": 1.0}))
+
+
+def test_a_device_says_what_friction_it_may_have():
+    with pytest.raises(ValueError, match="friction is -1, allowed are 0 to 1000 N"):
+        CompliantDevice(friction=-1.0)
+
+
+# --- the command ---------------------------------------------------------------------------------------------------
+
+OMEGA3 = [
+    "--rigid",
+    "--T",
+    "1e-3",
+    "--theta",
+    "0",
+    "--mark",
+    "5000,0",
+    "--humans",
+    "60",
+    "--grid",
+    "12",
+    "--points",
+    "3",
+]
+
+
+@pytest.fixture(scope="module")
+def audit(tmp_path_factory):
+    """CHAI3D's limits for an omega.3, where a user would look for them."""
+    out = tmp_path_factory.mktemp("zwidth")
+    code = zwidth.main([*OMEGA3, "--duration", "1.5", "--out", str(out), "--json", str(out / "again.json")])
+    return code, json.loads((out / "report.json").read_text()), out
+
+
+def test_where_the_limits_of_an_omega3_lie(audit):
+    code, report, _ = audit
+    (mark,) = report["marks"]
+    assert code == DOES_NOT_HOLD
+    for condition in ("theorem4", "closed-loop"):
+        assert mark[condition]["required_damping"] == pytest.approx([2.5])
+        assert not mark[condition]["certified"]
+        assert mark["stiffest_K_at_this_B"][condition] == pytest.approx(2740, rel=1e-5)
+    assert mark["unstable_humans"] > 30
+    # what random humans allow is more than what every passive human does, and not much more
+    assert 2740 < mark["stiffest_K_at_this_B"]["population"] < 3200
+
+
+def test_the_map_holds_together(audit):
+    _, report, _ = audit
+    K, B = np.meshgrid(report["grid"]["K"], report["grid"]["B"], indexing="ij")
+    ratio = np.array(report["closed-loop"]["required_over_available"], float)
+    # constant over frequency at B = 0, where rounding at the lowest one is 1e-8
+    np.testing.assert_allclose(ratio * DELTA, K * T / 2 + B, rtol=3e-8)
+    growth = np.array(report["population"]["growth_rate_per_s"], float)
+    assert (growth[ratio < 1] <= 1e-9).all()
+    assert report["closed-loop"]["contradicted_cells"] == 0
+    assert (growth[(B == 0) & (K > 3300)] > 0).all()
+    assert len(report["simulation"]["points"]) == 9
+    assert report["simulation"]["differ_from_linear"] == 0
+    for error in report["error"].values():
+        assert error["figure_relative"] < 3e-8
+        # this edge is a straight line, which interpolation meets; the search for the true edge stops at 1e-7
+        assert error["edge_relative_in_K"] < 1e-6
+
+
+def test_the_files_of_a_map(audit):
+    _, report, out = audit
+    assert report["files"] == [str(out / name) for name in ("map.csv", "zwidth.png", "report.json")]
+    assert json.loads((out / "again.json").read_text()) == report
+    assert (out / "zwidth.png").read_bytes().startswith(b"\x89PNG")
+    rows = list(csv.DictReader((out / "map.csv").read_text().splitlines()))
+    assert len(rows) == 144
+    assert sum(row["simulated"] != "" for row in rows) == 9
+    assert float(rows[0]["closed-loop required/available"]) == pytest.approx(
+        report["closed-loop"]["required_over_available"][0][0]
+    )
+
+
+def test_a_seed_gives_the_same_map_again(audit, tmp_path):
+    _, report, _ = audit
+    zwidth.main([*OMEGA3, "--duration", "1.5", "--no-plot", "--out", str(tmp_path)])
+    again = json.loads((tmp_path / "report.json").read_text())
+    for part in ("population", "simulation", "closed-loop", "theorem4", "marks"):
+        assert again[part] == report[part]
+
+
+@pytest.mark.parametrize("stage", ["certificates", "population", "MuJoCo"])
+def test_the_keyboard_keeps_what_is_done(stage, tmp_path, monkeypatch, capsys):
+    def draw(*arguments):
+        def stop(at, done, total):
+            if at == stage and done:
+                raise KeyboardInterrupt
+
+        return draw_map(*arguments[:-1], stop)
+
+    monkeypatch.setattr(zwidth, "draw_map", draw)
+    options = ["--rigid", "--theta", "1", "--humans", "10", "--grid", "12", "--points", "5", "--out", str(tmp_path)]
+    assert zwidth.main(options) == INTERRUPTED
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["interrupted"]
+    known = [report["theorem4"]["required_over_available"], report["population"]["growth_rate_per_s"]]
+    whole = [all(value is not None for row in rows for value in row) for rows in known]
+    assert whole == {"certificates": [False, False], "population": [True, False], "MuJoCo": [True, True]}[stage]
+    assert any(value is not None for row in known[0] for value in row)
+    assert "Interrupted" in capsys.readouterr().out
+
+
+def test_slices_cover_everything_once():
+    seen = []
+    done, stopped = in_slices(lambda part: part.stop - part.start, 25, 4, lambda k, of: seen.append((k, of)))
+    assert not stopped
+    assert sorted(part.start for part, _ in done) == [0, 4, 8, 12, 16, 20, 24]
+    assert sum(size for _, size in done) == 25
+    assert seen[-1] == (25, 25)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--grid", "1"], "--grid is 1, allowed are 4 to 400"),
+        (["--humans", "0"], "--humans is 0, allowed are 1 to 100000"),
+        (["--K-range", "5"], "--K-range is '5', expected two numbers separated by a comma"),
+        (["--mark", "5000,x"], "--mark is '5000,x', expected numbers"),
+        (["--mark", "0,1"], "--mark is 0,1, allowed are K"),
+        (["--case", "none"], "--case none is the loop without coupling"),
+        (["--rigid", "--theta", "1,2"], "--rigid is one channel: --theta has 2 entries"),
+        (["--rigid", "--theta", "1", "--psi", "1"], "no loop with a delayed environment is stable"),
+        (["--friction", "-1"], "--friction is -1, allowed are 0 to 1000 N"),
+        (["--velocity-filter", "0"], "--velocity-filter is 0, allowed are 0.001 to 1e+06 Hz"),
+        (["--quantisation", "1"], "--quantisation is 1, allowed are 0 to 0.01 m"),
+        (["--duration", "0.1"], "--duration is 0.1, allowed are 1.5 to 10000 s"),
+        (["--theta", "200"], "theta is 200, 200, allowed are 0 to 100 samples"),
+        (["--seed", "-1"], "--seed is -1"),
+    ],
+)
+def test_bad_input_is_one_line(options, message, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["zwidth", *options, "--out", str(tmp_path)])
+    with pytest.raises(SystemExit) as leaving:
+        execute(zwidth.main)
+    error = capsys.readouterr().err
+    assert leaving.value.code == BAD_INPUT
+    assert message in error
+    assert error.count("\n") == 1
