@@ -111,7 +111,7 @@ def result_of(recorder: Recorder, units: Units, T: float, meta: dict[str, Any]) 
 
 
 def save_npz(path: Path, result: Result, recorder: Recorder) -> Path:
-    """An npz that sim.result reads, with the arrays of _LINK beside its own."""
+    """An npz that sim.trace reads, with the arrays of _LINK beside its own."""
     recorded = recorder.link()
     link = {f"link_{name}": recorded[name] for name in _LINK | _LATER}
     own = {name: getattr(result, name) for name in ("t", "x", "f", "x_handle", "v_handle", "w")}

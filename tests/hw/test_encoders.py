@@ -39,7 +39,7 @@ def session_with(scenario, rungs, *faults, seconds=1.0, place=None, encoder_step
     session = Session(scenario, Limits((12.0, 12.0)), Settings(measure=60, **settings))
     emulator = Emulator(scenario, faults)
     if place is not None:  # where the handles are before anything begins
-        emulator.plant.s[: len(emulator.plant.s) // 2] = place
+        emulator.plant.s[: emulator.plant.scene.model.nq] = place
     rehearsal = Rehearsal(session, emulator, lambda ages: rungs, faults)
     rehearsal.run_until_armed(seconds)
     return session, rehearsal
