@@ -19,8 +19,7 @@ import msgspec
 import numpy as np
 
 from hw.emulator import EmulatedPlant, nobody
-from hw.identify import chirp
-from hw.identify import Estimate, identify
+from hw.identify import Estimate, chirp, identify
 from models.device import RigidDevice
 from sim.scenario import load
 
