@@ -18,11 +18,11 @@ from cli.options import console, numbers, scenario_from
 from hw.control import Program, link_delay
 from hw.emulator import Emulator, FaultInjection, spawned
 from hw.emulator import nobody as without_hands
-from hw.monitor import Ages, Settings
+from hw.monitor import Ages, LinkSettings
 from hw.recording import IncidentLog
 from hw.rehearsal import Rehearsal
 from hw.session import Operator, Session
-from hw.transport import Live, Port, preflight
+from hw.transport import Live, SerialPort, preflight
 from sim.scenario import InputError, Scenario
 
 USUAL_BAUD = 921_600
@@ -100,7 +100,7 @@ def _mtime(path: str) -> int | None:
         return None
 
 
-def check_link(args: argparse.Namespace) -> Settings:
+def check_link(args: argparse.Namespace) -> LinkSettings:
     """The settings of a session. Raises InputError where the options contradict each other."""
     if bool(args.port) + args.emulate + args.rehearse != 1:
         raise InputError("give either --port PATH or --emulate or --rehearse")
@@ -114,7 +114,7 @@ def check_link(args: argparse.Namespace) -> Settings:
     measure = numbers("--measure", args.measure, int, 1)[0]
     if not 50 <= measure <= 100_000:
         raise InputError(f"--measure is {measure}, allowed are 50 to 100000")
-    return Settings(baud=_baud(args), measure=measure)
+    return LinkSettings(baud=_baud(args), measure=measure)
 
 
 def _baud(args: argparse.Namespace) -> int | None:
@@ -186,7 +186,7 @@ def hold_session(
             return _rehearsed(args, session, plan, seconds, seed, incidents, nobody, coulomb)
         options = [*_emulator_options(args, seed, seconds), *["--nobody"][:nobody], f"--coulomb={coulomb}"]
         path = args.port or stack.enter_context(spawned(options))
-        port = stack.enter_context(Port(path, session.settings.baud))
+        port = stack.enter_context(SerialPort(path, session.settings.baud))
         if args.port and not getattr(args, "no_preflight", True):
             console(args).print(preflight(path).line(), soft_wrap=True, highlight=False)
         keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None

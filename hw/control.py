@@ -24,7 +24,7 @@ from design.certificate import assess, certificate_part, promise_of
 from design.conditions import Requirement
 from design.result import DesignFailed
 from hw.limits import Fault, Gain, Heat, Limits, Units, check_jolt, check_jump, check_range, check_speed, shape
-from hw.monitor import Ages, ClockMonitor, CommandMonitor, Counters, EncoderMonitor, EncoderTest, Settings
+from hw.monitor import Ages, ClockMonitor, CommandMonitor, Counters, EncoderMonitor, EncoderTest, LinkSettings
 from hw.protocol import MAX_THETA, Config, State
 from sim.couplings import Chosen, choose
 from sim.scenario import InputError, Scenario
@@ -78,7 +78,7 @@ def fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tupl
     return [*line, tuple(x)]
 
 
-class Row(NamedTuple):
+class TraceRow(NamedTuple):
     """One tick of a trace. Where `state` is None no STATE came: x is filled in and nothing was sent."""
 
     tick: int  # modulo 2^16
@@ -100,9 +100,9 @@ class Drive:
         units: Units,
         config: Config,
         limits: Limits,
-        settings: Settings,
+        settings: LinkSettings,
         counters: Counters,
-        record: Callable[[Row], None],
+        record: Callable[[TraceRow], None],
         arming: int = 0,
     ) -> None:
         self.controller, self.units, self.config, self.limits = controller, units, config, limits
@@ -157,7 +157,7 @@ class Drive:
         self._counters.slowed += shaped.slowed
         steps = self.units.steps(shaped.force, self.config.cap)
         self._commands.tell(state.tick, steps)
-        self._record(Row(state.tick, x, asked, self.gain.value, steps, state, self._arming, test))
+        self._record(TraceRow(state.tick, x, asked, self.gain.value, steps, state, self._arming, test))
         return steps
 
     def _check_motion(self, x: tuple[float, ...], ticks: int) -> None:
@@ -178,7 +178,7 @@ class Drive:
         """The controller moves on through ticks of which no STATE came."""
         for back, x in zip(range(len(positions), 0, -1), positions, strict=True):
             tick, asked = (state.tick - back) & 0xFFFF, self.controller.step(x)
-            self._record(Row(tick, x, asked, self.gain.value, (), None, self._arming))
+            self._record(TraceRow(tick, x, asked, self.gain.value, (), None, self._arming))
 
 
 # couplings that are certified for a link

@@ -17,7 +17,7 @@ from controller.lti import Array
 from hw.control import CertifiedCoupling, certified_couplings, link_delay
 from hw.emulator import Emulator, FaultInjection, info_of
 from hw.limits import ENDED, Limits, Stage
-from hw.monitor import Ages, Settings
+from hw.monitor import Ages, LinkSettings
 from hw.protocol import Info
 from hw.rehearsal import Plan, Rehearsal
 from hw.session import Session
@@ -249,7 +249,9 @@ def rehearse_case(
     """One case. `made` are couplings for a link of one tick, and softer ones."""
     info = info_of(scenario)
     cap = tuple(d.force_limit for d in scenario.device)
-    session = Session(scenario, Limits(cap, continuous=case.continuous, thermal=1.0), Settings(case.baud, _MEASURED))
+    session = Session(
+        scenario, Limits(cap, continuous=case.continuous, thermal=1.0), LinkSettings(case.baud, _MEASURED)
+    )
     faults = tuple(FaultInjection.parse(text) for text in case.faults)
     emulator = Emulator(scenario, faults, case.info(info) if case.info else info)
     emulator.device.k = case.first_tick

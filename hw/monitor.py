@@ -34,7 +34,7 @@ _FORGETTING = 8  # right ticks that make up for a wrong one: seldom wrong is sto
 
 
 @dataclass(frozen=True)
-class Settings:
+class LinkSettings:
     """How a session judges its link, and how it arms."""
 
     baud: int | None = None  # of a UART; None for a link without one (USB, pseudo-terminal)
@@ -142,7 +142,7 @@ class Counters:
 class LinkMonitor:
     """Order of STATEs, and over a sliding window what came late, what was missed, and what nobody told."""
 
-    def __init__(self, settings: Settings, counters: Counters) -> None:
+    def __init__(self, settings: LinkSettings, counters: Counters) -> None:
         self.settings, self.counters = settings, counters
         self.restart()
 

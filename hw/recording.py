@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from controller.coupling import Form
 from controller.lti import Array
-from hw.control import CertifiedCoupling, LinearController, Program, Row, host_controller
+from hw.control import CertifiedCoupling, LinearController, Program, TraceRow, host_controller
 from hw.limits import Fault, Limits, Units, shape
 from hw.protocol import NO_MARGIN, Config
 from hw.session import Session
@@ -49,7 +49,7 @@ class Recorder:
         self._floats = array("d")  # x, asked, gain
         self._whole = array("i")  # tick, arming, received, sent, applied, margin, status
 
-    def __call__(self, row: Row) -> None:
+    def __call__(self, row: TraceRow) -> None:
         """Take in one tick."""
         m, state = self.channels, row.state
         self._floats.extend((*row.x, *row.asked, row.gain, *(row.test or (0.0,) * m)))

@@ -22,7 +22,7 @@ from design.result import COUPLING, Design, bare, number, of_kind, whole
 from hw.control import CertifiedCoupling, Program, certified_coupling, certified_couplings, link_delay
 from hw.emulator import Emulator, FaultInjection, Line
 from hw.limits import ENDED, Fault, Stage
-from hw.monitor import Ages, Settings
+from hw.monitor import Ages, LinkSettings
 from hw.protocol import Phase
 from hw.recording import Recorder, result_of
 from hw.session import Operator, Session, session_for
@@ -236,7 +236,7 @@ def rehearse(
     require_constant_delay(scenario, "rehearse")
     if min(scenario.delta) <= 0:
         raise InputError(f"delta is {list(scenario.delta)}: a device without damping can promise no human anything")
-    session = session_for(scenario, Settings(measure=_MEASURE))
+    session = session_for(scenario, LinkSettings(measure=_MEASURE))
     session.record = recorder = Recorder(scenario.channels)
     programs: list[CertifiedCoupling] = []
     delays: list[float] = []  # [s]

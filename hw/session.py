@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from hw.control import Drive, Program, Row
+from hw.control import Drive, Program, TraceRow
 from hw.limits import (
     DRIVING,
     ENDED,
@@ -26,7 +26,7 @@ from hw.limits import (
     probe_delay,
     watchdog_for,
 )
-from hw.monitor import Counters, LinkMonitor, Measurement, Settings, check_state
+from hw.monitor import Counters, LinkMonitor, LinkSettings, Measurement, check_state
 from hw.protocol import (
     Ack,
     Command,
@@ -67,10 +67,10 @@ class Event(NamedTuple):
 class Session:
     """The host's side of the link."""
 
-    def __init__(self, scenario: Scenario, limits: Limits, settings: Settings | None = None) -> None:
+    def __init__(self, scenario: Scenario, limits: Limits, settings: LinkSettings | None = None) -> None:
         if len(limits.cap) != scenario.channels:
             raise ValueError(f"cap has {len(limits.cap)} entries for {scenario.channels} channels")
-        self.scenario, self.limits, self.settings = scenario, limits, settings or Settings()
+        self.scenario, self.limits, self.settings = scenario, limits, settings or LinkSettings()
         self.probe = probe_delay(scenario.T)
         self.decoder, self.counters = Decoder(), Counters()
         self.link = LinkMonitor(self.settings, self.counters)
@@ -83,7 +83,7 @@ class Session:
         self.program: Program | None = None
         self.drive: Drive | None = None  # the coupling at work, from one arming to the next end
         self.armings: list[tuple[Program, Config]] = []  # what forces came from, arming by arming
-        self.record: Callable[[Row], None] = lambda row: None
+        self.record: Callable[[TraceRow], None] = lambda row: None
         self.listen: Callable[[Event], None] = lambda event: None
         self.missed_while_driving = 0  # ticks
         self.now = self.entered = self.heard = 0  # [us]
@@ -382,7 +382,7 @@ def limits_for(scenario: Scenario, cap: float = _STRONGEST, **more: Any) -> Limi
     return Limits(tuple(min(cap, d.force_limit) for d in scenario.device), watchdog_us=watchdog, **more)
 
 
-def session_for(scenario: Scenario, settings: Settings, cap: float = _STRONGEST, **more: Any) -> Session:
+def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:
     """A session that never asks for more than `cap` [N], with `more` Limits. Raises InputError for what cannot be."""
     try:
         return Session(scenario, limits_for(scenario, cap, **more), settings)

@@ -34,7 +34,7 @@ class PortLost(OSError):
     """The device at the other end of the port is gone."""
 
 
-class Port:
+class SerialPort:
     """A port in raw mode: whole bytes in, whole bytes out, no echo, no flow control."""
 
     def __init__(self, path: str, baud: int | None) -> None:

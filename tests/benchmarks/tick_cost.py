@@ -19,11 +19,11 @@ from hw.control import certified_couplings
 from hw.emulator import Emulator, Terminal
 from hw.faults import lively
 from hw.limits import Stage
-from hw.monitor import Settings
+from hw.monitor import LinkSettings
 from hw.protocol import Command, Decoder, Force, State, encode
 from hw.recording import Recorder
 from hw.session import session_for
-from hw.transport import Live, Port
+from hw.transport import Live, SerialPort
 from sim.scenario import load
 
 BLOCK = 200
@@ -33,9 +33,9 @@ def tick_cost(ticks: int) -> tuple[list[float], list[float]]:
     """Times [us] of bare and of whole ticks at full gain."""
     scenario = lively(load())
     made = certified_couplings(scenario, "I", None, None, 1, spare=0)
-    session, terminal, emulator = session_for(scenario, Settings(measure=60)), Terminal(), Emulator(scenario)
+    session, terminal, emulator = session_for(scenario, LinkSettings(measure=60)), Terminal(), Emulator(scenario)
     session.record = Recorder(scenario.channels)
-    port = Port(terminal.path, None)
+    port = SerialPort(terminal.path, None)
     live = Live(session, port, lambda ages: made, True, 3600.0)
     clock = [0]
     live.now = lambda: clock[0]  # the clock of the ticks: what is measured here takes longer than they do

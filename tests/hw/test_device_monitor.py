@@ -18,8 +18,8 @@ from hw.monitor import (
     ClockDrift,
     ClockMonitor,
     CommandMonitor,
+    LinkSettings,
     Measurement,
-    Settings,
     check_state,
 )
 from hw.protocol import NO_MARGIN, Ack, Command, Config, Force, Phase, Reason, State, Stop, config_crc, encode
@@ -104,7 +104,7 @@ def rungs(scenario):
 
 
 def test_a_session_stops_where_a_disarmed_device_pushes(scenario, rungs):
-    session = Session(scenario, Limits((12.0, 12.0)), Settings(measure=60))
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60))
     Rehearsal(session, Emulator(scenario), lambda ages: rungs, arm=False).run(0.5)
     assert session.stage == Stage.DISARMED
     last = session.link.last
@@ -120,7 +120,7 @@ def test_an_obedient_device_on_a_bad_line_is_left_alone(scenario, rungs):
     faults = tuple(
         map(FaultInjection.parse, ("up:drop=0.05@0", "down:flip=0.05@0", "reorder=0.03@0", "duplicate=0.1@0"))
     )
-    session = Session(scenario, Limits((12.0, 12.0)), Settings(measure=60))
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60))
     Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults).run_until_armed(1.5)
     assert session.stage == Stage.ARMED
     assert session.counters.misses > 50
@@ -129,7 +129,7 @@ def test_an_obedient_device_on_a_bad_line_is_left_alone(scenario, rungs):
 
 def hand_driven(scenario, rungs):
     """A session at the first STATEs after arming, and what sends it one: `lie` is what the device's clock says."""
-    session, t, k = Session(scenario, Limits((12.0, 12.0)), Settings(measure=50, test_encoders=False)), 0, 0
+    session, t, k = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=50, test_encoders=False)), 0, 0
     session.start(t)
     session.receive(encode(info_of(scenario)), t)
     session.receive(encode(Ack(config_crc(session.config), 0)), t)
@@ -276,7 +276,7 @@ def test_gaps_within_the_watchdog_are_allowed():
 @pytest.mark.parametrize("misses", [0, 1])
 def test_a_measurement_without_answers_ends(scenario, misses):
     """Whether or not the device counts what it does not hear."""
-    session, most = Session(scenario, Limits((12.0, 12.0)), Settings(measure=50)), 8 * 50 + 2 * 15
+    session, most = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=50)), 8 * 50 + 2 * 15
     session.start(0)
     session.receive(encode(info_of(scenario)), 0)
     session.receive(encode(Ack(config_crc(session.config), 0)), 0)
@@ -307,7 +307,7 @@ def test_a_link_that_brings_several_forces_at_once_is_measured():
 
 def test_an_identification_closes_no_loop_that_could_grow(scenario):
     recorder = Recorder(2)
-    session = Session(scenario, Limits((1.0, 1.0)), Settings(measure=50))
+    session = Session(scenario, Limits((1.0, 1.0)), LinkSettings(measure=50))
     session.record = recorder
     tune = chirp(2, scenario.T, 1, 1.0, (3, 200), 0.5)
     Rehearsal(session, Emulator(nobody(scenario)), lambda ages: [tune]).run_until_armed(0.6)

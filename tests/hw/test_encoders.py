@@ -11,7 +11,7 @@ from hw.control import certified_couplings
 from hw.emulator import Emulator, FaultInjection, nobody
 from hw.faults import lively
 from hw.limits import Fault, Limits, Stage
-from hw.monitor import EncoderMonitor, EncoderTest, Settings
+from hw.monitor import EncoderMonitor, EncoderTest, LinkSettings
 from hw.rehearsal import Rehearsal
 from hw.session import Session
 from sim.scenario import InputError
@@ -36,7 +36,7 @@ def session_with(scenario, rungs, *faults, seconds=1.0, place=None, encoder_step
         devices = tuple(replace(d, encoder_step=encoder_step) for d in scenario.device)
         scenario = scenario.replace(device=devices)
     faults = tuple(map(FaultInjection.parse, faults))
-    session = Session(scenario, Limits((12.0, 12.0)), Settings(measure=60, **settings))
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60, **settings))
     emulator = Emulator(scenario, faults)
     if place is not None:  # where the handles are before anything begins
         emulator.plant.s[: emulator.plant.scene.model.nq] = place
@@ -69,7 +69,7 @@ def test_live_encoders_answer_a_force_that_one_hardly_feels(scenario, rungs, ste
     """Newtons until encoders of 1 to 100 um have answered, held by the scenario's hands and free."""
     still = scenario if held else nobody(scenario)
     forces = []
-    session = Session(still, Limits((12.0, 12.0)), Settings(measure=60))
+    session = Session(still, Limits((12.0, 12.0)), LinkSettings(measure=60))
     devices = tuple(replace(d, encoder_step=step) for d in still.device)
     session.record = lambda row: forces.append(row.test or (0.0, 0.0))
     Rehearsal(session, Emulator(still.replace(device=devices)), lambda ages: rungs).run_until_armed(0.5)

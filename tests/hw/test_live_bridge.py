@@ -27,9 +27,9 @@ from cli.session_cli import add_link_options, check_link
 from controller.delay import Jitter
 from hw.control import certified_coupling, certified_couplings
 from hw.limits import ENDED, Limits, Stage
-from hw.monitor import Settings
+from hw.monitor import LinkSettings
 from hw.session import Session
-from hw.transport import Live, Port
+from hw.transport import Live, SerialPort
 from sim.scenario import InputError
 from sim.scenario import load as scenario_of
 
@@ -82,8 +82,8 @@ def rungs(scenario):
 
 
 def run(emulator, scenario, plan, glance=lambda session: None, pace=PACE):
-    session = Session(scenario, Limits((12.0, 12.0)), Settings(measure=150))
-    with Port(emulator.path, 921_600) as port:
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=150))
+    with SerialPort(emulator.path, 921_600) as port:
         live = Live(session, port, plan, True, seconds=60.0, glance=glance, pace=pace)
         live.run()
     return session, live
@@ -368,7 +368,7 @@ def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
     for path in (os.ttyname(slave), str(link)):
         settings = check_link(parser.parse_args(["--port", path, "--arm"]))
         assert settings.baud is None
-        with Port(path, settings.baud) as port:
+        with SerialPort(path, settings.baud) as port:
             assert port.write(b"\x01") == 1
             assert os.read(master, 1) == b"\x01"
     os.close(master)

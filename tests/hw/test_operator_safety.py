@@ -18,7 +18,7 @@ from hw.control import certified_couplings
 from hw.emulator import Emulator
 from hw.faults import lively
 from hw.limits import Limits, Stage
-from hw.monitor import Settings
+from hw.monitor import LinkSettings
 from hw.recording import IncidentLog
 from hw.rehearsal import Rehearsal
 from hw.session import Operator, Session, session_for
@@ -40,7 +40,7 @@ def rungs(scenario):
 
 
 def rehearsal_of(scenario, rungs, operator):
-    session = Session(scenario, Limits((12.0, 12.0)), Settings(measure=60))
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60))
     return Rehearsal(session, Emulator(scenario), lambda ages: rungs, operator=operator)
 
 
@@ -101,11 +101,11 @@ def test_a_file_that_is_touched(tmp_path):
 
 def test_a_first_session_is_gentle(scenario):
     args = _parser().parse_args(["--emulate"])
-    limits = session_for(scenario, Settings(), **limits_from(args, scenario)).limits
+    limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits
     assert limits.cap == (2.0, 2.0)
     assert limits.speed == 1.0
     args = _parser().parse_args(["--emulate", "--force-cap", "12", "--max-speed", "0.5", "--continuous-force", "3"])
-    limits = session_for(scenario, Settings(), **limits_from(args, scenario)).limits
+    limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits
     assert (limits.cap, limits.speed, limits.continuous) == ((12.0, 12.0), 0.5, (3.0, 3.0))
 
 
@@ -123,7 +123,7 @@ def test_a_first_session_is_gentle(scenario):
 def test_impossible_limits_are_refused(scenario, options, words):
     args = _parser().parse_args(["--emulate", *options])
     with pytest.raises(InputError) as error:
-        session_for(scenario, Settings(), **limits_from(args, scenario))
+        session_for(scenario, LinkSettings(), **limits_from(args, scenario))
     assert words in str(error.value)
 
 

@@ -17,7 +17,7 @@ from hw.control import CertifiedCoupling, LinearController, certified_coupling, 
 from hw.emulator import Emulator, FaultInjection
 from hw.faults import CASES, Case, at, lively, person, rehearse_case
 from hw.limits import Fault, Limits, Stage, Units
-from hw.monitor import Ages, Settings
+from hw.monitor import Ages, LinkSettings
 from hw.protocol import Command, Decoder, Force, Phase, State, Stop, encode
 from hw.recording import Recorder, digest, load, outcome, recipes_of, replay, result_of, save, save_npz, steady_ticks
 from hw.rehearsal import Rehearsal
@@ -31,8 +31,8 @@ from sim.scenario import load as scenario_of
 from sim.stability import close, dominant_mode
 from sim.trace import Result
 
-FAST = Settings(measure=100)
-AT_REST = Settings(measure=100, test_encoders=False)  # nothing moves the handles before the person does
+FAST = LinkSettings(measure=100)
+AT_REST = LinkSettings(measure=100, test_encoders=False)  # nothing moves the handles before the person does
 
 
 @pytest.fixture(scope="module")
