@@ -121,8 +121,9 @@ def preflight(path: str) -> Preflight:
 
 def _scheduling() -> str:
     with suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
-    policy = os.sched_getscheduler(0)
+        # the dashboard and other children do without
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(10))
+    policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
     if policy in (os.SCHED_FIFO, os.SCHED_RR):
         return f"real-time scheduling, priority {os.sched_getparam(0).sched_priority}"
     return "no real-time scheduling (allow it: `rtprio 20` in /etc/security/limits.conf, or start by chrt -f 10)"
