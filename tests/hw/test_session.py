@@ -197,14 +197,14 @@ def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
     assert link["received"].all()
     assert (link["gain"][first:] == 1.0).all()
     n = len(recorder) - first
-    exact = run(assemble(scenario, rungs[0].chosen.coupling), "exact", samples=n)
+    exact = run(assemble(scenario, rungs[0].chosen.coupling), "exact", ticks=n)
     step, coupling = 1e-6, rungs[0].chosen.coupling
     assert n > 1800
-    assert np.abs(exact.s[:, :2, 0]).max() > 5e-3  # the people do move
-    assert np.abs(link["x"][first:] - exact.s[:, :2, 0]).max() < step
+    assert np.abs(exact.s[:, :2]).max() > 5e-3  # the people do move
+    assert np.abs(link["x"][first:] - exact.s[:, :2]).max() < step
     forces = -link["applied"][first:] * 4e-4
     bound = max(coupling.K) * step + max(coupling.B) * step / scenario.T + 4e-4
-    assert np.abs(forces - exact.f[:, :, 0]).max() < bound
+    assert np.abs(forces - exact.f).max() < bound
 
 
 def test_the_same_to_the_last_bit_but_for_rounded_forces(scenario, rungs):
@@ -414,8 +414,7 @@ def test_the_replay_command(trace, capsys):
 
 def test_a_trace_of_sim_run_is_no_session(scenario, rungs, tmp_path):
     assembly = assemble(scenario, rungs[0].chosen.coupling)
-    plain = Trace.from_record(assembly, run(assembly, "exact", samples=10), {})
-    path = plain.save_npz(tmp_path / "trace.npz")
+    path = run(assembly, "exact", ticks=10).save_npz(tmp_path / "trace.npz")
     with pytest.raises(InputError, match="not of a bridge's session"):
         load(path)
 
