@@ -1,6 +1,6 @@
 """python -m sim.zwidth: the K-B map that haptics people draw - certified, exact for random humans, simulated.
 
-options -> the loop (Ground: K and B are the coupling's; Surroundings: the environment's) -> Grid -> Map -> files
+options -> CouplingSweep or EnvironmentSweep: whose K and B -> Grid -> Map -> files
 """
 
 from __future__ import annotations
@@ -36,7 +36,6 @@ from cli.options import (
 from cli.run import coupling_part
 from controller.lti import Array
 from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, promise_of
-from design.maps import contact_springs
 from design.ranges import check_set, set_part
 from sim.couplings import NAMES, Chosen, choose
 from sim.files import write, write_json
@@ -46,22 +45,23 @@ from sim.zwidth import (
     DECIDED,
     MODEL_KEPT,
     UNDECIDED,
+    CouplingSweep,
     Effects,
+    EnvironmentSweep,
     Grid,
-    Ground,
+    HeldDevices,
     Map,
-    MapLoop,
+    MapError,
     Mark,
     Plan,
     Range,
-    Surroundings,
-    Truth,
+    Sweep,
+    contact_springs,
     draw_map,
-    holders,
-    look,
+    evaluate_point,
     make_grid,
+    map_error,
     one_sided,
-    truth,
 )
 
 # ----------------------------------------------------------------------------------------------------
@@ -195,23 +195,23 @@ def _share(count: int, cells: int) -> str:
 NOT_REACHED = "not reached before the interruption"
 
 
-def summary(ground: MapLoop, drawn: Map, plan: Plan, population: dict[str, Any]) -> dict[str, Any]:
+def summary(sweep: Sweep, drawn: Map, plan: Plan, population: dict[str, Any]) -> dict[str, Any]:
     """The whole map. Rows are stiffnesses; null is infinite, or not reached before an interruption."""
     known = np.isfinite(drawn.growth)
     unsafe = known & (drawn.growth > MARGINAL)
     part: dict[str, Any] = {
-        "rigid": ground.network is None,
-        "T": ground.T,
-        "theta": list(ground.theta),
-        "psi": list(ground.psi),
-        "delta": list(ground.delta),
-        "velocity_filter_hz": ground.cutoff,
-        "one_sided": ground.walled is not None,
+        "rigid": sweep.network is None,
+        "T": sweep.T,
+        "theta": list(sweep.theta),
+        "psi": list(sweep.psi),
+        "delta": list(sweep.delta),
+        "velocity_filter_hz": sweep.cutoff,
+        "one_sided": sweep.walled is not None,
         "conditions": list(drawn.ratio),
         "grid": {"K": drawn.grid.K.tolist(), "B": drawn.grid.B.tolist(), "scale": drawn.grid.scale},
     }
     for name, ratio in drawn.ratio.items():
-        reason = _nulls(ground, drawn, name)
+        reason = _nulls(sweep, drawn, name)
         part[name] = ({"reason": reason} if reason else {}) | {
             "required_over_available": _rows(drawn, ratio),
             "certified_cells": int((ratio < 1).sum()),
@@ -225,7 +225,7 @@ def summary(ground: MapLoop, drawn: Map, plan: Plan, population: dict[str, Any])
         "stable_cells": int((known & ~unsafe).sum()),
         "decided_cells": int(known.sum()),
     } | ({"reason": f"null: {NOT_REACHED}"} if np.isnan(drawn.growth).any() else {})
-    part["simulation"] = _simulation(ground, drawn, plan)
+    part["simulation"] = _simulation(sweep, drawn, plan)
     contradicted = sum(part[name]["contradicted_cells"] for name in CONDITIONS)
     disagree = 0 if part["simulation"]["nonlinear"] else part["simulation"]["differ_from_linear"]
     part["holds"] = contradicted == 0 and disagree == 0
@@ -235,22 +235,22 @@ def summary(ground: MapLoop, drawn: Map, plan: Plan, population: dict[str, Any])
     return part
 
 
-def _nulls(ground: MapLoop, drawn: Map, name: str) -> str | None:
+def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
     """Why a condition has cells without a figure, in words of one such cell; None where it has none."""
-    if name in ground.refusals:
-        return ground.refusals[name]
+    if name in sweep.refusals:
+        return sweep.refusals[name]
     ratio, (K, B) = drawn.ratio[name], drawn.grid.flat
     unreached, infinite = np.isnan(ratio), np.flatnonzero(np.isposinf(ratio))
     parts = [f"null at {unreached.sum()} cells: {NOT_REACHED}"] if unreached.any() else []
     if infinite.size:
         first = infinite[0]
-        why = ground.requirement(name, float(K[first]), float(B[first])).reason or "the figure grows without end"
+        why = sweep.requirement(name, float(K[first]), float(B[first])).reason or "the figure grows without end"
         at = f"at K {K[first]:.4g}, B {B[first]:.4g}, {why}"
         parts.append(f"null at {infinite.size} cells: no damping is enough; {at}")
     return "; ".join(parts) or None
 
 
-def _simulation(ground: MapLoop, drawn: Map, plan: Plan) -> dict[str, Any]:
+def _simulation(sweep: Sweep, drawn: Map, plan: Plan) -> dict[str, Any]:
     points, (K, B) = drawn.points, drawn.grid.flat
     rows = [
         {
@@ -264,15 +264,15 @@ def _simulation(ground: MapLoop, drawn: Map, plan: Plan) -> dict[str, Any]:
         }
         for i, cell in enumerate(points.cell.tolist())
     ]
-    devices = plan.effects.on(ground.devices)
+    devices = plan.effects.on(sweep.devices)
     return {
         "effects": {
             "encoder_step_m": [device.encoder_step for device in devices],
             "friction_n": [device.friction for device in devices],
             "force_limit_n": [d.force_limit for d in devices] if plan.effects.saturation else None,
-            "one_sided": ground.walled is not None,
+            "one_sided": sweep.walled is not None,
         },
-        "nonlinear": plan.effects.nonlinear(ground.devices) or ground.walled is not None,
+        "nonlinear": plan.effects.nonlinear(sweep.devices) or sweep.walled is not None,
         "trials": plan.trials,
         "duration_s": plan.duration,
         "start_m": plan.start,
@@ -286,12 +286,12 @@ def _simulation(ground: MapLoop, drawn: Map, plan: Plan) -> dict[str, Any]:
     }
 
 
-def add_truth(outcome: dict[str, Any], found: dict[str, Truth | None]) -> None:
+def add_errors(outcome: dict[str, Any], found: dict[str, MapError | None]) -> None:
     """How far the map is from design.margin."""
     outcome["error"] = {
-        name: truth
-        and {"figure_relative": truth.ratio, "edge_relative_in_K": truth.edge, "columns_compared": truth.columns}
-        for name, truth in found.items()
+        name: error
+        and {"figure_relative": error.ratio, "edge_relative_in_K": error.edge, "columns_compared": error.columns}
+        for name, error in found.items()
     }
 
 
@@ -358,28 +358,28 @@ def main(argv: list[str]) -> int:
     seed, humans = seed_from(args), _whole(args, "humans", 1, 100_000)
     marks = tuple(_pair("--mark", mark) for mark in args.mark or ())
     chosen = _chosen(args, scenario)
-    ground: MapLoop = _surroundings(scenario, chosen) if chosen else _ground(args, scenario)
-    grid = _grid(args, ground, marks)
-    plan = _plan(args, ground)
+    sweep: Sweep = _environment_sweep(scenario, chosen) if chosen else _coupling_sweep(args, scenario)
+    grid = _grid(args, sweep, marks)
+    plan = _plan(args, sweep)
     out = out_folder(args, "zwidth")
 
-    crowd = holders(ground.devices, ground.population, seed, humans, ground.population.links, ground.T)
+    crowd = HeldDevices.drawn(sweep, seed, humans)
     bar, moved = progress_bar("certificates")
     with bar:
         drawn = draw_map(
-            ground,
+            sweep,
             grid,
             crowd,
             plan,
             lambda stage, k, of: moved(k, of) or bar.update(bar.task_ids[0], description=stage),
         )
-    outcome = summary(ground, drawn, plan, {"humans": humans, "seed": seed})
+    outcome = summary(sweep, drawn, plan, {"humans": humans, "seed": seed})
     outcome |= {"scenario": None if args.rigid else scenario.name, "scenario_digest": scenario.digest}
     outcome |= _coupling(args, scenario, chosen, seed) if chosen else {"axes": "coupling", "coupling": None}
     if not drawn.interrupted:
-        add_truth(outcome, {name: truth(ground, drawn, name) for name in drawn.ratio})
-        add_marks(outcome, [look(ground, crowd, *mark, grid.K) for mark in marks])
-    _save(args, ground, drawn, outcome, out)
+        add_errors(outcome, {name: map_error(sweep, drawn, name) for name in drawn.ratio})
+        add_marks(outcome, [evaluate_point(sweep, crowd, *mark, grid.K) for mark in marks])
+    _save(args, sweep, drawn, outcome, out)
     print_map(outcome, console(args))
     if args.json:
         write_json(args.json, outcome)
@@ -447,11 +447,11 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
     return choose(scenario, args.case, args.coupling, args.condition)
 
 
-def _surroundings(scenario: Scenario, chosen: Chosen) -> Surroundings:
+def _environment_sweep(scenario: Scenario, chosen: Chosen) -> EnvironmentSweep:
     """The loop with that coupling. Raises InputError."""
     who = scenario.device, scenario.population
     try:
-        return Surroundings(*who, scenario.environment, scenario.T, scenario.theta, scenario.psi, chosen.coupling)
+        return EnvironmentSweep(*who, scenario.environment, scenario.T, scenario.theta, scenario.psi, chosen.coupling)
     except ValueError as error:
         raise InputError(str(error)) from None
 
@@ -476,7 +476,7 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, seed
     }
 
 
-def _ground(args: argparse.Namespace, scenario: Scenario) -> Ground:
+def _coupling_sweep(args: argparse.Namespace, scenario: Scenario) -> CouplingSweep:
     """The loop without its coupling. Raises InputError."""
     cutoff = None
     if args.velocity_filter is not None:
@@ -488,14 +488,14 @@ def _ground(args: argparse.Namespace, scenario: Scenario) -> Ground:
             loop, devices = {"network": None, **rigid_loop(args, scenario)}, devices[:1]
         elif args.wall:
             loop["network"] = one_sided(scenario.environment)
-        return Ground(
+        return CouplingSweep(
             devices, scenario.population, T=scenario.T, cutoff=cutoff, one_sided=args.rigid and args.wall, **loop
         )
     except ValueError as error:
         raise error if isinstance(error, InputError) else InputError(str(error)) from None
 
 
-def _grid(args: argparse.Namespace, ground: MapLoop, marks: tuple[Range, ...]) -> Grid:
+def _grid(args: argparse.Namespace, sweep: Sweep, marks: tuple[Range, ...]) -> Grid:
     K, B = (
         None if getattr(args, f"{name}_range") is None else _pair(f"--{name}-range", getattr(args, f"{name}_range"))
         for name in "KB"
@@ -503,22 +503,22 @@ def _grid(args: argparse.Namespace, ground: MapLoop, marks: tuple[Range, ...]) -
     for stiffness, damping in marks:
         if not (1e-3 <= stiffness <= 1e9 and 0 <= damping <= 1e6):
             raise InputError(f"--mark is {stiffness:g},{damping:g}, allowed are K 1e-3 to 1e9 N/m, B 0 to 1e6 N s/m")
-    return make_grid(ground, _whole(args, "grid", 4, 400), K, B, args.scale, marks)
+    return make_grid(sweep, _whole(args, "grid", 4, 400), K, B, args.scale, marks)
 
 
-def _plan(args: argparse.Namespace, ground: MapLoop) -> Plan:
+def _plan(args: argparse.Namespace, sweep: Sweep) -> Plan:
     step = None if args.quantisation is None else _number(args, "quantisation", 0, 1e-2, "m")
     friction = None if args.friction is None else _number(args, "friction", 0, 1e3, "N")
     effects = Effects(step, friction, args.saturation)
-    coarsest = max(device.encoder_step for device in effects.on(ground.devices))
+    coarsest = max(device.encoder_step for device in effects.on(sweep.devices))
     threshold = max(2 * coarsest, FINEST) if args.threshold is None else _number(args, "threshold", 1e-9, 1, "m")
-    duration = _number(args, "duration", max(1.5, 1024 * ground.T), 1e4, "s")
+    duration = _number(args, "duration", max(1.5, 1024 * sweep.T), 1e4, "s")
     trials, points = _whole(args, "trials", 1, 100), _whole(args, "points", 0, 400)
     start, press = _number(args, "start", 1e-9, 1, "m"), _number(args, "press", 0, 1e3, "N")
     return Plan(effects, points, trials, start, press, duration, threshold)
 
 
-def _save(args: argparse.Namespace, ground: MapLoop, drawn: Map, outcome: dict[str, Any], out: Path) -> None:
+def _save(args: argparse.Namespace, sweep: Sweep, drawn: Map, outcome: dict[str, Any], out: Path) -> None:
     """The picture, the table and the report; `outcome` learns where they are."""
     files = [save_csv(drawn, out / "map.csv")]
     if not args.no_plot:

@@ -94,6 +94,24 @@ def _neighbours(grid: Array, at: Array) -> tuple[Array, Array]:
     return below, above
 
 
+#: [rad/sample] a figure is even at 0, so that 1e-4 stands for it up to 1e-8; what bends it nearer to 0, as slow poles
+#: of a model that is wrong do, is asked for at a few frequencies below
+LOWEST, BELOW = 1e-4, np.geomspace(1e-5, 0.9e-4, 8)
+EVEN = 192  # even frequencies, as many again evenly in their logarithm; more where delays make lobes
+PER_LOBE = 24
+NEAR_POLE = np.concatenate([-np.geomspace(0.05, 20, 10)[::-1], [0.0], np.geomspace(0.05, 20, 10)])  # in widths
+
+
+def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> Array:
+    """As `frequencies`, a row for each system of a stack, (n, k) and sorted: poles (n, p), `delay` in samples."""
+    even = np.linspace(LOWEST, np.pi, max(EVEN, PER_LOBE * (delay + 1)))
+    common = np.unique(np.concatenate([BELOW, even, np.geomspace(LOWEST, np.pi, EVEN)]))
+    width = np.maximum(1 - np.abs(poles), 1e-9)
+    near = (np.abs(np.angle(poles))[..., None] + width[..., None] * NEAR_POLE).reshape(poles.shape[0], -1)
+    everywhere = np.broadcast_to(common, (poles.shape[0], common.size))
+    return np.sort(np.concatenate([everywhere, np.clip(near, LOWEST, np.pi)], axis=1), axis=1)
+
+
 Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)
 
 
@@ -182,3 +200,14 @@ def on_circle(w: Array) -> NDArray[np.complex128]:
 def hermitian(G: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """He G = (G + G*)/2 over the last two axes."""
     return (G + np.conj(np.swapaxes(G, -1, -2))) / 2
+
+
+def largest_eigenvalue(H: NDArray[np.complex128]) -> Array:
+    """Of Hermitian matrices over the last two axes; in closed form up to two rows: LAPACK takes ten times as long."""
+    m = H.shape[-1]
+    if m == 1:
+        return H[..., 0, 0].real
+    if m == 2:
+        a, d, b = H[..., 0, 0].real, H[..., 1, 1].real, np.abs(H[..., 0, 1])
+        return (a + d) / 2 + np.hypot((a - d) / 2, b)
+    return np.linalg.eigvalsh(H)[..., -1].astype(np.float64)
