@@ -369,7 +369,7 @@ def _delayed_scale(response: Complex, delta: Array, phi: Array) -> Array:
 
 # Many couplings or environments at once: a row for each, as a map asks for them.
 
-Responses = Callable[[Complex], Sampled]  # z (n, k) -> responses there, a row for each system
+Responses = Callable[[Complex], Sampled]  # z (n, k) or (1, k) -> responses there, a row for each system
 
 
 def this_environment_ratios(at: Responses, poles: Complex, delta: Sequence[float], delay: int) -> Array:
@@ -385,7 +385,7 @@ def this_environment_ratios(at: Responses, poles: Complex, delta: Sequence[float
     def needed(w: Array) -> Array:
         return _least_scales(this_environment_demand(at(on_circle(w)), delta))
 
-    return np.where(sound, np.maximum(suprema(needed, frequencies_of_many(poles, delay)), 0.0), np.inf)
+    return np.where(sound, np.maximum(suprema(needed, *frequencies_of_many(poles, delay)), 0.0), np.inf)
 
 
 def any_environment_ratios(
@@ -399,7 +399,7 @@ def any_environment_ratios(
             return _least_scales(any_environment_demand(response, theta, delta))
         return _delayed_scale(_delayed_response(response, theta).G, np.asarray(delta), np.asarray(phi))
 
-    return suprema(needed, frequencies_of_many(np.zeros((count, 0)), max(theta)))
+    return suprema(needed, *frequencies_of_many(np.zeros((count, 0)), max(theta)))
 
 
 def _least_scales(demand: Demand[Sampled]) -> Array:

@@ -60,15 +60,20 @@ def _gauss(response: Callable[[Array], Array], left: Array, right: Array) -> Arr
 PEAKS = 3  # highest local maxima of a row that are refined
 POINTS, ROUNDS = 17, 8  # a round narrows a bracket by (POINTS - 1)/2, so eight locate a smooth peak to rounding
 
-Responses = Callable[[Array], Array]  # w (n, k) [rad/sample] -> real values (n, k)
+Responses = Callable[[Array], Array]  # w (n, k) or (1, k) [rad/sample] -> real values (n, k)
 
 
-def suprema(responses: Responses, grid: Array) -> Array:
-    """The largest value of each row over its frequencies, (n,); `grid` (n, k) is sorted along its last axis.
+def suprema(responses: Responses, common: Array, own: Array) -> Array:
+    """The largest value of each row, (n,), over frequencies `common` to all, (k,), and its `own`, (n, p).
 
     A row with a value that is not finite gives infinity.
     """
-    values = responses(grid)
+    n = own.shape[0]
+    parts = [np.broadcast_to(w, (n, w.shape[-1])) for w in (common[None], own)]
+    found = [responses(common[None]), responses(own)] if own.size else [responses(common[None])]
+    order = np.argsort(np.concatenate(parts, axis=1), axis=1, kind="stable")
+    grid = np.take_along_axis(np.concatenate(parts, axis=1), order, axis=1)
+    values = np.take_along_axis(np.concatenate([np.broadcast_to(v, (n, v.shape[-1])) for v in found], axis=1), order, 1)
     endless = ~np.isfinite(values).all(axis=1)
     values = np.where(np.isfinite(values), values, -np.inf)
     padded = np.pad(values, ((0, 0), (1, 1)), constant_values=-np.inf)
@@ -102,14 +107,16 @@ PER_LOBE = 24
 NEAR_POLE = np.concatenate([-np.geomspace(0.05, 20, 10)[::-1], [0.0], np.geomspace(0.05, 20, 10)])  # in widths
 
 
-def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> Array:
-    """As `frequencies`, a row for each system of a stack, (n, k) and sorted: poles (n, p), `delay` in samples."""
+def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Array, Array]:
+    """As `frequencies`, for many systems: those common to all, (k,), and around the poles (n, p) of each, (n, j).
+
+    `delay` [samples] is the longest of the loop, which makes so many lobes.
+    """
     even = np.linspace(LOWEST, np.pi, max(EVEN, PER_LOBE * (delay + 1)))
     common = np.unique(np.concatenate([BELOW, even, np.geomspace(LOWEST, np.pi, EVEN)]))
     width = np.maximum(1 - np.abs(poles), 1e-9)
     near = (np.abs(np.angle(poles))[..., None] + width[..., None] * NEAR_POLE).reshape(poles.shape[0], -1)
-    everywhere = np.broadcast_to(common, (poles.shape[0], common.size))
-    return np.sort(np.concatenate([everywhere, np.clip(near, LOWEST, np.pi)], axis=1), axis=1)
+    return common, np.clip(near, LOWEST, np.pi)
 
 
 Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)
