@@ -189,7 +189,7 @@ def _share(count: int, cells: int) -> str:
 
 
 # ----------------------------------------------------------------------------------------------------
-# A K-B map as JSON and CSV; sim.zwidth.text prints it.
+# A K-B map as JSON and CSV.
 
 
 NOT_REACHED = "not reached before the interruption"

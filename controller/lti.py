@@ -356,7 +356,7 @@ def vstack(*blocks: Any) -> Any:
     """The outputs of several blocks of one input, one below the other; those that share A and B share the states."""
     first = blocks[0]
     if isinstance(first, Sampled):
-        return Sampled(first.z, _block([[b.G] for b in blocks]), first.T)
+        return first._with(_block([[b.G] for b in blocks]))
     T = _common_period(*blocks)
     C, D = [[b.C] for b in blocks], _block([[b.D] for b in blocks])
     if all(b.A is first.A and b.B is first.B for b in blocks):
@@ -369,7 +369,7 @@ def hstack(*blocks: Any) -> Any:
     """One output from the inputs of several blocks, side by side."""
     first = blocks[0]
     if isinstance(first, Sampled):
-        return Sampled(first.z, _block([[b.G for b in blocks]]), first.T)
+        return first._with(_block([[b.G for b in blocks]]))
     T = _common_period(*blocks)
     A, B = block_diagonal([b.A for b in blocks]), block_diagonal([b.B for b in blocks])
     return Lti(A, B, _block([[b.C for b in blocks]]), _block([[b.D for b in blocks]]), T)
@@ -383,7 +383,7 @@ def as_like(block: Lti | Sampled, system: Lti) -> Any:
 def constant_like(block: Block, D: Any) -> Block:
     """The memoryless block y = D u, of the kind of another."""
     if isinstance(block, Sampled):
-        return Sampled(block.z, np.asarray(D, dtype=np.float64)[None, None] + 0j, block.T)
+        return block._with(np.asarray(D, dtype=np.complex128)[None, None])
     return Lti.constant(D, block.T)
 
 

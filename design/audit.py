@@ -415,7 +415,7 @@ def report(
         "set": whole and set_part(whole),
         "certified": here and (whole is None or proved or promised == ANY),
         "promise": promised,
-        "helps": _helps(subject, requirements["theorem4" if this_environment else "closed-loop"]),
+        "helps": _helps(subject, requirements["theorem4" if here else "closed-loop"]),
         "not_covered": CAVEATS,
     }
 

@@ -90,7 +90,7 @@ def any_environment_demand(V: Block, theta: Sequence[int], delta: Sequence[Any])
 
 
 def switching_block(
-    G: Block, lo: Sequence[int], hi: Sequence[int], delta: Sequence[Any], alpha: Sequence[Any]
+    G: Block, lo: Sequence[int], hi: Sequence[int], delta: Sequence[Any] | Array, alpha: Sequence[Any] | Array
 ) -> tuple[Block, Array]:
     """[[F/(z-1) + Delta_D/T - diag(alpha)/2, 0], [2 h G, 2 diag(alpha)]], which must be positive real; and F(1).
 
@@ -399,7 +399,7 @@ def any_environment_ratios(
             return _least_scales(any_environment_demand(response, theta, delta))
         return _delayed_scale(_delayed_response(response, theta).G, np.asarray(delta), np.asarray(phi))
 
-    return suprema(needed, *frequencies_of_many(np.zeros((count, 0)), max(theta)))
+    return suprema(needed, *frequencies_of_many(np.zeros((count, 0), dtype=np.complex128), max(theta)))
 
 
 def _least_scales(demand: Demand[Sampled]) -> Array:

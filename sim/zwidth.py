@@ -48,7 +48,7 @@ from design.conditions import (
     this_environment,
     this_environment_ratios,
 )
-from design.lmi import Specification, shortage
+from design.lmi import least_phi
 from design.result import DesignFailed, listed
 from models.device import Device, passivity_level
 from models.human import Population
@@ -91,10 +91,8 @@ class _Sweep:
         """(m,) guaranteed dampings [N s/m]"""
         return tuple(passivity_level(device) for device in self.devices)
 
-    @property
-    def _longest(self) -> int:
-        """Samples on the longest way through the loop."""
-        return max(n + p for n, p in zip(self.theta, self.psi, strict=True))
+    def _loop(self, network: Network) -> Loop:
+        return Loop(self.T, self.theta, self.psi, self.theta, self.delta, network)
 
     def _ratios(self, F: Lti, sent: Callable[[Complex], Sampled]) -> Array:
         """this-environment's ratios, (n,), of the force maps F, whose responses without Theta are `sent`."""
@@ -104,7 +102,8 @@ class _Sweep:
             G = sent(z)
             return as_like(G, theta) @ G
 
-        return this_environment_ratios(at, F.poles(), self.delta, self._longest)
+        longest = max(n + p for n, p in zip(self.theta, self.psi, strict=True))
+        return this_environment_ratios(at, F.poles(), self.delta, longest)
 
     def _limits(self, devices: Sequence[Device]) -> tuple[Array, Array]:
         """Force limits [N] and encoder steps [m], (m,) each."""
@@ -163,9 +162,8 @@ class CouplingSweep(_Sweep):
             return None, None
         if self.network.walls:
             return None, "with delay in the environment its multiplier is of a linear one: no walls"
-        E = environment(self.network, self.T)
         try:
-            return shortage(Specification(E, self.theta, self.psi, self.theta, self.delta)), None
+            return least_phi(self._loop(self.network)), None
         except (ValueError, DesignFailed) as error:
             return None, " ".join(str(error).split())
 
@@ -218,7 +216,8 @@ class CouplingSweep(_Sweep):
 
     def _couplings(self, K: Array, B: Array, channels: int | None = None) -> SpringDamper:
         m = channels or self.channels
-        return SpringDamper(*(np.repeat(np.asarray(gain)[:, None], m, axis=1) for gain in (K, B)), self.cutoff)
+        each = np.ones(m)
+        return SpringDamper(np.multiply.outer(K, each), np.multiply.outer(B, each), self.cutoff)
 
     @cached_property
     def _environments(self) -> tuple[Lti | None, ...]:
@@ -324,7 +323,7 @@ class EnvironmentSweep(_Sweep):
         """theorem4's requirement, which no spring of the environment changes."""
         if any(self.psi):
             return refusal("theorem4", self.delta, "not asked")
-        return theorem4_of(Loop(self.T, self.theta, self.psi, self.theta, self.delta, self.network), self.coupling)
+        return theorem4_of(self._loop(self.network), self.coupling)
 
     def _facing(self, condition: str) -> Coupling:
         """The coupling; for MODEL_KEPT as the V whose model stays that of the scenario's environment."""
@@ -629,12 +628,12 @@ def _simulated(
     sweep: Sweep, grid: Grid, held: HeldDevices, plan: Plan, cells: Cells, progress: Progress
 ) -> tuple[Points, bool]:
     """These cells, simulated in batches of whole cells, and whether the keyboard ended it."""
-    parts: list[Points] = []
+    (K, B), parts = grid.flat, []
     size, ticks = max(1, _BATCH // plan.trials), round(plan.duration / sweep.T)
     try:
         for first in range(0, cells.size, size):
             some, seen = cells[first : first + size], 0
-            trials, growth = _trials(sweep, *(axis[some] for axis in grid.flat), held, plan)
+            trials, growth = _trials(sweep, K[some], B[some], held, plan)
 
             def ticked(count: int, first: int = first) -> None:
                 nonlocal seen
