@@ -39,21 +39,17 @@ from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, fi
 from design.ranges import check_set, set_part
 from sim.couplings import NAMES, Chosen, choose
 from sim.files import write, write_json
+from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
 from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, SUSTAINED, slowest_seen
 from sim.zwidth import (
-    DECIDED,
     MODEL_KEPT,
-    UNDECIDED,
     CouplingSweep,
-    Effects,
     EnvironmentSweep,
     Grid,
-    HeldDevices,
     Map,
     MapError,
     Mark,
-    Plan,
     Range,
     Sweep,
     contact_springs,
@@ -363,7 +359,7 @@ def main(argv: list[str]) -> int:
     plan = _plan(args, sweep)
     out = out_folder(args, "zwidth")
 
-    crowd = HeldDevices.drawn(sweep, seed, humans)
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.T, seed, humans)
     bar, moved = progress_bar("certificates")
     with bar:
         drawn = draw_map(

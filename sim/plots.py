@@ -17,9 +17,10 @@ from matplotlib.patches import Patch
 
 from controller.lti import Array
 from sim.files import write
+from sim.limit_cycles import UNDECIDED
 from sim.stability import MARGINAL
 from sim.trace import Result
-from sim.zwidth import MODEL_KEPT, UNDECIDED, Map
+from sim.zwidth import MODEL_KEPT, Map
 
 # ----------------------------------------------------------------------------------------------------
 # Pictures of runs, as in Figures 5 and 6: readable in black and white and by the colour-blind.

@@ -13,9 +13,10 @@ from design.frequency import on_circle
 from models.scene import variants
 from sim.couplings import choose
 from sim.crowds import crowds
+from sim.limit_cycles import HeldDevices
 from sim.scenario import load
 from sim.stability import dominant_modes, exact_loops
-from sim.zwidth import MODEL_KEPT, EnvironmentSweep, HeldDevices
+from sim.zwidth import MODEL_KEPT, EnvironmentSweep
 
 PAIR, STAR = load("omega-pair"), load("three-rigid")
 WALL = Network(("tip",), (Spring(("tip", GROUND), 2000.0, 0.2),))
@@ -109,7 +110,7 @@ def test_what_no_environment_changes_is_the_same_in_all():
 def test_the_population_meets_the_pair_of_the_cell(optimal):
     """Eigenvalues of the loops one by one, with the force map that `sim.run` closes."""
     sweep = around(PAIR, optimal["omega-pair"])
-    crowd = HeldDevices.drawn(sweep, 1, 12, 1)
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.T, 1, 12, 1)
     F = sweep.force_maps(np.array([300.0, 3000.0]), np.array([0.5, 0.5]))[0]
     for i, stable in ((0, True), (1, False)):
         growth = crowd.growth(F[i])[0]

@@ -17,12 +17,14 @@ from design.frequency import on_circle, suprema
 from models.device import CompliantDevice, RigidDevice
 from models.human import Human, Link
 from models.scene import build, variants
+from sim import limit_cycles
 from sim import zwidth as zwidth_map
 from sim.crowds import crowds
 from sim.engines import discretised
+from sim.limit_cycles import Effects, HeldDevices, Plan
 from sim.scenario import InputError, load
 from sim.stability import dominant_modes, exact_loops, oscillation, slowest_seen
-from sim.zwidth import CouplingSweep, Effects, Grid, HeldDevices, Plan, draw_map, make_grid, one_sided
+from sim.zwidth import CouplingSweep, Grid, draw_map, make_grid, one_sided
 
 DELTA, T = 1.37, 1e-3
 PAIR, STAR = load("omega-pair"), load("three-rigid")
@@ -170,7 +172,7 @@ def test_the_grid_says_what_is_wrong_with_it():
 def test_the_population_is_decided_as_one_by_one(links):
     """The same eigenvalues from sim.verdicts, human by human; 1e-7 1/s is rounding of eigenvalues over T."""
     sweep = rigid(1)
-    crowd = HeldDevices.drawn(sweep, 3, 30, links)
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.T, 3, 30, links)
     F = sweep.force_maps(np.array([1500.0]), np.array([0.4]))[0][0]
     growth, audible = crowd.growth(F)
     for index, some in crowds(sweep.population, 1, 3, range(30), links):
@@ -186,7 +188,7 @@ def test_the_population_is_decided_as_one_by_one(links):
 def test_a_cell_that_the_leading_humans_leave_stable_is_asked_of_all():
     """One unstable human outside the leading ones must still be found."""
     sweep = rigid(1)
-    crowd = HeldDevices.drawn(sweep, 0, 40, 1)
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.T, 0, 40, 1)
     F = sweep.force_maps(np.array([1300.0]), np.array([0.0]))[0][0]
     growth, _ = crowd.growth(F)
     unstable = growth > 0
@@ -241,7 +243,7 @@ def test_many_processes_are_each_as_alone(walls):
         (stack,) = rigid(1).force_maps(np.array([500.0, 900.0]), np.array([0.2, 1.0]))
         processes = [Process(stack[i], limit, step) for i in range(2)]
     x = rng.normal(scale=1e-3, size=(20, 2))
-    together = zwidth_map._ManyProcesses(processes, 20, 2, 0)
+    together = limit_cycles._ManyProcesses(processes, 20, 2, 0)
     alone = [Tape(process, 20, 2) for process in processes]
     for k in range(20):
         together.s[k, 0] = x[k]
@@ -276,7 +278,7 @@ def points(sweep, K, B, effects=None, **changes):
     """The simulated points of a 2 x 2 map whose corners they are."""
     settings = {"points": 2, "trials": 1, "start": 1e-3, "press": 3.0, "duration": 2.0, "threshold": 2e-5} | changes
     grid = Grid(np.array(K), np.array(B), "linear")
-    crowd = HeldDevices.drawn(sweep, 0, 40, 1)
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.T, 0, 40, 1)
     return draw_map(sweep, grid, crowd, Plan(effects or Effects(), **settings), lambda *stage: None).points
 
 
