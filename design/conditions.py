@@ -225,7 +225,7 @@ def this_environment(F: Lti, delta: Sequence[float]) -> Requirement:
     return from_ratio("closed-loop", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
 
 
-W_ZERO = 1e-7  # [rad/sample] stands for F(1) of many, whose real part is even: sampled, a network may be 0/0 there
+W_ZERO = 1e-10  # [rad/sample] stands for F(1) of many, whose real part is even: sampled, a network may be 0/0 there
 #: rounding that F(1) may miss of symmetry and of positive semidefiniteness
 STATIC = 1e-9
 

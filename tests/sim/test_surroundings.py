@@ -100,6 +100,15 @@ def test_a_wall_without_coupling_and_delay_needs_half_the_stiffness_times_T_plus
     np.testing.assert_allclose(needed, K * scenario.T / 2 + B, rtol=1e-6)
 
 
+def test_no_cell_of_the_widest_plane_is_lost(optimal):
+    """Finite where a single sweep is; 1e-7: the stiffest cells are 1e6 times as stiff as the model of the coupling."""
+    sweep = around(PAIR, optimal["omega-pair"])
+    K, B = (axis.ravel() for axis in np.meshgrid(np.geomspace(1e-3, 1e9, 6), np.geomspace(1e-5, 1e6, 5)))
+    for name in ("closed-loop", MODEL_KEPT):
+        true = [sweep.requirement(name, k, b).ratio for k, b in zip(K, B, strict=True)]
+        np.testing.assert_allclose(sweep.ratios(name, K, B), true, rtol=1e-7)
+
+
 def test_what_no_environment_changes_is_the_same_in_all():
     sweep = around(PAIR, SpringDamper([800.0, 500.0], [0.4, 0.5]))
     assert sweep.conditions == ("theorem4", "closed-loop")

@@ -84,6 +84,15 @@ def test_the_map_is_that_of_design_margin(name):
         assert sweep.multiplier[1] is not None
 
 
+@pytest.mark.parametrize("scenario", [PAIR, STAR], ids=lambda s: s.name)
+def test_no_cell_of_the_widest_plane_is_lost(scenario):
+    """K = 1e-3 N/m in series with a free mass swings at 1e-5 rad/sample: F(1) must be asked for far below that."""
+    sweep = of(scenario, scenario.theta)
+    K, B = (axis.ravel() for axis in np.meshgrid(np.geomspace(1e-3, 1e9, 5), np.geomspace(1e-5, 1e6, 4)))
+    true = [sweep.requirement("closed-loop", k, b).ratio for k, b in zip(K, B, strict=True)]
+    np.testing.assert_allclose(sweep.ratios("closed-loop", K, B), true, rtol=2e-9)
+
+
 def test_a_wall_without_delay_needs_half_the_stiffness_times_T_plus_the_damping():
     K, B = np.random.default_rng(0).uniform([[1], [0]], [[6000], [3]], (2, 50))
     for needed in wall(0, K, B):
