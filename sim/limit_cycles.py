@@ -15,14 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.lti import Array, Lti
-from controller.process import Process, Tape
+from controller.process import Process, StepBuffer
 from models.device import Device
 from models.human import Population
 from models.scene import Crowd, Scene, variants
 from sim.crowds import crowds
 from sim.engines import HeldPlant, MujocoBatchEngine, hold, profiler_off, quiet_warnings
-from sim.run import stretch
-from sim.stability import RUNAWAY, Oscillation, close, oscillation, pace, slowest_seen
+from sim.run import run_block
+from sim.stability import close
+from sim.stepping import pace
+from sim.trace import RUNAWAY, Oscillation, oscillation, slowest_seen
 
 Cells = NDArray[np.intp]
 Progress = Callable[[int, int], None]  # done, total
@@ -135,7 +137,7 @@ def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
 _UNLIMITED = 1e6  # [N] force limit of a motor that does not saturate: the largest that a device may have
 _BATCH = 20  # simulations in one MuJoCo batch
 _EASE = 0.5  # [s] in which the press grows
-_STRETCH = 64  # ticks between two looks at the keyboard
+_BLOCK = 64  # ticks between two looks at the keyboard
 DECIDED = 0.2  # [1/s] linear growth nearer to zero than this does not show within a trace
 UNDECIDED = "too slow to say"  # verdict where the trace goes on oscillating as the linear loop would, decaying or not
 
@@ -294,21 +296,21 @@ def _simulate(
     scene, ticks = held_by.scene, round(plan.duration / T)
     substeps = pace(held_by.plants().A).substeps(T)
     n, processes = 2 * scene.model.nv, [trial.process for trial in trials]
-    tape = _ManyProcesses(processes, min(_STRETCH, ticks), n, scene.outside)
+    buffer = _ManyProcesses(processes, min(_BLOCK, ticks), n, scene.outside)
     starts = np.stack([trial.start for trial in trials], axis=1)
-    tape.s[0] = starts[:n]
+    buffer.s[0] = starts[:n]
     if processes[0].contact is None:  # the states of a process with walls are others: it begins at rest
-        tape.z[0] = starts[n:]
+        buffer.z[0] = starts[n:]
     seen, kept, done = list(_motors_and_handles(scene)), [], 0
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
         engine = MujocoBatchEngine(scene, T, substeps=substeps, nsim=len(trials), fields=held_by.fields)
-        engine.start(tape)
+        engine.start(buffer)
         while done < ticks:
-            count = min(tape.ticks, ticks - done)
-            tape.w[:count] = _press_forces(scene, T, press, done, count)[:, :, None]
-            stretch(tape, engine, count)
-            kept.append(tape.s[:count, seen].copy())
-            tape.rewind(count)
+            count = min(buffer.ticks, ticks - done)
+            buffer.w[:count] = _press_forces(scene, T, press, done, count)[:, :, None]
+            run_block(buffer, engine, count)
+            kept.append(buffer.s[:count, seen].copy())
+            buffer.rewind(count)
             done += count
             ticked(count)
     return oscillation(np.concatenate(kept)[ticks // 2 :], T, plan.threshold)
@@ -327,7 +329,7 @@ def _press_forces(scene: Scene, T: float, press: Array, first: int, ticks: int) 
 _Transition = Callable[[Array, Array], object]  # [z; x] (order + m, nsim) -> writes [f; z+] (m + order, nsim)
 
 
-class _ManyProcesses(Tape):
+class _ManyProcesses(StepBuffer):
     """A process for each simulation, all of the same order, number of walls, force limits and encoder steps."""
 
     def __init__(self, processes: Sequence[Process], ticks: int, plant_states: int, outside: int) -> None:

@@ -12,7 +12,7 @@ from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, Wall, environment
 from controller.loop import force_map
-from controller.process import Process, Tape, contact
+from controller.process import Process, StepBuffer, contact
 from design.frequency import on_circle, suprema
 from models.device import CompliantDevice, RigidDevice
 from models.human import Human, Link
@@ -23,7 +23,8 @@ from sim.crowds import crowds
 from sim.engines import discretised
 from sim.limit_cycles import Effects, HeldDevices, Plan
 from sim.scenario import InputError, load
-from sim.stability import dominant_modes, exact_loops, oscillation, slowest_seen
+from sim.stability import dominant_mode, exact_loops
+from sim.trace import oscillation, slowest_seen
 from sim.zwidth import CouplingSweep, Grid, draw_map, make_grid, one_sided
 
 DELTA, T = 1.37, 1e-3
@@ -185,7 +186,7 @@ def test_the_population_is_decided_as_one_by_one(links):
     F = sweep.force_maps(np.array([1500.0]), np.array([0.4]))[0][0]
     growth, audible = crowd.growth(F)
     for index, some in crowds(sweep.population, 1, 3, range(30), links):
-        modes = dominant_modes(exact_loops(variants(sweep.devices, some), F))
+        modes = dominant_mode(exact_loops(variants(sweep.devices, some), F))
         np.testing.assert_allclose(growth[index], modes.growth, atol=1e-7)
     assert (audible <= growth + 1e-9).all()
     assert (growth > 0).any()
@@ -253,7 +254,7 @@ def test_many_processes_are_each_as_alone(walls):
         processes = [Process(stack[i], limit, step) for i in range(2)]
     x = rng.normal(scale=1e-3, size=(20, 2))
     together = limit_cycles._ManyProcesses(processes, 20, 2, 0)
-    alone = [Tape(process, 20, 2) for process in processes]
+    alone = [StepBuffer(process, 20, 2) for process in processes]
     for k in range(20):
         together.s[k, 0] = x[k]
         together.tick(k)
@@ -470,7 +471,7 @@ def test_slices_cover_everything_once():
         (["--grid", "1"], "--grid is 1, allowed are 4 to 400"),
         (["--humans", "0"], "--humans is 0, allowed are 1 to 100000"),
         (["--K-range", "5"], "--K-range is '5', expected two numbers separated by a comma"),
-        (["--mark", "5000,x"], "--mark is '5000,x', expected numbers"),
+        (["--mark", "5000,x"], "--mark is '5000,x', expected two numbers"),
         (["--mark", "0,1"], "--mark is 0,1, allowed are K"),
         (["--case", "none"], "--case none is the loop without coupling"),
         (["--rigid", "--theta", "1,2"], "--rigid is one channel: --theta has 2 entries"),
