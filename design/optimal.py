@@ -495,7 +495,7 @@ def high_frequency_limit(world: World, gain: float, above_hz: float) -> Inequali
 
 
 def switching(world: World, delta: Array, lo: Sequence[int], hi: Sequence[int]) -> Inequality:
-    """The condition of design.jitter for forces whose ages switch within [lo, hi] [samples], scaled to Delta_D/T = I.
+    """`switching_block` for forces whose ages switch within [lo, hi] [samples], scaled to Delta_D/T = I.
 
     Its multiplier, one number per channel for all frequencies, is a shared unknown.
     """

@@ -418,7 +418,7 @@ def design(
 
     any-environment: minimises ||W1 L W2||_inf (23) over the exact set; the result does not depend on the start.
     closed-loop: minimises the rms mismatch in this environment from every start, local optima only; with
-    `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it (design.jitter).
+    `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it (`switching_block`).
     Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for closed-loop.
     """
     if condition == "theorem4" and switching is None:
