@@ -1,6 +1,6 @@
 """python -m sim.zwidth: the Z-width map (K-B plane): certified, exact for random humans, simulated.
 
-options -> the loop (Ground: K and B are the coupling's; Surroundings: the environment's) -> Grid -> Map -> files
+options -> CouplingSweep or EnvironmentSweep: whose K and B -> Grid -> Map -> files
 """
 
 from __future__ import annotations
@@ -18,35 +18,31 @@ from rich.table import Table
 from cli import options, render
 from controller.lti import Array
 from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, promise_of
-from design.maps import contact_springs
 from design.ranges import check_set, set_part
 from design.result import CONDITION_NAMES
 from sim import report
 from sim.couplings import NAMES, Chosen, choose
 from sim.files import write
+from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
 from sim.scenario import InputError, Scenario, require_constant_delay
 from sim.stability import MARGINAL
 from sim.trace import SUSTAINED, slowest_seen
 from sim.zwidth import (
-    DECIDED,
     MODEL_KEPT,
-    UNDECIDED,
-    Effects,
+    CouplingSweep,
+    EnvironmentSweep,
     Grid,
-    Ground,
     Map,
-    MapLoop,
+    MapError,
     Mark,
-    Plan,
     Range,
-    Surroundings,
-    Truth,
+    Sweep,
+    contact_springs,
     draw_map,
-    holders,
-    look,
+    evaluate_point,
     make_grid,
+    map_error,
     one_sided,
-    truth,
 )
 
 # ----------------------------------------------------------------------------------------------------
@@ -174,23 +170,23 @@ def _share(count: int, cells: int) -> str:
 NOT_REACHED = "not reached before the interruption"
 
 
-def summary(ground: MapLoop, drawn: Map, plan: Plan, population: dict[str, Any]) -> dict[str, Any]:
+def summary(sweep: Sweep, drawn: Map, plan: Plan, population: dict[str, Any]) -> dict[str, Any]:
     """The whole map. Rows are stiffnesses; null is infinite, or not reached before an interruption."""
     known = np.isfinite(drawn.growth)
     unsafe = known & (drawn.growth > MARGINAL)
     part: dict[str, Any] = {
-        "rigid": ground.network is None,
-        "T": ground.T,
-        "theta": list(ground.theta),
-        "psi": list(ground.psi),
-        "delta": list(ground.delta),
-        "velocity_filter_hz": ground.cutoff,
-        "one_sided": ground.walled is not None,
+        "rigid": sweep.network is None,
+        "T": sweep.T,
+        "theta": list(sweep.theta),
+        "psi": list(sweep.psi),
+        "delta": list(sweep.delta),
+        "velocity_filter_hz": sweep.cutoff,
+        "one_sided": sweep.walled is not None,
         "conditions": list(drawn.ratio),
         "grid": {"K": drawn.grid.K.tolist(), "B": drawn.grid.B.tolist(), "scale": drawn.grid.scale},
     }
     for name, ratio in drawn.ratio.items():
-        reason = _nulls(ground, drawn, name)
+        reason = _nulls(sweep, drawn, name)
         part[name] = ({"reason": reason} if reason else {}) | {
             "required_over_available": _rows(drawn, ratio),
             "certified_cells": int((ratio < 1).sum()),
@@ -204,7 +200,7 @@ def summary(ground: MapLoop, drawn: Map, plan: Plan, population: dict[str, Any])
         "stable_cells": int((known & ~unsafe).sum()),
         "decided_cells": int(known.sum()),
     } | ({"reason": f"null: {NOT_REACHED}"} if np.isnan(drawn.growth).any() else {})
-    part["simulation"] = _simulation(ground, drawn, plan)
+    part["simulation"] = _simulation(sweep, drawn, plan)
     contradicted = sum(part[name]["contradicted_cells"] for name in CONDITIONS)
     disagree = 0 if part["simulation"]["nonlinear"] else part["simulation"]["differ_from_linear"]
     part["holds"] = contradicted == 0 and disagree == 0
@@ -214,22 +210,22 @@ def summary(ground: MapLoop, drawn: Map, plan: Plan, population: dict[str, Any])
     return part
 
 
-def _nulls(ground: MapLoop, drawn: Map, name: str) -> str | None:
+def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
     """Why a condition has cells without a figure, in words of one such cell; None where it has none."""
-    if name in ground.refusals:
-        return ground.refusals[name]
+    if name in sweep.refusals:
+        return sweep.refusals[name]
     ratio, (K, B) = drawn.ratio[name], drawn.grid.flat
     unreached, infinite = np.isnan(ratio), np.flatnonzero(np.isposinf(ratio))
     parts = [f"null at {unreached.sum()} cells: {NOT_REACHED}"] if unreached.any() else []
     if infinite.size:
         first = infinite[0]
-        why = ground.requirement(name, float(K[first]), float(B[first])).reason or "the figure grows without end"
+        why = sweep.requirement(name, float(K[first]), float(B[first])).reason or "the figure grows without end"
         at = f"at K {K[first]:.4g}, B {B[first]:.4g}, {why}"
         parts.append(f"null at {infinite.size} cells: no damping is enough; {at}")
     return "; ".join(parts) or None
 
 
-def _simulation(ground: MapLoop, drawn: Map, plan: Plan) -> dict[str, Any]:
+def _simulation(sweep: Sweep, drawn: Map, plan: Plan) -> dict[str, Any]:
     points, (K, B) = drawn.points, drawn.grid.flat
     rows = [
         {
@@ -243,15 +239,15 @@ def _simulation(ground: MapLoop, drawn: Map, plan: Plan) -> dict[str, Any]:
         }
         for i, cell in enumerate(points.cell.tolist())
     ]
-    devices = plan.effects.on(ground.devices)
+    devices = plan.effects.on(sweep.devices)
     return {
         "effects": {
             "encoder_step_m": [device.encoder_step for device in devices],
             "friction_n": [device.friction for device in devices],
             "force_limit_n": [d.force_limit for d in devices] if plan.effects.saturation else None,
-            "one_sided": ground.walled is not None,
+            "one_sided": sweep.walled is not None,
         },
-        "nonlinear": plan.effects.nonlinear(ground.devices) or ground.walled is not None,
+        "nonlinear": plan.effects.nonlinear(sweep.devices) or sweep.walled is not None,
         "trials": plan.trials,
         "duration_s": plan.duration,
         "start_m": plan.start,
@@ -265,12 +261,12 @@ def _simulation(ground: MapLoop, drawn: Map, plan: Plan) -> dict[str, Any]:
     }
 
 
-def add_truth(outcome: dict[str, Any], found: dict[str, Truth | None]) -> None:
+def add_errors(outcome: dict[str, Any], found: dict[str, MapError | None]) -> None:
     """How far the map is from design.margin."""
     outcome["error"] = {
-        name: truth
-        and {"figure_relative": truth.ratio, "edge_relative_in_K": truth.edge, "columns_compared": truth.columns}
-        for name, truth in found.items()
+        name: error
+        and {"figure_relative": error.ratio, "edge_relative_in_K": error.edge, "columns_compared": error.columns}
+        for name, error in found.items()
     }
 
 
@@ -336,19 +332,19 @@ def main(argv: list[str]) -> int:
     require_constant_delay(scenario, "sim.zwidth")
     _check_case(args)
     chosen = _chosen(args, scenario)
-    ground: MapLoop = _surroundings(scenario, chosen) if chosen else _ground(args, scenario)
+    sweep: Sweep = _environment_sweep(scenario, chosen) if chosen else _coupling_sweep(args, scenario)
     marks = _marks(args)
-    grid, plan, out = _grid(args, ground, marks), _plan(args, ground), options.out_folder(args, "zwidth")
+    grid, plan, out = _grid(args, sweep, marks), _plan(args, sweep), options.out_folder(args, "zwidth")
 
-    crowd = holders(ground.devices, ground.population, args.seed, args.humans, ground.population.links, ground.T)
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.T, args.seed, args.humans)
     with render.progress("certificates") as move:
-        drawn = draw_map(ground, grid, crowd, plan, lambda stage, k, of: move(k, of, stage))
-    outcome = summary(ground, drawn, plan, {"humans": args.humans, "seed": args.seed})
+        drawn = draw_map(sweep, grid, crowd, plan, lambda stage, k, of: move(k, of, stage))
+    outcome = summary(sweep, drawn, plan, {"humans": args.humans, "seed": args.seed})
     outcome |= {"scenario": None if args.rigid else scenario.name, "scenario_digest": scenario.digest}
     outcome |= _coupling(args, scenario, chosen) if chosen else {"axes": "coupling", "coupling": None}
     if not drawn.interrupted:
-        add_truth(outcome, {name: truth(ground, drawn, name) for name in drawn.ratio})
-        add_marks(outcome, [look(ground, crowd, *mark, grid.K) for mark in marks])
+        add_errors(outcome, {name: map_error(sweep, drawn, name) for name in drawn.ratio})
+        add_marks(outcome, [evaluate_point(sweep, crowd, *mark, grid.K) for mark in marks])
     files, lines = _save(args, drawn, outcome, out), [_mark_line(m, args.humans) for m in outcome.get("marks", ())]
     render.publish(args, outcome, [_table(outcome)], [*lines, *_remarks(outcome)], out, files)
     if drawn.interrupted:
@@ -424,11 +420,11 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
     return choose(scenario, args.case, args.coupling, args.condition)
 
 
-def _surroundings(scenario: Scenario, chosen: Chosen) -> Surroundings:
+def _environment_sweep(scenario: Scenario, chosen: Chosen) -> EnvironmentSweep:
     """The loop with that coupling. Raises InputError."""
     who = scenario.device, scenario.population
     try:
-        return Surroundings(*who, scenario.environment, scenario.T, scenario.theta, scenario.psi, chosen.coupling)
+        return EnvironmentSweep(*who, scenario.environment, scenario.T, scenario.theta, scenario.psi, chosen.coupling)
     except ValueError as error:
         raise InputError(str(error)) from None
 
@@ -453,7 +449,7 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
     }
 
 
-def _ground(args: argparse.Namespace, scenario: Scenario) -> Ground:
+def _coupling_sweep(args: argparse.Namespace, scenario: Scenario) -> CouplingSweep:
     """The loop without its coupling. Raises InputError."""
     loop: dict[str, Any] = {"network": scenario.environment, "theta": scenario.theta, "psi": scenario.psi}
     devices = scenario.device
@@ -463,7 +459,7 @@ def _ground(args: argparse.Namespace, scenario: Scenario) -> Ground:
         elif args.wall:
             loop["network"] = one_sided(scenario.environment)
         loop |= {"T": scenario.T, "cutoff": args.velocity_filter, "one_sided": args.rigid and args.wall}
-        return Ground(devices, scenario.population, **loop)
+        return CouplingSweep(devices, scenario.population, **loop)
     except ValueError as error:
         raise error if isinstance(error, InputError) else InputError(str(error)) from None
 
@@ -476,15 +472,15 @@ def _marks(args: argparse.Namespace) -> tuple[Range, ...]:
     return tuple(args.mark or ())
 
 
-def _grid(args: argparse.Namespace, ground: MapLoop, marks: tuple[Range, ...]) -> Grid:
-    return make_grid(ground, args.grid, args.K_range, args.B_range, args.scale, marks)
+def _grid(args: argparse.Namespace, sweep: Sweep, marks: tuple[Range, ...]) -> Grid:
+    return make_grid(sweep, args.grid, args.K_range, args.B_range, args.scale, marks)
 
 
-def _plan(args: argparse.Namespace, ground: MapLoop) -> Plan:
+def _plan(args: argparse.Namespace, sweep: Sweep) -> Plan:
     effects = Effects(args.quantisation, args.friction, args.saturation)
-    coarsest = max(device.encoder_step for device in effects.on(ground.devices))
+    coarsest = max(device.encoder_step for device in effects.on(sweep.devices))
     threshold = max(2 * coarsest, FINEST) if args.threshold is None else args.threshold
-    shortest = max(1.5, 1024 * ground.T)
+    shortest = max(1.5, 1024 * sweep.T)
     if not shortest <= args.duration <= 1e4:
         raise InputError(f"--duration is {args.duration:g}, allowed are {shortest:g} to 10000 s")
     return Plan(effects, args.points, args.trials, args.start, args.press, args.duration, threshold)

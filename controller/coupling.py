@@ -92,17 +92,16 @@ class SpringDamper:
         """V(z), diagonal."""
         return Lti.diag(*self.channels(T))
 
-    def stiffness_at(self, z: Complex, T: float) -> Complex:
-        """1/V(z) [N/m] of each channel, shape (n, k, m) for z (n, k) or (1, k) and gains (n, m)."""
-        beta, z = self._beta(T), np.asarray(z)[..., None]
-        damper = self.B[..., None, :] * ((1 - beta) / (1 - beta / z))
-        return self.K[..., None, :] + damper * (1 - 1 / z) / T
+    def sampled(self, z: Complex, T: float) -> Sampled:
+        """V at z (n, k) or (1, k), for gains (n, m) or (m,)."""
+        beta, points = self._beta(T), np.asarray(z)[..., None]
+        rate = (1 - beta) / (1 - beta / points) * (1 - 1 / points) / T
+        values = 1 / (self.K[..., None, :] + self.B[..., None, :] * rate)
+        return Sampled(z, values[..., None] * np.eye(values.shape[-1]), T)
 
     def around(self, environment: Block, further: int = 0) -> Block:
         if isinstance(environment, Sampled):
-            return environment.feedback(
-                _sampled_diagonal(1 / self.stiffness_at(environment.z, environment.T), environment)
-            )
+            return environment.feedback(self.sampled(environment.z, environment.T))
         return _feedback(environment, self.compliance(environment.T), further)
 
     def form(self) -> SpringDamperForm:
@@ -229,10 +228,6 @@ def _feedback(environment: Lti, V: Lti, further: int) -> Lti:
     if further:
         V = Lti.diag(V, Lti.constant(np.zeros((further, further)), V.T))
     return environment.feedback(V)
-
-
-def _sampled_diagonal(values: Complex, like: Sampled) -> Sampled:
-    return Sampled(like.z, values[..., None] * np.eye(values.shape[-1]), like.T)
 
 
 class Strict(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

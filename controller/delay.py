@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Literal
 
 import msgspec
@@ -32,12 +33,18 @@ def delay(steps: Sequence[int], T: Number) -> Lti:
     for n in steps:
         if n != int(n) or n < 0:
             raise ValueError(f"a delay is a whole number of samples, zero or more, got {n}")
-    return Lti.diag(*(taps([0] * int(n) + [1], T) for n in steps))
+    return _chains(tuple((0,) * int(n) + (1,) for n in steps), T)
 
 
 def moving_sum(steps: Sequence[int], T: Number) -> Lti:
     """diag(1 + 1/z + ... + z^-n_i)."""
-    return Lti.diag(*(taps([1] * (n + 1), T) for n in steps))
+    return _chains(tuple((1,) * (n + 1) for n in steps), T)
+
+
+@lru_cache(maxsize=256, typed=True)  # typed: the period's type decides the arithmetic
+def _chains(weights: tuple[tuple[int, ...], ...], T: Number) -> Lti:
+    """The taps of each channel, built once: loops are evaluated again and again with the same delays."""
+    return Lti.diag(*(taps(each, T) for each in weights))
 
 
 def packet_delays(values: ArrayLike) -> Ticks:

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.lti import Array, Lti, Number, inverse, rational
+from controller.lti import Array, Complex, Lti, Number, Sampled, inverse, rational
 
 # ----------------------------------------------------------------------------------------------------
 # Environments that are not known exactly: a box around a network's parameters, its vertices, and points inside.
@@ -383,16 +383,35 @@ def environment(network: Network, T: Number) -> Lti:
     for v at every tick. The states are q- and v- of the internal nodes, and what the contact dampers and
     masses need of the past. In the arithmetic of T. Raises ValueError if an internal node is held by nothing.
     """
-    return Lti(*realise(_solvable(network, T), len(network.contacts), T), T)
+    return environment_of(_solvable(network, T), len(network.contacts), T)
+
+
+#: mass [kg], damping [N s/m] and stiffness [N/m], (..., nodes, nodes) each, as Network.matrices gives them
+Matrices = tuple[Array, Array, Array]
+
+
+def environment_of(matrices: Matrices, contacts: int, T: Number) -> Lti:
+    """E(z) of the networks with these matrices, whose first nodes are the contacts: a stack where they have axes."""
+    return Lti(*_realise(matrices, contacts, T), T)
+
+
+def sampled_environment(matrices: Matrices, contacts: int, z: Complex, T: float) -> Sampled:
+    """The same at z (n, k) from the dynamic stiffness itself, Z_cc - Z_ci Z_ii^-1 Z_ic at s = (z-1)/(Tz)."""
+    M, D, K = (part[..., None, :, :] for part in matrices)
+    s = ((z - 1) / (T * z))[..., None, None]
+    Z = M * s**2 + D * s + K
+    cc, ci, ic, ii = (Z[(..., *quarter)] for quarter in _quarters(contacts))
+    inner = ic / ii if ii.shape[-1] == 1 else np.linalg.solve(ii, ic)
+    return Sampled(z, cc - ci @ inner, T)
 
 
 def walled_environment(network: Network, T: Number) -> Lti:
     """[x; p] -> [f; y]: as `environment`, wall forces p [N] put in and displacements y [m] across walls out."""
     across = network.across(network.walls)
-    return Lti(*realise(_solvable(network, T), len(network.contacts), T, across), T)
+    return Lti(*_realise(_solvable(network, T), len(network.contacts), T, across), T)
 
 
-def _solvable(network: Network, T: Number) -> tuple[Array, Array, Array]:
+def _solvable(network: Network, T: Number) -> Matrices:
     if isinstance(T, Fraction):
         return network.matrices(rational)
     M, D, K = network.matrices()
@@ -403,8 +422,8 @@ def _solvable(network: Network, T: Number) -> tuple[Array, Array, Array]:
     return M, D, K
 
 
-def realise(
-    matrices: tuple[Array, Array, Array],
+def _realise(
+    matrices: Matrices,
     c: int,
     T: Any,
     across: NDArray[np.int64] | None = None,
@@ -414,28 +433,31 @@ def realise(
     With `across` (w, nodes) there are w more inputs, forces that push the displacements `across q` back, and w more
     outputs, these displacements. The arithmetic is that of the entries.
     """
-    M, D, K = matrices
-    cc, ci, ic, ii = _quarters(c)
-    solve = inverse(M[ii] / T + D[ii] + T * K[ii])
+    (Mcc, _, _, Mii), (Dcc, Dci, Dic, Dii), (Kcc, Kci, Kic, Kii) = (
+        [part[(..., *quarter)] for quarter in _quarters(c)] for part in matrices
+    )
+    solve = inverse(Mii / T + Dii + T * Kii)
 
     # every signal is a row of coefficients over [x; p; q-; v-; x-; vx-]
-    n, w = M.shape[0] - c, 0 if across is None else len(across)
+    M = matrices[0]
+    n, w = M.shape[-1] - c, 0 if across is None else len(across)
     signals = np.eye(3 * c + w + 2 * n, dtype=M.dtype)
     x, p, q_old, v_old, x_old, vx_old = np.split(signals, np.cumsum([c, w, n, n, c]))
     vx = (x - x_old) / T
-    push = M[ii] / T @ v_old - K[ii] @ q_old - D[ic] @ vx - K[ic] @ x
+    push = Mii / T @ v_old - Kii @ q_old - Dic @ vx - Kic @ x
     if across is not None:
         push = push - across[:, c:].T @ p
     v = solve @ push
     q = q_old + T * v
-    force = M[cc] @ (vx - vx_old) / T + D[cc] @ vx + K[cc] @ x + D[ci] @ v + K[ci] @ q
+    force = Mcc @ (vx - vx_old) / T + Dcc @ vx + Kcc @ x + Dci @ v + Kci @ q
     if across is not None:
         force = np.vstack([force + across[:, :c].T @ p, across[:, :c] @ x + across[:, c:] @ q])
 
-    after, inputs = np.vstack([q, v, x, vx]), c + w
+    inputs = c + w
+    after = np.concatenate([np.broadcast_to(part, (*M.shape[:-2], *part.shape[-2:])) for part in (q, v, x, vx)], -2)
     keep = _remembered(after, force, inputs)
-    kept = after[keep]
-    return kept[:, inputs:][:, keep], kept[:, :inputs], force[:, inputs:][:, keep], force[:, :inputs]
+    kept, rest = after[..., keep, :], force[..., inputs:]
+    return kept[..., inputs:][..., keep], kept[..., :inputs], rest[..., keep], force[..., :inputs]
 
 
 def _quarters(c: int) -> tuple[tuple[slice, slice], ...]:
@@ -445,8 +467,9 @@ def _quarters(c: int) -> tuple[tuple[slice, slice], ...]:
 
 def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
     """Indices of the states that reach the outputs now or later: the others need not be stored."""
-    reads = after[:, inputs:] != 0
-    used = (force[:, inputs:] != 0).any(axis=0)
+    count = after.shape[-1]
+    reads = (after.reshape(-1, count - inputs, count)[..., inputs:] != 0).any(axis=0)
+    used = (force.reshape(-1, count)[:, inputs:] != 0).any(axis=0)
     for _ in range(used.size):
         used = used | reads[used].any(axis=0)
     return np.flatnonzero(used)

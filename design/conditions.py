@@ -14,13 +14,12 @@ switching          this-environment for delays of the forces that vary within lo
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from controller.delay import delay, moving_sum
@@ -30,6 +29,7 @@ from controller.lti import (
     Complex,
     Lti,
     Number,
+    Sampled,
     as_like,
     constant_like,
     hstack,
@@ -37,7 +37,16 @@ from controller.lti import (
     taps,
     vstack,
 )
-from design.frequency import Response, frequencies, hermitian, on_circle, supremum
+from design.frequency import (
+    Response,
+    frequencies,
+    frequencies_of_many,
+    hermitian,
+    largest_eigenvalue,
+    on_circle,
+    suprema,
+    supremum,
+)
 
 #: as files and options of today name them: theorem4 is any-environment, closed-loop is this-environment
 Condition = Literal["closed-loop", "theorem4"]
@@ -81,7 +90,7 @@ def any_environment_demand(V: Block, theta: Sequence[int], delta: Sequence[Any])
 
 
 def switching_block(
-    G: Block, lo: Sequence[int], hi: Sequence[int], delta: Sequence[Any], alpha: Sequence[Any]
+    G: Block, lo: Sequence[int], hi: Sequence[int], delta: Sequence[Any] | Array, alpha: Sequence[Any] | Array
 ) -> tuple[Block, Array]:
     """[[F/(z-1) + Delta_D/T - diag(alpha)/2, 0], [2 h G, 2 diag(alpha)]], which must be positive real; and F(1).
 
@@ -186,7 +195,7 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
     own = np.diagonal(gain, axis1=-2, axis2=-1).real
     if (own > 0).all() and not (gain * (1 - np.eye(gain.shape[-1]))).any():
         weight = 1 / np.sqrt(own)
-        return np.linalg.eigvalsh(-weight[..., :, None] * free * weight[..., None, :])[..., -1]
+        return largest_eigenvalue(-weight[..., :, None] * free * weight[..., None, :])
     eigenvalues, basis = np.linalg.eigh(gain)
     floor = np.maximum(1e-13 * np.abs(eigenvalues).max(axis=-1, keepdims=True), np.finfo(float).tiny)
     whitened = np.conj(np.swapaxes(basis, -1, -2)) / np.sqrt(np.maximum(eigenvalues, floor))[..., :, None]
@@ -206,16 +215,30 @@ def this_environment(F: Lti, delta: Sequence[float]) -> Requirement:
     radius = float(np.abs(F.poles()).max(initial=0.0))
     if radius >= 1:
         return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
-    demand = this_environment_demand(F, available)
-    F1 = demand.static["F(1)"]
-    # rounding in F(1) is relative to what F is elsewhere: a free mass has F(1) = 0 out of large numbers
-    scale = max(float(np.abs(F1).max()), float(np.abs(F.D).max()), float(np.abs(F.at(-1.0)).max()), 1e-12)
-    if np.abs(F1 - F1.T).max() > 1e-9 * scale:
+    skew, least = _static_errors(F.dc(), F.D, F.at(-1.0))
+    if skew > STATIC:
         return refused("the static stiffness F(1) is not symmetric: a slow closed path could extract energy")
-    if np.linalg.eigvalsh((F1 + F1.T) / 2).min() < -1e-9 * scale:
+    if least < -STATIC:
         return refused("the static stiffness F(1) has a negative direction: it pushes outwards")
+    demand = this_environment_demand(F, available)
     ratio, w = supremum(lambda w: least_scale(demand, w), np.concatenate([[0.0], frequencies(F)]))
     return from_ratio("closed-loop", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
+
+
+W_ZERO = 1e-10  # [rad/sample] stands for F(1) of many, whose real part is even: sampled, a network may be 0/0 there
+#: rounding that F(1) may miss of symmetry and of positive semidefiniteness
+STATIC = 1e-9
+
+
+def _static_errors(F1: Array, *elsewhere: Array | Complex) -> tuple[Array, Array]:
+    """How far F(1) is from symmetric, and its least eigenvalue; relatively to what F is elsewhere, (...,) each.
+
+    A free mass has F(1) = 0 out of large numbers.
+    """
+    scale = np.max([np.abs(part).max(axis=(-2, -1)) for part in (F1, *elsewhere)], axis=0, initial=1e-12)
+    turned = np.swapaxes(F1, -1, -2)
+    least = np.linalg.eigvalsh((F1 + turned) / 2).min(axis=-1)
+    return np.abs(F1 - turned).max(axis=(-2, -1)) / scale, least / scale
 
 
 def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Requirement:
@@ -283,8 +306,7 @@ def any_environment_delayed(
     """Theorem 4 for the coupling V with the diagonal multiplier phi (N,) [N s/m]; phi = 0 is `any_environment`.
 
     The ratio s is the least for which s Delta_D satisfies, at every frequency and divided by |1 - 1/z|^2,
-    He[H/(1-z)] >= H* Delta_V H with H = V - Theta-hat/s and Delta_V = Phi + Phi (s Delta_D - Phi)^-1 Phi. It is
-    found by bisection at each frequency: no solver.
+    He[H/(1-z)] >= H* Delta_V H with H = V - Theta-hat/s and Delta_V = Phi + Phi (s Delta_D - Phi)^-1 Phi.
     """
     available = dampings(delta, V.inputs)
 
@@ -317,33 +339,71 @@ def uncovered(environment: Lti, psi: Sequence[int], Phi: Array) -> float:
 
 
 def delayed_demand(V: Lti, theta: Sequence[int], delta: Array, phi: Array) -> Response:
-    """w (k,) -> the least s of `any_environment_delayed` at each frequency, up to 1000; inf beyond."""
-    V1, quotient, T = V.dc(), V.quotient_at_one(), V.T
-    floor = float((phi / delta).max())
+    """w (k,) -> the least s of `any_environment_delayed` at each frequency."""
+    response = _delayed_response(V, theta)
+    return lambda w: _delayed_scale(response.at(on_circle(w)), delta, phi)
+
+
+def _delayed_response(V: Block, theta: Sequence[int]) -> Block:
+    """[(V(1)/2 - R)/T; V/T; 1 + 1/z + ... + z^-theta], what `_delayed_scale` needs of V = V(1) + (z-1) R."""
+    V1, R = V.split_at_one()
+    return vstack((V1 / 2 - R) * (1 / V.T), V * (1 / V.T), as_like(V, moving_sum(theta, V.T)))
+
+
+def _delayed_scale(response: Complex, delta: Array, phi: Array) -> Array:
+    """The least s of `any_environment_delayed`, (...,), from `_delayed_response` (..., 3m, m); inf where there is none.
+
+    With S = He (V(1)/2 - R)/T - V* Phi V/T^2 and N = (1 + ... + z^-theta)/2 - Phi V/T the inequality is S > 0 and
+    s Delta_D >= Phi + N S^-1 N*: two Schur complements of a matrix that is affine in s.
+    """
+    passivity, VT, window = np.split(response, 3, axis=-2)
+    star = lambda M: np.conj(np.swapaxes(M, -1, -2))  # noqa: E731
+    S = hermitian(passivity) - star(VT) @ (phi[:, None] * VT)
+    N = window / 2 - phi[:, None] * VT
+    sound = -largest_eigenvalue(-S) > 0
+    S = np.where(sound[..., None, None], S, np.eye(phi.size))
+    root = 1 / np.sqrt(delta)
+    needed = np.diag(phi) + N @ np.linalg.solve(S, star(N))
+    return np.where(sound, largest_eigenvalue(root[:, None] * hermitian(needed) * root), np.inf)
+
+
+# Many couplings or environments at once: a row for each, as a map asks for them.
+
+Responses = Callable[[Complex], Sampled]  # z (n, k) or (1, k) -> responses there, a row for each system
+
+
+def this_environment_ratios(at: Responses, poles: Complex, delta: Sequence[float], delay: int) -> Array:
+    """Required over available damping, (n,), of n loops; inf where no damping is enough.
+
+    `at` gives the responses of their force maps, `poles` (n, p) are these maps' own, and `delay` [samples] is the
+    longest way through the loop, which makes so many lobes.
+    """
+    here, opposite = (np.full((len(poles), 1), w) for w in (W_ZERO, np.pi))
+    skew, least = _static_errors(at(on_circle(here)).G[:, 0].real, at(on_circle(opposite)).G[:, 0])
+    sound = (np.abs(poles).max(axis=1, initial=0.0) < 1) & (skew <= STATIC) & (least >= -STATIC)
 
     def needed(w: Array) -> Array:
-        z = on_circle(w)
-        passivity = (V1 / 2 - hermitian(quotient.at(z))) / T
-        response = V.at(z) / T
-        vt = np.stack([np.exp(-1j * np.outer(w, np.arange(n + 1))).sum(axis=1) for n in theta], axis=1)
+        return _least_scales(this_environment_demand(at(on_circle(w)), delta))
 
-        def short(s: Array) -> NDArray[np.bool_]:
-            damping = s[:, None] * delta
-            cover = phi + phi**2 / (damping - phi)
-            H = response - (vt / (2 * damping))[:, :, None] * np.eye(delta.size)
-            cost = np.conj(np.swapaxes(H, 1, 2)) @ (cover[:, :, None] * H)
-            window = (np.abs(vt) ** 2 / (4 * damping))[:, :, None] * np.eye(delta.size)
-            return np.linalg.eigvalsh(passivity - window - cost)[:, 0] < 0
+    return np.where(sound, np.maximum(suprema(needed, *frequencies_of_many(poles, delay)), 0.0), np.inf)
 
-        low, high = np.full(w.size, floor * (1 + 1e-12) + 1e-12), np.full(w.size, 1e3)
-        hopeless = short(high)
-        for _ in range(60):
-            middle = np.sqrt(low * high)
-            bad = short(middle)
-            low, high = np.where(bad, middle, low), np.where(bad, high, middle)
-        return np.where(hopeless, np.inf, high)
 
-    return needed
+def any_environment_ratios(
+    V: Responses, count: int, theta: Sequence[int], delta: Sequence[float], phi: Sequence[float] | None = None
+) -> Array:
+    """The same of any-environment for `count` couplings; phi (m,) [N s/m] is the multiplier that psi >= 1 needs."""
+
+    def needed(w: Array) -> Array:
+        response = V(on_circle(w))
+        if phi is None:
+            return _least_scales(any_environment_demand(response, theta, delta))
+        return _delayed_scale(_delayed_response(response, theta).G, np.asarray(delta), np.asarray(phi))
+
+    return suprema(needed, *frequencies_of_many(np.zeros((count, 0), dtype=np.complex128), max(theta)))
+
+
+def _least_scales(demand: Demand[Sampled]) -> Array:
+    return least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G))
 
 
 # delays that switch within [lo, hi]: the best multiplier

@@ -60,15 +60,20 @@ def _gauss(response: Callable[[Array], Array], left: Array, right: Array) -> Arr
 PEAKS = 3  # highest local maxima of a row that are refined
 POINTS, ROUNDS = 17, 8  # a round narrows a bracket by (POINTS - 1)/2, so eight locate a smooth peak to rounding
 
-Responses = Callable[[Array], Array]  # w (n, k) [rad/sample] -> real values (n, k)
+Responses = Callable[[Array], Array]  # w (n, k) or (1, k) [rad/sample] -> real values (n, k)
 
 
-def suprema(responses: Responses, grid: Array) -> Array:
-    """The largest value of each row over its frequencies, (n,); `grid` (n, k) is sorted along its last axis.
+def suprema(responses: Responses, common: Array, own: Array) -> Array:
+    """The largest value of each row, (n,), over frequencies `common` to all, (k,), and its `own`, (n, p).
 
     A row with a value that is not finite gives infinity.
     """
-    values = responses(grid)
+    n = own.shape[0]
+    parts = [np.broadcast_to(w, (n, w.shape[-1])) for w in (common[None], own)]
+    found = [responses(common[None]), responses(own)] if own.size else [responses(common[None])]
+    order = np.argsort(np.concatenate(parts, axis=1), axis=1, kind="stable")
+    grid = np.take_along_axis(np.concatenate(parts, axis=1), order, axis=1)
+    values = np.take_along_axis(np.concatenate([np.broadcast_to(v, (n, v.shape[-1])) for v in found], axis=1), order, 1)
     endless = ~np.isfinite(values).all(axis=1)
     values = np.where(np.isfinite(values), values, -np.inf)
     padded = np.pad(values, ((0, 0), (1, 1)), constant_values=-np.inf)
@@ -92,6 +97,26 @@ def _neighbours(grid: Array, at: Array) -> tuple[Array, Array]:
     below = np.where(grid[:, None] < (at - room)[..., None], grid[:, None], grid[:, None, :1]).max(axis=2)
     above = np.where(grid[:, None] > (at + room)[..., None], grid[:, None], grid[:, None, -1:]).min(axis=2)
     return below, above
+
+
+#: [rad/sample] a figure is even at 0, so that 1e-4 stands for it up to 1e-8; what bends it nearer to 0, as slow poles
+#: of a model that is wrong do, is asked for at a few frequencies below
+LOWEST, BELOW = 1e-4, np.geomspace(1e-5, 0.9e-4, 8)
+EVEN = 192  # even frequencies, as many again evenly in their logarithm; more where delays make lobes
+PER_LOBE = 24
+NEAR_POLE = np.concatenate([-np.geomspace(0.05, 20, 10)[::-1], [0.0], np.geomspace(0.05, 20, 10)])  # in widths
+
+
+def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Array, Array]:
+    """As `frequencies`, for many systems: those common to all, (k,), and around the poles (n, p) of each, (n, j).
+
+    `delay` [samples] is the longest of the loop, which makes so many lobes.
+    """
+    even = np.linspace(LOWEST, np.pi, max(EVEN, PER_LOBE * (delay + 1)))
+    common = np.unique(np.concatenate([BELOW, even, np.geomspace(LOWEST, np.pi, EVEN)]))
+    width = np.maximum(1 - np.abs(poles), 1e-9)
+    near = (np.abs(np.angle(poles))[..., None] + width[..., None] * NEAR_POLE).reshape(poles.shape[0], -1)
+    return common, np.clip(near, LOWEST, np.pi)
 
 
 Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)
@@ -182,3 +207,14 @@ def on_circle(w: Array) -> NDArray[np.complex128]:
 def hermitian(G: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """He G = (G + G*)/2 over the last two axes."""
     return (G + np.conj(np.swapaxes(G, -1, -2))) / 2
+
+
+def largest_eigenvalue(H: NDArray[np.complex128]) -> Array:
+    """Of Hermitian matrices over the last two axes; in closed form up to two rows: LAPACK takes ten times as long."""
+    m = H.shape[-1]
+    if m == 1:
+        return H[..., 0, 0].real
+    if m == 2:
+        a, d, b = H[..., 0, 0].real, H[..., 1, 1].real, np.abs(H[..., 0, 1])
+        return (a + d) / 2 + np.hypot((a - d) / 2, b)
+    return np.linalg.eigvalsh(H)[..., -1].astype(np.float64)

@@ -27,11 +27,10 @@ from scipy.optimize import minimize
 from controller.coupling import InternalModel, basis
 from controller.environment import Member, environment
 from controller.loop import force_map
-from controller.lti import Array, Lti
-from design.conditions import jitter_proof, this_environment
+from controller.lti import Array, Lti, Sampled
+from design.conditions import jitter_proof, switching_block, this_environment
 from design.frequency import frequencies, hermitian, on_circle, peaks
 from design.lmi import Specification
-from design.maps import blocks
 from design.ranges import Found, search
 from design.result import Attempt, Design, DesignFailed, Infeasible, number, of_kind, one_of, whole
 from design.transparency import BAND_HZ, transparency
@@ -496,25 +495,29 @@ def high_frequency_limit(world: World, gain: float, above_hz: float) -> Inequali
 
 
 def switching(world: World, delta: Array, lo: Sequence[int], hi: Sequence[int]) -> Inequality:
-    """The condition of design.jitter for forces whose ages switch within [lo, hi] [samples], scaled to Delta_D/T = I.
+    """`switching_block` for forces whose ages switch within [lo, hi] [samples], scaled to Delta_D/T = I.
 
     Its multiplier, one number per channel for all frequencies, is a shared unknown.
     """
     m, root = delta.size, np.sqrt(world.T / delta)
     none = np.zeros(m)
 
+    def condition(z: Complex, G: Complex, alpha: Array, damping: Array) -> Complex:
+        """(n, k, r, r) from z (k,) and G (n, k, m, m)."""
+        return hermitian(switching_block(Sampled(z[None], G, 1.0), lo, hi, damping, alpha)[0].G)
+
     def block(w: Array, Q: Parameter) -> Block:
         z = on_circle(w)
         constant, slope = loop_force(world.delayed(z), Q.at(z))
         constant, slope = root[:, None] * constant * root, root[:, None] * slope * root
-        own = blocks(z, constant, none, lo, hi, np.ones(m), 1.0)
-        each = [blocks(z, slope[:, j], none, lo, hi, none, 1.0) for j in range(slope.shape[1])]
-        return Block(own, np.stack(each, axis=1) if each else np.zeros((z.size, 0, 2 * m, 2 * m), dtype=complex))
+        (own,) = condition(z, constant[None], none, np.ones(m))
+        return Block(own, np.moveaxis(condition(z, np.moveaxis(slope, 1, 0), none, none), 0, 1))
 
     def multiplier(unit: Array) -> Array:
-        return blocks(np.array([-1.0 + 0j]), np.zeros((1, m, m), dtype=complex), unit, lo, hi, none, 1.0)[0].real
+        return condition(np.array([-1.0 + 0j]), np.zeros((1, 1, m, m), dtype=complex), unit, none)[0, 0].real
 
-    shared = {f"alpha {i + 1}": multiplier(unit) for i, unit in enumerate(np.eye(m))}
+    varying = [i for i in range(m) if lo[i] < hi[i]]
+    shared = {f"alpha {i + 1}": multiplier(np.eye(m)[i]) for i in varying}
     return Inequality(SWITCHING, block, _imposed(world, 40), _swept(world), shared)
 
 

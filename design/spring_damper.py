@@ -17,18 +17,18 @@ from scipy.optimize import OptimizeResult, minimize
 from controller.coupling import SpringDamper
 from controller.delay import delay
 from controller.loop import force_map
-from controller.lti import Array
+from controller.lti import Array, Sampled
 from design.conditions import (
     Requirement,
     any_environment,
     any_environment_delayed,
     half_widths,
     jitter_proof,
+    switching_block,
     this_environment,
 )
 from design.frequency import frequencies, hermitian, on_circle, peaks
 from design.lmi import RESERVE, Complex, Shaping, Specification, affine_lmis, gain_lmi, shortage, solve, solved
-from design.maps import nominal_over_step
 from design.result import Design, DesignFailed, Infeasible
 from design.transparency import BAND_HZ, transparency
 
@@ -207,7 +207,7 @@ STUCK = 1e-3  # a search that leaves the sampled condition violated by this has 
 MOST_ROUNDS_FROZEN_ENVIRONMENT = 8
 
 
-class Sampled:
+class SampledLoop:
     """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta), shape (2N,)."""
 
     def __init__(self, spec: Specification) -> None:
@@ -307,7 +307,7 @@ def least_rms(
 
 def _certified_optimum(spec: Specification, start: SpringDamper) -> tuple[SpringDamper | None, int]:
     """(a local optimum that passes the refined sweep or None, searches), adding the frequencies where one fails."""
-    sampled = Sampled(spec)
+    sampled = SampledLoop(spec)
     x = sampled.point(start)
     for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
@@ -326,16 +326,16 @@ def _certified_optimum(spec: Specification, start: SpringDamper) -> tuple[Spring
 # ----------------------------------------------------------------------------------------------------
 # Spring-damper gains that are safe under any switching of their delays: a local search as in frozen_environment.py.
 #
-# Its sampled condition is that of design.jitter.condition: the multiplier is searched together with the gains. What
-# is returned passes that module's own sweep, which knows nothing of the multiplier found here.
+# Its sampled condition is `switching_block`: the multiplier is searched together with the gains. What is returned
+# passes the sweep of `jitter_proof`, which knows nothing of the multiplier found here.
 
 
 FIRST = 0.5  # the multiplier alpha T/delta that a search begins with where the start has none
 MULTIPLIERS = (1e-4, 10.0)  # ... and its bounds
 
 
-class SwitchingSampled(Sampled):
-    """As Sampled, with x = (log K, B/delta, log alpha T/delta of the channels whose delay varies)."""
+class SwitchingLoop(SampledLoop):
+    """As SampledLoop, with x = (log K, B/delta, log alpha T/delta of the channels whose delay varies)."""
 
     def __init__(self, spec: Specification, lo: Sequence[int], hi: Sequence[int]) -> None:
         self.range, self.h = (lo, hi), half_widths(lo, hi)
@@ -360,16 +360,15 @@ class SwitchingSampled(Sampled):
 
     def room(self, x: Array) -> Array:
         """1 - SAMPLED_RESERVE less the damping ratio at each sampled frequency, with the multiplier in x."""
-        a = np.exp(x[2 * self.spec.channels :])
+        m, alpha = self.spec.channels, np.zeros(self.spec.channels)
+        alpha[self.active] = np.exp(x[2 * m :]) * (np.asarray(self.spec.delta) / self.spec.T)[self.active]
         D, E, _ = self.loop_at_conditions
-        now = np.broadcast_to(np.eye(self.spec.channels, dtype=complex), E.shape)
-        G = self.root[:, None] * self.force(x, (D, E, now)) * self.root
-        nominal = nominal_over_step(on_circle(self.conditions), *self.range)[:, :, None] * G
-        error = (self.h[:, None] * G)[:, self.active]
-        diagonal = np.zeros(self.h.size)
-        diagonal[self.active] = a / 2
-        need = np.diag(diagonal) - hermitian(nominal) + np.conj(np.swapaxes(error, 1, 2)) @ (error / (2 * a[:, None]))
-        room = (1 - SAMPLED_RESERVE - np.linalg.eigvalsh(need)[:, -1]).astype(float)
+        now = np.broadcast_to(np.eye(m, dtype=complex), E.shape)
+        G = Sampled(on_circle(self.conditions)[None], self.force(x, (D, E, now))[None], self.spec.T)
+        block = hermitian(switching_block(G, *self.range, self.spec.delta, alpha)[0].G[0])
+        error = block[:, m:, :m]
+        schur = block[:, :m, :m] - np.conj(np.swapaxes(error, 1, 2)) @ (error / (2 * alpha[self.active])[:, None])
+        room = (np.linalg.eigvalsh(self.root[:, None] * schur * self.root)[:, 0] - SAMPLED_RESERVE).astype(float)
         return np.append(room, self.stability(x)) if any(self.spec.psi) else room
 
     def search(self, x: Array) -> OptimizeResult:
@@ -383,10 +382,10 @@ def least_rms_switching(
     spec: Specification, lo: Sequence[int], hi: Sequence[int], starts: Iterable[SpringDamper]
 ) -> tuple[SpringDamper | None, float, int]:
     """(gains, rms mismatch as a ratio, searches) of the best local optimum that is safe under any switching."""
-    return least_rms(spec, starts, lambda start: _safe_optimum(SwitchingSampled(spec, lo, hi), start))
+    return least_rms(spec, starts, lambda start: _safe_optimum(SwitchingLoop(spec, lo, hi), start))
 
 
-def _safe_optimum(sampled: SwitchingSampled, start: SpringDamper) -> tuple[SpringDamper | None, int]:
+def _safe_optimum(sampled: SwitchingLoop, start: SpringDamper) -> tuple[SpringDamper | None, int]:
     """(a local optimum that passes the refined sweep or None, searches)."""
     spec, x = sampled.spec, sampled.point(start)
     for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
@@ -419,7 +418,7 @@ def design(
 
     any-environment: minimises ||W1 L W2||_inf (23) over the exact set; the result does not depend on the start.
     closed-loop: minimises the rms mismatch in this environment from every start, local optima only; with
-    `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it (design.jitter).
+    `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it (`switching_block`).
     Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for closed-loop.
     """
     if condition == "theorem4" and switching is None:

@@ -21,9 +21,10 @@ from matplotlib.ticker import NullFormatter
 
 from controller.lti import Array
 from sim.files import write
+from sim.limit_cycles import UNDECIDED
 from sim.stability import MARGINAL
 from sim.trace import Trace
-from sim.zwidth import MODEL_KEPT, UNDECIDED, Map
+from sim.zwidth import MODEL_KEPT, Map
 
 mpl.use("Agg")
 

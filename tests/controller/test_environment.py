@@ -3,7 +3,15 @@
 import numpy as np
 import pytest
 
-from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.environment import (
+    FIGURE_4,
+    GROUND,
+    Network,
+    Spring,
+    environment,
+    environment_of,
+    sampled_environment,
+)
 
 T = 1.2e-3
 W = np.geomspace(1e-3, np.pi, 80)
@@ -52,6 +60,21 @@ def random_network(rng) -> Network:
         springs.append(Spring((str(a), str(b)), float(rng.uniform(0, 900)), float(rng.uniform(0, 3))))
     masses = {n: float(np.exp(rng.uniform(-4, 1))) for n in inner if rng.random() < 0.7}
     return Network(tuple(contacts), tuple(springs), masses)
+
+
+def test_many_networks_are_each_as_alone():
+    """As a stack of systems, and sampled from the dynamic stiffness; one of them has less to remember."""
+    other = (Spring(("contact 1", "mass"), 90.0, 0.0), Spring(("mass", "contact 2"), 5e3, 7.0))
+    networks = [FIGURE_4, Network(FIGURE_4.contacts, other, FIGURE_4.masses)]
+    matrices = tuple(np.stack(parts) for parts in zip(*(network.matrices() for network in networks), strict=True))
+    z = np.stack([Z, Z[::-1]])
+    sampled, stack = sampled_environment(matrices, 2, z, T), environment_of(matrices, 2, T)
+    assert stack.count == 2
+    for i, network in enumerate(networks):
+        alone = environment(network, T).at(z[i])
+        # near z = 1 the force of the free mass is the small difference of two large ones
+        np.testing.assert_allclose(stack[i].at(z[i]), alone, rtol=1e-7)
+        np.testing.assert_allclose(sampled.G[i], alone, rtol=1e-7)
 
 
 @pytest.mark.parametrize("seed", range(25))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from controller.delay import delay
-from controller.lti import Lti, SingularLoop
+from controller.lti import Lti, Sampled, SingularLoop
 
 Z = np.exp(1j * np.linspace(0.01, 3.1, 60))
 
@@ -50,6 +50,31 @@ def test_algebra_is_pointwise(blocks):
     close(both[:, :2, :2], g)
     close(both[:, 2:, 2:], h)
     assert not both[:, :2, 2:].any()
+
+
+@pytest.mark.parametrize("m", [1, 2, 3])
+def test_sampled_responses_obey_the_same_algebra(m):
+    """Of one system, and of two whose responses are sampled at points of their own."""
+    rng = np.random.default_rng(m)
+    G, H = (random_lti(rng, 4, m, m) for _ in range(2))
+    for z in (Z[None], np.stack([Z, Z[::-1] * np.exp(0.001j)])):
+        g, h, M = Sampled.of(G, z), Sampled.of(H, z), rng.normal(size=(m, m))
+        for sampled, system in (
+            (g @ h, G @ H),
+            (M @ g + g @ M - h, M @ G + G @ M - H),
+            (g.feedback(h), G.feedback(H)),
+            (g.inverse(), G.inverse()),
+        ):
+            close(sampled.G, system.at(z))
+        (_, sampled), (at_one, quotient) = g.split_at_one(), G.split_at_one()
+        close(sampled.G - at_one / (z - 1)[..., None, None], quotient.at(z))
+
+
+def test_a_sampled_split_keeps_what_z_loses_near_one():
+    """He[K/(z-1)] = -K/2 on the whole circle; 1 - cos w from z itself is off by 1e-16/w^2."""
+    z = np.exp(1j * np.geomspace(1e-8, 3, 50))[None]
+    split = Sampled.of(Lti.constant([[800.0]], 1e-3), z).split_at_one()[1]
+    np.testing.assert_allclose(split.G.real, -400.0, rtol=1e-15)
 
 
 def test_quotient_at_one(blocks):

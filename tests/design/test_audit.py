@@ -151,6 +151,7 @@ def test_remedies_are_tried_and_mild():
     assert changes["faster"].requirement.certified
     assert changes["faster"].requirement.required[0] > 0.98 * 1.37
     assert remedies(wall(500, 0), wall(500, 0).requirement("closed-loop")) == []
+    assert {helping["condition"] for helping in report(wall(5000, 0))["helps"]} == {"closed-loop"}
 
 
 def test_a_delayed_environment_needs_a_multiplier_that_the_default_scenario_has_not():

@@ -10,12 +10,12 @@ from cli.audit import main
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.loop import DelayRange, Loop, force_map
-from controller.lti import Lti
+from controller.lti import Lti, Sampled
 from design.certificate import prove_switching, storage, switching_part, switching_requirement
-from design.conditions import half_widths, jitter_proof, this_environment
+from design.conditions import half_widths, jitter_proof, switching_block, this_environment
 from design.exact import Matrix
+from design.frequency import hermitian
 from design.lmi import solve
-from design.maps import blocks, nominal_over_step
 from sim.scenario import InputError
 
 T, DELTA = 1.2e-3, (1.37, 1.37)
@@ -31,9 +31,15 @@ def loop_of(lo, hi, delta=DELTA, network=FIGURE_4) -> Loop:
     return Loop(T, lo, (0,) * len(lo), lo, delta, network, jitter=DelayRange(lo, hi))
 
 
+def condition(z, G, alpha, lo, hi, damping, T=T):
+    """The condition's matrix at each z (k,), to be positive: (k, 2m, 2m) from G (k, m, m)."""
+    block, _ = switching_block(Sampled(z[None], G[None], T), lo, hi, damping, alpha)
+    return hermitian(block.G[0])
+
+
 def block(z, G, alpha, lo, hi, damping):
-    """The condition's matrix for cvxpy at one z, affine in G (m, m), alpha (m,) and damping (m,) [N s/m]."""
-    c, h = nominal_over_step(np.array([z]), lo, hi)[0], half_widths(lo, hi)
+    """The same for cvxpy at one z, affine in G (m, m), alpha (m,) and damping (m,) [N s/m]."""
+    c, h = (z ** -np.array(lo) + z ** -np.array(hi)) / 2 / (z - 1), half_widths(lo, hi)
     passing, error = cp.diag(cp.Constant(c)) @ G, cp.diag(cp.Constant(h)) @ G
     upper = (passing + cp.conj(passing).T) / 2 + cp.diag(damping / T - alpha / 2)
     return cp.bmat([[upper, cp.conj(error).T], [error, cp.diag(2 * alpha)]])
@@ -79,7 +85,7 @@ def test_the_least_factor_is_that_of_a_convex_solver():
     assert s.value == pytest.approx(found.requirement.ratio, rel=2e-4)  # a peak 0.5 % off its sample, squared
     np.testing.assert_allclose(
         conditions[0].value,
-        blocks(z[:1], G.at(z[:1]) / scale, a.value, lo, hi, s.value * delta / scale, T)[0],
+        condition(z[:1], G.at(z[:1]) / scale, a.value, lo, hi, s.value * delta / scale)[0],
         atol=1e-12,
     )
 
@@ -92,7 +98,7 @@ def test_a_dense_sweep_agrees(lo, hi):
     alpha, needed, response = np.array(found.alpha), np.array(found.requirement.required), G.at(z)
 
     def least(share):
-        return np.linalg.eigvalsh(blocks(z, response, alpha, lo, hi, share * needed, T)).min()
+        return np.linalg.eigvalsh(condition(z, response, alpha, lo, hi, share * needed)).min()
 
     if all(half_widths(lo, hi)):
         assert least(1 + 1e-5) > 0

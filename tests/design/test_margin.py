@@ -8,8 +8,8 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.loop import force_map
 from controller.lti import Lti
-from design.conditions import any_environment, any_environment_per_channel, this_environment
-from design.frequency import frequencies, supremum
+from design.conditions import any_environment, any_environment_per_channel, delayed_demand, this_environment
+from design.frequency import frequencies, hermitian, on_circle, supremum
 from design.result import CASE_I, CASE_II
 
 T, THETA, DELTA = 1.2e-3, (1, 2), (1.37, 1.37)
@@ -152,3 +152,22 @@ def test_supremum_finds_a_needle():
     height, w = supremum(lambda w: np.abs(needle.at(np.exp(1j * w))[:, 0, 0]), frequencies(needle))
     assert height == pytest.approx(0.5e7, rel=1e-4)
     assert w == pytest.approx(1.2345, abs=1e-6)
+
+
+def test_with_a_multiplier_the_factor_is_the_least_by_definition():
+    """He[H/(1-z)] >= H* Delta_V H with H = V - Theta-hat/s, (11) to (14): met at s, kept above, missed below."""
+    V, theta, delta, phi = SpringDamper([300.0, 200.0], [0.2, 0.3]).compliance(T), (1, 2), np.array(DELTA), (0.37, 0.1)
+    w = np.linspace(0.05, 3.1, 23)
+    z, star = on_circle(w), lambda M: np.conj(np.swapaxes(M, 1, 2))
+    vt = np.stack([sum(z**-k for k in range(n + 1)) for n in theta], axis=1)
+
+    def least(s):
+        covered = 1 / (1 / np.array(phi) - 1 / (s[:, None] * delta))  # Delta_V
+        H = V.at(z) / T - (vt / (2 * s[:, None] * delta))[:, :, None] * np.eye(2)
+        return np.linalg.eigvalsh(hermitian(H / (1 - z)[:, None, None]) - star(H) @ (covered[:, :, None] * H))[:, 0]
+
+    s = delayed_demand(V, theta, delta, np.array(phi))(w)
+    scale = np.abs(least(2 * s))
+    assert (np.abs(least(s)) < 1e-9 * scale).all()
+    assert (least(1.001 * s) > 0).all()
+    assert (least(0.999 * s) < 0).all()

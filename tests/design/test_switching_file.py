@@ -17,6 +17,7 @@ from controller.coupling import SpringDamper
 from controller.delay import LOST, Jitter, ages
 from controller.environment import FIGURE_4, Box, UncertainSpring, environment
 from controller.loop import DelayRange, Loop, force_map
+from controller.lti import Sampled
 from design import certify
 from design import exact as positive_real
 from design.certificate import (
@@ -33,9 +34,9 @@ from design.certificate import (
     sealed,
     verify,
 )
-from design.conditions import jitter_proof, this_environment
+from design.conditions import jitter_proof, switching_block, this_environment
 from design.exact import Matrix
-from design.maps import blocks
+from design.frequency import hermitian
 from hw.control import certified_couplings
 from sim.scenario import load as scenario_of
 
@@ -87,7 +88,8 @@ def test_what_is_on_file_is_a_witness_on_a_dense_sweep(stored):
     the KYP inequality in floating point."""
     proof = stored.certificate.switching
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
-    assert np.linalg.eigvalsh(blocks(z, sent(SOFT).at(z), np.array(proof.alpha), (1, 1), (2, 2), DELTA, T)).min() > 0
+    block, _ = switching_block(Sampled.of(sent(SOFT), z[None]), (1, 1), (2, 2), DELTA, proof.alpha)
+    assert np.linalg.eigvalsh(hermitian(block.G)).min() > 0
     G = condition_block(LOOP, SOFT, proof.alpha)
     F, S = G.floats(), Matrix.of(proof.P).floats()
     A, B, C, D = F.A, F.B, F.C, F.D

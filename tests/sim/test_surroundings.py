@@ -10,20 +10,20 @@ from cli.options import BAD_INPUT, DONE, execute
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring
 from design.frequency import on_circle
-from design.maps import Environments
 from models.scene import variants
 from sim.couplings import choose
 from sim.crowds import crowds
+from sim.limit_cycles import HeldDevices
 from sim.scenario import load
 from sim.stability import dominant_mode, exact_loops
-from sim.zwidth import MODEL_KEPT, Surroundings, holders
+from sim.zwidth import MODEL_KEPT, EnvironmentSweep
 
 PAIR, STAR = load("omega-pair"), load("three-rigid")
 WALL = Network(("tip",), (Spring(("tip", GROUND), 2000.0, 0.2),))
 
 
 def around(scenario, coupling):
-    return Surroundings(
+    return EnvironmentSweep(
         scenario.device,
         scenario.population,
         scenario.environment,
@@ -39,20 +39,20 @@ def optimal():
     return {scenario.name: choose(scenario, "I", "optimal").coupling for scenario in (PAIR, STAR)}
 
 
-def densely(ground, coupling_force, K, B):
+def densely(sweep, coupling_force, K, B):
     """Required over available damping at 60000 frequencies, from the network's equations alone."""
     w = np.linspace(1e-5, np.pi, 60_000)
     z = on_circle(w)
-    T, (M, D, S) = ground.T, ground.network.matrices()
-    for spring, row in zip(ground.network.springs, ground.network.across(ground.network.springs), strict=True):
-        if set(spring.between) & set(ground.network.contacts):
+    T, (M, D, S) = sweep.T, sweep.network.matrices()
+    for spring, row in zip(sweep.network.springs, sweep.network.across(sweep.network.springs), strict=True):
+        if set(spring.between) & set(sweep.network.contacts):
             pattern = np.outer(row, row)
             D, S = D + (B - spring.damping) * pattern, S + (K - spring.stiffness) * pattern
-    m, s = ground.channels, ((z - 1) / (T * z))[:, None, None]
+    m, s = sweep.channels, ((z - 1) / (T * z))[:, None, None]
     E = np.linalg.inv(np.linalg.inv(M * s**2 + D * s + S)[:, :m, :m])
-    G = coupling_force(z, z[:, None, None] ** -np.array(ground.psi)[:, None] * E)
-    F = z[:, None, None] ** -np.array(ground.theta)[:, None] * G / (z - 1)[:, None, None]
-    root = np.sqrt(T / np.array(ground.delta))
+    G = coupling_force(z, z[:, None, None] ** -np.array(sweep.psi)[:, None] * E)
+    F = z[:, None, None] ** -np.array(sweep.theta)[:, None] * G / (z - 1)[:, None, None]
+    root = np.sqrt(T / np.array(sweep.delta))
     return np.linalg.eigvalsh(-(root[:, None] * root) * (F + np.conj(np.swapaxes(F, 1, 2))) / 2)[:, -1].max()
 
 
@@ -60,23 +60,22 @@ def densely(ground, coupling_force, K, B):
 def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
     """1e-5: between points of the sweep 5e-5 apart a peak of width 0.01 rises by (2.5e-5/0.01)^2."""
     coupling = optimal[scenario.name]
-    ground = around(scenario, coupling)
+    sweep = around(scenario, coupling)
     Q = coupling.parameter(scenario.T)
 
     def pair(z, E):
         return E - E @ Q.at(z) @ E
 
     for K, B in ((90.0, 0.3), (350.0, 2.0), (1213.2, 2.54)):
-        found = ground.ratios("closed-loop", ground.gains(np.array([K]), np.array([B])))[0]
-        assert found == pytest.approx(densely(ground, pair, K, B), rel=1e-5)
-        assert ground.requirement("closed-loop", K, B).ratio == pytest.approx(found, rel=1e-7)
+        found = sweep.ratios("closed-loop", np.array([K]), np.array([B]))[0]
+        assert found == pytest.approx(densely(sweep, pair, K, B), rel=1e-5)
+        assert sweep.requirement("closed-loop", K, B).ratio == pytest.approx(found, rel=1e-7)
 
 
 def test_the_model_may_stay_behind(optimal):
     """With V = Q (I - E0 Q)^-1 from the network of the scenario, in the pair's own environment the two are one loop."""
     coupling = optimal["omega-pair"]
-    ground = around(PAIR, coupling)
-    nominal = Environments(PAIR.environment, np.array([800.0]), np.array([1.0]), PAIR.T)
+    sweep = around(PAIR, coupling)
 
     def kept(z, E):
         M, D, S = PAIR.environment.matrices()
@@ -85,39 +84,47 @@ def test_the_model_may_stay_behind(optimal):
         V = Q @ np.linalg.inv(np.eye(2) - E0 @ Q)
         return np.linalg.solve(np.eye(2) + E @ V, E)
 
-    found = [ground.ratios(name, ground.gains(np.array([300.0]), np.array([0.5])))[0] for name in ground.conditions]
-    assert found[2] == pytest.approx(densely(ground, kept, 300.0, 0.5), rel=1e-5)
+    found = [sweep.ratios(name, np.array([300.0]), np.array([0.5]))[0] for name in sweep.conditions]
+    assert found[2] == pytest.approx(densely(sweep, kept, 300.0, 0.5), rel=1e-5)
     assert found[2] != pytest.approx(found[1], rel=1e-4)
     assert np.isinf(found[0])
-    assert "knows none" in ground.refusals["theorem4"]
-    assert nominal[0].order == 4  # as many states as Figure 4 itself has
+    assert "knows none" in sweep.refusals["theorem4"]
 
 
 def test_a_wall_without_coupling_and_delay_needs_half_the_stiffness_times_T_plus_the_damping():
     scenario = load("one-wall").replace(environment=WALL, theta=(0,))
-    ground = around(scenario, NoCoupling())
+    sweep = around(scenario, NoCoupling())
     K, B = np.array([100.0, 900.0, 3000.0]), np.array([0.1, 0.9, 0.0])
-    needed = ground.ratios("closed-loop", ground.gains(K, B)) * ground.delta[0]
+    needed = sweep.ratios("closed-loop", K, B) * sweep.delta[0]
     # near w = 0, at 1e-5 rad/sample, 1e-16 of rounding is 1e-11 of F/(z-1), and that is K T/w large
     np.testing.assert_allclose(needed, K * scenario.T / 2 + B, rtol=1e-6)
 
 
+def test_no_cell_of_the_widest_plane_is_lost(optimal):
+    """Finite where a single sweep is; 1e-7: the stiffest cells are 1e6 times as stiff as the model of the coupling."""
+    sweep = around(PAIR, optimal["omega-pair"])
+    K, B = (axis.ravel() for axis in np.meshgrid(np.geomspace(1e-3, 1e9, 6), np.geomspace(1e-5, 1e6, 5)))
+    for name in ("closed-loop", MODEL_KEPT):
+        true = [sweep.requirement(name, k, b).ratio for k, b in zip(K, B, strict=True)]
+        np.testing.assert_allclose(sweep.ratios(name, K, B), true, rtol=1e-7)
+
+
 def test_what_no_environment_changes_is_the_same_in_all():
-    ground = around(PAIR, SpringDamper([800.0, 500.0], [0.4, 0.5]))
-    assert ground.conditions == ("theorem4", "closed-loop")
-    ratios = ground.ratios("theorem4", ground.gains(np.array([50.0, 5e3]), np.array([0.1, 3.0])))
-    assert ratios[0] == ratios[1] == ground.requirement("theorem4", 1.0, 1.0).ratio < 1
+    sweep = around(PAIR, SpringDamper([800.0, 500.0], [0.4, 0.5]))
+    assert sweep.conditions == ("theorem4", "closed-loop")
+    ratios = sweep.ratios("theorem4", np.array([50.0, 5e3]), np.array([0.1, 3.0]))
+    assert ratios[0] == ratios[1] == sweep.requirement("theorem4", 1.0, 1.0).ratio < 1
 
 
 def test_the_population_meets_the_pair_of_the_cell(optimal):
     """Eigenvalues of the loops one by one, with the force map that `sim.run` closes."""
-    ground = around(PAIR, optimal["omega-pair"])
-    crowd = holders(ground.devices, ground.population, 1, 12, 1, ground.T)
-    F = ground.force_maps(ground.gains(np.array([300.0, 3000.0]), np.array([0.5, 0.5])))[0]
+    sweep = around(PAIR, optimal["omega-pair"])
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.T, 1, 12, 1)
+    F = sweep.force_maps(np.array([300.0, 3000.0]), np.array([0.5, 0.5]))[0]
     for i, stable in ((0, True), (1, False)):
         growth = crowd.growth(F[i])[0]
-        for index, some in crowds(ground.population, 2, 1, range(12), 1):
-            modes = dominant_mode(exact_loops(variants(ground.devices, some), F[i]))
+        for index, some in crowds(sweep.population, 2, 1, range(12), 1):
+            modes = dominant_mode(exact_loops(variants(sweep.devices, some), F[i]))
             np.testing.assert_allclose(growth[index], modes.growth, atol=1e-6)
         assert (growth < 0).all() == stable
 

@@ -1,0 +1,383 @@
+"""Which loops go on oscillating in human hands: exactly with every human, in MuJoCo with the worst of them.
+
+A cell is a force map F, and a process that computes it. `HeldDevices` closes F around the devices in the hands of every
+human and gives the growth of the dominant mode. `simulate_cells` runs many cells, each with a process of its own, as
+one MuJoCo batch, with the effects that no theory covers switched on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from controller.lti import Array, Lti
+from controller.process import Process, StepBuffer
+from models.device import Device
+from models.human import Population
+from models.scene import Crowd, Scene, variants
+from sim.crowds import crowds
+from sim.engines import HeldPlant, MujocoBatchEngine, hold, profiler_off, quiet_warnings
+from sim.run import run_block
+from sim.stability import close
+from sim.stepping import pace
+from sim.trace import RUNAWAY, Oscillation, oscillation, slowest_seen
+
+Cells = NDArray[np.intp]
+Progress = Callable[[int, int], None]  # done, total
+
+# ----------------------------------------------------------------------------------------------------
+# The exact loop's eigenvalues, with every human.
+
+
+#: slower modes [Hz] decay so little that they would hide an oscillation that is about to grow
+_MIN_FREQUENCY_HZ = 2.0
+_LEADING = 0.1  # share of the humans that meet every cell; the rest meet those that are stable with them
+
+
+@dataclass(frozen=True, eq=False)
+class HeldDevices:
+    """The devices in the hands of every human, sampled; in groups of humans with the same number of links."""
+
+    devices: tuple[Device, ...]  # (m,)
+    T: float  # [s]
+    #: (index of each human, who, plant, positions of motors and handles in its state)
+    groups: tuple[tuple[Cells, Crowd, HeldPlant, tuple[int, ...]], ...]
+
+    @classmethod
+    def drawn(
+        cls,
+        devices: tuple[Device, ...],
+        population: Population,
+        T: float,
+        seed: int,
+        humans: int,
+        links: int | None = None,
+    ) -> HeldDevices:
+        """Random humans with the devices; of so many links each, by default as their population says."""
+        groups = []
+        for index, crowd in crowds(
+            population, len(devices), seed, range(humans), population.links if links is None else links
+        ):
+            held_by = variants(devices, crowd)
+            groups.append((index, crowd, hold(held_by.plants(), T), _motors_and_handles(held_by.scene)))
+        return cls(devices, T, tuple(groups))
+
+    def __len__(self) -> int:
+        return sum(index.size for index, *_ in self.groups)
+
+    def links(self, human: int) -> Array:
+        """(m, links, 3) of one human, as in Crowd."""
+        (_, crowd, *_), i = self._place(human)
+        return crowd.links[i]
+
+    def growth(
+        self, F: Lti, humans: NDArray[np.bool_] | None = None, min_frequency_hz: float = _MIN_FREQUENCY_HZ
+    ) -> tuple[Array, Array]:
+        """Growth [1/s] of the dominant mode, and of the dominant one above `min_frequency_hz`, with every human (n,).
+
+        Where `humans` (n,) is false nothing is computed, and the answer is -inf.
+        """
+        n = len(self)
+        everything, turning = np.full((2, n), -np.inf)
+        for index, _, plants, _ in self.groups:
+            chosen = np.ones(index.size, dtype=bool) if humans is None else humans[index]
+            if not chosen.any():
+                continue
+            some = HeldPlant(plants.A[chosen], plants.B[chosen], plants.C, plants.T)
+            values = np.linalg.eigvals(close(some, F).A)
+            size = np.abs(values)
+            fast = np.abs(np.angle(values)) >= 2 * np.pi * min_frequency_hz * plants.T
+            with np.errstate(divide="ignore"):
+                everything[index[chosen]] = np.log(size.max(axis=1)) / plants.T
+                turning[index[chosen]] = np.log(np.where(fast, size, 0.0).max(axis=1)) / plants.T
+        return everything, turning
+
+    def mode(self, F: Lti, human: int, min_frequency_hz: float) -> Array:
+        """The dominant mode above that frequency with one human, as a state [s; z]: the motor or handle that moves most
+        moves by 1 m."""
+        (_, _, plants, seen), i = self._place(human)
+        values, vectors = np.linalg.eig(close(HeldPlant(plants.A[i], plants.B[i], plants.C, plants.T), F).A)
+        fast = np.abs(np.angle(values)) >= 2 * np.pi * min_frequency_hz * plants.T
+        vector = vectors[:, np.argmax(np.where(fast, np.abs(values), 0.0))]
+        positions = vector[list(seen)]
+        return (vector / positions[np.argmax(np.abs(positions))]).real
+
+    def leading(self, some: Sequence[Lti]) -> NDArray[np.bool_]:
+        """The tenth (8 at least) of the humans that are unstable with most of these maps, then nearest to it."""
+        growths = np.array([self.growth(F)[1] for F in some])
+        score = (growths > 0).sum(axis=0) + np.clip(growths, -100, 100).mean(axis=0) / 1000
+        first = np.zeros(len(self), dtype=bool)
+        first[np.argsort(-score, kind="stable")[: max(8, round(_LEADING * len(self)))]] = True
+        return first
+
+    def _place(self, human: int) -> tuple[tuple[Cells, Crowd, HeldPlant, tuple[int, ...]], int]:
+        """The group of a human, and the position in it."""
+        for group in self.groups:
+            at = np.flatnonzero(group[0] == human)
+            if at.size:
+                return group, int(at[0])
+        raise IndexError(f"human {human} of {len(self)}")
+
+
+def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
+    """Their positions in a plant state; of a rigid device they are one."""
+    return tuple(dict.fromkeys((*range(scene.channels), *scene.handles)))
+
+
+# ----------------------------------------------------------------------------------------------------
+# Cells in MuJoCo, with the effects that no theory covers switched on. The human that is nearest to oscillating, by the
+# exact linear loop, holds the devices. The loop starts on that mode, so far out that Coulomb friction does not hold it;
+# the hand presses with a constant force, eased in; and what still oscillates at the end decides (sim.stability).
+
+
+_UNLIMITED = 1e6  # [N] force limit of a motor that does not saturate: the largest that a device may have
+_BATCH = 20  # simulations in one MuJoCo batch
+_EASE = 0.5  # [s] in which the press grows
+_BLOCK = 64  # ticks between two looks at the keyboard
+DECIDED = 0.2  # [1/s] linear growth nearer to zero than this does not show within a trace
+UNDECIDED = "too slow to say"  # verdict where the trace goes on oscillating as the linear loop would, decaying or not
+
+
+@dataclass(frozen=True)
+class Effects:
+    """What the simulated cells have beside the linear loop. None leaves what the devices of the scenario have."""
+
+    quantisation: float | None = None  # [m] encoder step
+    friction: float | None = None  # [N] Coulomb friction at each motor
+    saturation: bool = False  # whether motors have their force limits
+
+    def on(self, devices: Sequence[Device]) -> tuple[Device, ...]:
+        changes: dict[str, float] = {} if self.saturation else {"force_limit": _UNLIMITED}
+        if self.quantisation is not None:
+            changes["encoder_step"] = self.quantisation
+        if self.friction is not None:
+            changes["friction"] = self.friction
+        return tuple(msgspec.structs.replace(device, **changes) for device in devices)
+
+    def nonlinear(self, devices: Sequence[Device]) -> bool:
+        """Whether the devices make the simulated loop another one than the linear one."""
+        return self.saturation or any(device.encoder_step or device.friction for device in self.on(devices))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How cells are simulated."""
+
+    effects: Effects
+    points: int  # rows and columns of the grid that are simulated; 0 for none
+    trials: int  # humans at each cell
+    start: float  # [m] displacement of the motor or handle that moves most, at the start
+    press: float  # [N]
+    duration: float  # [s]
+    threshold: float  # [m] amplitude above which a handle oscillates
+
+    @property
+    def runaway_growth(self) -> float:
+        """[1/s] A mode that grows faster has diverged by the end of the trace, whether it swings or not."""
+        return 1.2 * np.log(RUNAWAY / self.start) / self.duration
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """The simulated cells, (k,) each."""
+
+    cell: Cells  # flat index in the grid
+    oscillates: NDArray[np.bool_]  # to the end of the trace, with any of the humans that were tried
+    amplitude: Array  # [m] the largest among them that decided; inf: diverged
+    frequency_hz: Array  # [Hz] of it; nan: diverged
+    growth: Array  # [1/s] of the exact loop's dominant mode, swinging or running away, with the worst of these humans
+
+    @classmethod
+    def joined(cls, parts: Sequence[Points]) -> Points:
+        """The cells of all parts; of none, no cell."""
+        if not parts:
+            return cls(np.zeros(0, dtype=int), np.zeros(0, dtype=bool), *np.zeros((3, 0)))
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__dataclass_fields__))
+
+    @property
+    def near(self) -> NDArray[np.bool_]:
+        """Whether the linear loop neither grows nor decays enough to be told from a limit cycle."""
+        return np.abs(self.growth) <= DECIDED
+
+    @property
+    def differ(self) -> NDArray[np.bool_]:
+        """Whether MuJoCo does what the linear loop clearly does not."""
+        return ~self.near & ((self.growth > 0) != self.oscillates)
+
+    @property
+    def verdicts(self) -> list[str]:
+        """Each one "rests", "oscillates" or UNDECIDED."""
+        words = np.where(self.oscillates, np.where(self.near, UNDECIDED, "oscillates"), "rests")
+        return [str(word) for word in words]
+
+
+#: flat indices of cells -> their linear force maps, a stack, and what the computer does in each
+Loops = Callable[[Cells], tuple[Lti, Sequence[Process]]]
+
+
+def simulate_cells(
+    cells: Cells, loops: Loops, held: HeldDevices, plan: Plan, press: Array, progress: Progress
+) -> tuple[Points, bool]:
+    """These cells, in batches of whole ones, and whether the keyboard ended it; `press` (m,) [N] is the hands' push."""
+    parts: list[Points] = []
+    size, ticks = max(1, _BATCH // plan.trials), round(plan.duration / held.T)
+    try:
+        for first in range(0, cells.size, size):
+            some, seen = cells[first : first + size], 0
+            trials, growth = _trials(*loops(some), held, plan)
+
+            def ticked(count: int, first: int = first) -> None:
+                nonlocal seen
+                seen += count
+                progress(first * ticks + min(seen, ticks) * min(size, cells.size - first), cells.size * ticks)
+
+            parts.append(_points(some, growth, trials, plan.effects.on(held.devices), plan, press, ticked))
+    except KeyboardInterrupt:
+        return Points.joined(parts), True
+    return Points.joined(parts), False
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """One simulation: a process, who holds the devices, and where it starts."""
+
+    process: Process
+    links: Array  # (m, links, 3) as in Crowd
+    start: Array  # (2n + order,) plant state, then the state of the linear process
+
+
+def _trials(F: Lti, processes: Sequence[Process], held: HeldDevices, plan: Plan) -> tuple[list[_Trial], Array]:
+    """The trials of these cells, plan.trials of each in succession, and the growth of the worst of each."""
+    slowest, trials, growth = slowest_seen(plan.duration), [], []
+    for i, process in enumerate(processes):
+        whole, swinging = held.growth(F[i], min_frequency_hz=slowest)
+        runs_away = whole > plan.runaway_growth  # without an oscillation: what pushes outwards at rest
+        shown = np.where(runs_away, whole, swinging)
+        worst = np.argsort(-shown, kind="stable")[: plan.trials]
+        for human in worst.tolist():
+            mode = held.mode(F[i], human, 0.0 if runs_away[human] else slowest)
+            trials.append(_Trial(process, held.links(human), plan.start * mode))
+        growth.append(shown[worst[0]])
+    return trials, np.array(growth)
+
+
+def _points(
+    cells: Cells,
+    growth: Array,
+    trials: list[_Trial],
+    devices: Sequence[Device],
+    plan: Plan,
+    press: Array,
+    ticked: Callable[[int], None],
+) -> Points:
+    """Simulate the trials of these cells, plan.trials of each in succession."""
+    lasting, amplitude, frequency = np.zeros(len(trials), dtype=bool), np.zeros(len(trials)), np.zeros(len(trials))
+    links = np.array([trial.links.shape[1] for trial in trials])
+    for count in np.unique(links):
+        which = np.flatnonzero(links == count)
+        found = _simulate([trials[i] for i in which], devices, press, plan, ticked)
+        lasting[which], amplitude[which], frequency[which] = found.sustained, found.amplitude, found.frequency_hz
+    shape = (cells.size, -1)
+    shown = np.where(lasting, amplitude + 1e9, amplitude).reshape(shape).argmax(axis=1)[:, None]
+    pick = lambda values: np.take_along_axis(values.reshape(shape), shown, axis=1)[:, 0]  # noqa: E731
+    return Points(cells, np.any(lasting.reshape(shape), axis=1), pick(amplitude), pick(frequency), growth)
+
+
+def _simulate(
+    trials: Sequence[_Trial], devices: Sequence[Device], press: Array, plan: Plan, ticked: Callable[[int], None]
+) -> Oscillation:
+    """All trials at once; their humans must have the same number of links. `press` (m,) [N]."""
+    T = trials[0].process.F.T
+    held_by = variants(devices, Crowd(np.stack([trial.links for trial in trials])))
+    scene, ticks = held_by.scene, round(plan.duration / T)
+    substeps = pace(held_by.plants().A).substeps(T)
+    n, processes = 2 * scene.model.nv, [trial.process for trial in trials]
+    buffer = _ManyProcesses(processes, min(_BLOCK, ticks), n, scene.outside)
+    starts = np.stack([trial.start for trial in trials], axis=1)
+    buffer.s[0] = starts[:n]
+    if processes[0].contact is None:  # the states of a process with walls are others: it begins at rest
+        buffer.z[0] = starts[n:]
+    seen, kept, done = list(_motors_and_handles(scene)), [], 0
+    with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
+        engine = MujocoBatchEngine(scene, T, substeps=substeps, nsim=len(trials), fields=held_by.fields)
+        engine.start(buffer)
+        while done < ticks:
+            count = min(buffer.ticks, ticks - done)
+            buffer.w[:count] = _press_forces(scene, T, press, done, count)[:, :, None]
+            run_block(buffer, engine, count)
+            kept.append(buffer.s[:count, seen].copy())
+            buffer.rewind(count)
+            done += count
+            ticked(count)
+    return oscillation(np.concatenate(kept)[ticks // 2 :], T, plan.threshold)
+
+
+def _press_forces(scene: Scene, T: float, press: Array, first: int, ticks: int) -> Array:
+    """Outside forces [N], (ticks, outside): `press` (m,) on the ends of the humans."""
+    t = (first + np.arange(ticks)) * T
+    eased = np.where(t < _EASE, (1 - np.cos(np.pi * t / _EASE)) / 2, 1.0)
+    w = np.zeros((ticks, scene.outside))
+    for force, column in zip(press, scene.pushed, strict=True):
+        w[:, column] += force * eased
+    return w
+
+
+_Transition = Callable[[Array, Array], object]  # [z; x] (order + m, nsim) -> writes [f; z+] (m + order, nsim)
+
+
+class _ManyProcesses(StepBuffer):
+    """A process for each simulation, all of the same order, number of walls, force limits and encoder steps."""
+
+    def __init__(self, processes: Sequence[Process], ticks: int, plant_states: int, outside: int) -> None:
+        super().__init__(processes[0], ticks, plant_states, outside, len(processes))
+        walls = len(processes[0].contact.walls) if processes[0].contact else 0
+        self._together = _linear(processes) if walls == 0 else _one_wall(processes) if walls == 1 else _each(processes)
+
+    def tick(self, k: int) -> None:
+        self._together(self.seen(k), self._output[k])
+
+
+def _linear(processes: Sequence[Process]) -> _Transition:
+    blocks = _last_axis([np.block([[p.F.C, p.F.D], [p.F.A, p.F.B]]) for p in processes])
+    return lambda before, after: np.einsum("oin,in->on", blocks, before, out=after)
+
+
+def _one_wall(processes: Sequence[Process]) -> _Transition:
+    """Contact.transition for one wall each, whose complementarity problem is p = max(0, q)/M."""
+    contacts = [p.contact for p in processes if p.contact]
+    m, order = contacts[0].channels, contacts[0].block.order
+    linear = _linear(processes)
+    reach = _last_axis([np.concatenate([c.block.C[m], [0.0], c.block.D[m, :m]]) for c in contacts])
+    kick = _last_axis([np.concatenate([c.block.D[:m, m], c.block.B[:, m], [0.0]]) for c in contacts])
+    give, M = np.array([c.block.D[m, m] for c in contacts]), np.array([c.problem.M[0, 0] for c in contacts])
+    gap, damping = (np.array([getattr(c.walls[0], name) for c in contacts]) for name in ("gap", "damping"))
+    memory = damping / contacts[0].block.T / np.array([c.steepness[0] for c in contacts])
+
+    def together(before: Array, after: Array) -> None:
+        way = np.einsum("in,in->n", reach, before) - gap
+        force = np.maximum(way - memory * before[order], 0.0) / M
+        linear(before, after)
+        after += kick * force
+        after[-1] = np.maximum(way + give * force, 0.0)
+
+    return together
+
+
+def _each(processes: Sequence[Process]) -> _Transition:
+    transitions = [process.transition() for process in processes]
+
+    def together(before: Array, after: Array) -> None:
+        column = np.empty((after.shape[0], 1))
+        for i, transition in enumerate(transitions):
+            transition(np.ascontiguousarray(before[:, i : i + 1]), column)
+            after[:, i : i + 1] = column
+
+    return together
+
+
+def _last_axis(parts: Sequence[Array]) -> Array:
+    return np.ascontiguousarray(np.moveaxis(np.array(parts), 0, -1))
