@@ -56,6 +56,8 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
     environment: Network
     box: Box | None = None  # what else the environment may be
     jitter: DelayRange | None = None  # what else the delays of the forces may be, switching at every tick
+    T_max: Positive | None = None  # [s] the longest period there is, where it varies from tick to tick; T if None
+    latency: tuple[tuple[float, float], ...] | None = None  # (m,) [s] least and most by which forces latch after kT
 
     def __post_init__(self) -> None:
         m = len(self.environment.contacts)
@@ -71,6 +73,22 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
                 raise ValueError(f"{member.name}: {error}" if self.box else str(error)) from None
         if self.jitter:
             self._check_jitter(self.jitter)
+        if self.T_max is not None and not self.T <= self.T_max < float("inf"):
+            raise ValueError(f"T_max is {self.T_max:g} s, expected at least T = {self.T:g} s")
+        if self.latency is not None:
+            self._check_latency(self.latency)
+
+    def _check_latency(self, latency: tuple[tuple[float, float], ...]) -> None:
+        if len(latency) != len(self.theta):
+            raise ValueError(f"latency has {len(latency)} ranges for {len(self.theta)} channels")
+        for i, (least, most) in enumerate(latency):
+            if not 0 <= least <= most < self.T:
+                raise ValueError(
+                    f"latency[{i}] is {least:g} to {most:g} s, expected 0 <= least <= most < T = {self.T:g} s"
+                )
+        if self.jitter or self.environment.walls:
+            other = "jitter" if self.jitter else "environment.walls"
+            raise ValueError(f"latency and {other}: a latency is judged with constant delays in linear environments")
 
     def _check_jitter(self, jitter: DelayRange) -> None:
         if self.box or self.environment.walls:

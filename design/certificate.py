@@ -227,7 +227,7 @@ def _required(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
         F = loop.at(member.network).F(coupling)
     except SingularLoop as error:
         return refusal("closed-loop", loop.delta, str(error))
-    return this_environment(F, loop.delta)
+    return this_environment(F, loop.delta, loop.T_max, loop.latency)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -250,7 +250,7 @@ def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) 
         G = loop.sent(coupling)
     except SingularLoop as error:
         return jitter_refusal(loop.delta, str(error))
-    return jitter_proof(G, span.lo, span.hi, loop.delta, alpha)
+    return jitter_proof(G, span.lo, span.hi, loop.delta, alpha, loop.T_max)
 
 
 def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
@@ -311,7 +311,7 @@ def condition_block(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> L
     G = loop.sent(coupling, exact=True)
     if reason := too_large(G.order + sum(span.hi)):  # splitting it takes long too
         raise ValueError(reason)
-    block, F1 = switching_block(G, span.lo, span.hi, loop.delta, alpha)
+    block, F1 = switching_block(G, span.lo, span.hi, loop.delta, alpha, loop.T_max)
     static = Matrix.of(F1)
     if not static.equals(static.T) or not definiteness(static).semidefinite:
         raise ValueError("G(1) is not exactly symmetric and positive semidefinite")
@@ -340,12 +340,12 @@ def switching_requirement(loop: Loop, coupling: Coupling) -> JitterProof:
     return replace(found, requirement=replace(found.requirement, proof="rational"))
 
 
-def switching_part(found: JitterProof, G: Lti, span: DelayRange) -> dict[str, Any]:
+def switching_part(found: JitterProof, G: Lti, span: DelayRange, T_max: float | None = None) -> dict[str, Any]:
     """The requirement with its multiplier, and what a playout buffer to the constant delay hi would need.
 
     G is the force map without Theta.
     """
-    buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available)
+    buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available, T_max)
     return certificate_part(found.requirement) | {
         "lo": list(span.lo),
         "hi": list(span.hi),
@@ -482,15 +482,21 @@ def required_damping(
     if condition == "closed-loop":
         requirements = in_each(loop, coupling, loop.members())
         return requirements[worst(requirements)]
+    if loop.latency:
+        return refusal("theorem4", loop.delta, LATE)
     V = coupling.compliance(loop.T)
     if V is None:
         return refusal("theorem4", loop.delta, no_compliance(coupling))
     if not any(loop.psi):
-        return any_environment(V, loop.theta, loop.delta)
+        return any_environment(V, loop.theta, loop.delta, loop.T_max)
     if phi is None or len(phi) != len(loop.delta):
         raise NotProved("theorem4 with psi >= 1 needs a multiplier Phi, one entry per channel")
     values = np.array([float(p) for p in phi])
-    return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, values)
+    return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, values, loop.T_max)
+
+
+#: Why any-environment says nothing of forces that latch between ticks.
+LATE = "a latency of a fraction of a sample is derived for this environment only: count it as a whole sample of theta"
 
 
 def no_compliance(coupling: Coupling) -> str:
@@ -525,12 +531,12 @@ def _blocks(loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[
     _require_size(V.order + sum(loop.theta))
     try:
         if not any(loop.psi):
-            demand = any_environment_demand(V, loop.theta, loop.delta)
+            demand = any_environment_demand(V, loop.theta, loop.delta, loop.T_max)
             _require_symmetric("H(1)", demand.static["V(1)"])
             return {"P": demand.gain + demand.free}
         assert phi is not None
         E1, passive = delayed_environment_block(delay(loop.psi, T) @ loop.E(exact=True), phi)
-        H1, excess = delayed_coupling_block(V, loop.theta, phi, [rational(d) for d in loop.delta])
+        H1, excess = delayed_coupling_block(V, loop.theta, phi, [rational(d) for d in loop.delta], loop.T_max)
     except (SingularLoop, ValueError) as error:
         raise NotProved(str(error)) from None
     _require_static("E(1)", E1)
@@ -543,7 +549,7 @@ def _this_environment(loop: Loop, coupling: Coupling) -> Lti:
     try:
         F = loop.F(coupling, exact=True)
         _require_size(F.order)
-        demand = this_environment_demand(F, loop.delta)
+        demand = this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
     except SingularLoop as error:
         raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
     _require_static("F(1)", demand.static["F(1)"])
@@ -630,22 +636,24 @@ def assess(loop: Loop, coupling: Coupling, phi: Array | None = None) -> dict[str
 def closed_loop_of(loop: Loop, coupling: Coupling) -> Requirement:
     """What this-environment asks; of an environment with walls, in its most demanding contact state."""
     states = (loop.at(state) for state in frozen_states(loop.environment).values())
-    requirements = [this_environment(state.F(coupling), loop.delta) for state in states]
+    requirements = [this_environment(state.F(coupling), loop.delta, loop.T_max, loop.latency) for state in states]
     return max(requirements, key=lambda requirement: requirement.ratio)
 
 
 def theorem4_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Requirement:
     """What any-environment asks; walls are covered without delay in the environment, and refused with it."""
+    if loop.latency:
+        return refusal("theorem4", loop.delta, LATE)
     if loop.environment.walls and any(loop.psi):
         reason = "with delay in the environment its multiplier is of a linear one: no walls"
         return refusal("theorem4", loop.delta, reason)
     if isinstance(coupling, SpringDamper) and not any(loop.psi):
-        return any_environment_per_channel(coupling.channels(loop.T), loop.theta, loop.delta)
+        return any_environment_per_channel(coupling.channels(loop.T), loop.theta, loop.delta, loop.T_max)
     V = coupling.compliance(loop.T)
     if V is None:
         return refusal("theorem4", loop.delta, no_compliance(coupling))
     if not any(loop.psi):
-        return any_environment(V, loop.theta, loop.delta)
+        return any_environment(V, loop.theta, loop.delta, loop.T_max)
     if phi is None:
         from design.lmi import least_phi  # only an environment with delay inside needs the solver
 
@@ -654,7 +662,7 @@ def theorem4_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Req
         except ValueError as error:
             return refusal("theorem4", loop.delta, str(error))
     assert phi is not None  # psi >= 1 has a multiplier or none is possible
-    return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, phi)
+    return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, phi, loop.T_max)
 
 
 def _proved(loop: Loop, coupling: Coupling, requirement: Requirement, phi: Array | None = None) -> Requirement:

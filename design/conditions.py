@@ -10,6 +10,10 @@ this-environment   He[F/(z-1)] > -Delta_D/T,  F stable,  F(1) symmetric positive
 any-environment    Lemma 4 of the paper for Psi = I and any passive environment under backward Euler:
                    He[(z-1) V/(Tz)] >= diag((1 - cos n_i w) / (2 delta_i)),   n_i = theta_i + 1
 switching          this-environment for delays of the forces that vary within lo..hi at every tick
+latency            this-environment for forces that latch a fraction of a sample after the tick, anew at every tick
+walls              this-environment for walls that make and break contact
+
+The period may vary from tick to tick, up to T_max, in all of them: `per_tick` is where it enters.
 """
 
 from __future__ import annotations
@@ -58,30 +62,77 @@ class Demand(Generic[Block]):
     semidefinite: tuple[str, ...] = ()
 
 
-def this_environment_demand(F: Block, delta: Sequence[Any]) -> Demand[Block]:
-    """He[F/(z-1)] > -s Delta_D/T. F displaces devices to forces (6), in any arithmetic; delta (m,) [N s/m].
+def per_tick(delta: Sequence[Any], T: Number, T_max: float | None = None) -> Any:
+    """Delta_D/T_max [N/m], (m,): what the devices dissipate at least in a tick, per square of the displacement in it.
+
+    The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. Nothing else
+    in the energy balance depends on T: the force map is the same at every tick, however long the tick is. `delta` is
+    in N s/m; without T_max [s] every period is T.
+    """
+    return numbers(delta, T) / (T if T_max is None else numbers(T_max, T))
+
+
+Latency = Sequence[tuple[float, float]]  # (m,) t1 and t2 [s], 0 <= t1 <= t2 < T: how late after a tick forces latch
+
+
+def this_environment_demand(
+    F: Block, delta: Sequence[Any], T_max: float | None = None, latency: Latency | None = None
+) -> Demand[Block]:
+    """He[F/(z-1)] > -s Delta_D/T_max. F displaces devices to forces (6), in any arithmetic; delta (m,) [N s/m].
 
     The energy that a device with a passive human can give back in a tick is at most the damping's, Delta_D dx^2/T, and
-    what the force map gives is -F dx; with F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T.
+    what the force map gives is -F dx; with F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T. Forces that
+    latch later than at the tick have a block of twice the size, see `latency_demand`.
     """
+    if latency is not None:
+        return latency_demand(F, delta, latency, T_max)
     F1, R = F.split_at_one()
-    damping = np.diag(numbers(delta, F.T) / F.T)
-    return Demand(R - F1 / 2, constant_like(F, damping), {"F(1)": F1}, ("F(1)",))
+    return Demand(R - F1 / 2, constant_like(F, np.diag(per_tick(delta, F.T, T_max))), {"F(1)": F1}, ("F(1)",))
 
 
-def any_environment_demand(V: Block, theta: Sequence[int], delta: Sequence[Any]) -> Demand[Block]:
+def latency_demand(F: Block, delta: Sequence[Any], latency: Latency, T_max: float | None = None) -> Demand[Block]:
+    """this-environment for forces that latch at kT + tau_k, with any tau_k in [t1, t2] at every tick and channel.
+
+    Between kT and kT + tau_k the force of the tick before still acts: a device moves by a under f[k-1] and then by b
+    under f[k], and dissipates at least delta a^2/t2 + delta b^2/(T_max - t1). With Gam = F/(z-1) the block is, on
+    (a, b),
+        [[Gam/z + s Delta_D/t2, Gam/z], [Gam, Gam + s Delta_D/(T_max - t1)]],
+    whose pole at z = 1 has F(1) in all four entries. A channel with t2 = 0 has no row of the first kind. The shortest
+    period must be longer than t2.
+    """
+    T, m = F.T, F.D.shape[-1] if isinstance(F, Lti) else F.G.shape[-1]
+    longest = T if T_max is None else numbers(T_max, T)
+    first, last = (numbers([row[i] for row in latency], T) for i in (0, 1))
+    late = [i for i in range(m) if last[i]]
+    one = np.eye(m, dtype=int)
+    before = one[late] @ delay((1,) * m, T)
+    both = as_like(F, vstack(before, Lti.constant(one, T))) @ F @ np.hstack([one[:, late], one])
+    E1, R = both.split_at_one()
+    damping = numbers(delta, T)
+    gain = np.concatenate([damping[late] / last[late], damping / (longest - first)])
+    return Demand(R - E1 / 2, constant_like(F, np.diag(gain)), {"F(1)": E1[..., len(late) :, len(late) :]}, ("F(1)",))
+
+
+def any_environment_demand(
+    V: Block, theta: Sequence[int], delta: Sequence[Any], T_max: float | None = None
+) -> Demand[Block]:
     """He[(1 - 1/z) V/T] >= diag(|1 - z^-n_i|^2 / (4 s delta_i)), n = theta + 1, divided by |1 - 1/z|^2 and times s.
 
     With Theta-hat = diag(T/(2 delta_i) (1 + 1/z + ... + z^-theta_i)) (12) and H = V - Theta-hat/s, which (11) makes
     V-hat of, the block is H(1)/2 - (H - H(1))/(z - 1) for either part.
     """
-    window = np.diag(V.T / (2 * numbers(delta, V.T))) @ as_like(V, moving_sum(theta, V.T))
+    window = np.diag(1 / (2 * per_tick(delta, V.T, T_max))) @ as_like(V, moving_sum(theta, V.T))
     (V1, R), (W1, S) = V.split_at_one(), window.split_at_one()
     return Demand(S - W1 / 2, V1 / 2 - R, {"V(1)": V1})
 
 
 def switching_block(
-    G: Block, lo: Sequence[int], hi: Sequence[int], delta: Sequence[Any], alpha: Sequence[Any]
+    G: Block,
+    lo: Sequence[int],
+    hi: Sequence[int],
+    delta: Sequence[Any],
+    alpha: Sequence[Any],
+    T_max: float | None = None,
 ) -> tuple[Block, Array]:
     """[[F/(z-1) + Delta_D/T - diag(alpha)/2, 0], [2 h G, 2 diag(alpha)]], which must be positive real; and F(1).
 
@@ -102,7 +153,7 @@ def switching_block(
     both: Any = as_like(G, vstack(half, spread)) @ G
     m = len(lo)
     F1, R = both.rows(slice(None, m)).split_at_one()
-    upper = R - F1 / 2 + np.diag(numbers(delta, T) / T - a / 2)
+    upper = R - F1 / 2 + np.diag(per_tick(delta, T, T_max) - a / 2)
     if not varying:
         return upper, F1
     lower = np.zeros((m + len(varying), len(varying)), dtype=object)
@@ -131,17 +182,20 @@ STRICT = Fraction(1, 10**9)
 UNLIMITED = 10**6
 
 
-def delayed_coupling_block(V: Lti, theta: Sequence[int], phi: Sequence[Any], delta: Sequence[Any]) -> tuple[Array, Lti]:
+def delayed_coupling_block(
+    V: Lti, theta: Sequence[int], phi: Sequence[Any], delta: Sequence[Any], T_max: float | None = None
+) -> tuple[Array, Lti]:
     """H(1), which must be symmetric, and the block that carries the excess of V-hat, exactly, for the multiplier phi.
 
     V-hat must be Delta_V-OSP with Delta_V^-1 = S < Phi^-1 - Delta_D^-1 (14). With H = V - Theta-hat = H(1) + (z-1) R,
     divided by |1 - 1/z|^2: T He[H(1)/2 - R] > H* S^-1 H, by a Schur complement the Hermitian part of
     [[T (H(1)/2 - R), 0], [2 H, S]]. Raises ValueError for a multiplier that is none.
     """
+    T = V.T
+    delta = T * per_tick(delta, T, T_max)
     if len(phi) != len(delta) or not all(0 <= p < d for p, d in zip(phi, delta, strict=True)):
         raise ValueError("the multiplier Phi is not between 0 and the device damping on every channel")
-    T = V.T
-    H = V - np.diag(T / (2 * numbers(delta, T))) @ moving_sum(theta, T)
+    H = V - np.diag(T / (2 * delta)) @ moving_sum(theta, T)
     H1, R = H.split_at_one()
     excess = [(1 / p - 1 / d) * (1 - STRICT) if p else UNLIMITED / d for p, d in zip(phi, delta, strict=True)]
     m = len(delta)
@@ -182,8 +236,20 @@ def least_scale(demand: Demand[Any], w: Array) -> Array:
 
 
 def least_multiple(free: Complex, gain: Complex) -> Array:
-    """The least s with free + s gain >= 0, (...,), of Hermitian (..., p, p); inf where gain is not positive."""
+    """The least s with free + s gain >= 0, (...,), of Hermitian (..., p, p); inf where gain is not positive.
+
+    Inputs that no damping reaches (gain zero, as of a wall's force) are eliminated by a Schur complement.
+    """
     own = np.diagonal(gain, axis1=-2, axis2=-1).real
+    idle = ~own.any(axis=tuple(range(own.ndim - 1)))
+    if idle.any():
+        damped = ~idle
+        rest, cross = free[..., idle, :][..., idle], free[..., idle, :][..., damped]
+        positive = np.linalg.eigvalsh(rest)[..., 0] > 0
+        rest = np.where(positive[..., None, None], rest, np.eye(idle.sum()))
+        schur = free[..., damped, :][..., damped] - np.conj(np.swapaxes(cross, -1, -2)) @ np.linalg.solve(rest, cross)
+        least = least_multiple(schur, gain[..., damped, :][..., damped]) if damped.any() else -np.inf
+        return np.where(positive, least, np.inf)
     if (own > 0).all() and not (gain * (1 - np.eye(gain.shape[-1]))).any():
         weight = 1 / np.sqrt(own)
         return np.linalg.eigvalsh(-weight[..., :, None] * free * weight[..., None, :])[..., -1]
@@ -194,8 +260,13 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
     return np.where(eigenvalues[..., 0] > floor[..., 0], np.linalg.eigvalsh(H)[..., -1], np.inf)
 
 
-def this_environment(F: Lti, delta: Sequence[float]) -> Requirement:
-    """The damping that this-environment asks for the force map F, with device dampings `delta` [N s/m]."""
+def this_environment(
+    F: Lti, delta: Sequence[float], T_max: float | None = None, latency: Latency | None = None
+) -> Requirement:
+    """The damping that this-environment asks for the force map F, with device dampings `delta` [N s/m].
+
+    For periods up to T_max [s] (T without it), and forces that latch late by `latency` (m,) [s] (at the tick without).
+    """
     available = dampings(delta, F.inputs)
 
     def refused(reason: str) -> Requirement:
@@ -206,7 +277,7 @@ def this_environment(F: Lti, delta: Sequence[float]) -> Requirement:
     radius = float(np.abs(F.poles()).max(initial=0.0))
     if radius >= 1:
         return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
-    demand = this_environment_demand(F, available)
+    demand = this_environment_demand(F, available, T_max, latency)
     F1 = demand.static["F(1)"]
     # rounding in F(1) is relative to what F is elsewhere: a free mass has F(1) = 0 out of large numbers
     scale = max(float(np.abs(F1).max()), float(np.abs(F.D).max()), float(np.abs(F.at(-1.0)).max()), 1e-12)
@@ -218,7 +289,7 @@ def this_environment(F: Lti, delta: Sequence[float]) -> Requirement:
     return from_ratio("closed-loop", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
 
 
-def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Requirement:
+def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float], T_max: float | None = None) -> Requirement:
     """The damping that any-environment asks for psi = 0 and V, whatever passive environment is behind it."""
     available = dampings(delta, V.inputs)
     if len(theta) != V.inputs:
@@ -231,7 +302,7 @@ def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Req
         return refused("a device guarantees no damping, so no coupling is safe for every passive human")
     if not V.is_stable():
         return refused("the coupling V has a pole on or outside the unit circle")
-    demand = any_environment_demand(V, theta, available)
+    demand = any_environment_demand(V, theta, available, T_max)
     V1 = demand.static["V(1)"]
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return refused("the static compliance V(1) is not symmetric")
@@ -241,9 +312,11 @@ def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Req
     return from_ratio("theorem4", ratio, available, w / (2 * np.pi * V.T))
 
 
-def any_environment_per_channel(V: Sequence[Lti], theta: Sequence[int], delta: Sequence[float]) -> Requirement:
+def any_environment_per_channel(
+    V: Sequence[Lti], theta: Sequence[int], delta: Sequence[float], T_max: float | None = None
+) -> Requirement:
     """any-environment for a diagonal coupling, given its channels: each device's own figure."""
-    each = [any_environment(v, [n], [d]) for v, n, d in zip(V, theta, delta, strict=True)]
+    each = [any_environment(v, [n], [d], T_max) for v, n, d in zip(V, theta, delta, strict=True)]
     worst = max(each, key=lambda r: r.ratio)
     required = tuple(r.required[0] for r in each)
     available = tuple(r.available[0] for r in each)
@@ -278,7 +351,13 @@ ROUNDING = 1e-6
 
 
 def any_environment_delayed(
-    V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int], delta: Sequence[float], phi: Array
+    V: Lti,
+    environment: Lti,
+    theta: Sequence[int],
+    psi: Sequence[int],
+    delta: Sequence[float],
+    phi: Array,
+    T_max: float | None = None,
 ) -> Requirement:
     """Theorem 4 for the coupling V with the diagonal multiplier phi (N,) [N s/m]; phi = 0 is `any_environment`.
 
@@ -296,9 +375,10 @@ def any_environment_delayed(
     V1 = V.dc()
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return refused("the static compliance V(1) is not symmetric")
-    if uncovered(environment, psi, np.diag(phi)) > ROUNDING * max(available):
+    damping = V.T * per_tick(available, V.T, T_max)
+    if uncovered(environment, psi, np.diag(phi)) > ROUNDING * max(damping):
         return refused("E-hat + Phi is not passive for this multiplier")
-    needed = delayed_demand(V, theta, np.asarray(available), np.asarray(phi))
+    needed = delayed_demand(V, theta, damping, np.asarray(phi))
     ratio, w = supremum(needed, np.concatenate([[0.0], frequencies(V)]))
     if np.isinf(ratio):
         return refused(f"V is not passive enough at {w / (2 * np.pi * V.T):.4g} Hz for this multiplier")
@@ -369,7 +449,12 @@ class JitterProof:
 
 
 def jitter_proof(
-    G: Lti, lo: Sequence[int], hi: Sequence[int], delta: Sequence[float], alpha: Sequence[float] | None = None
+    G: Lti,
+    lo: Sequence[int],
+    hi: Sequence[int],
+    delta: Sequence[float],
+    alpha: Sequence[float] | None = None,
+    T_max: float | None = None,
 ) -> JitterProof:
     """The least common factor on `delta` [N s/m] with which some multiplier satisfies the condition, and which does.
 
@@ -379,10 +464,11 @@ def jitter_proof(
     available, h = dampings(delta, G.inputs), half_widths(lo, hi)
     if len(h) != G.inputs:
         raise ValueError(f"delays are given for {len(h)} channels, expected {G.inputs}")
-    constant = this_environment(nominal(lo, hi, G.T) @ G, delta)
+    constant = this_environment(nominal(lo, hi, G.T) @ G, delta, T_max)
     if not np.isfinite(constant.ratio):
         return jitter_refusal(available, constant.reason or "no constant delay is safe")
-    search, unit = _Search(G, lo, hi, np.asarray(available)), np.asarray(available) / G.T
+    unit = per_tick(available, G.T, T_max)
+    search = _Search(G, lo, hi, unit)
     given = None if alpha is None else (np.asarray(alpha) / unit)[search.active]
     a, ratio, w, bound = search.least() if given is None else search.only(given)
     multiplier = np.zeros(h.size)
@@ -403,13 +489,13 @@ class _Search:
     """s(a) = sup over w of the largest eigenvalue of N + diag(a)/2 + Y* diag(1/2a) Y, over the channels that vary.
 
     A Schur complement of `switching_block`, scaled by W = diag(sqrt(T/delta)): N = -W He[F/(z-1)] W,
-    F = Theta_nom G, Y = h W G W.
+    F = Theta_nom G, Y = h W G W. `unit` is delta/T.
     """
 
-    def __init__(self, G: Lti, lo: Sequence[int], hi: Sequence[int], delta: Array) -> None:
+    def __init__(self, G: Lti, lo: Sequence[int], hi: Sequence[int], unit: Array) -> None:
         F = nominal(lo, hi, G.T) @ G
-        self._G, self._demand = G, this_environment_demand(F, delta.tolist())
-        self._weight, self._h = np.sqrt(G.T / delta), half_widths(lo, hi)
+        self._G, self._demand = G, this_environment_demand(F, (G.T * unit).tolist())
+        self._weight, self._h = np.sqrt(1 / unit), half_widths(lo, hi)
         self.active = np.flatnonzero(self._h)
         self._grid = np.concatenate([[0.0], frequencies(G)])
         none = np.zeros((0, self.active.size))
