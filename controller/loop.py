@@ -14,10 +14,11 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import msgspec
+import numpy as np
 
 from controller.coupling import Coupling, Strict
 from controller.delay import delay
-from controller.environment import Box, Member, Network, environment, held, members
+from controller.environment import Box, Member, Network, environment, held, members, walled_environment
 from controller.lti import Lti, Number, rational
 
 Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=100)], ...]
@@ -119,6 +120,15 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
         """F = Theta G (6): displacements to forces, as the devices see them. Raises SingularLoop."""
         return force_map(self.E(exact), coupling, self.theta, self.psi)
 
+    def walled(self, coupling: Coupling, exact: bool = False) -> Lti:
+        """[x; p] to [f; y]: as F with no wall touching, wall forces [N] put in and the ways into walls [m] out.
+
+        Raises SingularLoop, and ValueError for a coupling that walls cannot stand behind.
+        """
+        return walled_force_map(
+            walled_environment(self.environment, self.period(exact)), coupling, self.theta, self.psi
+        )
+
     def members(self) -> tuple[Member, ...]:
         """The environment, and the vertices of its box where it has one."""
         return members(self.environment, self.box)
@@ -140,6 +150,16 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
 def sent(E: Lti, coupling: Coupling, psi: Sequence[int]) -> Lti:
     """G = (I + Psi E V)^-1 Psi E."""
     return coupling.around(delay(psi, E.T) @ E)
+
+
+def walled_force_map(E: Lti, coupling: Coupling, theta: Sequence[int], psi: Sequence[int]) -> Lti:
+    """[x; p] to [f; y] from that of the environment. Psi and Theta delay what the devices feel of the walls."""
+    w = E.inputs - len(theta)
+
+    def late(steps: Sequence[int]) -> Lti:
+        return Lti.diag(delay(steps, E.T), Lti.constant(np.eye(w), E.T))
+
+    return late(theta) @ coupling.around(late(psi) @ E, further=w)
 
 
 def force_map(E: Lti, coupling: Coupling, theta: Sequence[int], psi: Sequence[int]) -> Lti:

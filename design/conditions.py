@@ -18,14 +18,15 @@ The period may vary from tick to tick, up to T_max, in all of them: `per_tick` i
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.linalg import solve_discrete_lyapunov
+from scipy.optimize import minimize, minimize_scalar
 
 from controller.delay import delay, moving_sum
 from controller.lti import (
@@ -34,6 +35,7 @@ from controller.lti import (
     Complex,
     Lti,
     Number,
+    Sampled,
     as_like,
     constant_like,
     hstack,
@@ -111,6 +113,36 @@ def latency_demand(F: Block, delta: Sequence[Any], latency: Latency, T_max: floa
     damping = numbers(delta, T)
     gain = np.concatenate([damping[late] / last[late], damping / (longest - first)])
     return Demand(R - E1 / 2, constant_like(F, np.diag(gain)), {"F(1)": E1[..., len(late) :, len(late) :]}, ("F(1)",))
+
+
+def walls_demand(
+    G: Block,
+    delta: Sequence[Any],
+    stiffness: Sequence[Any],
+    g: Sequence[Any],
+    lam: Sequence[Any] | None = None,
+    T_max: float | None = None,
+) -> Demand[Block]:
+    """this-environment for walls p = k max(0, y - gap) of any slope k up to `stiffness` (w,) [N/m] and any gap.
+
+    G takes [x; p] to [f; y], displacements (m,) and wall forces to the forces of the devices and the ways into the
+    walls, [[F, J], [H, Y]]. With a multiplier g >= 0 and a weight lam > 0 for each wall (1 if not given) and
+    M = g (z-1) - 1 the block is, on (dx, dp),
+        [[F, J], [-lam M H, -lam M Y]]/(z-1) + diag(s Delta_D/T, lam g/stiffness),
+    whose static part must be symmetric, J(1) = H(1)' lam and lam Y(1) = Y(1)' lam, with F(1) >= 0 >= lam Y(1).
+    """
+    T, m, w = G.T, len(delta), len(stiffness)
+    gains, one = numbers(g, T), numbers(np.eye(m + w), T)
+    weights = numbers([1] * w if lam is None else lam, T)
+    weigh = np.diag(np.concatenate([numbers([1] * m, T), weights]))
+    S1, R = (weigh @ G).split_at_one()
+    slopes = np.diag(np.concatenate([numbers([0] * m, T), weights * gains]))
+    limits = np.concatenate([numbers([0] * m, T), weights * gains / numbers(stiffness, T)])
+    free = np.hstack([one, -slopes]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
+    damping = np.concatenate([per_tick(delta, T, T_max), numbers([0] * w, T)])
+    F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]
+    static = {"F(1)": F1, "-Y(1)": -Y1, "the static map of devices and walls": S1}
+    return Demand(free, constant_like(G, np.diag(damping)), static, ("F(1)", "-Y(1)"))
 
 
 def any_environment_demand(
@@ -245,7 +277,8 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
     if idle.any():
         damped = ~idle
         rest, cross = free[..., idle, :][..., idle], free[..., idle, :][..., damped]
-        positive = np.linalg.eigvalsh(rest)[..., 0] > 0
+        eigenvalues = np.linalg.eigvalsh(rest)
+        positive = eigenvalues[..., 0] > 1e-13 * np.abs(eigenvalues).max(axis=-1)
         rest = np.where(positive[..., None, None], rest, np.eye(idle.sum()))
         schur = free[..., damped, :][..., damped] - np.conj(np.swapaxes(cross, -1, -2)) @ np.linalg.solve(rest, cross)
         least = least_multiple(schur, gain[..., damped, :][..., damped]) if damped.any() else -np.inf
@@ -341,6 +374,148 @@ def dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
     if not all(0 <= d < np.inf for d in values):
         raise ValueError(f"delta is {list(values)}, expected dampings >= 0 in N s/m")
     return values
+
+
+# this-environment with walls: the best multiplier. The least s is convex in g, because the block is affine in both.
+
+
+#: Where the multiplier of a wall is looked for [samples], and the digits that are kept of it.
+LEAST_G, MOST_G, G_DIGITS = 1e-3, 1e3, 4
+
+
+@dataclass(frozen=True)
+class WallsProof:
+    """What walls that make and break contact ask of the devices."""
+
+    requirement: Requirement  # condition "closed-loop"
+    g: tuple[float, ...]  # (w,) the multiplier that shows it
+
+
+def walls_proof(
+    G: Lti,
+    delta: Sequence[float],
+    stiffness: Sequence[float],
+    g: Sequence[float] | None = None,
+    T_max: float | None = None,
+) -> WallsProof:
+    """The damping that `walls_demand` asks with the best multiplier found, or with g (w,) where it is given.
+
+    G takes [x; p] to [f; y] while no wall touches.
+    """
+    m, w = len(delta), len(stiffness)
+    available = dampings(delta, m)
+
+    def refused(reason: str) -> WallsProof:
+        return WallsProof(refusal("closed-loop", available, reason), tuple(g or (1.0,) * w))
+
+    if min(available) == 0:
+        return refused("a device guarantees no damping, so no coupling is safe for every passive human")
+    radius = float(np.abs(G.poles()).max(initial=0.0))
+    if radius >= 1:
+        return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
+    S1 = G.dc()
+    # rounding, relative to what each channel and wall is elsewhere
+    own = np.abs([np.diag(S1), np.diag(G.D), np.diag(G.at(-1.0))]).max(axis=0)
+    if (np.abs(S1 - S1.T) > 1e-9 * np.sqrt(np.outer(own, own))).any():
+        return refused("the static map of devices and walls is not symmetric: a slow closed path could extract energy")
+    for name, part, size in (("F(1)", S1[:m, :m], own[:m]), ("-Y(1)", -S1[m:, m:], own[m:])):
+        if np.linalg.eigvalsh((part + part.T) / 2).min() < -1e-9 * size.max():
+            return refused(f"{name} has a negative direction: it pushes outwards")
+    grid = np.concatenate([[0.0], frequencies(G)])
+    z = on_circle(frequencies(G, points=100))
+    sampled = Sampled(z[None], G.at(z)[None], G.T)
+
+    def needed(values: Array) -> float:
+        demand = walls_demand(sampled, available, stiffness, values, None, T_max)
+        return float(least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G)).max())
+
+    found = _best_g(needed, w) if g is None else np.asarray(g, dtype=float)
+    demand = walls_demand(G, available, stiffness, found, None, T_max)
+    ratio, at = supremum(lambda w: least_scale(demand, w), grid)
+    if np.isinf(ratio):
+        return refused("no multiplier was found with which the walls are covered, whatever the damping")
+    return WallsProof(
+        from_ratio("closed-loop", max(ratio, 0.0), available, at / (2 * np.pi * G.T)), tuple(found.tolist())
+    )
+
+
+def _best_g(needed: Callable[[Array], float], walls: int) -> Array:
+    """g (walls,) with about the least `needed`: one for all of them, then one by one, each by a search in log g."""
+    g = np.ones(walls)
+    turns = [np.ones(walls, dtype=bool), *(np.eye(walls, dtype=bool) if walls > 1 else ())]
+
+    def moved(which: Array, value: float) -> Array:
+        return np.where(which, value, g)
+
+    for which in turns:
+        grid = np.geomspace(LEAST_G, MOST_G, 13)
+        values = [needed(moved(which, value)) for value in grid]
+        best = int(np.argmin(values))
+        ends = np.log(grid[max(best - 1, 0)]), np.log(grid[min(best + 1, grid.size - 1)])
+        finer = minimize_scalar(
+            lambda x, which=which: min(needed(moved(which, np.exp(x))), 1e300),
+            bounds=ends,
+            method="bounded",
+            options={"xatol": 1e-2},
+        )
+        g = moved(which, float(np.exp(finer.x)) if finer.fun < values[best] else float(grid[best]))
+    return np.array([float(f"{value:.{G_DIGITS}g}") for value in g])
+
+
+# Encoder steps under Coulomb friction
+#
+# f = F (x + n) with |n_j| <= q_j/2 is F x + w with |w_i| <= W_i = sum_j |F_ij|_1 q_j/2, where |F_ij|_1 is the sum of
+# the absolute values of the impulse response. In a tick w does the work w'dx <= sum_i W_i (integral of |v_i|), and
+# Coulomb friction of at least W_i at the encoder's coordinate dissipates that.
+
+
+SMALL_TAIL, CHUNK, MOST_CHUNKS = (
+    1e-9,
+    256,
+    20_000,
+)  # of the bound; ticks summed at once; where the sum ends at the latest
+
+
+def l1_gain(F: Lti) -> Array:
+    """The sum over all ticks of |impulse response| of every entry, (p, m), from above; inf for an unstable F.
+
+    Ticks are summed until what is left is small, and the rest is bounded: with A'PA <= r^2 P, r < 1,
+    |c A^k b| <= r^k sqrt(c P^-1 c' b'P b).
+    """
+    A, X = F.A, F.B
+    radius = float(np.abs(F.poles()).max(initial=0.0))
+    if radius >= 1:
+        return np.full(F.D.shape, np.inf)
+    total = np.abs(F.D)
+    if not F.order:
+        return total
+    r = (1 + radius) / 2
+    P = solve_discrete_lyapunov(A.T / r, np.eye(F.order))
+    P = (P + P.T) / 2
+    reach = np.sqrt(np.einsum("in,ni->i", F.C, np.linalg.solve(P, F.C.T)))
+    powers = [F.C]
+    for _ in range(CHUNK - 1):
+        powers.append(powers[-1] @ A)
+    rows, ahead = np.stack(powers), np.linalg.matrix_power(A, CHUNK)
+    tail = np.full_like(total, np.inf)
+    for _ in range(MOST_CHUNKS):
+        total = total + np.abs(rows @ X).sum(axis=0)
+        X = ahead @ X
+        tail = np.outer(reach, np.sqrt(np.maximum(np.einsum("nj,nk,kj->j", X, P, X), 0.0))) / (1 - r)
+        if (tail <= SMALL_TAIL * total.max()).all():
+            break
+    return total + tail
+
+
+def encoder_friction(F: Lti, steps: Sequence[float]) -> Array:
+    """(p,) [N] Coulomb friction at each device that pays for encoder steps (m,) [m], whatever condition F satisfies.
+
+    It is the friction at the encoder's own coordinate, beside the damping delta. Not behind a limiter or walls.
+    """
+    q = np.asarray(steps, dtype=float)
+    if q.shape != (F.inputs,) or not (q >= 0).all():
+        raise ValueError(f"steps is {q.tolist()}, expected {F.inputs} encoder steps >= 0 in m")
+    return l1_gain(F) @ (q / 2)
 
 
 # any-environment with delay inside the environment (psi >= 1), for a given multiplier Phi

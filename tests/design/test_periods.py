@@ -84,7 +84,7 @@ def test_a_design_for_uneven_periods_is_certified_for_them():
 
 
 def test_a_longest_period_below_the_period_is_refused():
-    with pytest.raises(ValueError, match="T_max is 0.0009 s, expected at least T = 0.001 s"):
+    with pytest.raises(ValueError, match=r"T_max is 0\.0009 s, expected at least T = 0\.001 s"):
         change(LOOP, T_max=0.9e-3)
 
 
