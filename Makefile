@@ -1,5 +1,6 @@
 # make run    the paper's case I, from a fresh clone to a picture
 # make test   the whole test suite
+# make check  lint, and the tests of what your change touches, under a minute
 # make lint   ruff and pyright, without a finding: to be run, with make test, before anything is committed
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
 # make validate  every check that a verdict rests on: a report in out/validate/report.md, under five minutes
@@ -9,13 +10,16 @@ PY := .venv/bin/python
 # a file of tests stays on one core: its tests share fixtures, and those of the documentation files
 PARALLEL := -n auto --dist loadfile
 
-.PHONY: run test validate lint coverage bench figures clean
+.PHONY: run test check validate lint coverage bench figures clean
 
 run: .venv/ready
 	$(PY) -m sim.run --case I
 
 test: .venv/ready
 	$(PY) -m pytest $(PARALLEL)
+
+check: lint
+	$(PY) -m pytest $(PARALLEL) $$($(PY) tests/touched.py)
 
 validate: .venv/ready
 	$(PY) -m sim.suite --out out/validate

@@ -553,7 +553,9 @@ def _parser() -> Parser:
     parser.add_argument("--integrator", choices=(*INTEGRATORS, LEAPFROG), default="RK4", help="of MuJoCo (default RK4)")
     parser.add_argument("--substeps", metavar="N", help="MuJoCo steps per period (default 4, more where needed)")
     parser.add_argument("--duration", metavar="SECONDS", help="default: the scenario's")
-    parser.add_argument("--human", metavar="FILE.toml", help="other humans: [[human]] per channel, [[person]]")
+    parser.add_argument(
+        "--human", metavar="FILE", help="other humans: [[human]] per channel in a .toml, or `humans` in a .py"
+    )
     parser.add_argument(
         "--vertex", metavar="N", help="simulate at this vertex of the scenario's box (default 0: nominal)"
     )

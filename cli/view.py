@@ -8,7 +8,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
+
+from rich.console import Console
 
 from cli.options import (
     DONE,
@@ -24,28 +26,16 @@ from cli.options import (
 from design.certificate import CONDITIONS
 from sim.files import write_json
 from sim.scenario import InputError
-from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Script, parse_script
-from sim.view.film import Picture, check_film, save_film
-from sim.view.flat import Flat
-from sim.view.overlay import keys_help
-from sim.view.pace import LONGEST_LAG
-from sim.view.session import Frame, Session
-from sim.view.setting import Menu, Setting, first_setting
-from sim.view.story import happened, print_story
+from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, Script, first_loop, parse_script
+from sim.view.film import Picture, check_film, painter, save_film
+from sim.view.session import LONGEST_LAG, Session, session_report
+from sim.view.stage import Stage, keys_help
 
 EXAMPLE = "python -m sim.view --video out.gif --script '0:none 1:theta+1 6:designed'"
 SCRIPT = "0:none 1:theta+1 6:designed"  # of a video: an oscillation starts and dies
 AFTER = 3.0  # [s] that a video goes on after the last event of its script
 LONGEST = 3600  # [s]
 DRAWN = ("auto", "gl", "flat")
-
-
-class Painter(Protocol):
-    """Makes pictures of frames."""
-
-    def picture(self, frame: Frame) -> Picture: ...
-
-    def close(self) -> None: ...
 
 
 def main(argv: list[str]) -> int:
@@ -58,15 +48,15 @@ def main(argv: list[str]) -> int:
     label, script = _beginning(args, scenario.channels)
     # --case none begins without a coupling; those that keys bring are for case I
     menu = Menu("I" if args.case == "none" else args.case, args.condition, args.coupling if label == GIVEN else None)
-    setting = first_setting(menu, scenario, label)
+    prepared = first_loop(menu, scenario, label)
     executor = ThreadPoolExecutor(1)
     try:
-        session = Session(setting, executor, script, inf if args.video else LONGEST_LAG)
+        session = Session(prepared, executor, script, inf if args.video else LONGEST_LAG)
         outcome = _film(args, session, wish) if args.video else _window(session, wish)
     finally:
         executor.shutdown(cancel_futures=True)
-    outcome = {"case": args.case, **happened(session), **outcome}
-    print_story(outcome, console(args))
+    outcome = {"case": args.case, **session_report(session), **outcome}
+    _print_story(outcome, console(args))
     if args.json:
         write_json(args.json, outcome)
     return INTERRUPTED if outcome["interrupted"] else DONE
@@ -148,14 +138,15 @@ def _film(args: argparse.Namespace, session: Session, wish: Wish) -> dict[str, A
     """The session against a clock of its own: the same film every time. Interrupted, it is as long as it got."""
     seconds = wish.duration or (session.script_ends + AFTER)
     count, interrupted = round(seconds * wish.fps) + 1, False
-    painter, drawn, remarks = _painter(args.draw, session.setting)
+    assembly = session.prepared.assembly
+    artist, drawn, remarks = painter(args.draw, assembly.scene, assembly.process.force_limit)
     bar, progress = progress_bar("filming")
 
     def pictures() -> Iterator[Picture]:
         nonlocal interrupted
         for i in range(count):
             try:
-                picture = painter.picture(session.frame(i / wish.fps))
+                picture = artist.picture(session.frame(i / wish.fps))
             except KeyboardInterrupt:
                 interrupted = True
                 return
@@ -166,33 +157,15 @@ def _film(args: argparse.Namespace, session: Session, wish: Wish) -> dict[str, A
         with bar:
             made = save_film(Path(args.video), pictures(), wish.fps)
     finally:
-        painter.close()
+        artist.close()
     video = {"file": args.video, "pictures": made, "fps": wish.fps, "drawn": drawn}
     return {"video": video, "interrupted": interrupted, "remarks": remarks}
 
 
-def _painter(draw: str, setting: Setting) -> tuple[Painter, str, list[str]]:
-    """Who draws, under which name, and why not OpenGL where that is not there. Raises InputError where it must be."""
-    scene, limit = setting.assembly.scene, setting.assembly.process.force_limit
-    if draw == "flat":
-        return Flat(scene, limit), draw, []
-    from sim.view.offscreen import NoOffscreen, Offscreen, backend
-    from sim.view.stage import Stage
-
-    try:
-        name = backend()
-        return Offscreen(Stage(scene, limit), name), name, []
-    except NoOffscreen as error:
-        if draw == "gl":
-            raise InputError(f"--draw gl: {error}") from None
-        return Flat(scene, limit), "flat", [f"{error}: the bodies are drawn flat"]
-
-
 def _window(session: Session, wish: Wish) -> dict[str, Any]:
-    from sim.view.live import NoWindow, show
-    from sim.view.stage import Stage
+    from sim.view.window import NoWindow, show
 
-    stage = Stage(session.setting.assembly.scene, session.setting.assembly.process.force_limit)
+    stage = Stage(session.prepared.assembly.scene, session.prepared.assembly.process.force_limit)
     interrupted = False
     try:
         show(session, stage, wish.duration)
@@ -202,3 +175,25 @@ def _window(session: Session, wish: Wish) -> dict[str, Any]:
         interrupted = True
     clock = {"overruns": session.pace.overruns, "lost_s": session.pace.lost}
     return {"clock": clock, "interrupted": interrupted, "remarks": []}
+
+
+def _print_story(outcome: dict[str, Any], out: Console) -> None:
+    """One line per event, and where the film is."""
+    for event in outcome["events"]:
+        held = [name for name, part in event["certificates"].items() if part["certified"]]
+        growth = event["exact_growth_rate_per_s"]
+        grows = "no growth" if growth is None else f"{growth:+.3g} 1/s at {event['exact_frequency_hz']:.1f} Hz"
+        delays = f"theta {event['theta']}, psi {event['psi']}"
+        proved = f"certified ({', '.join(held)})" if held else "NOT certified"
+        loop = f"{event['coupling']}, {delays}: {grows}, {proved}"
+        out.print(f"{event['t_s']:6.2f} s  {event['event']:<10} {loop}", soft_wrap=True)
+    out.print(f"{outcome['simulated_s']:6.2f} s  end        {outcome['clipped_ticks']} ticks at a force limit")
+    if "clock" in outcome:
+        out.print(
+            f"The clock was missed {outcome['clock']['overruns']} times: {outcome['clock']['lost_s']:.2f} s lost."
+        )
+    if "video" in outcome:
+        video = outcome["video"]
+        out.print(f"{video['file']}: {video['pictures']} pictures, drawn by {video['drawn']}", soft_wrap=True)
+    for remark in outcome["remarks"]:
+        out.print(f"Note: {remark}.", soft_wrap=True)

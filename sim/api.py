@@ -102,7 +102,7 @@ def validate(
     duration = number("duration", duration, "a number of seconds")
     if not (duration == 0 or duration >= 4 * scenario.T):
         raise InputError(f"duration is {duration:g}, allowed are 0 and {4 * scenario.T:g} s or more")
-    links = scenario.population.links
+    links = getattr(scenario.population, "links", 1)  # of a user's own population there are none
     return examine_all(Question(scenario, alone, seed, humans, links, engine, duration), shards, progress)
 
 

@@ -22,7 +22,7 @@ from controller.coupling import Coupling
 from controller.environment import Member
 from controller.lti import Array
 from models.human import Population
-from models.scene import Crowd, Variants, variants
+from models.scene import Crowd, HumanSets, Variants, variants
 from sim.engines import ExactBatchEngine, MujocoBatchEngine, hold
 from sim.run import Assembly, Progress, assemble
 from sim.scenario import InputError, Scenario
@@ -83,13 +83,31 @@ def crowds(
 
 def crowds_of(
     scenario: Scenario, seed: int, indices: Iterable[int], links: int
-) -> Iterator[tuple[NDArray[np.intp], Crowd]]:
-    """`crowds` for a scenario: of its population, and held together as its persons hold its devices."""
+) -> Iterator[tuple[NDArray[np.intp], Crowd | HumanSets]]:
+    """`crowds` for a scenario: of its population, and held together as its persons hold its devices.
+
+    A user's own population draws from the same seeds, with the persons as they stand in the scenario.
+    """
+    if not isinstance(scenario.population, Population):
+        yield from _own_crowds(scenario, seed, indices)
+        return
     holds = tuple(person.holds for person in scenario.person)
-    return crowds(scenario.population, scenario.channels, seed, indices, links, holds)
+    yield from crowds(scenario.population, scenario.channels, seed, indices, links, holds)
 
 
-def crowd_of(scenario: Scenario, seed: int, index: int, links: int) -> Crowd:
+def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], HumanSets]]:
+    """Humans of a user's own population, grouped by how they are built: (indices of the group, sets)."""
+    drawn, layouts = {}, {}
+    for i in indices:
+        rng = np.random.default_rng(np.random.SeedSequence((seed, i)))
+        drawn[i] = tuple(scenario.population.draw(rng, scenario.channels))
+        layouts[i] = tuple(human.port().layout for human in drawn[i])
+    for layout in dict.fromkeys(layouts.values()):
+        group = [i for i in drawn if layouts[i] == layout]
+        yield np.array(group), HumanSets(tuple(drawn[i] for i in group), scenario.person)
+
+
+def crowd_of(scenario: Scenario, seed: int, index: int, links: int) -> Crowd | HumanSets:
     """The one set of humans with this index."""
     ((_, crowd),) = crowds_of(scenario, seed, [index], links)
     return crowd
@@ -191,7 +209,11 @@ def merge(parts: Sequence[Findings], interrupted: bool = False) -> Findings:
 
 
 def _group(
-    question: Question, assembly: Assembly, index: NDArray[np.intp], crowd: Crowd, ticked: Callable[[int], None]
+    question: Question,
+    assembly: Assembly,
+    index: NDArray[np.intp],
+    crowd: Crowd | HumanSets,
+    ticked: Callable[[int], None],
 ) -> Findings:
     scenario, nowhere = question.scenario, np.full(len(crowd), np.nan)
     held_by = variants(scenario.device, crowd)
@@ -207,6 +229,9 @@ def _group(
         with_mujoco = question.engine != "exact" and question.ticks > 0
         arguments = (held_by, index, question.seed, question.duration, with_mujoco, question.threads)
         switched = switched_crowd(assembly, question.coupling, *arguments)
+    ports = crowd.ports
+    mass = np.stack([port.mass.sum(axis=1) for port in ports], axis=1)  # (n, channels)
+    damping = np.stack([port.damping.min(axis=1) for port in ports], axis=1)
     return Findings(
         index=index,
         radius=modes.spectral_radius,
@@ -218,12 +243,18 @@ def _group(
         energy=exact.least_energy if exact else nowhere,
         audited=exact.audited if exact else nowhere,
         settling=exact.settling if exact else nowhere,
-        mass=np.exp(np.log(crowd.links[..., 0].sum(axis=2)).mean(axis=1)),
-        damping=np.exp(np.log(crowd.links[..., 1].min(axis=2)).mean(axis=1)),
+        mass=_geometric_mean(mass),
+        damping=_geometric_mean(damping),
         switching=switched.exact,
         switching_mujoco=switched.mujoco,
         simulated=sum(t.simulated for _, t in traces),
     )
+
+
+def _geometric_mean(values: Array) -> Array:
+    """Over the channels, (n, channels) -> (n,); 0 where one of them is."""
+    with np.errstate(divide="ignore"):
+        return np.exp(np.log(values).mean(axis=1))
 
 
 def _traces(

@@ -22,8 +22,8 @@ from scipy.sparse.csgraph import connected_components
 
 from controller.lti import Array
 from controller.process import Tape
-from models.scene import Plant, Scene
-from sim.scenario import Scenario
+from models.scene import Plant, Scene, impeded
+from sim.scenario import InputError, Scenario
 
 # ----------------------------------------------------------------------------------------------------
 # The matrix exponential of many small matrices at once.
@@ -293,6 +293,8 @@ def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoc
         raise ValueError(f"integrator is {integrator!r}, allowed are {', '.join(INTEGRATORS)}")
     if substeps < 1:
         raise ValueError(f"substeps is {substeps}, allowed are whole numbers from 1")
+    if impeded(scene.model):
+        raise InputError("a human has an impedance (A, B, C, D), which MuJoCo does not simulate: use the exact engine")
     model = copy(scene.model)
     model.opt.timestep = T / substeps
     model.opt.integrator = INTEGRATORS[integrator][0]

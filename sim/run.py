@@ -124,7 +124,7 @@ class Assembly:
             return self
         devices = tuple(msgspec.structs.replace(device, friction=0.0) for device in self.scenario.device)
         scenario = self.scenario.replace(device=devices)
-        return replace(self, scenario=scenario, scene=build(devices, scenario.human))
+        return replace(self, scenario=scenario, scene=build(devices, scenario.human, scenario.person))
 
     @property
     def felt(self) -> Lti:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import re
+import runpy
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -78,7 +79,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if lam > self.theta[i] + self.psi[i]:
                 total = self.theta[i] + self.psi[i]
                 raise ValueError(f"lam[{i}] is {lam}, allowed are 0 to theta + psi = {total} samples")
-        check_holds(self.person, self.channels)
+        check_holds([person.holds for person in self.person], self.channels)
         if self.jitter:
             self._check_jitter(self.jitter)
         if self.box and self.environment.walls:
@@ -126,7 +127,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def digest(self) -> str:
         """SHA-256 over the scenario's contents."""
-        return hashlib.sha256(msgspec.json.encode(self, order="sorted")).hexdigest()
+        return hashlib.sha256(msgspec.json.encode(self, order="sorted", enc_hook=_contents)).hexdigest()
 
     def reference_delays(self, case: str) -> tuple[int, ...]:
         """Lambda of a case: what `lam` says, else 0 in case II and theta + psi otherwise. Raises InputError."""
@@ -151,17 +152,22 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping [N s/m].
 
-        As strict as a file, and what comes out is what a file would have given: lists become tuples.
+        As strict as a file, and what comes out is what a file would have given: lists become tuples. Humans may also
+        be of a user's own class (models.human.Hand), and so may a population with `draw(rng, n)`, n humans.
         Raises InputError naming the field, what came and what is allowed.
         """
         fields = {name: getattr(self, name) for name in self.__struct_fields__} | changes
+        own = {name: fields.pop(name) for name in ("human", "population") if _is_own(name, fields[name])}
         try:
             if delta is not None:
                 damping = _strictly({"delta": delta}, _Damping).delta
                 if len(damping) != self.channels:
                     raise InputError(f"delta has {len(damping)} entries for {self.channels} channels")
                 fields["device"] = tuple(with_damping(d, b) for d, b in zip(self.device, damping, strict=True))
-            return _strictly(fields, type(self))
+            if "human" in own:
+                fields["human"] = [_NOBODY] * len(own["human"])
+            made = _strictly(fields, type(self))
+            return msgspec.structs.replace(made, **{name: _kept(value) for name, value in own.items()})
         except InputError:
             raise
         except ValueError as error:
@@ -232,6 +238,33 @@ def _plain(name: str, value: Any) -> Any:
     return msgspec.to_builtins(value, enc_hook=of_numpy)
 
 
+_NOBODY = Human((Link(0.0, 0.0, 0.0),))
+
+
+def _is_own(name: str, value: Any) -> bool:
+    """Whether some of these humans, or this population, are of a user's own class, which no file could have given."""
+    if name == "population":
+        return callable(getattr(value, "draw", None)) and not isinstance(value, Population)
+    parts = value if isinstance(value, list | tuple) else ()
+    return any(hasattr(part, "port") and not isinstance(part, Human) for part in parts)
+
+
+def _kept(value: Any) -> Any:
+    """A user's own population as it is, or humans, each of which must be able to hold a device. Raises ValueError."""
+    if not isinstance(value, list | tuple):
+        return value
+    for i, human in enumerate(value):
+        if not (callable(getattr(human, "port", None)) and callable(getattr(human, "voluntary_force", None))):
+            raise ValueError(f"human[{i}] is {human!r}, expected a Human, or what has port() and voluntary_force(t)")
+        human.port()  # raises ValueError where it is not passive
+    return tuple(value)
+
+
+def _contents(part: Any) -> Any:
+    """What a user's own human or population is made of."""
+    return part.tolist() if isinstance(part, np.ndarray | np.generic) else [type(part).__qualname__, vars(part)]
+
+
 def built_in() -> list[str]:
     """Names of the scenarios that come with the program."""
     return sorted(path.stem for path in SCENARIOS.glob("*.toml"))
@@ -284,10 +317,15 @@ class HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def load_humans(path: str | Path, channels: int) -> HumanFile:
     """The humans of a file, one per channel, and who holds several devices.
 
+    A Python file is run, and says who they are: `humans`, and `persons` if it likes, of any class (models.human.Hand).
     Raises InputError with one line that names the file and the field.
     """
     try:
-        people = msgspec.convert(tomllib.loads(Path(path).read_text(encoding="utf-8")), HumanFile)
+        if Path(path).suffix == ".py":
+            names = runpy.run_path(str(path))
+            people = HumanFile(tuple(names.get("humans", ())), tuple(names.get("persons", ())))
+        else:
+            people = msgspec.convert(tomllib.loads(Path(path).read_text(encoding="utf-8")), HumanFile)
     except OSError as error:
         raise InputError(f"--human {path}: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -296,12 +334,11 @@ def load_humans(path: str | Path, channels: int) -> HumanFile:
         raise InputError(f"--human {path}: not valid TOML: {error}") from None
     except msgspec.ValidationError as error:
         raise InputError(f"--human {path}: {error}") from None
+    what = "`humans`" if Path(path).suffix == ".py" else "[[human]] tables"
     if len(people.human) != channels:
-        raise InputError(
-            f"--human {path} has {len(people.human)} [[human]] tables, expected {channels} (one per channel)"
-        )
+        raise InputError(f"--human {path} has {len(people.human)} {what}, expected {channels} (one per channel)")
     try:
-        check_holds(people.person, channels)
+        check_holds([person.holds for person in people.person], channels)
     except ValueError as error:
         raise InputError(f"--human {path}: {error}") from None
     return people

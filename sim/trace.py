@@ -50,7 +50,7 @@ class Result:
         """The one simulation of a record, in the scenario's terms."""
         m, handles = assembly.process.channels, list(assembly.scene.handles)
         s = record.s[:, :, 0]
-        n = s.shape[1] // 2
+        n = assembly.scene.model.nq
         t = np.arange(s.shape[0]) * assembly.scenario.T
         x = assembly.process.measured(s[:, :m])
         return cls(t, x, record.f[:, :, 0], s[:, handles], s[:, n:][:, handles], record.w[:, :, 0], meta)

@@ -47,7 +47,7 @@ class EmulatedPlant:
     def advance(self, f: Array) -> None:
         """Hold the forces f (m,) [N] for one period; the device feels -f."""
         w = np.zeros(self.scene.outside) if self.tick is None else self._next_outside()
-        f, m, n = np.clip(f, -self._limit, self._limit), self.channels, len(self.s) // 2
+        f, m, n = np.clip(f, -self._limit, self._limit), self.channels, self.scene.model.nq
         for _ in range(self._substeps):
             friction = self.coulomb * np.tanh(self.s[n : n + m] / SLIP) if self.coulomb else 0.0
             self.s = self._product @ np.concatenate([self.s, w, f + friction])

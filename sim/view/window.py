@@ -12,13 +12,11 @@ import mujoco
 from mujoco import viewer
 
 from sim.view.events import KEYS
-from sim.view.grip import Grip
-from sim.view.overlay import apart, columns, keys_help, overlay
-from sim.view.session import Frame, Session
-from sim.view.stage import Stage
+from sim.view.session import Frame, Grip, Session
+from sim.view.stage import Stage, apart, columns, keys_help, overlay
 
-RATE = 60.0  # frames per second
-PATIENCE = 30  # [s] for the display to answer
+_RATE = 60.0  # frames per second
+_PATIENCE = 30  # [s] for the display to answer
 
 # without a display the viewer's thread dies and its caller waits for ever: a process of its own asks first
 _PROBE = (
@@ -31,10 +29,10 @@ class NoWindow(Exception):
     """The viewer cannot open a window here."""
 
 
-def display() -> bool:
+def _display() -> bool:
     """Whether a window can be opened here."""
     try:
-        done = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, timeout=PATIENCE, check=False)
+        done = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, timeout=_PATIENCE, check=False)
     except subprocess.TimeoutExpired:
         return False
     return done.returncode == 0
@@ -45,7 +43,7 @@ def show(session: Session, stage: Stage, until: float | None = None) -> None:
 
     Raises NoWindow where there is no display, or on macOS without MuJoCo's own launcher.
     """
-    if not display():
+    if not _display():
         raise NoWindow("no window can be opened: there is no display, or none with OpenGL")
     threads = set(threading.enumerate())
     try:
@@ -61,7 +59,7 @@ def show(session: Session, stage: Stage, until: float | None = None) -> None:
             loop(session, stage, window, time.perf_counter, time.sleep, until)
     finally:  # the viewer must have left OpenGL before Python ends
         for thread in set(threading.enumerate()) - threads:
-            thread.join(PATIENCE)
+            thread.join(_PATIENCE)
 
 
 def loop(
@@ -80,7 +78,7 @@ def loop(
         grip = _shown(stage, window, session.frame(begun - start, grip))
         if until is not None and begun - start >= until:
             return
-        sleep(max(0.0, 1 / RATE - (clock() - begun)))
+        sleep(max(0.0, 1 / _RATE - (clock() - begun)))
 
 
 def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Grip | None:
@@ -92,7 +90,7 @@ def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Grip | None:
             window.user_scn.ngeom = 0
             stage.draw(window.user_scn, frame)
     window.sync()
-    (said, refused), keys = apart(overlay(frame, live=True)), keys_help(frame.setting.menu.given is not None)
+    (said, refused), keys = apart(overlay(frame, live=True)), keys_help(frame.prepared.menu.given is not None)
     font, grid = mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos
     places = {grid.mjGRID_TOPLEFT: said, grid.mjGRID_TOPRIGHT: keys, grid.mjGRID_BOTTOMLEFT: refused}
     window.set_texts([(font, place, *columns(lines)) for place, lines in places.items() if lines])
