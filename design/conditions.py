@@ -268,29 +268,40 @@ def least_scale(demand: Demand[Any], w: Array) -> Array:
 
 
 def least_multiple(free: Complex, gain: Complex) -> Array:
-    """The least s with free + s gain >= 0, (...,), of Hermitian (..., p, p); inf where gain is not positive.
+    """The least s with free + s gain >= 0, (...,), of Hermitian (..., p, p) with gain >= 0; inf where there is none.
 
-    Inputs that no damping reaches (gain zero, as of a wall's force) are eliminated by a Schur complement.
+    Where gain is singular, free must be positive on its null space; the rest is a Schur complement.
     """
     own = np.diagonal(gain, axis1=-2, axis2=-1).real
-    idle = ~own.any(axis=tuple(range(own.ndim - 1)))
-    if idle.any():
-        damped = ~idle
-        rest, cross = free[..., idle, :][..., idle], free[..., idle, :][..., damped]
-        eigenvalues = np.linalg.eigvalsh(rest)
-        positive = eigenvalues[..., 0] > 1e-13 * np.abs(eigenvalues).max(axis=-1)
-        rest = np.where(positive[..., None, None], rest, np.eye(idle.sum()))
-        schur = free[..., damped, :][..., damped] - np.conj(np.swapaxes(cross, -1, -2)) @ np.linalg.solve(rest, cross)
-        least = least_multiple(schur, gain[..., damped, :][..., damped]) if damped.any() else -np.inf
-        return np.where(positive, least, np.inf)
     if (own > 0).all() and not (gain * (1 - np.eye(gain.shape[-1]))).any():
         weight = 1 / np.sqrt(own)
         return np.linalg.eigvalsh(-weight[..., :, None] * free * weight[..., None, :])[..., -1]
     eigenvalues, basis = np.linalg.eigh(gain)
     floor = np.maximum(1e-13 * np.abs(eigenvalues).max(axis=-1, keepdims=True), np.finfo(float).tiny)
-    whitened = np.conj(np.swapaxes(basis, -1, -2)) / np.sqrt(np.maximum(eigenvalues, floor))[..., :, None]
-    H = -whitened @ (free @ np.conj(np.swapaxes(whitened, -1, -2)))
-    return np.where(eigenvalues[..., 0] > floor[..., 0], np.linalg.eigvalsh(H)[..., -1], np.inf)
+    scale = np.where(eigenvalues > floor, 1 / np.sqrt(np.maximum(eigenvalues, floor)), 1.0)
+    whitened = np.conj(np.swapaxes(basis, -1, -2)) * scale[..., :, None]
+    H = whitened @ (free @ np.conj(np.swapaxes(whitened, -1, -2)))
+    flat, missing = H.reshape(-1, *H.shape[-2:]), (eigenvalues <= floor).sum(axis=-1).ravel()
+    needed = np.empty(missing.size)
+    for r in np.unique(missing):  # eigenvalues ascend: the first r directions are those that the gain does not reach
+        here = flat[missing == r]
+        needed[missing == r] = _beyond_the_null_space(here, r) if r else np.linalg.eigvalsh(-here)[:, -1]
+    needed[(eigenvalues < -floor).any(axis=-1).ravel()] = np.inf
+    return needed.reshape(H.shape[:-2])
+
+
+def _beyond_the_null_space(H: Complex, r: int) -> Array:
+    """The least s with H + s diag(0, I) >= 0, where 0 has r rows; (n,)."""
+    null, cross, rest = H[:, :r, :r], H[:, :r, r:], H[:, r:, r:]
+    size = np.abs(np.diagonal(H, axis1=1, axis2=2)).max(axis=1, initial=0.0)
+    positive = np.linalg.eigvalsh(null)[:, 0] > 1e-13 * size
+    needed = np.full(len(H), np.inf)
+    left = rest - np.conj(np.swapaxes(cross, 1, 2)) @ np.linalg.solve(
+        np.where(positive[:, None, None], null, np.eye(r)), cross
+    )
+    if r < H.shape[-1]:
+        needed[positive] = np.linalg.eigvalsh(-left)[positive, -1]
+    return needed
 
 
 def this_environment(
