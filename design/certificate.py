@@ -162,8 +162,9 @@ MAKING = "this environment, with walls up to their stiffness that make and break
 #: What no certificate covers.
 CAVEATS = (
     "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted), "
-    "not for contacts that make and break (except walls under theorem4, without delay in the environment), "
-    "jitter of T, quantisation, velocity filters or friction compensation."
+    "not for walls with dampers that make and break contact (except under theorem4, without delay in the environment), "
+    "periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb friction pays for, "
+    "velocity filters or friction compensation."
 )
 
 
@@ -347,7 +348,7 @@ def _margin(found: JitterProof) -> float:
 
 NOT_COVERED = (
     "Covered: any ages of the forces within the range, at every tick and on every channel. Not covered: jitter on the "
-    "measured positions, jitter of T, or forces older than the range, which lost packets make."
+    "measured positions, periods longer than T_max, or forces older than the range, which lost packets make."
 )
 
 
