@@ -26,8 +26,8 @@ from design.conditions import (
     Requirement,
     any_environment_demand,
     delayed_demand,
+    even_damping,
     least_scale,
-    per_tick,
     this_environment,
     this_environment_demand,
 )
@@ -87,7 +87,7 @@ def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Judged:
     if V is not None and np.isfinite(requirements["theorem4"].ratio):
         if any(loop.psi):
             assert phi is not None  # a finite figure had a multiplier
-            demands["theorem4"] = delayed_demand(V, loop.theta, loop.T * per_tick(loop.delta, loop.T, loop.T_max), phi)
+            demands["theorem4"] = delayed_demand(V, loop.theta, even_damping(loop.delta, loop.T, loop.T_max), phi)
         else:
             demands["theorem4"] = partial(least_scale, any_environment_demand(V, loop.theta, loop.delta, loop.T_max))
     return Judged(F, requirements, demands)

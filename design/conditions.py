@@ -13,7 +13,7 @@ switching          this-environment for delays of the forces that vary within lo
 latency            this-environment for forces that latch a fraction of a sample after the tick, anew at every tick
 walls              this-environment for walls that make and break contact
 
-The period may vary from tick to tick, up to T_max, in all of them: `per_tick` is where it enters.
+The period may vary from tick to tick, up to T_max, in all of them: `even_damping` is where it enters.
 """
 
 from __future__ import annotations
@@ -64,14 +64,14 @@ class Demand(Generic[Block]):
     semidefinite: tuple[str, ...] = ()
 
 
-def per_tick(delta: Sequence[Any], T: Number, T_max: float | None = None) -> Any:
-    """Delta_D/T_max [N/m], (m,): what the devices dissipate at least in a tick, per square of the displacement in it.
+def even_damping(delta: Sequence[Any], T: Number, T_max: float | None = None) -> Any:
+    """Delta_D T/T_max [N s/m], (m,): the damping that does in even periods T what delta does in periods up to T_max.
 
     The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. Nothing else
-    in the energy balance depends on T: the force map is the same at every tick, however long the tick is. `delta` is
-    in N s/m; without T_max [s] every period is T.
+    in the energy balance depends on T: the force map is the same at every tick, however long the tick is.
     """
-    return numbers(delta, T) / (T if T_max is None else numbers(T_max, T))
+    damping = numbers(delta, T)
+    return damping if T_max is None else damping * (T / numbers(T_max, T))
 
 
 Latency = Sequence[tuple[float, float]]  # (m,) t1 and t2 [s], 0 <= t1 <= t2 < T: how late after a tick forces latch
@@ -89,7 +89,7 @@ def this_environment_demand(
     if latency is not None:
         return latency_demand(F, delta, latency, T_max)
     F1, R = F.split_at_one()
-    return Demand(R - F1 / 2, constant_like(F, np.diag(per_tick(delta, F.T, T_max))), {"F(1)": F1}, ("F(1)",))
+    return Demand(R - F1 / 2, constant_like(F, np.diag(even_damping(delta, F.T, T_max) / F.T)), {"F(1)": F1}, ("F(1)",))
 
 
 def latency_demand(F: Block, delta: Sequence[Any], latency: Latency, T_max: float | None = None) -> Demand[Block]:
@@ -139,7 +139,7 @@ def walls_demand(
     slopes = np.diag(np.concatenate([numbers([0] * m, T), weights * gains]))
     limits = np.concatenate([numbers([0] * m, T), weights * gains / numbers(stiffness, T)])
     free = np.hstack([one, -slopes]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
-    damping = np.concatenate([per_tick(delta, T, T_max), numbers([0] * w, T)])
+    damping = np.concatenate([even_damping(delta, T, T_max) / T, numbers([0] * w, T)])
     F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]
     static = {"F(1)": F1, "-Y(1)": -Y1, "the static map of devices and walls": S1}
     return Demand(free, constant_like(G, np.diag(damping)), static, ("F(1)", "-Y(1)"))
@@ -153,7 +153,7 @@ def any_environment_demand(
     With Theta-hat = diag(T/(2 delta_i) (1 + 1/z + ... + z^-theta_i)) (12) and H = V - Theta-hat/s, which (11) makes
     V-hat of, the block is H(1)/2 - (H - H(1))/(z - 1) for either part.
     """
-    window = np.diag(1 / (2 * per_tick(delta, V.T, T_max))) @ as_like(V, moving_sum(theta, V.T))
+    window = np.diag(V.T / (2 * even_damping(delta, V.T, T_max))) @ as_like(V, moving_sum(theta, V.T))
     (V1, R), (W1, S) = V.split_at_one(), window.split_at_one()
     return Demand(S - W1 / 2, V1 / 2 - R, {"V(1)": V1})
 
@@ -185,7 +185,7 @@ def switching_block(
     both: Any = as_like(G, vstack(half, spread)) @ G
     m = len(lo)
     F1, R = both.rows(slice(None, m)).split_at_one()
-    upper = R - F1 / 2 + np.diag(per_tick(delta, T, T_max) - a / 2)
+    upper = R - F1 / 2 + np.diag(even_damping(delta, T, T_max) / T - a / 2)
     if not varying:
         return upper, F1
     lower = np.zeros((m + len(varying), len(varying)), dtype=object)
@@ -224,7 +224,7 @@ def delayed_coupling_block(
     [[T (H(1)/2 - R), 0], [2 H, S]]. Raises ValueError for a multiplier that is none.
     """
     T = V.T
-    delta = T * per_tick(delta, T, T_max)
+    delta = even_damping(delta, T, T_max)
     if len(phi) != len(delta) or not all(0 <= p < d for p, d in zip(phi, delta, strict=True)):
         raise ValueError("the multiplier Phi is not between 0 and the device damping on every channel")
     H = V - np.diag(T / (2 * delta)) @ moving_sum(theta, T)
@@ -561,7 +561,7 @@ def any_environment_delayed(
     V1 = V.dc()
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return refused("the static compliance V(1) is not symmetric")
-    damping = V.T * per_tick(available, V.T, T_max)
+    damping = even_damping(available, V.T, T_max)
     if uncovered(environment, psi, np.diag(phi)) > ROUNDING * max(damping):
         return refused("E-hat + Phi is not passive for this multiplier")
     needed = delayed_demand(V, theta, damping, np.asarray(phi))
@@ -653,8 +653,8 @@ def jitter_proof(
     constant = this_environment(nominal(lo, hi, G.T) @ G, delta, T_max)
     if not np.isfinite(constant.ratio):
         return jitter_refusal(available, constant.reason or "no constant delay is safe")
-    unit = per_tick(available, G.T, T_max)
-    search = _Search(G, lo, hi, unit)
+    damping = even_damping(available, G.T, T_max)
+    search, unit = _Search(G, lo, hi, damping), damping / G.T
     given = None if alpha is None else (np.asarray(alpha) / unit)[search.active]
     a, ratio, w, bound = search.least() if given is None else search.only(given)
     multiplier = np.zeros(h.size)
@@ -675,13 +675,13 @@ class _Search:
     """s(a) = sup over w of the largest eigenvalue of N + diag(a)/2 + Y* diag(1/2a) Y, over the channels that vary.
 
     A Schur complement of `switching_block`, scaled by W = diag(sqrt(T/delta)): N = -W He[F/(z-1)] W,
-    F = Theta_nom G, Y = h W G W. `unit` is delta/T.
+    F = Theta_nom G, Y = h W G W.
     """
 
-    def __init__(self, G: Lti, lo: Sequence[int], hi: Sequence[int], unit: Array) -> None:
+    def __init__(self, G: Lti, lo: Sequence[int], hi: Sequence[int], delta: Array) -> None:
         F = nominal(lo, hi, G.T) @ G
-        self._G, self._demand = G, this_environment_demand(F, (G.T * unit).tolist())
-        self._weight, self._h = np.sqrt(1 / unit), half_widths(lo, hi)
+        self._G, self._demand = G, this_environment_demand(F, delta.tolist())
+        self._weight, self._h = np.sqrt(G.T / delta), half_widths(lo, hi)
         self.active = np.flatnonzero(self._h)
         self._grid = np.concatenate([[0.0], frequencies(G)])
         none = np.zeros((0, self.active.size))

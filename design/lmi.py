@@ -28,7 +28,7 @@ from controller.delay import delay
 from controller.environment import Region, environment, members, regions, shrunk
 from controller.loop import Loop
 from controller.lti import Array, Lti
-from design.conditions import dampings, per_tick, regular_part, uncovered
+from design.conditions import dampings, even_damping, regular_part, uncovered
 from design.frequency import frequencies, hermitian, on_circle, supremum
 from design.result import Attempt, DesignFailed, Infeasible
 
@@ -75,7 +75,7 @@ class Specification:
     @classmethod
     def of(cls, loop: Loop) -> Specification:
         """The loop as a request for a design, every wall touching. Raises ValueError naming the field that is wrong."""
-        box, usable = loop.box, tuple((loop.T * per_tick(loop.delta, loop.T, loop.T_max)).tolist())
+        box, usable = loop.box, tuple(even_damping(loop.delta, loop.T, loop.T_max).tolist())
         if box is None:
             return cls(loop.E(), loop.theta, loop.psi, loop.lam, usable)
 

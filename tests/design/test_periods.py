@@ -11,7 +11,7 @@ from controller.coupling import SpringDamper
 from controller.environment import FIGURE_4, Network, Spring
 from controller.loop import DelayRange, Loop
 from design.certificate import Stored, assess, digest, prove, required_damping, swept, verify
-from design.conditions import any_environment, any_environment_demand, per_tick, this_environment_demand
+from design.conditions import any_environment, any_environment_demand, even_damping, this_environment_demand
 from design.lmi import Specification
 from design.spring_damper import design
 
@@ -54,7 +54,7 @@ def test_the_any_environment_line_by_hand():
 
 
 def test_the_damping_of_a_tick_is_exact_over_the_rationals():
-    assert per_tick([1.37], Fraction(1, 1000), 1.6e-3)[0] == Fraction(137, 100) / Fraction(16, 10000)
+    assert even_damping([1.37], Fraction(1, 1000), 1.6e-3)[0] == Fraction(137, 100) / Fraction(16, 10)
     F = LOOP.F(SOFT, exact=True)
     gain = this_environment_demand(F, LOOP.delta, LONG).gain.D
     assert gain[0, 0] == Fraction(137, 100) / Fraction(16, 10000)
