@@ -94,7 +94,8 @@ def _subject(args: argparse.Namespace, scenario: Scenario) -> Subject:
         loop = {"network": scenario.environment, "delta": scenario.delta, **delays}
     coupling = _coupling(args, len(loop["delta"]), scenario)
     try:
-        return Subject(coupling, T=scenario.T, **loop)
+        m, late = len(loop["delta"]), scenario.latency
+        return Subject(coupling, T=scenario.T, T_max=scenario.T_max, latency=late and late[:m], **loop)
     except ValueError as error:
         raise InputError(str(error)) from None
 
