@@ -33,6 +33,7 @@ from design.conditions import (
     any_environment_per_channel,
     delayed_coupling_block,
     delayed_environment_block,
+    encoder_friction,
     jitter_proof,
     jitter_refusal,
     refusal,
@@ -162,9 +163,9 @@ MAKING = "this environment, with walls up to their stiffness that make and break
 #: What no certificate covers.
 CAVEATS = (
     "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted), "
-    "not for walls with dampers that make and break contact (except under theorem4, without delay in the environment), "
-    "periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb friction pays for, "
-    "velocity filters or friction compensation."
+    "not for walls with dampers that make and break contact (except under any-environment without delay in the "
+    "environment), periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb "
+    "friction pays for, velocity filters or friction compensation."
 )
 
 
@@ -220,6 +221,27 @@ def promise_of(requirements: Mapping[str, Requirement], loop: Loop, whole_set: b
     walls = bool(loop.environment.walls)
     anything = held["theorem4"] and not any(loop.psi)
     return promise(anything, any(held.values()), walls=walls, making=making_covered(loop), whole_set=whole_set)
+
+
+def encoder_part(
+    loop: Loop, coupling: Coupling, steps: Sequence[float], friction: Sequence[float]
+) -> dict[str, Any] | None:
+    """Whether declared Coulomb friction (m,) [N] pays for encoder steps (m,) [m]; None where encoders are ideal."""
+    if not any(steps):
+        return None
+    widths = ", ".join(f"{1e6 * q:.4g}" for q in steps)
+    part: dict[str, Any] = {"encoder_step": list(steps), "friction": list(friction)}
+    if loop.environment.walls:
+        words = f"encoder steps of {widths} um: with walls nothing is proved of them"
+        return part | {"friction_needed": None, "covered": False, "words": words}
+    needed = encoder_friction(loop.F(coupling), steps)
+    covered = bool((needed <= np.asarray(friction)).all())
+    has = ", ".join(f"{f:.4g}" for f in friction)
+    enough = (
+        f"friction of {', '.join(f'{f:.4g}' for f in needed)} N is enough for {widths} um, the devices declare {has} N"
+    )
+    words = f"encoder steps {'are covered' if covered else 'are not covered'}: {enough}"
+    return part | {"friction_needed": [finite(f) for f in needed], "covered": covered, "words": words}
 
 
 # ----------------------------------------------------------------------------------------------------

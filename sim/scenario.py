@@ -224,6 +224,13 @@ def require_constant_delay(scenario: Scenario, what: str) -> None:
         raise InputError(f"jitter: {what} takes the delays that its link has; take the table out, {instead}")
 
 
+def require_forces_at_ticks(scenario: Scenario, what: str) -> None:
+    """Raises InputError where forces latch between ticks, for what would let them act from the tick on."""
+    if scenario.latency is not None:
+        instead = "designs, audits and certificates take it; without it, count a whole sample of theta"
+        raise InputError(f"latency: {what} lets forces act from the tick on; {instead}")
+
+
 # ---- humans in a file of their own
 
 

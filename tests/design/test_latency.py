@@ -12,6 +12,7 @@ from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled
 from design.certificate import LATE, NotProved, Stored, assess, prove, required_damping, verify
 from design.conditions import latency_demand, least_scale, this_environment, this_environment_demand
+from design.designs import design_coupling, transparency_of
 from design.frequency import frequencies, hermitian, on_circle
 
 T, TAU, K = 1.2e-3, 0.13e-3, 1000.0
@@ -151,3 +152,14 @@ def test_no_hand_grows_at_the_requirement_and_some_do_below(mean):
     assert need == pytest.approx(0.841354, rel=1e-4)
     assert growing(1.02 * need, latencies, mean) == 0
     assert growing(0.6 * need, latencies, mean) > 0
+
+
+def test_a_design_for_late_forces_uses_the_damping_and_beats_a_whole_sample():
+    loop = change(PAIR, latency=((0.0, TAU),) * 2)
+    found = design_coupling(loop, "spring-damper", "closed-loop")
+    assert 0.99 < found.requirement.ratio < 1
+    assert assess(loop, found.coupling)["closed-loop"].proof == "rational"
+    whole = design_coupling(change(PAIR, theta=(1, 2)), "spring-damper", "closed-loop")
+    assert transparency_of(loop, found).rms_mismatch_db < transparency_of(loop, whole).rms_mismatch_db - 1
+    with pytest.raises(ValueError, match="latency"):
+        design_coupling(loop, "spring-damper", "theorem4")
