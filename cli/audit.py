@@ -19,6 +19,7 @@ from design.designs import KINDS
 from design.ranges import check_set, set_rows
 from design.result import CONDITION_NAMES, listed
 from sim.couplings import check_stored, fitted, read_coupling
+from sim.report import encoder_steps
 from sim.scenario import InputError, Scenario
 
 EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
@@ -44,6 +45,7 @@ def main(argv: list[str]) -> int:
         "scenario": None if args.rigid else scenario.name,
         "preset": args.preset and {"name": args.preset, "source": PRESETS[args.preset].source},
         **report(subject, switching, whole),
+        "encoder": None if args.rigid else encoder_steps(scenario, args.case, subject.coupling),
         "notes": _notes(args, scenario, switching),
         "wall_s": time.perf_counter() - begin,
     }
@@ -94,7 +96,8 @@ def _subject(args: argparse.Namespace, scenario: Scenario) -> Subject:
         loop = {"network": scenario.environment, "delta": scenario.delta, **delays}
     coupling = _coupling(args, len(loop["delta"]), scenario)
     try:
-        return Subject(coupling, T=scenario.T, **loop)
+        m, late = len(loop["delta"]), scenario.latency
+        return Subject(coupling, T=scenario.T, T_max=scenario.T_max, latency=late and late[:m], **loop)
     except ValueError as error:
         raise InputError(str(error)) from None
 
@@ -220,6 +223,8 @@ def _remarks(outcome: dict[str, Any]) -> list[str]:
         lines.append(f"What helps: {helping['change']} ({need}).")
     if (part := outcome["jitter-proof"]) is not None:
         lines += _switching_remarks(part)
+    if part := outcome["encoder"]:
+        lines.append(f"{part['words'][0].upper()}{part['words'][1:]}.")
     return [*lines, outcome["not_covered"]]
 
 

@@ -99,6 +99,17 @@ def delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}") from None
 
 
+def latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
+    """'130e-6' as 0 to 0.13 ms, '100e-6:130e-6' as a range of its own; one for all, or one per channel [s]."""
+    try:
+        parts = [[float(word) for word in part.split(":")] for part in text.split(",")]
+    except ValueError:
+        parts = [[]]
+    if not all(len(part) in (1, 2) for part in parts):
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected S or LO:HI in seconds, one or one per channel")
+    return tuple((0.0, part[0]) if len(part) == 1 else (part[0], part[1]) for part in parts)
+
+
 def condition(text: str) -> str:
     """A condition by its name, or by the name that it had before, as reports and files call it."""
     known = {name: key for key, name in CONDITION_NAMES.items()} | {key: key for key in CONDITION_NAMES}
@@ -173,6 +184,10 @@ def add_loop_options(parser: argparse.ArgumentParser) -> None:
     damping, what = several(float, 0, MOST_DAMPING, "N s/m"), "damping of each device [N s/m]; one is for all"
     loop.add_argument("--delta", type=damping, metavar="D,D,..", help=what)
     loop.add_argument("--T", type=number(), metavar="SECONDS", help="sampling period [s]")
+    longest = "longest period [s], where it varies from tick to tick: certificates then are for any up to it"
+    loop.add_argument("--T-max", type=number(), metavar="SECONDS", help=longest)
+    late = "how late after a tick forces latch [s], less than T: at most S, or LO:HI; one is for all"
+    loop.add_argument("--latency", type=latency_ranges, metavar="S", help=late)
 
 
 def scenario_from(args: argparse.Namespace) -> Scenario:
@@ -180,8 +195,11 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     scenario = load(args.scenario)
     given = {name: getattr(args, name) for name in ("theta", "psi", "lam") if getattr(args, name) is not None}
     changes: dict[str, Any] = {name: per_channel(f"--{name}", n, scenario.channels) for name, n in given.items()}
-    if args.T is not None:
-        changes["T"] = args.T
+    for name in ("T", "T_max"):
+        if getattr(args, name) is not None:
+            changes[name] = getattr(args, name)
+    if args.latency is not None:
+        changes["latency"] = per_channel("--latency", args.latency, scenario.channels)
     delta = None if args.delta is None else per_channel("--delta", args.delta, scenario.channels)
     return scenario.replace(delta, **changes) if changes or delta else scenario
 

@@ -44,6 +44,7 @@ def main(argv: list[str]) -> int:
         "scenario": scenario.name,
         "coupling": report.coupling_part(chosen.kind, chosen.coupling, scenario.T),
         **_certified(chosen, requirements, done.loop(args.case), whole),
+        "encoder": report.encoder_steps(scenario, args.case, chosen.coupling),
         "transparency": report.transparency_part(transparency(done.simulation.felt, done.simulation.E, loop.lam)),
         **_stability(chosen, done, any(requirement.certified for requirement in requirements.values())),
         "run": _settings(args, done, loop.lam) | {"environment": environment},

@@ -14,10 +14,11 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import msgspec
+import numpy as np
 
 from controller.coupling import Coupling, Strict
 from controller.delay import delay
-from controller.environment import Box, Member, Network, environment, held, members
+from controller.environment import Box, Member, Network, environment, held, members, walled_environment
 from controller.lti import Lti, Number, rational
 
 Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=100)], ...]
@@ -56,6 +57,8 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
     environment: Network
     box: Box | None = None  # what else the environment may be
     jitter: DelayRange | None = None  # what else the delays of the forces may be, switching at every tick
+    T_max: Positive | None = None  # [s] the longest period there is, where it varies from tick to tick; T if None
+    latency: tuple[tuple[float, float], ...] | None = None  # (m,) [s] least and most by which forces latch after kT
 
     def __post_init__(self) -> None:
         m = len(self.environment.contacts)
@@ -71,6 +74,22 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
                 raise ValueError(f"{member.name}: {error}" if self.box else str(error)) from None
         if self.jitter:
             self._check_jitter(self.jitter)
+        if self.T_max is not None and not self.T <= self.T_max < float("inf"):
+            raise ValueError(f"T_max is {self.T_max:g} s, expected at least T = {self.T:g} s")
+        if self.latency is not None:
+            self._check_latency(self.latency)
+
+    def _check_latency(self, latency: tuple[tuple[float, float], ...]) -> None:
+        if len(latency) != len(self.theta):
+            raise ValueError(f"latency has {len(latency)} ranges for {len(self.theta)} channels")
+        for i, (least, most) in enumerate(latency):
+            if not 0 <= least <= most < self.T:
+                raise ValueError(
+                    f"latency[{i}] is {least:g} to {most:g} s, expected 0 <= least <= most < T = {self.T:g} s"
+                )
+        if self.jitter or self.environment.walls:
+            other = "jitter" if self.jitter else "environment.walls"
+            raise ValueError(f"latency and {other}: a latency is judged with constant delays in linear environments")
 
     def _check_jitter(self, jitter: DelayRange) -> None:
         if self.box or self.environment.walls:
@@ -101,6 +120,15 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
         """F = Theta G (6): displacements to forces, as the devices see them. Raises SingularLoop."""
         return force_map(self.E(exact), coupling, self.theta, self.psi)
 
+    def walled(self, coupling: Coupling, exact: bool = False) -> Lti:
+        """[x; p] to [f; y]: as F with no wall touching, wall forces [N] put in and the ways into walls [m] out.
+
+        Raises SingularLoop, and ValueError for a coupling that walls cannot stand behind.
+        """
+        return walled_force_map(
+            walled_environment(self.environment, self.period(exact)), coupling, self.theta, self.psi
+        )
+
     def members(self) -> tuple[Member, ...]:
         """The environment, and the vertices of its box where it has one."""
         return members(self.environment, self.box)
@@ -122,6 +150,16 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
 def sent(E: Lti, coupling: Coupling, psi: Sequence[int]) -> Lti:
     """G = (I + Psi E V)^-1 Psi E."""
     return coupling.around(delay(psi, E.T) @ E)
+
+
+def walled_force_map(E: Lti, coupling: Coupling, theta: Sequence[int], psi: Sequence[int]) -> Lti:
+    """[x; p] to [f; y] from that of the environment. Psi and Theta delay what the devices feel of the walls."""
+    w = E.inputs - len(theta)
+
+    def late(steps: Sequence[int]) -> Lti:
+        return Lti.diag(delay(steps, E.T), Lti.constant(np.eye(w), E.T))
+
+    return late(theta) @ coupling.around(late(psi) @ E, further=w)
 
 
 def force_map(E: Lti, coupling: Coupling, theta: Sequence[int], psi: Sequence[int]) -> Lti:

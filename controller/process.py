@@ -23,8 +23,9 @@ from functools import cached_property
 import numpy as np
 
 from controller.coupling import Coupling
-from controller.delay import HeldLine, Ticks, delay, packet_delays
+from controller.delay import HeldLine, Ticks, packet_delays
 from controller.environment import Network, Wall, walled_environment
+from controller.loop import walled_force_map
 from controller.lti import Array, Lti, SingularLoop, frozen
 
 # ----------------------------------------------------------------------------------------------------
@@ -126,13 +127,7 @@ class Contact:
 
 def contact(network: Network, coupling: Coupling, theta: Sequence[int], psi: Sequence[int], T: float) -> Contact:
     """F of (6) with the walls of the network as further ports. Psi and Theta delay what the devices feel of them."""
-    w = len(network.walls)
-
-    def late(steps: Sequence[int]) -> Lti:
-        return Lti.diag(delay(steps, T), Lti.constant(np.eye(w), T))
-
-    coupled = coupling.around(late(psi) @ walled_environment(network, T), further=w)
-    return Contact(late(theta) @ coupled, network.walls)
+    return Contact(walled_force_map(walled_environment(network, T), coupling, theta, psi), network.walls)
 
 
 @dataclass(frozen=True, eq=False)

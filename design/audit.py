@@ -20,8 +20,10 @@ from controller.lti import Lti, SingularLoop
 from design.certificate import (
     ANY,
     CAVEATS,
+    LATE,
     certificate_part,
     closed_loop_of,
+    making_covered,
     promise,
     switching_part,
     switching_requirement,
@@ -83,6 +85,8 @@ class Subject:
     theta: tuple[int, ...]  # (m,) transmission delays [samples]
     psi: tuple[int, ...]  # (m,) environment delays [samples]
     delta: tuple[float, ...]  # (m,) damping that the devices guarantee [N s/m]
+    T_max: float | None = None  # [s] the longest period, where it varies
+    latency: tuple[tuple[float, float], ...] | None = None  # (m,) [s] by which forces latch after a tick
 
     def __post_init__(self) -> None:
         for name in ("theta", "psi"):
@@ -127,10 +131,9 @@ class Subject:
     def switching(self, span: DelayRange) -> JitterProof:
         """The damping that any switching of the forces' delays within this range asks of the devices."""
         if self.network is not None and not self.walls:
-            loop = Loop(self.T, self.theta, self.psi, self.theta, self.delta, self.network, jitter=span)
-            return switching_requirement(loop, self.coupling)
+            return switching_requirement(replace(self, latency=None)._loop(self.network).switching(span), self.coupling)
         try:
-            return jitter_proof(self.G, span.lo, span.hi, self.delta)
+            return jitter_proof(self.G, span.lo, span.hi, self.delta, T_max=self.T_max)
         except SingularLoop as error:
             return jitter_refusal(self.delta, str(error))
 
@@ -143,7 +146,8 @@ class Subject:
         coupling = self.coupling
         if isinstance(coupling, Compliance):
             coupling = Compliance(replace(coupling.V, T=T))
-        return replace(self, coupling=coupling, T=T)
+        longest = self.T_max and self.T_max * (T / self.T)  # periods vary in proportion
+        return replace(self, coupling=coupling, T=T, T_max=longest)
 
     def with_gains(self, K: ArrayLike, B: ArrayLike) -> Self:
         """The same loop with another spring-damper [N/m, N s/m]."""
@@ -152,18 +156,22 @@ class Subject:
     def _closed_loop(self) -> Requirement:
         try:
             if self.network is None:
-                return this_environment(self.F, self.delta)
+                return this_environment(self.F, self.delta, self.T_max, self.latency)
             return closed_loop_of(self._loop(self.network), self.coupling)
-        except SingularLoop as error:
+        except ValueError as error:  # no solution of the algebraic loop, or a latency that is longer than a period
             return refusal("closed-loop", self.delta, str(error))
 
     def _theorem4(self) -> Requirement:
         # what is behind a wall's coupling does not matter to Theorem 4
         network = self.network or Network(("contact",), masses={"contact": 1.0})
-        return theorem4_of(self._loop(network), self.coupling)
+        try:
+            return theorem4_of(self._loop(network), self.coupling)
+        except ValueError as error:
+            return refusal("theorem4", self.delta, str(error))
 
     def _loop(self, network: Network) -> Loop:
-        return Loop(self.T, self.theta, self.psi, self.theta, self.delta, network)
+        timing = {"T_max": self.T_max, "latency": self.latency}
+        return Loop(self.T, self.theta, self.psi, self.theta, self.delta, network, **timing)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -229,6 +237,8 @@ def _stiffest_for_any_environment(subject: Subject, coupling: SpringDamper) -> S
     """Between 0 and 2 (delta - B)/T, the bound where z^-n = -1; the set of gains is convex and contains K -> 0."""
     if any(subject.psi):
         return Stiffest((None,) * subject.channels, "with psi >= 1 each K needs a multiplier of its own: not searched")
+    if subject.latency:
+        return Stiffest((None,) * subject.channels, LATE)
     stiffest, reasons = [], []
     for B, theta, delta in zip(coupling.B.tolist(), subject.theta, subject.delta, strict=True):
         if delta <= B:
@@ -238,7 +248,8 @@ def _stiffest_for_any_environment(subject: Subject, coupling: SpringDamper) -> S
 
         @cache
         def ratio(K: float, B: float = B, theta: int = theta, delta: float = delta) -> float:
-            return any_environment(SpringDamper([K], [B]).compliance(subject.T), [theta], [delta]).ratio
+            V = SpringDamper([K], [B]).compliance(subject.T)
+            return any_environment(V, [theta], [delta], subject.T_max).ratio
 
         bound = 2 * (delta - B) / subject.T
         stiffest.append(edge(ratio, 1e-9 * bound, bound))
@@ -393,7 +404,8 @@ def report(
     here, anywhere = requirements["closed-loop"].certified, requirements["theorem4"].certified
     proved = bool(whole and whole.proved)
     rigid = subject.network is None
-    promised = promise(anywhere, here, rigid=rigid, walls=subject.walls, whole_set=proved)
+    making = subject.network is not None and making_covered(subject._loop(subject.network))
+    promised = promise(anywhere, here, rigid=rigid, walls=subject.walls, making=making, whole_set=proved)
     gains = subject.coupling if isinstance(subject.coupling, SpringDamper) else None
     return {
         "coupling": {
@@ -403,6 +415,8 @@ def report(
         },
         "loop": {
             "T_s": subject.T,
+            "T_max_s": subject.T_max,
+            "latency_s": subject.latency,
             "theta": list(subject.theta),
             "psi": list(subject.psi),
             "delta": list(subject.delta),
@@ -429,7 +443,7 @@ def _switching_part(subject: Subject, span: DelayRange) -> dict[str, Any]:
     found = subject.switching(span)
     if found.requirement.reason:
         return certificate_part(found.requirement) | {"lo": list(span.lo), "hi": list(span.hi)}
-    return switching_part(found, subject.G, span)
+    return switching_part(found, subject.G, span, subject.T_max)
 
 
 def _stiffest_part(found: Stiffest) -> dict[str, Any]:

@@ -26,18 +26,22 @@ from design.conditions import (
     Condition,
     JitterProof,
     Requirement,
+    WallsProof,
     any_environment,
     any_environment_delayed,
     any_environment_demand,
     any_environment_per_channel,
     delayed_coupling_block,
     delayed_environment_block,
+    encoder_friction,
     jitter_proof,
     jitter_refusal,
     refusal,
     switching_block,
     this_environment,
     this_environment_demand,
+    walls_demand,
+    walls_proof,
 )
 from design.exact import Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
 
@@ -154,11 +158,14 @@ def save(stored: Stored, path: str | Path) -> None:
 ANY, SET, HERE, WALL = "any passive environment", "a set", "this environment", "a rigid wall only"
 FROZEN = "each frozen contact state of this environment (contact that makes and breaks is not covered)"
 
+MAKING = "this environment, with walls up to their stiffness that make and break contact"
+
 #: What no certificate covers.
 CAVEATS = (
     "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted), "
-    "not for contacts that make and break (except walls under theorem4, without delay in the environment), "
-    "jitter of T, quantisation, velocity filters or friction compensation."
+    "not for walls with dampers that make and break contact (except under any-environment without delay in the "
+    "environment), periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb "
+    "friction pays for, velocity filters or friction compensation."
 )
 
 
@@ -182,18 +189,25 @@ def certificate_part(requirement: Requirement) -> dict[str, Any]:
 
 
 def promise(
-    theorem4: bool, closed_loop: bool, *, rigid: bool = False, walls: bool = False, whole_set: bool = False
+    theorem4: bool,
+    closed_loop: bool,
+    *,
+    rigid: bool = False,
+    walls: bool = False,
+    making: bool = False,
+    whole_set: bool = False,
 ) -> str | None:
     """For which environments a coupling is certified, given which conditions hold.
 
-    `rigid` if E is a rigid wall that is never left, `walls` if contact is made and broken, `whole_set` if closed-loop
+    `rigid` if E is a rigid wall that is never left, `walls` if contact is made and broken, `making` if closed-loop is
+    about that and not about frozen contact states, `whole_set` if closed-loop
     is proved at every vertex of a box around E and a search has found no violation between them.
     """
     if theorem4:
         return ANY
     if whole_set:
         return SET
-    return (WALL if rigid else FROZEN if walls else HERE) if closed_loop else None
+    return (WALL if rigid else MAKING if making else FROZEN if walls else HERE) if closed_loop else None
 
 
 def switching_promise(span: DelayRange) -> str:
@@ -205,11 +219,39 @@ def promise_of(requirements: Mapping[str, Requirement], loop: Loop, whole_set: b
     """The promise of a coupling by its requirements; the multiplier that psi >= 1 takes is of one environment."""
     held = {name: requirement.certified for name, requirement in requirements.items()}
     walls = bool(loop.environment.walls)
-    return promise(held["theorem4"] and not any(loop.psi), any(held.values()), walls=walls, whole_set=whole_set)
+    anything = held["theorem4"] and not any(loop.psi)
+    return promise(anything, any(held.values()), walls=walls, making=making_covered(loop), whole_set=whole_set)
+
+
+def encoder_part(
+    loop: Loop, coupling: Coupling, steps: Sequence[float], friction: Sequence[float]
+) -> dict[str, Any] | None:
+    """Whether declared Coulomb friction (m,) [N] pays for encoder steps (m,) [m]; None where encoders are ideal."""
+    if not any(steps):
+        return None
+    widths = ", ".join(f"{1e6 * q:.4g}" for q in steps)
+    part: dict[str, Any] = {"encoder_step": list(steps), "friction": list(friction)}
+    if loop.environment.walls:
+        words = f"encoder steps of {widths} um: with walls nothing is proved of them"
+        return part | {"friction_needed": None, "covered": False, "words": words}
+    needed = encoder_friction(loop.F(coupling), steps)
+    covered = bool((needed <= np.asarray(friction)).all())
+    has = ", ".join(f"{f:.4g}" for f in friction)
+    enough = (
+        f"friction of {', '.join(f'{f:.4g}' for f in needed)} N is enough for {widths} um, the devices declare {has} N"
+    )
+    words = f"encoder steps {'are covered' if covered else 'are not covered'}: {enough}"
+    return part | {"friction_needed": [finite(f) for f in needed], "covered": covered, "words": words}
 
 
 # ----------------------------------------------------------------------------------------------------
 # A coupling in every environment of a set: what the closed-loop condition asks at each vertex of a box.
+
+
+def making_covered(loop: Loop) -> bool:
+    """Whether this-environment covers walls that make and break contact: those without dampers."""
+    walls = loop.environment.walls
+    return bool(walls) and not loop.box and not any(wall.damping for wall in walls)
 
 
 def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[Requirement]:
@@ -227,7 +269,7 @@ def _required(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
         F = loop.at(member.network).F(coupling)
     except SingularLoop as error:
         return refusal("closed-loop", loop.delta, str(error))
-    return this_environment(F, loop.delta)
+    return this_environment(F, loop.delta, loop.T_max, loop.latency)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -250,7 +292,7 @@ def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) 
         G = loop.sent(coupling)
     except SingularLoop as error:
         return jitter_refusal(loop.delta, str(error))
-    return jitter_proof(G, span.lo, span.hi, loop.delta, alpha)
+    return jitter_proof(G, span.lo, span.hi, loop.delta, alpha, loop.T_max)
 
 
 def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
@@ -311,7 +353,7 @@ def condition_block(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> L
     G = loop.sent(coupling, exact=True)
     if reason := too_large(G.order + sum(span.hi)):  # splitting it takes long too
         raise ValueError(reason)
-    block, F1 = switching_block(G, span.lo, span.hi, loop.delta, alpha)
+    block, F1 = switching_block(G, span.lo, span.hi, loop.delta, alpha, loop.T_max)
     static = Matrix.of(F1)
     if not static.equals(static.T) or not definiteness(static).semidefinite:
         raise ValueError("G(1) is not exactly symmetric and positive semidefinite")
@@ -328,7 +370,7 @@ def _margin(found: JitterProof) -> float:
 
 NOT_COVERED = (
     "Covered: any ages of the forces within the range, at every tick and on every channel. Not covered: jitter on the "
-    "measured positions, jitter of T, or forces older than the range, which lost packets make."
+    "measured positions, periods longer than T_max, or forces older than the range, which lost packets make."
 )
 
 
@@ -340,12 +382,12 @@ def switching_requirement(loop: Loop, coupling: Coupling) -> JitterProof:
     return replace(found, requirement=replace(found.requirement, proof="rational"))
 
 
-def switching_part(found: JitterProof, G: Lti, span: DelayRange) -> dict[str, Any]:
+def switching_part(found: JitterProof, G: Lti, span: DelayRange, T_max: float | None = None) -> dict[str, Any]:
     """The requirement with its multiplier, and what a playout buffer to the constant delay hi would need.
 
     G is the force map without Theta.
     """
-    buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available)
+    buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available, T_max)
     return certificate_part(found.requirement) | {
         "lo": list(span.lo),
         "hi": list(span.hi),
@@ -366,6 +408,9 @@ def switching_part(found: JitterProof, G: Lti, span: DelayRange) -> dict[str, An
 #     R + Delta_D/T - F(1)/2
 # is strictly positive real (design.proof.positive_real). On |z| = 1 the Hermitian part of F(1)/(z - 1) is -F(1)/2, so
 # He[F/(z-1)] > -Delta_D/T there; the same certificate shows that F is stable.
+#
+# closed-loop, forces that latch late, or walls without dampers: the blocks of latency_demand and walls_demand, the
+# latter with the multipliers g of its walls, stored too.
 #
 # theorem4, psi = 0: with H = V - Theta-hat (11), (12), V-hat = (1 - 1/z) H/T, H(1) is exactly symmetric, and with
 # H(z) = H(1) + (z - 1) R(z) the block
@@ -409,6 +454,8 @@ def prove(loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[fl
 
     Raises NotProved with the reason.
     """
+    if condition == "closed-loop" and loop.environment.walls:
+        phi = walls_of(loop, coupling).g
     multiplier = None if phi is None else [rational(float(p)) for p in phi]
     requirement = required_damping(loop, coupling, condition, multiplier)
     if not requirement.certified:
@@ -426,7 +473,7 @@ def prove(loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[fl
             raise NotProved(f"{_place_certificate(loop, condition, name)}{reason}; {asked}", requirement)
         proof[name] = P
     if multiplier is not None:
-        proof["Phi"] = Matrix.of([multiplier])
+        proof[_multiplier_name(loop, condition)] = Matrix.of([multiplier])
     return sealed(
         Certificate(
             condition=condition,
@@ -477,20 +524,72 @@ def required_damping(
 
     Raises NotProved where it is undefined: theorem4 with psi >= 1 needs the multiplier phi.
     """
-    if loop.environment.walls and (condition == "closed-loop" or any(loop.psi)):
-        raise NotProved("of walls only theorem4 without delay in the environment is proved; the rest is for linear E")
+    if loop.environment.walls:
+        if condition == "closed-loop":
+            return walls_of(loop, coupling, phi).requirement
+        if any(loop.psi):
+            raise NotProved("with delay in the environment the multiplier of theorem4 is of a linear one: no walls")
     if condition == "closed-loop":
         requirements = in_each(loop, coupling, loop.members())
         return requirements[worst(requirements)]
+    if loop.latency:
+        return refusal("theorem4", loop.delta, LATE)
     V = coupling.compliance(loop.T)
     if V is None:
         return refusal("theorem4", loop.delta, no_compliance(coupling))
     if not any(loop.psi):
-        return any_environment(V, loop.theta, loop.delta)
+        return any_environment(V, loop.theta, loop.delta, loop.T_max)
     if phi is None or len(phi) != len(loop.delta):
         raise NotProved("theorem4 with psi >= 1 needs a multiplier Phi, one entry per channel")
     values = np.array([float(p) for p in phi])
-    return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, values)
+    return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, values, loop.T_max)
+
+
+#: What a certificate calls the multipliers of walls that make and break contact, one each.
+WALL_MULTIPLIER = "g"
+
+
+def walls_of(loop: Loop, coupling: Coupling, g: Sequence[Fraction] | None = None) -> WallsProof:
+    """What this-environment asks where walls make and break contact, with the multipliers g (w,) or the best found.
+
+    Raises NotProved for walls that nothing is proved of.
+    """
+    walls = loop.environment.walls
+    if any(wall.damping for wall in walls):
+        raise NotProved(
+            "of walls with dampers only each frozen contact state is judged, and any-environment proves all"
+        )
+    if loop.box:
+        raise NotProved("walls and a box: walls are proved in one environment")
+    try:
+        G = loop.walled(coupling)
+    except (SingularLoop, ValueError) as error:
+        raise NotProved(str(error)) from None
+    stiffness = [wall.stiffness for wall in walls]
+    values = None if g is None else [float(value) for value in g]
+    if values is not None and (len(values) != len(walls) or min(values) < 0):
+        raise NotProved(f"{WALL_MULTIPLIER} is {values}, expected a number >= 0 for each of {len(walls)} walls")
+    return walls_proof(G, loop.delta, stiffness, values, loop.T_max)
+
+
+def _walls_block(loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Lti:
+    """The block of this-environment with walls, after the exact tests at z = 1. Raises NotProved."""
+    try:
+        G = loop.walled(coupling, exact=True)
+        _require_size(G.order)
+        stiffness = [wall.stiffness for wall in loop.environment.walls]
+        demand = walls_demand(G, loop.delta, stiffness, g, None, loop.T_max)
+    except SingularLoop as error:
+        raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
+    for name, value in demand.static.items():
+        _require_symmetric(name, value)
+        if name in demand.semidefinite:
+            _require_static(name, value)
+    return demand.gain + demand.free
+
+
+#: Why any-environment says nothing of forces that latch between ticks.
+LATE = "a latency of a fraction of a sample is derived for this environment only: count it as a whole sample of theta"
 
 
 def no_compliance(coupling: Coupling) -> str:
@@ -516,6 +615,9 @@ def _place_certificate(loop: Loop, condition: Condition, matrix: str) -> str:
 
 def _blocks(loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[Fraction] | None) -> dict[str, Lti]:
     """The exact blocks to be strictly positive real, by the name of the matrix that proves it. Raises NotProved."""
+    if condition == "closed-loop" and loop.environment.walls:
+        assert phi is not None  # prove has found it, or the file holds it
+        return {"P": _walls_block(loop, coupling, phi)}
     if condition == "closed-loop":
         loops = [loop.at(member.network) for member in loop.members()]
         return {f"P{i or ''}": _this_environment(each, coupling) for i, each in enumerate(loops)}
@@ -525,12 +627,12 @@ def _blocks(loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[
     _require_size(V.order + sum(loop.theta))
     try:
         if not any(loop.psi):
-            demand = any_environment_demand(V, loop.theta, loop.delta)
+            demand = any_environment_demand(V, loop.theta, loop.delta, loop.T_max)
             _require_symmetric("H(1)", demand.static["V(1)"])
             return {"P": demand.gain + demand.free}
         assert phi is not None
         E1, passive = delayed_environment_block(delay(loop.psi, T) @ loop.E(exact=True), phi)
-        H1, excess = delayed_coupling_block(V, loop.theta, phi, [rational(d) for d in loop.delta])
+        H1, excess = delayed_coupling_block(V, loop.theta, phi, [rational(d) for d in loop.delta], loop.T_max)
     except (SingularLoop, ValueError) as error:
         raise NotProved(str(error)) from None
     _require_static("E(1)", E1)
@@ -543,7 +645,7 @@ def _this_environment(loop: Loop, coupling: Coupling) -> Lti:
     try:
         F = loop.F(coupling, exact=True)
         _require_size(F.order)
-        demand = this_environment_demand(F, loop.delta)
+        demand = this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
     except SingularLoop as error:
         raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
     _require_static("F(1)", demand.static["F(1)"])
@@ -575,7 +677,7 @@ def _refuted_claims(loop: Loop, coupling: Coupling, certificate: Certificate) ->
         return f"{certificate.condition} does not promise {certificate.promise!r}"
     if certificate.available != loop.delta:
         return f"available is {list(certificate.available)}, the loop has delta = {list(loop.delta)}"
-    requirement = required_damping(loop, coupling, certificate.condition, _multiplier(certificate))
+    requirement = required_damping(loop, coupling, certificate.condition, _multiplier(loop, certificate))
     if len(certificate.required) != len(loop.delta) or not np.allclose(
         certificate.required, requirement.required, rtol=CLAIM_TOLERANCE_CERTIFICATE
     ):
@@ -587,9 +689,11 @@ def _refuted_claims(loop: Loop, coupling: Coupling, certificate: Certificate) ->
 
 def _refuted_proof(loop: Loop, coupling: Coupling, certificate: Certificate) -> str | None:
     """Why the matrices prove nothing, or None if they prove the condition."""
-    phi = _multiplier(certificate)
+    phi, name = _multiplier(loop, certificate), _multiplier_name(loop, certificate.condition)
+    if name == WALL_MULTIPLIER and phi is None:
+        return f"no multiplier {name} of the walls is on file"
     blocks = _blocks(loop, coupling, certificate.condition, phi)
-    expected = {*blocks, *(["Phi"] if "P_E" in blocks else [])}
+    expected = {*blocks, *([name] if "P_E" in blocks or name == WALL_MULTIPLIER else [])}
     if set(certificate.matrices) != expected:
         found = ", ".join(certificate.matrices) or "none"
         return f"matrices are {found}, expected {', '.join(sorted(expected))}"
@@ -599,15 +703,21 @@ def _refuted_proof(loop: Loop, coupling: Coupling, certificate: Certificate) -> 
     return refuted(loop, coupling, certificate.switching)
 
 
-def _multiplier(certificate: Certificate) -> list[Fraction] | None:
-    """The stored Phi, or None. Raises NotProved where it is no row of rationals."""
-    rows = certificate.matrices.get("Phi")
+def _multiplier_name(loop: Loop, condition: Condition) -> str:
+    """What the matrices call it: Phi of theorem4 with psi >= 1, or g of walls under closed-loop."""
+    return WALL_MULTIPLIER if condition == "closed-loop" and loop.environment.walls else "Phi"
+
+
+def _multiplier(loop: Loop, certificate: Certificate) -> list[Fraction] | None:
+    """The stored multiplier, or None. Raises NotProved where it is no row of rationals."""
+    name = _multiplier_name(loop, certificate.condition)
+    rows = certificate.matrices.get(name)
     if rows is None:
         return None
     try:
         return [Fraction(value) for value in rows[0]]
     except (IndexError, ValueError, ZeroDivisionError):
-        raise NotProved("Phi is no row of rational numbers") from None
+        raise NotProved(f"{name} is no row of rational numbers") from None
 
 
 CONDITIONS: tuple[Condition, ...] = ("theorem4", "closed-loop")
@@ -628,24 +738,31 @@ def assess(loop: Loop, coupling: Coupling, phi: Array | None = None) -> dict[str
 
 
 def closed_loop_of(loop: Loop, coupling: Coupling) -> Requirement:
-    """What this-environment asks; of an environment with walls, in its most demanding contact state."""
+    """What this-environment asks; with walls that have dampers, in their most demanding frozen contact state."""
+    if making_covered(loop):
+        try:
+            return walls_of(loop, coupling).requirement
+        except NotProved as error:
+            return refusal("closed-loop", loop.delta, str(error))
     states = (loop.at(state) for state in frozen_states(loop.environment).values())
-    requirements = [this_environment(state.F(coupling), loop.delta) for state in states]
+    requirements = [this_environment(state.F(coupling), loop.delta, loop.T_max, loop.latency) for state in states]
     return max(requirements, key=lambda requirement: requirement.ratio)
 
 
 def theorem4_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Requirement:
     """What any-environment asks; walls are covered without delay in the environment, and refused with it."""
+    if loop.latency:
+        return refusal("theorem4", loop.delta, LATE)
     if loop.environment.walls and any(loop.psi):
         reason = "with delay in the environment its multiplier is of a linear one: no walls"
         return refusal("theorem4", loop.delta, reason)
     if isinstance(coupling, SpringDamper) and not any(loop.psi):
-        return any_environment_per_channel(coupling.channels(loop.T), loop.theta, loop.delta)
+        return any_environment_per_channel(coupling.channels(loop.T), loop.theta, loop.delta, loop.T_max)
     V = coupling.compliance(loop.T)
     if V is None:
         return refusal("theorem4", loop.delta, no_compliance(coupling))
     if not any(loop.psi):
-        return any_environment(V, loop.theta, loop.delta)
+        return any_environment(V, loop.theta, loop.delta, loop.T_max)
     if phi is None:
         from design.lmi import least_phi  # only an environment with delay inside needs the solver
 
@@ -654,7 +771,7 @@ def theorem4_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Req
         except ValueError as error:
             return refusal("theorem4", loop.delta, str(error))
     assert phi is not None  # psi >= 1 has a multiplier or none is possible
-    return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, phi)
+    return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, phi, loop.T_max)
 
 
 def _proved(loop: Loop, coupling: Coupling, requirement: Requirement, phi: Array | None = None) -> Requirement:

@@ -24,6 +24,7 @@ from design.conditions import (
     Requirement,
     any_environment_demand,
     delayed_demand,
+    even_damping,
     least_scale,
     this_environment,
     this_environment_demand,
@@ -74,19 +75,19 @@ def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Judged:
     F = loop.F(coupling)
     phi = _multiplier(loop, coupling) if phi is None and any(loop.psi) else phi
     requirements = {
-        "closed-loop": this_environment(F, loop.delta),
+        "closed-loop": this_environment(F, loop.delta, loop.T_max, loop.latency),
         "theorem4": theorem4_of(loop, coupling, phi),
     }
     demands: dict[str, Response | None] = dict.fromkeys(requirements)
     if np.isfinite(requirements["closed-loop"].ratio):
-        demands["closed-loop"] = partial(least_scale, this_environment_demand(F, loop.delta))
+        demands["closed-loop"] = partial(least_scale, this_environment_demand(F, loop.delta, loop.T_max, loop.latency))
     V = coupling.compliance(loop.T)
     if V is not None and np.isfinite(requirements["theorem4"].ratio):
         if any(loop.psi):
             assert phi is not None  # a finite figure had a multiplier
-            demands["theorem4"] = delayed_demand(V, loop.theta, np.asarray(loop.delta), phi)
+            demands["theorem4"] = delayed_demand(V, loop.theta, even_damping(loop.delta, loop.T, loop.T_max), phi)
         else:
-            demands["theorem4"] = partial(least_scale, any_environment_demand(V, loop.theta, loop.delta))
+            demands["theorem4"] = partial(least_scale, any_environment_demand(V, loop.theta, loop.delta, loop.T_max))
     return Judged(F, requirements, demands)
 
 
@@ -254,7 +255,7 @@ def measured(setting: Setting, kind: str, condition: Condition | None, options: 
     figures: dict[str, Any] = dict.fromkeys(("rms_mismatch_db", "relative_mismatch_db", "required_damping", "dc_ratio"))
     bare: tuple[float | None, ...] = (None,) * len(loop.delta)
     try:
-        bare = _damping(this_environment(loop.F(NoCoupling()), loop.delta))
+        bare = _damping(this_environment(loop.F(NoCoupling()), loop.delta, loop.T_max, loop.latency))
         design = design_by_kind(loop, kind, condition, **options)
     except ValueError as error:  # no such design, or a loop that cannot be
         figures["reason"] = str(error)
@@ -264,7 +265,7 @@ def measured(setting: Setting, kind: str, condition: Condition | None, options: 
         figures = {
             "rms_mismatch_db": finite(decibels(transparent.rms_mismatch)),
             "relative_mismatch_db": finite(decibels(transparent.relative_mismatch)),
-            "required_damping": _damping(this_environment(F, loop.delta)),
+            "required_damping": _damping(this_environment(F, loop.delta, loop.T_max, loop.latency)),
             "dc_ratio": finite(transparent.dc_ratio),
         } | _proof(loop, design)
     functions = setting.wish.functions if kind == "optimal" else None
@@ -432,7 +433,7 @@ def ladder_row(case: str, loop: Loop, entry: Entry) -> LadderRow:
         )
     wall = time.perf_counter() - begin
     F = loop.F(coupling)
-    requirement = this_environment(F, loop.delta)
+    requirement = this_environment(F, loop.delta, loop.T_max, loop.latency)
     figures = transparency(F, loop.E(), loop.lam)
     begin, proof, reason = time.perf_counter(), None, requirement.reason
     if design or requirement.certified:

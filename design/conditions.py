@@ -10,6 +10,10 @@ this-environment   He[F/(z-1)] > -Delta_D/T,  F stable,  F(1) symmetric positive
 any-environment    Lemma 4 of the paper for Psi = I and any passive environment under backward Euler:
                    He[(z-1) V/(Tz)] >= diag((1 - cos n_i w) / (2 delta_i)),   n_i = theta_i + 1
 switching          this-environment for delays of the forces that vary within lo..hi at every tick
+latency            this-environment for forces that latch a fraction of a sample after the tick, anew at every tick
+walls              this-environment for walls that make and break contact
+
+The period may vary from tick to tick, up to T_max, in all of them: `even_damping` is where it enters.
 """
 
 from __future__ import annotations
@@ -20,7 +24,8 @@ from fractions import Fraction
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.linalg import solve_discrete_lyapunov
+from scipy.optimize import minimize, minimize_scalar
 
 from controller.delay import delay, moving_sum
 from controller.lti import (
@@ -67,30 +72,107 @@ class Demand(Generic[Block]):
     semidefinite: tuple[str, ...] = ()
 
 
-def this_environment_demand(F: Block, delta: Sequence[Any]) -> Demand[Block]:
-    """He[F/(z-1)] > -s Delta_D/T. F displaces devices to forces (6), in any arithmetic; delta (m,) [N s/m].
+def even_damping(delta: Sequence[Any], T: Number, T_max: float | None = None) -> Any:
+    """Delta_D T/T_max [N s/m], (m,): the damping that does in even periods T what delta does in periods up to T_max.
+
+    The integral of delta v^2 over a period T_k is at least delta dx^2/T_k, so the longest period counts. Nothing else
+    in the energy balance depends on T: the force map is the same at every tick, however long the tick is.
+    """
+    damping = numbers(delta, T)
+    return damping if T_max is None else damping * (T / numbers(T_max, T))
+
+
+Latency = Sequence[tuple[float, float]]  # (m,) t1 and t2 [s], 0 <= t1 <= t2 < T: how late after a tick forces latch
+
+
+def this_environment_demand(
+    F: Block, delta: Sequence[Any], T_max: float | None = None, latency: Latency | None = None
+) -> Demand[Block]:
+    """He[F/(z-1)] > -s Delta_D/T_max. F displaces devices to forces (6), in any arithmetic; delta (m,) [N s/m].
 
     The energy that a device with a passive human can give back in a tick is at most the damping's, Delta_D dx^2/T, and
-    what the force map gives is -F dx; with F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T.
+    what the force map gives is -F dx; with F(z) = F(1) + (z-1) R the block is R - F(1)/2 + s Delta_D/T. Forces that
+    latch later than at the tick have a block of twice the size, see `latency_demand`.
     """
+    if latency is not None:
+        return latency_demand(F, delta, latency, T_max)
     F1, R = F.split_at_one()
-    damping = np.diag(numbers(delta, F.T) / F.T)
-    return Demand(R - F1 / 2, constant_like(F, damping), {"F(1)": F1}, ("F(1)",))
+    return Demand(R - F1 / 2, constant_like(F, np.diag(even_damping(delta, F.T, T_max) / F.T)), {"F(1)": F1}, ("F(1)",))
 
 
-def any_environment_demand(V: Block, theta: Sequence[int], delta: Sequence[Any]) -> Demand[Block]:
+def latency_demand(F: Block, delta: Sequence[Any], latency: Latency, T_max: float | None = None) -> Demand[Block]:
+    """this-environment for forces that latch at kT + tau_k, with any tau_k in [t1, t2] at every tick and channel.
+
+    Between kT and kT + tau_k the force of the tick before still acts: a device moves by a under f[k-1] and then by b
+    under f[k], and dissipates at least delta a^2/t2 + delta b^2/(T_max - t1). With Gam = F/(z-1) the block is, on
+    (a, b),
+        [[Gam/z + s Delta_D/t2, Gam/z], [Gam, Gam + s Delta_D/(T_max - t1)]],
+    whose pole at z = 1 has F(1) in all four entries. A channel with t2 = 0 has no row of the first kind. The shortest
+    period must be longer than t2.
+    """
+    T, m = F.T, F.D.shape[-1] if isinstance(F, Lti) else F.G.shape[-1]
+    longest = T if T_max is None else numbers(T_max, T)
+    first, last = (numbers([row[i] for row in latency], T) for i in (0, 1))
+    late = [i for i in range(m) if last[i]]
+    one = np.eye(m, dtype=int)
+    before = one[late] @ delay((1,) * m, T)
+    both = as_like(F, vstack(before, Lti.constant(one, T))) @ F @ np.hstack([one[:, late], one])
+    E1, R = both.split_at_one()
+    damping = numbers(delta, T)
+    gain = np.concatenate([damping[late] / last[late], damping / (longest - first)])
+    return Demand(R - E1 / 2, constant_like(F, np.diag(gain)), {"F(1)": E1[..., len(late) :, len(late) :]}, ("F(1)",))
+
+
+def walls_demand(
+    G: Block,
+    delta: Sequence[Any],
+    stiffness: Sequence[Any],
+    g: Any,
+    lam: Sequence[Any] | None = None,
+    T_max: float | None = None,
+) -> Demand[Block]:
+    """this-environment for walls p = k max(0, y - gap) of any slope k up to `stiffness` (w,) [N/m] and any gap.
+
+    G takes [x; p] to [f; y], displacements (m,) and wall forces to the forces of the devices and the ways into the
+    walls, [[F, J], [H, Y]]. With a multiplier g >= 0 and a weight lam > 0 for each wall (1 if not given) and
+    M = g (z-1) - 1 the block is, on (dx, dp),
+        [[F, J], [-lam M H, -lam M Y]]/(z-1) + diag(s Delta_D/T, lam g/stiffness),
+    whose static part must be symmetric, J(1) = H(1)' lam and lam Y(1) = Y(1)' lam, with F(1) >= 0 >= lam Y(1).
+    """
+    T, m, w = G.T, len(delta), len(stiffness)
+    gains, one = numbers(g, T), numbers(np.eye(m + w), T)
+    weights = numbers([1] * w if lam is None else lam, T)
+    weigh = np.diag(np.concatenate([numbers([1] * m, T), weights]))
+    S1, R = (weigh @ G).split_at_one()
+    slopes = np.diag(np.concatenate([numbers([0] * m, T), weights * gains]))
+    limits = np.concatenate([numbers([0] * m, T), weights * gains / numbers(stiffness, T)])
+    free = np.hstack([one, -slopes]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
+    damping = np.concatenate([even_damping(delta, T, T_max) / T, numbers([0] * w, T)])
+    F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]
+    static = {"F(1)": F1, "-Y(1)": -Y1, "the static map of devices and walls": S1}
+    return Demand(free, constant_like(G, np.diag(damping)), static, ("F(1)", "-Y(1)"))
+
+
+def any_environment_demand(
+    V: Block, theta: Sequence[int], delta: Sequence[Any], T_max: float | None = None
+) -> Demand[Block]:
     """He[(1 - 1/z) V/T] >= diag(|1 - z^-n_i|^2 / (4 s delta_i)), n = theta + 1, divided by |1 - 1/z|^2 and times s.
 
     With Theta-hat = diag(T/(2 delta_i) (1 + 1/z + ... + z^-theta_i)) (12) and H = V - Theta-hat/s, which (11) makes
     V-hat of, the block is H(1)/2 - (H - H(1))/(z - 1) for either part.
     """
-    window = np.diag(V.T / (2 * numbers(delta, V.T))) @ as_like(V, moving_sum(theta, V.T))
+    window = np.diag(V.T / (2 * even_damping(delta, V.T, T_max))) @ as_like(V, moving_sum(theta, V.T))
     (V1, R), (W1, S) = V.split_at_one(), window.split_at_one()
     return Demand(S - W1 / 2, V1 / 2 - R, {"V(1)": V1})
 
 
 def switching_block(
-    G: Block, lo: Sequence[int], hi: Sequence[int], delta: Sequence[Any] | Array, alpha: Sequence[Any] | Array
+    G: Block,
+    lo: Sequence[int],
+    hi: Sequence[int],
+    delta: Any,
+    alpha: Any,
+    T_max: float | None = None,
 ) -> tuple[Block, Array]:
     """[[F/(z-1) + Delta_D/T - diag(alpha)/2, 0], [2 h G, 2 diag(alpha)]], which must be positive real; and F(1).
 
@@ -111,7 +193,7 @@ def switching_block(
     both: Any = as_like(G, vstack(half, spread)) @ G
     m = len(lo)
     F1, R = both.rows(slice(None, m)).split_at_one()
-    upper = R - F1 / 2 + np.diag(numbers(delta, T) / T - a / 2)
+    upper = R - F1 / 2 + np.diag(even_damping(delta, T, T_max) / T - a / 2)
     if not varying:
         return upper, F1
     lower = np.zeros((m + len(varying), len(varying)), dtype=object)
@@ -140,17 +222,20 @@ STRICT = Fraction(1, 10**9)
 UNLIMITED = 10**6
 
 
-def delayed_coupling_block(V: Lti, theta: Sequence[int], phi: Sequence[Any], delta: Sequence[Any]) -> tuple[Array, Lti]:
+def delayed_coupling_block(
+    V: Lti, theta: Sequence[int], phi: Sequence[Any], delta: Sequence[Any], T_max: float | None = None
+) -> tuple[Array, Lti]:
     """H(1), which must be symmetric, and the block that carries the excess of V-hat, exactly, for the multiplier phi.
 
     V-hat must be Delta_V-OSP with Delta_V^-1 = S < Phi^-1 - Delta_D^-1 (14). With H = V - Theta-hat = H(1) + (z-1) R,
     divided by |1 - 1/z|^2: T He[H(1)/2 - R] > H* S^-1 H, by a Schur complement the Hermitian part of
     [[T (H(1)/2 - R), 0], [2 H, S]]. Raises ValueError for a multiplier that is none.
     """
+    T = V.T
+    delta = even_damping(delta, T, T_max)
     if len(phi) != len(delta) or not all(0 <= p < d for p, d in zip(phi, delta, strict=True)):
         raise ValueError("the multiplier Phi is not between 0 and the device damping on every channel")
-    T = V.T
-    H = V - np.diag(T / (2 * numbers(delta, T))) @ moving_sum(theta, T)
+    H = V - np.diag(T / (2 * delta)) @ moving_sum(theta, T)
     H1, R = H.split_at_one()
     excess = [(1 / p - 1 / d) * (1 - STRICT) if p else UNLIMITED / d for p, d in zip(phi, delta, strict=True)]
     m = len(delta)
@@ -191,20 +276,49 @@ def least_scale(demand: Demand[Any], w: Array) -> Array:
 
 
 def least_multiple(free: Complex, gain: Complex) -> Array:
-    """The least s with free + s gain >= 0, (...,), of Hermitian (..., p, p); inf where gain is not positive."""
+    """The least s with free + s gain >= 0, (...,), of Hermitian (..., p, p) with gain >= 0; inf where there is none.
+
+    Where gain is singular, free must be positive on its null space; the rest is a Schur complement.
+    """
     own = np.diagonal(gain, axis1=-2, axis2=-1).real
     if (own > 0).all() and not (gain * (1 - np.eye(gain.shape[-1]))).any():
         weight = 1 / np.sqrt(own)
         return largest_eigenvalue(-weight[..., :, None] * free * weight[..., None, :])
     eigenvalues, basis = np.linalg.eigh(gain)
     floor = np.maximum(1e-13 * np.abs(eigenvalues).max(axis=-1, keepdims=True), np.finfo(float).tiny)
-    whitened = np.conj(np.swapaxes(basis, -1, -2)) / np.sqrt(np.maximum(eigenvalues, floor))[..., :, None]
-    H = -whitened @ (free @ np.conj(np.swapaxes(whitened, -1, -2)))
-    return np.where(eigenvalues[..., 0] > floor[..., 0], np.linalg.eigvalsh(H)[..., -1], np.inf)
+    scale = np.where(eigenvalues > floor, 1 / np.sqrt(np.maximum(eigenvalues, floor)), 1.0)
+    whitened = np.conj(np.swapaxes(basis, -1, -2)) * scale[..., :, None]
+    H = whitened @ (free @ np.conj(np.swapaxes(whitened, -1, -2)))
+    flat, missing = H.reshape(-1, *H.shape[-2:]), (eigenvalues <= floor).sum(axis=-1).ravel()
+    needed = np.empty(missing.size)
+    for r in np.unique(missing):  # eigenvalues ascend: the first r directions are those that the gain does not reach
+        here = flat[missing == r]
+        needed[missing == r] = _beyond_the_null_space(here, r) if r else np.linalg.eigvalsh(-here)[:, -1]
+    needed[(eigenvalues < -floor).any(axis=-1).ravel()] = np.inf
+    return needed.reshape(H.shape[:-2])
 
 
-def this_environment(F: Lti, delta: Sequence[float]) -> Requirement:
-    """The damping that this-environment asks for the force map F, with device dampings `delta` [N s/m]."""
+def _beyond_the_null_space(H: Complex, r: int) -> Array:
+    """The least s with H + s diag(0, I) >= 0, where 0 has r rows; (n,)."""
+    null, cross, rest = H[:, :r, :r], H[:, :r, r:], H[:, r:, r:]
+    size = np.abs(np.diagonal(H, axis1=1, axis2=2)).max(axis=1, initial=0.0)
+    positive = np.linalg.eigvalsh(null)[:, 0] > 1e-13 * size
+    needed = np.full(len(H), np.inf)
+    left = rest - np.conj(np.swapaxes(cross, 1, 2)) @ np.linalg.solve(
+        np.where(positive[:, None, None], null, np.eye(r)), cross
+    )
+    if r < H.shape[-1]:
+        needed[positive] = np.linalg.eigvalsh(-left)[positive, -1]
+    return needed
+
+
+def this_environment(
+    F: Lti, delta: Sequence[float], T_max: float | None = None, latency: Latency | None = None
+) -> Requirement:
+    """The damping that this-environment asks for the force map F, with device dampings `delta` [N s/m].
+
+    For periods up to T_max [s] (T without it), and forces that latch late by `latency` (m,) [s] (at the tick without).
+    """
     available = dampings(delta, F.inputs)
 
     def refused(reason: str) -> Requirement:
@@ -220,7 +334,7 @@ def this_environment(F: Lti, delta: Sequence[float]) -> Requirement:
         return refused("the static stiffness F(1) is not symmetric: a slow closed path could extract energy")
     if least < -STATIC:
         return refused("the static stiffness F(1) has a negative direction: it pushes outwards")
-    demand = this_environment_demand(F, available)
+    demand = this_environment_demand(F, available, T_max, latency)
     ratio, w = supremum(lambda w: least_scale(demand, w), np.concatenate([[0.0], frequencies(F)]))
     return from_ratio("closed-loop", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
 
@@ -241,7 +355,7 @@ def _static_errors(F1: Array, *elsewhere: Array | Complex) -> tuple[Array, Array
     return np.abs(F1 - turned).max(axis=(-2, -1)) / scale, least / scale
 
 
-def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Requirement:
+def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float], T_max: float | None = None) -> Requirement:
     """The damping that any-environment asks for psi = 0 and V, whatever passive environment is behind it."""
     available = dampings(delta, V.inputs)
     if len(theta) != V.inputs:
@@ -254,7 +368,7 @@ def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Req
         return refused("a device guarantees no damping, so no coupling is safe for every passive human")
     if not V.is_stable():
         return refused("the coupling V has a pole on or outside the unit circle")
-    demand = any_environment_demand(V, theta, available)
+    demand = any_environment_demand(V, theta, available, T_max)
     V1 = demand.static["V(1)"]
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return refused("the static compliance V(1) is not symmetric")
@@ -264,9 +378,11 @@ def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float]) -> Req
     return from_ratio("theorem4", ratio, available, w / (2 * np.pi * V.T))
 
 
-def any_environment_per_channel(V: Sequence[Lti], theta: Sequence[int], delta: Sequence[float]) -> Requirement:
+def any_environment_per_channel(
+    V: Sequence[Lti], theta: Sequence[int], delta: Sequence[float], T_max: float | None = None
+) -> Requirement:
     """any-environment for a diagonal coupling, given its channels: each device's own figure."""
-    each = [any_environment(v, [n], [d]) for v, n, d in zip(V, theta, delta, strict=True)]
+    each = [any_environment(v, [n], [d], T_max) for v, n, d in zip(V, theta, delta, strict=True)]
     worst = max(each, key=lambda r: r.ratio)
     required = tuple(r.required[0] for r in each)
     available = tuple(r.available[0] for r in each)
@@ -293,6 +409,148 @@ def dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
     return values
 
 
+# this-environment with walls: the best multiplier. The least s is convex in g, because the block is affine in both.
+
+
+#: Where the multiplier of a wall is looked for [samples], and the digits that are kept of it.
+LEAST_G, MOST_G, G_DIGITS = 1e-3, 1e3, 4
+
+
+@dataclass(frozen=True)
+class WallsProof:
+    """What walls that make and break contact ask of the devices."""
+
+    requirement: Requirement  # condition "closed-loop"
+    g: tuple[float, ...]  # (w,) the multiplier that shows it
+
+
+def walls_proof(
+    G: Lti,
+    delta: Sequence[float],
+    stiffness: Sequence[float],
+    g: Sequence[float] | None = None,
+    T_max: float | None = None,
+) -> WallsProof:
+    """The damping that `walls_demand` asks with the best multiplier found, or with g (w,) where it is given.
+
+    G takes [x; p] to [f; y] while no wall touches.
+    """
+    m, w = len(delta), len(stiffness)
+    available = dampings(delta, m)
+
+    def refused(reason: str) -> WallsProof:
+        return WallsProof(refusal("closed-loop", available, reason), tuple(g or (1.0,) * w))
+
+    if min(available) == 0:
+        return refused("a device guarantees no damping, so no coupling is safe for every passive human")
+    radius = float(np.abs(G.poles()).max(initial=0.0))
+    if radius >= 1:
+        return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
+    S1 = G.dc()
+    # rounding, relative to what each channel and wall is elsewhere
+    own = np.abs([np.diag(S1), np.diag(G.D), np.diag(G.at(-1.0))]).max(axis=0)
+    if (np.abs(S1 - S1.T) > 1e-9 * np.sqrt(np.outer(own, own))).any():
+        return refused("the static map of devices and walls is not symmetric: a slow closed path could extract energy")
+    for name, part, size in (("F(1)", S1[:m, :m], own[:m]), ("-Y(1)", -S1[m:, m:], own[m:])):
+        if np.linalg.eigvalsh((part + part.T) / 2).min() < -1e-9 * size.max():
+            return refused(f"{name} has a negative direction: it pushes outwards")
+    grid = np.concatenate([[0.0], frequencies(G)])
+    z = on_circle(frequencies(G, points=100))
+    sampled = Sampled(z[None], G.at(z)[None], G.T)
+
+    def needed(values: Array) -> float:
+        demand = walls_demand(sampled, available, stiffness, values, None, T_max)
+        return float(least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G)).max())
+
+    found = _best_g(needed, w) if g is None else np.asarray(g, dtype=float)
+    demand = walls_demand(G, available, stiffness, found, None, T_max)
+    ratio, at = supremum(lambda w: least_scale(demand, w), grid)
+    if np.isinf(ratio):
+        return refused("no multiplier was found with which the walls are covered, whatever the damping")
+    return WallsProof(
+        from_ratio("closed-loop", max(ratio, 0.0), available, at / (2 * np.pi * G.T)), tuple(found.tolist())
+    )
+
+
+def _best_g(needed: Callable[[Array], float], walls: int) -> Array:
+    """g (walls,) with about the least `needed`: one for all of them, then one by one, each by a search in log g."""
+    g = np.ones(walls)
+    turns = [np.ones(walls, dtype=bool), *(np.eye(walls, dtype=bool) if walls > 1 else ())]
+
+    def moved(which: Array, value: float) -> Array:
+        return np.where(which, value, g)
+
+    for which in turns:
+        grid = np.geomspace(LEAST_G, MOST_G, 13)
+        values = [needed(moved(which, value)) for value in grid]
+        best = int(np.argmin(values))
+        ends = np.log(grid[max(best - 1, 0)]), np.log(grid[min(best + 1, grid.size - 1)])
+        finer = minimize_scalar(
+            lambda x, which=which: min(needed(moved(which, np.exp(x))), 1e300),
+            bounds=ends,
+            method="bounded",
+            options={"xatol": 1e-2},
+        )
+        g = moved(which, float(np.exp(finer.x)) if finer.fun < values[best] else float(grid[best]))
+    return np.array([float(f"{value:.{G_DIGITS}g}") for value in g])
+
+
+# Encoder steps under Coulomb friction
+#
+# f = F (x + n) with |n_j| <= q_j/2 is F x + w with |w_i| <= W_i = sum_j |F_ij|_1 q_j/2, where |F_ij|_1 is the sum of
+# the absolute values of the impulse response. In a tick w does the work w'dx <= sum_i W_i (integral of |v_i|), and
+# Coulomb friction of at least W_i at the encoder's coordinate dissipates that.
+
+
+SMALL_TAIL, CHUNK, MOST_CHUNKS = (
+    1e-9,
+    256,
+    20_000,
+)  # of the bound; ticks summed at once; where the sum ends at the latest
+
+
+def l1_gain(F: Lti) -> Array:
+    """The sum over all ticks of |impulse response| of every entry, (p, m), from above; inf for an unstable F.
+
+    Ticks are summed until what is left is small, and the rest is bounded: with A'PA <= r^2 P, r < 1,
+    |c A^k b| <= r^k sqrt(c P^-1 c' b'P b).
+    """
+    A, X = F.A, F.B
+    radius = float(np.abs(F.poles()).max(initial=0.0))
+    if radius >= 1:
+        return np.full(F.D.shape, np.inf)
+    total = np.abs(F.D)
+    if not F.order:
+        return total
+    r = (1 + radius) / 2
+    P = solve_discrete_lyapunov(A.T / r, np.eye(F.order))
+    P = (P + P.T) / 2
+    reach = np.sqrt(np.einsum("in,ni->i", F.C, np.linalg.solve(P, F.C.T)))
+    powers = [F.C]
+    for _ in range(CHUNK - 1):
+        powers.append(powers[-1] @ A)
+    rows, ahead = np.stack(powers), np.linalg.matrix_power(A, CHUNK)
+    tail = np.full_like(total, np.inf)
+    for _ in range(MOST_CHUNKS):
+        total = total + np.abs(rows @ X).sum(axis=0)
+        X = ahead @ X
+        tail = np.outer(reach, np.sqrt(np.maximum(np.einsum("nj,nk,kj->j", X, P, X), 0.0))) / (1 - r)
+        if (tail <= SMALL_TAIL * total.max()).all():
+            break
+    return total + tail
+
+
+def encoder_friction(F: Lti, steps: Sequence[float]) -> Array:
+    """(p,) [N] Coulomb friction at each device that pays for encoder steps (m,) [m], whatever condition F satisfies.
+
+    It is the friction at the encoder's own coordinate, beside the damping delta. Not behind a limiter or walls.
+    """
+    q = np.asarray(steps, dtype=float)
+    if q.shape != (F.inputs,) or not (q >= 0).all():
+        raise ValueError(f"steps is {q.tolist()}, expected {F.inputs} encoder steps >= 0 in m")
+    return l1_gain(F) @ (q / 2)
+
+
 # any-environment with delay inside the environment (psi >= 1), for a given multiplier Phi
 
 
@@ -301,7 +559,13 @@ ROUNDING = 1e-6
 
 
 def any_environment_delayed(
-    V: Lti, environment: Lti, theta: Sequence[int], psi: Sequence[int], delta: Sequence[float], phi: Array
+    V: Lti,
+    environment: Lti,
+    theta: Sequence[int],
+    psi: Sequence[int],
+    delta: Sequence[float],
+    phi: Array,
+    T_max: float | None = None,
 ) -> Requirement:
     """Theorem 4 for the coupling V with the diagonal multiplier phi (N,) [N s/m]; phi = 0 is `any_environment`.
 
@@ -318,9 +582,10 @@ def any_environment_delayed(
     V1 = V.dc()
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return refused("the static compliance V(1) is not symmetric")
-    if uncovered(environment, psi, np.diag(phi)) > ROUNDING * max(available):
+    damping = even_damping(available, V.T, T_max)
+    if uncovered(environment, psi, np.diag(phi)) > ROUNDING * max(damping):
         return refused("E-hat + Phi is not passive for this multiplier")
-    needed = delayed_demand(V, theta, np.asarray(available), np.asarray(phi))
+    needed = delayed_demand(V, theta, damping, np.asarray(phi))
     ratio, w = supremum(needed, np.concatenate([[0.0], frequencies(V)]))
     if np.isinf(ratio):
         return refused(f"V is not passive enough at {w / (2 * np.pi * V.T):.4g} Hz for this multiplier")
@@ -429,7 +694,12 @@ class JitterProof:
 
 
 def jitter_proof(
-    G: Lti, lo: Sequence[int], hi: Sequence[int], delta: Sequence[float], alpha: Sequence[float] | None = None
+    G: Lti,
+    lo: Sequence[int],
+    hi: Sequence[int],
+    delta: Sequence[float],
+    alpha: Sequence[float] | None = None,
+    T_max: float | None = None,
 ) -> JitterProof:
     """The least common factor on `delta` [N s/m] with which some multiplier satisfies the condition, and which does.
 
@@ -439,10 +709,11 @@ def jitter_proof(
     available, h = dampings(delta, G.inputs), half_widths(lo, hi)
     if len(h) != G.inputs:
         raise ValueError(f"delays are given for {len(h)} channels, expected {G.inputs}")
-    constant = this_environment(nominal(lo, hi, G.T) @ G, delta)
+    constant = this_environment(nominal(lo, hi, G.T) @ G, delta, T_max)
     if not np.isfinite(constant.ratio):
         return jitter_refusal(available, constant.reason or "no constant delay is safe")
-    search, unit = _Search(G, lo, hi, np.asarray(available)), np.asarray(available) / G.T
+    damping = even_damping(available, G.T, T_max)
+    search, unit = _Search(G, lo, hi, damping), damping / G.T
     given = None if alpha is None else (np.asarray(alpha) / unit)[search.active]
     a, ratio, w, bound = search.least() if given is None else search.only(given)
     multiplier = np.zeros(h.size)

@@ -28,7 +28,7 @@ from controller.delay import delay
 from controller.environment import Region, environment, members, regions, shrunk
 from controller.loop import Loop
 from controller.lti import Array, Lti
-from design.conditions import dampings, regular_part, uncovered
+from design.conditions import dampings, even_damping, regular_part, uncovered
 from design.frequency import frequencies, hermitian, on_circle, supremum
 from design.result import Attempt, DesignFailed, Infeasible
 
@@ -75,16 +75,16 @@ class Specification:
     @classmethod
     def of(cls, loop: Loop) -> Specification:
         """The loop as a request for a design, every wall touching. Raises ValueError naming the field that is wrong."""
-        box = loop.box
+        box, usable = loop.box, tuple(even_damping(loop.delta, loop.T, loop.T_max).tolist())
         if box is None:
-            return cls(loop.E(), loop.theta, loop.psi, loop.lam, loop.delta)
+            return cls(loop.E(), loop.theta, loop.psi, loop.lam, usable)
 
         def others(factor: float = 1.0) -> dict[str, Lti]:
             _, *vertices = members(loop.environment, box if factor == 1 else shrunk(loop.environment, box, factor))
             return {vertex.name: environment(vertex.network, loop.T) for vertex in vertices}
 
         delays, parts = (loop.theta, loop.psi, loop.lam), regions(loop.environment, box)
-        return cls(loop.E(), *delays, loop.delta, others=others(), regions=parts, shrunk=others)
+        return cls(loop.E(), *delays, usable, others=others(), regions=parts, shrunk=others)
 
     @property
     def channels(self) -> int:

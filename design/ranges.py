@@ -149,7 +149,7 @@ def cost(name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -
     for member in members:
         E = environment(member.network, loop.T)
         F = force_map(E, coupling, loop.theta, loop.psi)
-        ratios.append(this_environment(F, loop.delta).ratio)
+        ratios.append(this_environment(F, loop.delta, loop.T_max, loop.latency).ratio)
         if E.D.any():
             figures[member.name] = transparency(F, E, loop.lam)
     nominal = figures[members[0].name]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from controller.coupling import Compliance, Coupling, InternalModel, SpringDamper
 from controller.delay import LOST, Jitter, Ticks, ages
 from controller.lti import Array
-from design.certificate import ANY, CAVEATS, assess, certificate_part, finite
+from design.certificate import ANY, CAVEATS, MAKING, assess, certificate_part, encoder_part, finite
 from design.conditions import Requirement
 from design.result import CONDITION_NAMES, PRINTED_TAU_DB, PUBLISHED, listed
 from design.transparency import Transparency, decibels
@@ -68,6 +68,15 @@ def transparency_part(figures: Transparency) -> dict[str, Any]:
     return part
 
 
+def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> dict[str, Any] | None:
+    """Whether the devices' friction pays for their encoders' steps."""
+    steps, friction = ([getattr(device, of) for device in scenario.device] for of in ("encoder_step", "friction"))
+    try:
+        return encoder_part(scenario.loop(case), coupling, steps, friction)
+    except ValueError:  # no solution of the algebraic loop, which the conditions have said
+        return None
+
+
 # ----------------------------------------------------------------------------------------------------
 # What a run was worth: one dictionary for machines, and the same as tables for people.
 
@@ -87,9 +96,9 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
             f"These gains fail {condition}: they need {worst:.3g} times the damping that the devices guarantee."
         )
     if "contact" in outcome["stability"]:
-        covered = "any-environment covers" if outcome["promise"] == ANY else "no certificate covers"
-        frozen = "this-environment is about frozen contact states"
-        lines.append(f"Contact that makes and breaks: {covered} it in this loop; {frozen}.")
+        covered = {ANY: "any-environment", MAKING: "this-environment"}.get(outcome["promise"], "no certificate")
+        frozen = "this-environment is about frozen contact states where walls have dampers"
+        lines.append(f"Contact that makes and breaks: {covered} covers it in this loop; {frozen}.")
     for name in ("stability", "error", "transparency"):
         if "reason" in outcome[name]:
             lines.append(f"{name}: {outcome[name]['reason']}.")
@@ -98,6 +107,8 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
             lines.append(f"{CONDITION_NAMES[name]}: {part['reason']}.")
     if outcome.get("jitter"):
         lines.append(f"Delays that vary: {outcome['jitter']['covers']}.")
+    if part := outcome.get("encoder"):
+        lines.append(f"{part['words'][0].upper()}{part['words'][1:]}.")
     return [*lines, CAVEATS]
 
 

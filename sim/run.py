@@ -33,7 +33,7 @@ from sim.engines import (
     profiler_off,
     quiet_warnings,
 )
-from sim.scenario import InputError, Scenario
+from sim.scenario import InputError, Scenario, require_forces_at_ticks
 from sim.trace import Trace
 
 ENGINES = ("mujoco", "exact")
@@ -82,6 +82,7 @@ def assemble(scenario: Scenario, coupling: Coupling) -> Simulation:
     Raises SingularLoop where the algebraic loop of environment and coupling has no solution, InputError for walls that
     no compliance V stands before.
     """
+    require_forces_at_ticks(scenario, "a simulation")
     network, delays = scenario.environment, (scenario.theta, scenario.psi)
     if network.walls and not isinstance(coupling, NoCoupling | SpringDamper | Compliance):
         raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")

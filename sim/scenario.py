@@ -64,6 +64,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     duration: float = 15.0  # [s]
     population: Population = Population()  # who `validate` draws
     jitter: Jitter | None = None  # how the delays of the forces vary around theta; None where they do not
+    T_max: float | None = None  # [s] the longest period, where it varies from tick to tick; certificates are for it
+    latency: tuple[tuple[float, float], ...] | None = None  # [s] least and most by which a channel's force latches late
 
     def __post_init__(self) -> None:
         require("T", self.T, 1e-6, 0.1, "s")
@@ -127,7 +129,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def digest(self) -> str:
         """SHA-256 over the scenario's contents."""
-        return hashlib.sha256(msgspec.json.encode(self, order="sorted", enc_hook=_contents)).hexdigest()
+        newer = {"T_max", "latency"}  # left out where they are not given, so that a scenario keeps the digest it had
+        contents = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in newer or value}
+        return hashlib.sha256(msgspec.json.encode(contents, order="sorted", enc_hook=_contents)).hexdigest()
 
     def reference_delays(self, case: str) -> tuple[int, ...]:
         """Lambda of a case: what `lam` says, else 0 in case II and theta + psi otherwise. Raises InputError."""
@@ -147,7 +151,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         span = self.delay_range
         jitter = span if self.switches and span.lo != span.hi else None
         delays = (self.theta, self.psi, self.reference_delays(case))
-        return Loop(self.T, *delays, self.delta, self.environment, self.box, jitter)
+        return Loop(
+            self.T, *delays, self.delta, self.environment, self.box, jitter, T_max=self.T_max, latency=self.latency
+        )
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping [N s/m].
@@ -216,6 +222,13 @@ def require_constant_delay(scenario: Scenario, what: str) -> None:
     if scenario.jitter is not None:
         instead = "sim.run simulates it"
         raise InputError(f"jitter: {what} takes the delays that its link has; take the table out, {instead}")
+
+
+def require_forces_at_ticks(scenario: Scenario, what: str) -> None:
+    """Raises InputError where forces latch between ticks, for what would let them act from the tick on."""
+    if scenario.latency is not None:
+        instead = "designs, audits and certificates take it; without it, count a whole sample of theta"
+        raise InputError(f"latency: {what} lets forces act from the tick on; {instead}")
 
 
 # ---- humans in a file of their own

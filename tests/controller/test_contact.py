@@ -242,7 +242,7 @@ def test_closed_loop_is_asked_of_every_frozen_state():
     assert requirement.ratio == max(single.ratio for single in singles)
     assert len({single.ratio for single in singles}) == 4
     assert requirement.proof == "sampled"
-    with pytest.raises(NotProved, match="of walls only theorem4"):
+    with pytest.raises(NotProved, match="of walls with dampers"):
         prove(loop, SOFT, "closed-loop")
     assert prove(loop, SOFT, "theorem4").promise == "any passive environment"
     late = boxed(load()).replace(psi=(1, 0)).loop("I")

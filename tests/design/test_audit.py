@@ -217,7 +217,7 @@ def test_the_command(run, argv, code, required):
     assert set(outcome) >= {"theorem4", "closed-loop", "promise", "helps", "not_covered", "wall_s"}
     assert outcome["not_covered"] == CAVEATS
     assert "certified" in err
-    assert "not for contacts that make and break" in " ".join(err.split())
+    assert "not for walls with dampers that make and break" in " ".join(err.split())
 
 
 def test_the_report_is_kept(run, tmp_path):

@@ -1,0 +1,66 @@
+"""Coulomb friction pays for encoder steps: the bound on the impulse response, and the energy of quantised loops."""
+
+import numpy as np
+import pytest
+
+from controller.coupling import SpringDamper
+from controller.delay import delay
+from controller.environment import FIGURE_4
+from controller.loop import Loop
+from controller.lti import Lti, taps
+from design.conditions import encoder_friction, l1_gain, this_environment
+
+T, STEP = 1.2e-3, 1e-5
+LOOP = Loop(T, (0, 1), (0, 0), (0, 1), (1.37, 1.37), FIGURE_4)
+F = LOOP.F(SpringDamper([879.0, 552.0], [0.39, 0.52]))
+
+
+def test_the_friction_that_a_step_of_ten_micrometres_needs():
+    assert l1_gain(F).sum(axis=1) == pytest.approx([10019.6547, 7563.3655], abs=1e-4)
+    assert encoder_friction(F, [STEP, STEP]) == pytest.approx([0.050098, 0.037817], abs=1e-6)
+    assert encoder_friction(F, [0.0, 0.0]) == pytest.approx([0.0, 0.0])
+    with pytest.raises(ValueError, match="expected 2 encoder steps"):
+        encoder_friction(F, [STEP])
+
+
+def test_the_bound_is_above_the_sum_and_close_to_it():
+    total, X = np.abs(F.D), F.B
+    for _ in range(60_000):
+        total, X = total + np.abs(F.C @ X), F.A @ X
+    assert (l1_gain(F) >= total * (1 - 1e-13)).all()  # rounding of 60,000 terms
+    assert l1_gain(F) == pytest.approx(total, rel=1e-8)
+
+
+@pytest.mark.parametrize("pole", [0.0, 0.9, -0.99, 1 - 1e-5])
+def test_first_order_closed_form(pole):
+    one = Lti([[pole]], [[1.0]], [[1 - pole]], [[0.5]], T)
+    assert l1_gain(one)[0, 0] == pytest.approx(0.5 + (1 - pole) / (1 - abs(pole)), rel=1e-7)
+    slow = Lti([[1 - 1e-9]], [[1.0]], [[1.0]], [[0.0]], T)  # too slow to be summed: still a bound
+    assert 1e9 <= l1_gain(slow)[0, 0] < np.inf
+
+
+def test_taps_delays_and_unstable_maps():
+    assert l1_gain(delay((3,), T) @ taps([1.0, -2.0, 0.5], T))[0, 0] == pytest.approx(3.5)
+    assert l1_gain(Lti([[1.0]], [[1.0]], [[1.0]], [[0.0]], T))[0, 0] == np.inf
+
+
+@pytest.mark.parametrize("amplitude", [0.05, 3.0, 100.0])
+def test_quantised_loops_take_no_more_than_damping_and_friction(amplitude):
+    """sum f'dx + dx' D dx + W |dx| >= 0 from rest, on motions around an edge of a step; without W some take more."""
+    requirement = this_environment(F, LOOP.delta)
+    delta, W = np.array(requirement.required) * (1 + 1e-9), encoder_friction(F, [STEP, STEP])
+    k = np.arange(4000)
+    rng, least = np.random.default_rng(1), np.inf
+    for hz in np.geomspace(2, 400, 25):
+        phase = rng.uniform(0, 2 * np.pi, 2)
+        way = np.minimum(k / 200, 1)[:, None]  # from rest to where the encoder's value changes
+        x = STEP * way * (0.5 + amplitude * np.sin(2 * np.pi * hz * T * k[:, None] + phase))
+        seen, state, plain, paid = np.round(x / STEP) * STEP, np.zeros(F.order), 0.0, 0.0
+        for measured, dx in zip(seen, np.diff(x, axis=0), strict=False):
+            work = (F.C @ state + F.D @ measured) @ dx + dx @ (delta / T * dx)
+            state = F.A @ state + F.B @ measured
+            plain, paid = plain + work, paid + work + W @ np.abs(dx)
+            assert paid >= -1e-15
+            least = min(least, plain)
+    if amplitude < 1:
+        assert least < 0

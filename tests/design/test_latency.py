@@ -1,0 +1,165 @@
+"""Forces that latch a fraction of a sample late: closed forms, limits of whole samples, exact proofs, simulations."""
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from controller.coupling import SpringDamper
+from controller.delay import delay
+from controller.environment import FIGURE_4, GROUND, Network, Spring, Wall
+from controller.loop import DelayRange, Loop
+from controller.lti import Lti, Sampled
+from design.certificate import LATE, NotProved, Stored, assess, prove, required_damping, verify
+from design.conditions import latency_demand, least_scale, this_environment, this_environment_demand
+from design.designs import design_coupling, transparency_of
+from design.frequency import frequencies, hermitian, on_circle
+
+T, TAU, K = 1.2e-3, 0.13e-3, 1000.0
+SOFT = SpringDamper([879.0, 552.0], [0.39, 0.52])
+PAIR = Loop(T, (0, 1), (0, 0), (0, 1), (1.37, 1.37), FIGURE_4)
+change = msgspec.structs.replace
+
+
+def spring(theta=0) -> Lti:
+    """K z^-theta."""
+    return delay((theta,), T) @ Lti.constant([[K]], T)
+
+
+@pytest.mark.parametrize(
+    ("theta", "range", "needs"), [(0, (TAU, TAU), 0.774878), (0, (0.0, TAU), 0.841354), (1, (TAU, TAU), 1.947854)]
+)
+def test_a_wall_that_latches_late(theta, range, needs):
+    found = this_environment(spring(theta), [1.0], latency=[range])
+    assert found.required[0] == pytest.approx(needs, abs=2e-6)
+    if theta == 0:  # it binds as w -> 0: (delta/t2 - 3K/2)(delta/(T - t1) - K/2) = K^2
+        t1, t2 = range
+        closed = np.roots([1 / (t2 * (T - t1)), -K / (2 * t2) - 3 * K / (2 * (T - t1)), 3 * K**2 / 4 - K**2]).max()
+        assert found.required[0] == pytest.approx(closed, rel=1e-9)
+        assert found.frequency_hz == 0
+
+
+def test_the_block_at_a_frequency():
+    demand = latency_demand(spring(), [1.0], [(TAU, TAU)])
+    z = on_circle(np.array([0.5]))
+    block = hermitian(demand.free.at(z) + demand.gain.at(z))[0]
+    expected = [[6314.725130, -938.791281 + 239.712769j], [-938.791281 - 239.712769j, 434.579439]]
+    assert block == pytest.approx(np.array(expected), abs=1e-6)
+    sampled = latency_demand(Sampled(z[None], spring().at(z)[None], T), [1.0], [(TAU, TAU)])
+    assert hermitian(sampled.free.G + sampled.gain.G)[0, 0] == pytest.approx(block, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("range", "needs"),
+    [((1e-10, 1e-10), 0.584731), ((TAU, TAU), 0.574622), ((0.0, TAU), 0.637433), ((T - 1e-12, T - 1e-12), 0.714344)],
+)
+def test_a_pair_of_devices_between_two_whole_samples(range, needs):
+    """From the (0, 1) of no latency to the (1, 2) of a whole sample's."""
+    found = required_damping(change(PAIR, latency=(range, range)), SOFT, "closed-loop")
+    assert max(found.required) == pytest.approx(needs, abs=2e-6)
+    assert this_environment(PAIR.F(SOFT), PAIR.delta).required[0] == pytest.approx(0.584731, abs=1e-6)
+    assert this_environment(change(PAIR, theta=(1, 2)).F(SOFT), PAIR.delta).required[0] == pytest.approx(
+        0.714344, abs=1e-6
+    )
+
+
+def test_a_channel_that_latches_at_the_tick_has_no_row_of_its_own():
+    F = PAIR.F(SOFT)
+    none, plain = latency_demand(F, PAIR.delta, [(0.0, 0.0)] * 2), this_environment_demand(F, PAIR.delta)
+    w = frequencies(F, points=100)
+    assert least_scale(none, w) == pytest.approx(least_scale(plain, w), abs=1e-12)
+    mixed = latency_demand(F, PAIR.delta, [(0.0, TAU), (0.0, 0.0)])
+    assert mixed.free.inputs == 3
+    both = latency_demand(F, PAIR.delta, [(0.0, TAU), (0.0, 1e-12)])
+    assert least_scale(mixed, w) == pytest.approx(least_scale(both, w), abs=1e-6)
+
+
+@pytest.mark.parametrize("latency", [((TAU, TAU), (0.0, TAU)), ((0.0, TAU), (0.0, 0.0))])
+@pytest.mark.parametrize("longest", [None, 1.5e-3])
+def test_it_is_proved_stored_and_verified(latency, longest):
+    loop = change(PAIR, latency=latency, T_max=longest)
+    stored = Stored.of(loop, SOFT, prove(loop, SOFT, "closed-loop"))
+    again = msgspec.json.decode(msgspec.json.encode(stored), type=Stored)
+    assert verify(again).proved
+    assert not verify(change(again, loop=change(loop, latency=((0.0, TAU), (0.0, 2 * TAU))))).proved
+    least = required_damping(loop, SOFT, "closed-loop").required
+    enough, short = (change(loop, delta=tuple(f * d for d in least)) for f in (1.001, 0.999))
+    assert prove(enough, SOFT, "closed-loop").proof == "rational"
+    with pytest.raises(NotProved):
+        prove(short, SOFT, "closed-loop")
+
+
+def test_where_it_is_not_derived_it_is_refused():
+    loop = change(PAIR, latency=((0.0, TAU),) * 2)
+    judged = assess(loop, SOFT)
+    assert judged["closed-loop"].proof == "rational"
+    assert judged["theorem4"].reason == LATE
+    with pytest.raises(NotProved, match="count it as a whole sample"):
+        prove(loop, SOFT, "theorem4")
+    with pytest.raises(ValueError, match="latency and jitter"):
+        change(loop, jitter=DelayRange((0, 1), (1, 1)))
+    walled = Network(("tip",), walls=(Wall(("tip", GROUND), 500.0),))
+    with pytest.raises(ValueError, match=r"latency and environment\.walls"):
+        Loop(T, (0,), (0,), (0,), (1.0,), walled, latency=((0.0, TAU),))
+    with pytest.raises(ValueError, match=r"latency\[1\] is 0 to 0\.0012 s"):
+        change(loop, latency=((0.0, TAU), (0.0, T)))
+
+
+# Loops whose latency switches, simulated exactly: the force before acts until kT + tau_k, the new one after it.
+
+
+HANDS, TICKS = 60, 20000
+WALL = Loop(T, (0,), (0,), (0,), (1.0,), Network(("tip",), (Spring(("tip", GROUND), K),)))
+
+
+def growing(damping, latencies, mean, seed=3):
+    """How many lossless hands grow a hundredfold between a tenth of the ticks and the end.
+
+    tau is one of `latencies` [s], drawn anew after `mean` ticks, or where it is None the one that gives most energy.
+    """
+    rng = np.random.default_rng(seed)
+    mass, stiff = 10 ** rng.uniform(-4, 0, HANDS), 10 ** rng.uniform(0, 3, HANDS)
+    A = np.zeros((HANDS, 3, 3))
+    A[:, 0, 1] = 1
+    A[:, 1, 0], A[:, 1, 1], A[:, 1, 2] = -stiff / mass, -damping / mass, -1 / mass  # under a constant force
+    steps = []
+    latch, force = np.diag([1.0, 1.0, 0.0]), np.zeros((3, 3))
+    force[2, 0] = K  # computed from the position at the tick
+    for tau in latencies:
+        steps.append(expm(A * (T - tau)) @ (latch @ expm(A * tau) + force))
+    steps, energy = np.stack(steps), np.stack([stiff, mass], axis=1)
+    z = 1e-3 * rng.standard_normal((HANDS, 3, 1))
+    log, early, which = np.zeros(HANDS), np.zeros(HANDS), 0
+    for k in range(TICKS):
+        if mean is None:
+            each = steps @ z
+            z = each[(energy * each[:, :, :2, 0] ** 2).sum(axis=2).argmax(axis=0), np.arange(HANDS)]
+        else:
+            which = rng.integers(len(steps)) if rng.random() < 1 / mean else which
+            z = steps[which] @ z
+        if k % 20 == 19:
+            size = np.abs(z[:, :2, 0] * (1, 0.01)).max(axis=1)
+            log, z = log + np.log(size), z / size[:, None, None]
+        if k == TICKS // 10:
+            early = log.copy()
+    return int((log > early + np.log(100)).sum())
+
+
+@pytest.mark.parametrize("mean", [1, 100, None])
+def test_no_hand_grows_at_the_requirement_and_some_do_below(mean):
+    latencies = np.linspace(0, TAU, 3)
+    need = required_damping(change(WALL, latency=((0.0, TAU),)), SpringDamper([1e9], [0.0]), "closed-loop").required[0]
+    assert need == pytest.approx(0.841354, rel=1e-4)
+    assert growing(1.02 * need, latencies, mean) == 0
+    assert growing(0.6 * need, latencies, mean) > 0
+
+
+def test_a_design_for_late_forces_uses_the_damping_and_beats_a_whole_sample():
+    loop = change(PAIR, latency=((0.0, TAU),) * 2)
+    found = design_coupling(loop, "spring-damper", "closed-loop")
+    assert 0.99 < found.requirement.ratio < 1
+    assert assess(loop, found.coupling)["closed-loop"].proof == "rational"
+    whole = design_coupling(change(PAIR, theta=(1, 2)), "spring-damper", "closed-loop")
+    assert transparency_of(loop, found).rms_mismatch_db < transparency_of(loop, whole).rms_mismatch_db - 1
+    with pytest.raises(ValueError, match="latency"):
+        design_coupling(loop, "spring-damper", "theorem4")

@@ -1,0 +1,154 @@
+"""A period that varies: what it costs in every condition, and loops of drawn periods simulated exactly."""
+
+from fractions import Fraction
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from controller.coupling import SpringDamper
+from controller.environment import FIGURE_4, Network, Spring
+from controller.loop import DelayRange, Loop
+from design.certificate import Stored, assess, digest, prove, required_damping, swept, verify
+from design.conditions import any_environment, any_environment_demand, even_damping, this_environment_demand
+from design.lmi import Specification
+from design.spring_damper import design
+
+T, LONG = 1e-3, 1.6e-3
+LOOP = Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
+STIFF, SOFT = SpringDamper([7806, 3137], [0.105, 1.68]), SpringDamper([500, 350], [0.2, 0.3])
+change = msgspec.structs.replace
+
+
+@pytest.mark.parametrize("condition", ["closed-loop", "theorem4"])
+def test_the_longest_period_scales_the_required_damping(condition):
+    even = required_damping(LOOP, SOFT, condition)
+    uneven = required_damping(change(LOOP, T_max=LONG), SOFT, condition)
+    assert uneven.required == pytest.approx([1.6 * b for b in even.required], rel=1e-9)
+    assert uneven.available == LOOP.delta
+
+
+def test_so_it_does_with_delays_that_switch_and_with_the_multiplier_of_a_delayed_environment():
+    switching = change(LOOP, jitter=DelayRange((0, 1), (1, 2)))
+    even, uneven = (swept(change(switching, T_max=longest), SOFT).requirement for longest in (None, LONG))
+    assert uneven.required == pytest.approx([1.6 * b for b in even.required], rel=1e-6)  # of the search for alpha
+    soft = msgspec.structs.replace(
+        FIGURE_4, springs=tuple(change(s, stiffness=s.stiffness / 8, damping=0.2) for s in FIGURE_4.springs)
+    )
+    delayed = change(LOOP, psi=(1, 0), environment=soft)
+    longer = change(delayed, T_max=LONG, delta=tuple(1.6 * d for d in LOOP.delta))
+    found = design(Specification.of(delayed))
+    asked = [required_damping(one, found.coupling, "theorem4", found.phi) for one in (delayed, longer)]
+    assert asked[1].ratio == pytest.approx(asked[0].ratio, rel=1e-7)
+    assert verify(Stored.of(longer, found.coupling, prove(longer, found.coupling, "theorem4", found.phi))).proved
+
+
+def test_the_any_environment_line_by_hand():
+    """He[(1 - 1/z) V] >= T_max |1 - z^-n|^2 / (4 delta): one spring behind one sample of delay."""
+    V, n = SpringDamper([500.0], [0.0]).compliance(T), 2
+    w = np.linspace(0.01, np.pi, 4000)
+    have = ((1 - np.exp(-1j * w)) / 500).real
+    need = LONG * (np.abs(1 - np.exp(-1j * n * w)) ** 2 / (4 * have)).max()
+    assert any_environment(V, [1], [1.0], LONG).required[0] == pytest.approx(need, rel=1e-4)  # of the samples
+
+
+def test_the_damping_of_a_tick_is_exact_over_the_rationals():
+    assert even_damping([1.37], Fraction(1, 1000), 1.6e-3)[0] == Fraction(137, 100) / Fraction(16, 10)
+    F = LOOP.F(SOFT, exact=True)
+    gain = this_environment_demand(F, LOOP.delta, LONG).gain.D
+    assert gain[0, 0] == Fraction(137, 100) / Fraction(16, 10000)
+    V = SOFT.compliance(Fraction(1, 1000))
+    window = any_environment_demand(V, LOOP.theta, LOOP.delta, LONG).free.D[0, 0]
+    even = any_environment_demand(V, LOOP.theta, LOOP.delta).free.D[0, 0]
+    assert window / even == Fraction(8, 5)
+
+
+@pytest.mark.parametrize("condition", ["closed-loop", "theorem4"])
+def test_a_certificate_of_uneven_periods_is_proved_stored_and_verified(condition):
+    loop = change(LOOP, T_max=LONG)
+    stored = Stored.of(loop, SOFT, prove(loop, SOFT, condition))
+    again = msgspec.json.decode(msgspec.json.encode(stored), type=Stored)
+    assert verify(again).proved
+    assert not verify(change(again, loop=change(loop, T_max=1.7e-3))).proved
+    assert digest(change(LOOP, T_max=None)) == digest(LOOP) != digest(loop)
+
+
+def test_a_design_for_uneven_periods_is_certified_for_them():
+    loop = change(LOOP, T_max=LONG)
+    found = design(Specification.of(loop), "closed-loop")
+    requirement = assess(loop, found.coupling)["closed-loop"]
+    assert requirement.certified
+    assert requirement.proof == "rational"
+    assert requirement.ratio == pytest.approx(1, rel=1e-3)  # it uses the damping that there is
+
+
+def test_a_longest_period_below_the_period_is_refused():
+    with pytest.raises(ValueError, match=r"T_max is 0\.0009 s, expected at least T = 0\.001 s"):
+        change(LOOP, T_max=0.9e-3)
+
+
+# Loops of drawn periods, simulated exactly: devices of exactly the damping that is asked, hands without any.
+
+
+PERIODS = (0.2e-3, 0.7e-3, 1.1e-3, 1.6e-3)
+HANDS, TICKS = 60, 20000
+HELD = Network(("tip",), (Spring(("tip", "ground"), 20.0, 0.3),), {"tip": 0.05})
+ONE, COUPLING = Loop(T, (1,), (0,), (1,), (1.0,), HELD), SpringDamper([1000.0], [0.5])
+
+
+def plants(damping, rng):
+    """A, B of a device in lossless hands, (hands, 2, 2) and (hands, 2, 1): masses of 1 g to 1 kg on springs."""
+    mass, spring = (10 ** rng.uniform(*limits, HANDS) for limits in ((-3, 0), (0, 3)))
+    A, B = np.zeros((HANDS, 2, 2)), np.zeros((HANDS, 2, 1))
+    A[:, 0, 1] = 1
+    A[:, 1, 0], A[:, 1, 1], B[:, 1, 0] = -spring / mass, -damping / mass, -1 / mass
+    return A, B
+
+
+def tick(F, A, B, period):
+    """The transition of plants and computer over one period, exactly, (hands, 2 + states, 2 + states)."""
+    n, m = B.shape[1:]
+    whole = np.zeros((HANDS, n + m, n + m))
+    whole[:, :n, :n], whole[:, :n, n:] = A, B
+    step = expm(whole * period)
+    Ad, Bd, C = step[:, :n, :n], step[:, :n, n:], np.eye(m, n)
+    upper = np.concatenate([Ad + Bd @ F.D @ C, Bd @ F.C], axis=2)
+    lower = np.concatenate([F.B @ C, F.A], axis=1)
+    return np.concatenate([upper, np.broadcast_to(lower, (HANDS, *lower.shape))], axis=1)
+
+
+def growing(damping, mean, seed=7):
+    """How many hands grow a hundredfold between a tenth of the ticks and the end.
+
+    Periods are drawn anew after `mean` ticks, or, where it is None, each is the one that gives the hand most energy.
+    """
+    rng = np.random.default_rng(seed)
+    A, B = plants(damping, rng)
+    F = ONE.F(COUPLING)
+    steps = np.stack([tick(F, A, B, period) for period in PERIODS])
+    energy = np.stack([-A[:, 1, 0] / -B[:, 1, 0], -1 / B[:, 1, 0]], axis=1)  # twice: spring and mass
+    z = 1e-3 * rng.standard_normal((HANDS, steps.shape[2], 1))
+    log, early, which = np.zeros(HANDS), np.zeros(HANDS), 0
+    for k in range(TICKS):
+        if mean is None:
+            each = steps @ z
+            best = (energy * each[:, :, :2, 0] ** 2).sum(axis=2).argmax(axis=0)
+            z = each[best, np.arange(HANDS)]
+        else:
+            which = rng.integers(4) if rng.random() < 1 / mean else which
+            z = steps[which] @ z
+        if k % 20 == 19:
+            size = np.abs(z[:, :2, 0] * (1, 0.01)).max(axis=1)
+            log, z = log + np.log(size), z / size[:, None, None]
+        if k == TICKS // 10:
+            early = log.copy()
+    return int((log > early + np.log(100)).sum())
+
+
+@pytest.mark.parametrize("mean", [50, 1000, None])
+def test_no_hand_grows_at_the_requirement_of_the_longest_period_and_some_do_below(mean):
+    need = required_damping(ONE, COUPLING, "closed-loop").required[0]
+    assert need == pytest.approx(1.244099, rel=1e-6)
+    assert growing(1.01 * 1.6 * need, mean) == 0
+    assert growing(0.6 * 1.6 * need, mean) > 0
