@@ -1,0 +1,161 @@
+"""The limiter's condition: the stated block, closed forms, the figures of the default loop, the best multiplier."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from controller.coupling import NoCoupling, SpringDamper
+from controller.environment import FIGURE_4
+from controller.loop import Loop
+from controller.lti import Lti, Sampled, taps
+from design.conditions import least_multiple, limiter, limiter_demand, limiter_lag, this_environment
+from design.frequency import hermitian, on_circle
+from design.result import CASE_I
+
+T, DELTA = 1.2e-3, (1.37, 1.37)
+LOOP = Loop(T, (1, 2), (0, 0), (1, 2), DELTA, FIGURE_4)
+LAG = limiter_lag(DELTA, T, 0.01)
+BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # designed with the limiter's block
+
+
+def required(coupling, c=None, lag=LAG) -> float:
+    return limiter(LOOP.sent(coupling), LOOP.theta, DELTA, lag, c).requirement.required[0]
+
+
+def test_the_block_of_one_channel():
+    """G = 1000, theta = 1, c = 0.5, D = 2000, rho = 20 at w = 1, by hand; sampled responses give the same."""
+    G, z = Lti.constant([[1000.0]], 1.0), on_circle(np.array([1.0]))
+    upper = 984.010315 - 411.642518j
+    expected = [[959.697694, upper], [np.conj(upper), 2032.919914]]
+    demand = limiter_demand(G, (1,), (2000.0,), (20.0,), ((0.5,),))
+    np.testing.assert_allclose(hermitian((demand.free + demand.gain).at(z))[0], expected, atol=1e-6)
+    sampled = limiter_demand(Sampled.of(G, z[None]), (1,), (2000.0,), (20.0,), ((0.5,),))
+    np.testing.assert_allclose(hermitian(sampled.free.G + sampled.gain.G)[0, 0], expected, atol=1e-6)
+
+
+def test_the_block_is_the_energy_of_a_limited_loop():
+    """Motions that begin and end at rest in the same place: sum of f'dx + dx'D dx - (M f_e)'de, in time, against the
+    mean of the block's form over the circle; M = z + sum_j c_j sum_{i<j} (z - z^-i)."""
+    rng = np.random.default_rng(3)
+    theta, c, delta, rho = (1, 2), ((0.7, 0.2), (0.4, 0.1)), (1.3, 0.8), (30.0, 50.0)
+    weights = rng.normal(size=(4, 2, 2)) * 300
+    weights[-1] += (lambda total: (total.T - total) / 2)(weights.sum(axis=0))  # G(1) = G(1)'
+    G = sum((Lti.constant(w, T) @ Lti.diag(*[taps([0] * k + [1], T)] * 2) for k, w in enumerate(weights[1:], 1)),
+            Lti.constant(weights[0], T))  # fmt: skip
+    ticks, moving = 256, 100
+    dxi, de = np.zeros((2, ticks, 2))
+    dxi[20:moving], de[20:moving] = rng.normal(size=(2, moving - 20, 2))
+    dxi[moving], de[moving] = -dxi.sum(axis=0), -de.sum(axis=0)
+    xi, e = (np.concatenate([np.zeros((1, 2)), np.cumsum(step, axis=0)[:-1]]) for step in (dxi, de))
+
+    def late(signal, k):
+        return np.roll(signal, k, axis=0)
+
+    sent = sum(late(xi, k) @ w.T for k, w in enumerate(weights)) - (e - late(e, 1)) * rho
+    felt = np.column_stack([late(sent, n)[:, i] for i, n in enumerate(theta)])
+    multiplied = late(sent, -1)
+    for j in (1, 2):
+        own = sum(late(sent, -1) - late(sent, i) for i in range(j))
+        multiplied = multiplied + own * [row[j - 1] for row in c]
+    dx = dxi + de
+    energy = (felt * dx + dx**2 * np.array(delta) / T - multiplied * de).sum()
+    demand = limiter_demand(G, theta, delta, rho, c)
+    z = on_circle(2 * np.pi * np.arange(ticks) / ticks)
+    u = np.fft.fft(np.hstack([dxi, de]), axis=0)
+    block = (demand.free + demand.gain).at(z)
+    assert energy == pytest.approx((u.conj()[:, None] @ block @ u[:, :, None]).real.mean(), rel=1e-10)
+
+
+@pytest.mark.parametrize("theta", [0, 1, 2, 4])
+def test_closed_forms_of_a_spring(theta):
+    """(theta + 1)^2 K T/2 at c = 0, and what the loop without limiter needs, (theta + 1/2) K T, at c_1 = theta."""
+    K = 800.0
+    G = Lti.constant([[K]], T)
+
+    def needed(c):
+        return limiter(G, (theta,), (1.0,), (1e-9,), c).requirement.required[0]
+
+    assert needed(((0.0,),)) == pytest.approx((theta + 1) ** 2 * K * T / 2, rel=1e-6)
+    assert needed(((float(theta),),)) == pytest.approx((theta + 0.5) * K * T, rel=1e-6)
+    assert limiter(G, (theta,), (1.0,), (1e-9,)).requirement.required[0] == pytest.approx(
+        (theta + 0.5) * K * T, rel=1e-5
+    )
+
+
+@pytest.mark.parametrize(("c", "factor"), [(0.0, 2.0), (0.25, 1.6875), (0.5, 1.5625), (1.0, 1.5), (2.0, 1.6)])
+def test_a_delayed_spring_by_its_multiplier(c, factor):
+    G = Lti.constant([[1000.0]], T)
+    assert limiter(G, (1,), (1.0,), (1e-9,), ((c,),)).requirement.ratio == pytest.approx(factor * 1000 * T, rel=1e-6)
+
+
+def test_the_coupling_designed_with_the_block():
+    """K = (5832, 2545), B = (0.187, 1.386): 1.30132 linear, more with the limiter by its multiplier."""
+    assert this_environment(LOOP.F(BUILT), DELTA).required[0] == pytest.approx(1.30132, abs=5e-6)
+    for c, expected in (((0, 0), 1.42465), ((0.3, 0.3), 1.34059), ((0.278, 0.632), 1.32327)):
+        assert required(BUILT, tuple((float(v),) for v in c)) == pytest.approx(expected, abs=5e-6)
+    refused = limiter(LOOP.sent(BUILT), LOOP.theta, DELTA, LAG, ((1.0,), (1.0,))).requirement
+    assert not refused.certified
+    assert "no damping is enough" in str(refused.reason)
+
+
+@pytest.mark.parametrize(
+    ("coupling", "expected"),
+    [
+        (NoCoupling(), 1.74600),
+        (CASE_I, 1.41600),
+        (SpringDamper((879.0, 552.0), (0.39, 0.52)), 0.72345),
+        (SpringDamper((7806.0, 3137.0), (0.105, 1.68)), 1.38533),
+        (BUILT, 1.32327),
+    ],
+    ids=["none", "published", "any-environment", "this-environment", "built"],
+)
+def test_the_default_loop_with_its_best_multiplier(coupling, expected):
+    found = limiter(LOOP.sent(coupling), LOOP.theta, DELTA, LAG)
+    assert found.requirement.required[0] == pytest.approx(expected, abs=1e-4)
+    assert found.requirement.ratio <= found.bound * (1 + 2e-5)
+    assert required(coupling, found.c) == pytest.approx(found.requirement.required[0], rel=1e-9)
+    linear = this_environment(LOOP.F(coupling), DELTA).required[0]
+    assert found.requirement.required[0] >= linear * (1 - 1e-9)  # the block's first row is that of the linear loop
+
+
+def test_no_multiplier_on_a_grid_is_better():
+    best = limiter(LOOP.sent(BUILT), LOOP.theta, DELTA, LAG).requirement.ratio
+    grid = product(np.linspace(0.1, 0.6, 6), np.linspace(0.4, 0.9, 6))
+    others = [limiter(LOOP.sent(BUILT), LOOP.theta, DELTA, LAG, ((a,), (b,))).requirement.ratio for a, b in grid]
+    assert min(others) >= best * (1 - 1e-6)
+
+
+def test_unequal_weights_need_enough_lag():
+    """F(1) couples the channels: c = (0.2, 0.4) is infeasible at beta = 1e-4 and fine at 0.01."""
+    unequal = ((0.2,), (0.4,))
+    assert np.isinf(required(BUILT, unequal, limiter_lag(DELTA, T, 1e-4)))
+    assert required(BUILT, unequal) < 1.36
+
+
+def test_bad_requests_are_named():
+    G = LOOP.sent(BUILT)
+    with pytest.raises(ValueError, match="one entry for each of 2 channels"):
+        limiter(G, (1,), DELTA, LAG)
+    with pytest.raises(ValueError, match="expected numbers >= 0"):
+        limiter(G, (1, 2), DELTA, LAG, ((-0.1,), (0.0,)))
+    swinging = limiter(LOOP.sent(SpringDamper((1e6, 1e6), (50.0, 50.0))), (9, 9), DELTA, LAG).requirement
+    assert not swinging.certified
+
+
+@pytest.mark.parametrize("rank", [1, 2, 3])
+def test_the_least_multiple_of_a_singular_gain(rank):
+    """Against bisection on the least eigenvalue of free + s gain."""
+    rng = np.random.default_rng(rank)
+    for _ in range(20):
+        half = rng.normal(size=(3, rank)) + 1j * rng.normal(size=(3, rank))
+        gain = half @ half.conj().T
+        free = hermitian(rng.normal(size=(3, 3)) + 1j * rng.normal(size=(3, 3))) + 0.5 * np.eye(3)
+        null = np.linalg.svd(half)[0][:, rank:]
+        feasible = rank == 3 or np.linalg.eigvalsh(null.conj().T @ free @ null)[0] > 0
+        s = least_multiple(free[None], gain[None])[0]
+        assert np.isfinite(s) == feasible
+        if feasible:
+            assert np.linalg.eigvalsh(free + (s + 1e-6) * gain)[0] > 0
+            assert np.linalg.eigvalsh(free + (s - 1e-6) * gain)[0] < 1e-9
+            assert np.linalg.eigvalsh(free + s * gain)[0] == pytest.approx(0, abs=1e-8 * max(1, abs(s)))
