@@ -578,8 +578,8 @@ class LimiterProof:
 
 
 def limiter_lag(delta: Sequence[float], T: float, beta: float) -> tuple[float, ...]:
-    """rho = beta delta/T [N/m] of a limiter under this-environment."""
-    return tuple(beta * d / T for d in delta)
+    """rho = beta delta/T [N/m] of a limiter under this-environment, to six digits."""
+    return tuple(float(f"{beta * d / T:.6g}") for d in delta)
 
 
 def limiter(
