@@ -2,14 +2,27 @@
 
 from itertools import product
 
+import msgspec
 import numpy as np
 import pytest
 
 from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import FIGURE_4
-from controller.loop import Loop
+from controller.environment import FIGURE_4, Box, Network, Wall
+from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled, taps
-from design.conditions import least_multiple, limiter, limiter_demand, limiter_lag, this_environment
+from design.certificate import (
+    NotProved,
+    Stored,
+    covers_lag,
+    lag,
+    limiter_requirement,
+    load,
+    prove,
+    save,
+    sealed,
+    verify,
+)
+from design.conditions import any_environment, least_multiple, limiter, limiter_demand, limiter_lag, this_environment
 from design.frequency import hermitian, on_circle
 from design.result import CASE_I
 
@@ -159,3 +172,94 @@ def test_the_least_multiple_of_a_singular_gain(rank):
             assert np.linalg.eigvalsh(free + (s + 1e-6) * gain)[0] > 0
             assert np.linalg.eigvalsh(free + (s - 1e-6) * gain)[0] < 1e-9
             assert np.linalg.eigvalsh(free + s * gain)[0] == pytest.approx(0, abs=1e-8 * max(1, abs(s)))
+
+
+# the proof
+
+
+@pytest.fixture(scope="module")
+def stored() -> Stored:
+    return Stored.of(LOOP, BUILT, prove(LOOP, BUILT, "closed-loop", beta=0.01))
+
+
+def test_the_exact_proof_survives_the_file(stored, tmp_path):
+    save(stored, tmp_path / "limited.json")
+    read = load(tmp_path / "limited.json")
+    assert read == stored
+    assert verify(read).proved
+    proof = read.certificate.limiter
+    assert proof.rho == LAG
+    assert lag(LOOP, read.certificate) == LAG
+    assert proof.required == pytest.approx((1.32327, 1.32327), abs=5e-6)
+    assert proof.margin == pytest.approx(1.37 / 1.32327, rel=1e-5)
+
+
+def test_files_without_it_stay_as_they_were(tmp_path):
+    """A coupling needs 1.385 with the limiter: its linear proof is untouched, the other is refused with the figure."""
+    stiff = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
+    plain = prove(LOOP, stiff, "closed-loop")
+    assert "limiter" not in msgspec.to_builtins(plain)
+    assert lag(LOOP, plain) is None
+    with pytest.raises(NotProved, match=r"limiter: needs 1.38533, 1.38533 N s/m of damping, has 1.37, 1.37"):
+        prove(LOOP, stiff, "closed-loop", beta=0.01)
+
+
+def test_any_environment_is_its_own_proof():
+    soft = SpringDamper((879.0, 552.0), (0.39, 0.52))
+    loop = msgspec.structs.replace(LOOP, delta=(1.4, 1.4))
+    assert prove(loop, soft, "theorem4", beta=0.01) == prove(loop, soft, "theorem4")
+    assert lag(loop, prove(loop, soft, "theorem4")) == (0.0, 0.0)
+    requirement = any_environment(soft.compliance(T), LOOP.theta, (1.4, 1.4))
+    assert requirement.certified
+    assert not covers_lag(requirement, 0.01)  # 1.37 of 1.4: no room for 3 %
+    assert covers_lag(any_environment(soft.compliance(T), LOOP.theta, (1.5, 1.5)), 0.01)
+
+
+def tampered(stored, **fields):
+    proof = msgspec.structs.replace(stored.certificate.limiter, **fields)
+    return msgspec.structs.replace(
+        stored, certificate=sealed(msgspec.structs.replace(stored.certificate, limiter=proof))
+    )
+
+
+@pytest.mark.parametrize(
+    ("fields", "reason"),
+    [
+        ({"c": ((0.5,), (0.5,))}, "limiter: required is"),
+        ({"c": ((1.0,), (1.0,))}, "limiter: required is"),
+        ({"c": ((-0.1,), (0.7,))}, "rho and c must be numbers >= 0"),
+        ({"c": ((0.3,),)}, "one row of c each"),
+        ({"beta": 0.02}, "rho is"),
+        ({"margin": 1.1}, "limiter: margin is 1.1"),
+        ({"P": (("1",),)}, "limiter: P has 1 rows"),
+    ],
+)
+def test_what_was_changed_is_refused(stored, fields, reason):
+    verdict = verify(tampered(stored, **fields))
+    assert not verdict.proved
+    assert reason in str(verdict.reason)
+
+
+def test_a_storage_matrix_of_something_else_proves_nothing(stored):
+    P = [list(row) for row in stored.certificate.limiter.P]
+    P[0][0] = "1/1000"
+    assert "limiter: " in str(verify(tampered(stored, P=tuple(map(tuple, P)))).reason)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"jitter": DelayRange((1, 2), (1, 3))}, "not for delays that switch"),
+        ({"box": Box(masses={"mass": (0.9, 1.1)})}, "not for ranges"),
+        ({"environment": Network(("a", "b"), walls=(Wall(("a", "b"), 1000.0, 0.0, 0.0),))}, "with walls only"),
+    ],
+)
+def test_loops_that_are_not_covered_are_refused_in_words(change, reason):
+    loop = msgspec.structs.replace(LOOP, **change)
+    assert reason in str(limiter_requirement(loop, BUILT).requirement.reason)
+
+
+def test_delay_in_the_environment_is_open_under_any_environment():
+    loop = msgspec.structs.replace(LOOP, psi=(1, 1))
+    with pytest.raises(NotProved, match="any-environment with delay in the environment does not cover limited forces"):
+        prove(loop, BUILT, "theorem4", (0.1, 0.1), beta=0.01)
