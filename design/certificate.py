@@ -23,6 +23,7 @@ from controller.environment import Member, frozen_states
 from controller.loop import DelayRange, Loop
 from controller.lti import Array, Lti, SingularLoop, rational
 from design.conditions import (
+    BETA,
     Condition,
     JitterProof,
     Lags,
@@ -346,7 +347,6 @@ def _margin(found: JitterProof) -> float:
 # and the environment together are a passive environment.
 
 
-BETA = 0.01  # of a limiter under this-environment unless another is asked for
 LARGEST_BETA = 0.05  # up to which any-environment is claimed beside it
 
 

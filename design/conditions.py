@@ -562,6 +562,7 @@ class _Search:
 # u*(free(c) + s gain)u >= 0. The worst of them are collected, a linear program finds the least s that they allow, and
 # the search ends where the sweep attains it (Kelley's cutting planes).
 
+BETA = 0.01  # of a limiter's lag under this-environment unless another is asked for
 LARGEST_WEIGHT = 10.0  # that a search gives a c_ij
 HOPELESS = 1e6  # times the available damping
 LIMITER_SETTLED = 1e-6  # relative gap between the sweep at the best c and the bound that no c beats
