@@ -16,7 +16,7 @@ limiter            this-environment for forces that leave through the limiter of
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Generic, Literal, TypeVar
 
@@ -565,6 +565,7 @@ class _Search:
 BETA = 0.01  # of a limiter's lag under this-environment unless another is asked for
 LARGEST_WEIGHT = 10.0  # that a search gives a c_ij
 HOPELESS = 1e6  # times the available damping
+SPARE = 0.02  # of rho: what the block keeps, however large the damping, so that c may be rounded and the proof exact
 LIMITER_SETTLED = 1e-6  # relative gap between the sweep at the best c and the bound that no c beats
 
 
@@ -575,7 +576,7 @@ class LimiterProof:
     requirement: Requirement  # condition "limiter"
     rho: tuple[float, ...]  # (m,) [N/m] the lag of the limiter that is asked about
     c: tuple[tuple[float, ...], ...]  # (m, lags) the multiplier that shows it
-    bound: float  # no c with these lags shows less than this times the available damping; `ratio` where c was given
+    bound: float  # what the search proved of all c that keep SPARE of rho; the ratio itself where c was given
 
 
 def limiter_lag(delta: Sequence[float], T: float, beta: float) -> tuple[float, ...]:
@@ -619,7 +620,7 @@ class _LimiterSearch:
 
     def __init__(self, G: Lti, theta: Sequence[int], delta: tuple[float, ...], rho: Sequence[float], lags: int) -> None:
         self._loop, self._delta, self._shape = (G, theta, delta, rho), delta, (len(theta), lags)
-        self._grid = np.concatenate([[0.0], frequencies(G)])
+        self._grid, self._lag = np.concatenate([[0.0], frequencies(G)]), np.diag([*rho, *rho])
 
     def requirement(self, ratio: float, w: float) -> Requirement:
         T = self._loop[0].T
@@ -632,13 +633,14 @@ class _LimiterSearch:
         G, theta, delta, rho = self._loop
         return limiter_demand(G, theta, delta, rho, c)
 
-    def swept(self, c: Lags) -> tuple[float, float]:
-        """(s(c), w [rad/sample]) by a sweep that is refined between its samples."""
+    def swept(self, c: Lags, spare: float = 0.0) -> tuple[float, float]:
+        """(s(c), w [rad/sample]) by a sweep that is refined between its samples, with so much of rho to spare."""
         demand = self.demand(c)
+        demand = replace(demand, free=demand.free - spare * self._lag)
         return supremum(lambda w: least_scale(demand, w), self._grid)
 
     def least(self) -> tuple[tuple[tuple[float, ...], ...], float, float, float]:
-        """(c, s(c), where it binds, a lower bound on s over all c)."""
+        """(c, s(c), where it binds, a lower bound on s over all c that have something to spare)."""
         m, lags = self._shape
         c, bound = np.zeros(m * lags), -np.inf
         best: tuple[Array, float, float] = (c, np.inf, 0.0)
@@ -646,7 +648,7 @@ class _LimiterSearch:
         for _ in range(MOST_ROUNDS):
             found, top = self._cuts(c, *parts)
             if top <= bound + LIMITER_SETTLED * abs(bound):  # settled on the samples: look between them
-                ratio, w = self.swept(self._rows(c))
+                ratio, w = self.swept(self._rows(c), SPARE)
                 best = min(best, (c, ratio, w), key=lambda found: found[1])
                 if best[1] <= bound + 10 * LIMITER_SETTLED * abs(bound):
                     break
@@ -661,10 +663,10 @@ class _LimiterSearch:
                 bounds=[*[(0.0, LARGEST_WEIGHT)] * c.size, (0.0, None)],
             )
             if lowest.x is None:  # no c within the bounds makes the block positive, however large the damping
-                return self._rows(c), np.inf, self.swept(self._rows(c))[1], np.inf
+                return self._rows(c), np.inf, self.swept(self._rows(c), SPARE)[1], np.inf
             c, bound = np.maximum(lowest.x[:-1], 0.0), float(lowest.x[-1])
         if np.isinf(best[1]):
-            best = (c, *self.swept(self._rows(c)))
+            best = (c, *self.swept(self._rows(c), SPARE))
         c = np.round(best[0], 6)
         return self._rows(c), *self.swept(self._rows(c)), bound
 
@@ -679,7 +681,7 @@ class _LimiterSearch:
         free, gain = hermitian(none.free.at(z)), hermitian(none.gain.at(z))
         units = np.eye(int(np.prod(self._shape)))
         slopes = [hermitian(self.demand(self._rows(unit)).free.at(z)) - free for unit in units]
-        return free[None], np.array(slopes).reshape(-1, w.size, 2 * m, 2 * m), gain[None]
+        return (free - SPARE * self._lag)[None], np.array(slopes).reshape(-1, w.size, 2 * m, 2 * m), gain[None]
 
     def _cuts(self, c: Array, free: Complex, slopes: Complex, gain: Complex) -> tuple[Array, float]:
         """(rows, s): the bounds value + slope.c + s gain >= 0 at the worst peaks, and the worst s there."""

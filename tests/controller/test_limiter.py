@@ -180,6 +180,24 @@ def test_limiter_and_environment_are_passive_without_lag():
     assert energy.max() > 0.5
 
 
+def test_a_clipped_cycle_gives_energy_however_slow_and_a_limited_one_does_not():
+    """Two hands around a circle of 4 cm: clipping each force by itself gives 0.616 J a turn whatever the speed."""
+    coupling, rho = SpringDamper([5832.0, 2545.0], [0.187, 1.386]), (11.4167, 11.4167)
+    limit = np.array(LIMITS)[:, None]
+    linear = Process(force_map(environment(FIGURE_4, T), coupling, (1, 2), (0, 0)), np.full(2, np.inf), np.zeros(2))
+    for turn_s, dissipated in ((5.0, 0.0173), (10.0, 0.00865)):
+        ticks = round(turn_s / T)
+        angle = 2 * np.pi * np.arange(2 * ticks) / ticks
+        x = 0.04 * np.stack([np.cos(angle), -np.sin(angle)], axis=1)[..., None]
+        dx = np.diff(x, axis=0)[-ticks:]
+        assert (1.37 * dx**2 / T).sum() == pytest.approx(dissipated, rel=1e-2)
+        clipped = np.clip(drive(linear, x).f[: 2 * ticks], -limit, limit)
+        assert (clipped[-ticks - 1 : -1] * dx).sum() == pytest.approx(-0.616, abs=0.005)
+        f = drive(closed(limited(FIGURE_4, coupling, (1, 2), (0, 0), T, LIMITS, rho)), x).f[: 2 * ticks]
+        assert abs((f[-ticks - 1 : -1] * dx).sum()) < 0.1 * dissipated  # delay and friction of the environment
+        assert (np.abs(f).max(axis=0) <= limit).all()
+
+
 def test_bad_limits_are_named():
     G = Lti.constant(np.eye(2), T)
     with pytest.raises(ValueError, match="rho has 1 entries for 2 channels"):
