@@ -1,5 +1,6 @@
 # make run    the paper's case I, from a fresh clone to a picture
 # make test   the whole test suite
+# make check  lint, and the tests of what your change touches, under a minute
 # make lint   ruff and pyright, without a finding: to be run, with make test, before anything is committed
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
 # make validate  every check that a verdict rests on: a report in out/validate/report.md, under five minutes
@@ -9,13 +10,16 @@ PY := .venv/bin/python
 # a file of tests stays on one core: its tests share fixtures, and those of the documentation files
 PARALLEL := -n auto --dist loadfile
 
-.PHONY: run test validate lint coverage bench figures clean
+.PHONY: run test check validate lint coverage bench figures clean
 
 run: .venv/ready
 	$(PY) -m sim.run --case I
 
 test: .venv/ready
 	$(PY) -m pytest $(PARALLEL)
+
+check: lint
+	$(PY) -m pytest $(PARALLEL) $$($(PY) tests/touched.py)
 
 validate: .venv/ready
 	$(PY) -m sim.suite --out out/validate
@@ -33,10 +37,10 @@ figures: .venv/ready
 	$(PY) -m sim.run --case I --out out/figure-6
 	cp out/figure-5/figure.png docs/pictures/figure-5.png
 	cp out/figure-6/figure.png docs/pictures/figure-6.png
-	$(PY) -m design.plot --coupling published,spring-damper,spring-damper:closed-loop --out out/couplings
+	$(PY) -m design.compare --coupling published,spring-damper,spring-damper:this-environment --out out/couplings
 	for name in required-damping perceived singular-values; do cp out/couplings/$$name.png docs/pictures/; done
 	$(PY) -m sim.view --case I --video docs/pictures/view.gif --fps 5
-	$(PY) -m design.limits --out out/limits
+	$(PY) -m design.compare --over --out out/limits
 	cp out/limits/limits.png docs/pictures/limits.png
 	$(PY) -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0 --out out/zwidth || test $$? -eq 1 # 1: not certified
 	cp out/zwidth/zwidth.png docs/pictures/zwidth.png

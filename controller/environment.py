@@ -379,13 +379,13 @@ def environment(network: Network, T: Number) -> Lti:
     for v at every tick. The states are q- and v- of the internal nodes, and what the contact dampers and
     masses need of the past. In the arithmetic of T. Raises ValueError if an internal node is held by nothing.
     """
-    return Lti(*_realise(_solvable(network, T), len(network.contacts), T), T)
+    return Lti(*realise(_solvable(network, T), len(network.contacts), T), T)
 
 
 def walled_environment(network: Network, T: Number) -> Lti:
     """[x; p] -> [f; y]: as `environment`, wall forces p [N] put in and displacements y [m] across walls out."""
     across = network.across(network.walls)
-    return Lti(*_realise(_solvable(network, T), len(network.contacts), T, across), T)
+    return Lti(*realise(_solvable(network, T), len(network.contacts), T, across), T)
 
 
 def _solvable(network: Network, T: Number) -> tuple[Array, Array, Array]:
@@ -399,7 +399,7 @@ def _solvable(network: Network, T: Number) -> tuple[Array, Array, Array]:
     return M, D, K
 
 
-def _realise(
+def realise(
     matrices: tuple[Array, Array, Array],
     c: int,
     T: Any,

@@ -1,18 +1,211 @@
-"""Human hands as passive one-ports, people who hold several devices as multi-ports, and their voluntary motion."""
+"""Humans as passive ports at the handles: chains, persons with several devices, random draws, and a user's own hand.
+
+Whatever has the two methods of `Hand` can hold a device. Its `port()` says what the handle feels: masses and
+spring-dampers, which both engines know, and if need be an impedance (A, B, C, D), which the exact engine knows.
+A `Port` cannot be built unless it is passive, so there is nothing else to prove.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Annotated, Any, Protocol, Self
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eig
 
 from models.device import require
 
 Array = NDArray[np.floating[Any]]
 Range = tuple[float, float]
+
+_ROUNDING = 1e-9  # of |Z|: what rounding may take from the real part of a lossless impedance
+
+# ----------------------------------------------------------------------------------------------------
+# Ports: what a handle feels.
+
+
+@dataclass(frozen=True, eq=False)
+class Impedance:
+    """Z(s) = C (s I - A)^-1 B + D [N s/m], from the velocity of a handle to the force against it; passive.
+
+    Raises ValueError where it is not. For what decays: all eigenvalues of A have negative real parts. A spring (a pole
+    at zero) and a mass are parts of the Port. Many impedances alike have leading axes.
+    """
+
+    A: Array  # (..., n, n)
+    B: Array  # (..., n, 1)
+    C: Array  # (..., 1, n)
+    D: Array  # (..., 1, 1)
+
+    def __post_init__(self) -> None:
+        for name in "ABCD":
+            _freeze(self, name, getattr(self, name))
+        *many, n, _ = self.A.shape if self.A.ndim > 1 else (0, 0)
+        shapes = {"A": (n, n), "B": (n, 1), "C": (1, n), "D": (1, 1)}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != (*many, *shape):
+                raise ValueError(f"impedance: {name} has the shape {getattr(self, name).shape}, expected {shape}")
+        for i in np.ndindex(*many):
+            _check_positive_real(*(getattr(self, name)[i] for name in "ABCD"))
+
+    @property
+    def order(self) -> int:
+        return int(self.A.shape[-1])
+
+
+def _check_positive_real(A: Array, B: Array, C: Array, D: Array) -> None:
+    """Raise ValueError unless Z is stable and Re Z(jw) >= 0 at every frequency.
+
+    Re Z(jw) = D - C A (w^2 I + A^2)^-1 B is rational in w^2, so its sign changes at the real zeros of that function
+    only, which are eigenvalues of a pencil: one look between each two of them decides all frequencies.
+    """
+    n = A.shape[0]
+    if n and not np.linalg.eigvals(A).real.max() < 0:
+        raise ValueError("impedance: A has an eigenvalue on or right of the imaginary axis, expected what decays")
+    zeros = eig(-np.block([[A @ A, B], [C @ A, D]]), np.diag([*[1.0] * n, 0.0]), right=False)
+    zeros = np.sort(zeros[np.isfinite(zeros)])
+    real = np.real(zeros[(np.real(zeros) > 0) & (np.abs(np.imag(zeros)) <= 1e-6 * np.abs(zeros))])
+    between = [(a + b) / 2 for a, b in pairwise([0.0, *real])] + [2 * real.max() if real.size else 1.0]
+    for w in np.sqrt([0.0, *between]):
+        Z = complex((C @ np.linalg.solve(1j * w * np.eye(n) - A, B) + D).item())
+        if not Z.real >= -_ROUNDING * abs(Z):
+            raise ValueError(f"impedance: not passive, Re Z is {Z.real:g} N s/m at {w / (2 * np.pi):.3g} Hz")
+
+
+@dataclass(frozen=True, eq=False)
+class Port:
+    """What handles feel of a passive human: masses, the spring-dampers across them, and perhaps an impedance.
+
+    Points are the handles first (one, or those that a person holds), then the human's own masses; last comes the base,
+    which is ground, or the body of the person whose arm this is. A row of `across` says by how much its spring-damper
+    lengthens with the points and the base: -1 and 1 for one between two of them, other numbers for a lever. Passive,
+    because no number may be negative, and an Impedance is. Many humans alike have a leading axis.
+    """
+
+    mass: Array  # (..., points) [kg]; 0 is allowed at the handles only
+    across: Array  # (springs, points + 1)
+    damping: Array  # (..., springs) [N s/m]
+    stiffness: Array  # (..., springs) [N/m]
+    impedance: Impedance | None = None  # between the (only) handle and the base
+    handles: int = 1
+    pull: int = -1  # the spring-damper that the voluntary force contracts
+
+    def __post_init__(self) -> None:
+        for name in ("mass", "across", "damping", "stiffness"):
+            _freeze(self, name, getattr(self, name))
+        *many, points = self.mass.shape
+        shapes = {"across": (len(self.across), points + 1)}
+        shapes |= {name: (*many, len(self.across)) for name in ("damping", "stiffness")}
+        for name, shape in shapes.items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"port: {name} has the shape {getattr(self, name).shape}, expected {shape}")
+        for name in ("mass", "damping", "stiffness"):
+            if not (getattr(self, name) >= 0).all() or not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"port: {name} has a negative or infinite entry: such a human is not passive")
+        if not 1 <= self.handles <= points or not (self.mass[..., self.handles :] > 0).all():
+            raise ValueError("port: a point that is no handle has no mass")
+        if not self.across[:, :-1].any(axis=1).all() or not -len(self.across) <= self.pull < len(self.across):
+            raise ValueError("port: expected spring-dampers that touch a point each, and `pull` one of them")
+        if self.impedance and (self.handles > 1 or self.impedance.A.shape[:-2] != tuple(many)):
+            raise ValueError("port: an impedance belongs to one handle, and to each of many humans")
+
+    @classmethod
+    def stack(cls, ports: Sequence[Self]) -> Self:
+        """Many humans alike as one port with a leading axis. Raises ValueError where they are built differently."""
+        first = ports[0]
+        if any(port.layout != first.layout for port in ports):
+            raise ValueError("ports: expected humans with the same points and the same spring-dampers between them")
+        mass, damping, stiffness = (np.stack([getattr(p, n) for p in ports]) for n in ("mass", "damping", "stiffness"))
+        some = [port.impedance for port in ports if port.impedance]
+        impedance = Impedance(*(np.stack([getattr(z, name) for z in some]) for name in "ABCD")) if some else None
+        return cls(mass, first.across, damping, stiffness, impedance, first.handles, first.pull)
+
+    def of(self, i: int) -> Self:
+        """One of many."""
+        z = self.impedance
+        impedance = Impedance(z.A[i], z.B[i], z.C[i], z.D[i]) if z else None
+        one = self.mass[i], self.across, self.damping[i], self.stiffness[i]
+        return type(self)(*one, impedance, self.handles, self.pull)
+
+    @property
+    def layout(self) -> tuple[Any, ...]:
+        """What is the same for humans that differ in their numbers only."""
+        order = self.impedance.order if self.impedance else None
+        return self.across.shape, self.across.tobytes(), order, self.handles, self.pull
+
+
+def state_space(A: Any, B: Any, C: Any, D: Any, mass: float = 0.0) -> Port:
+    """The port of a hand of `mass` [kg] with the impedance C (s I - A)^-1 B + D from velocity [m/s] to force [N].
+
+    A may have one eigenvalue at zero, which is the hand's static stiffness: k/s is split off as a spring. Raises
+    ValueError for what is not passive. Only the exact engine knows such a hand: MuJoCo simulates bodies.
+    """
+    A, B, C, D = (np.atleast_2d(np.asarray(part, dtype=float)) for part in (A, B, C, D))
+    stiffness = 0.0
+    right, sizes, left = np.linalg.svd(A)  # A x = 0 and y A = 0 for the last vectors, where A is singular
+    if A.size and sizes[-1] <= 1e-12 * max(sizes[0], 1e-300):
+        null, left = left[-1], right[:, -1]
+        if abs(left @ null) <= 1e-9:
+            raise ValueError("impedance: A has a double eigenvalue at zero, expected one spring at most")
+        left = left / (left @ null)
+        stiffness = float((C @ null).item() * (left @ B).item())
+        # the rest lives where `left` vanishes: an orthonormal basis of that is invariant under A
+        rest = np.linalg.svd(left[None])[2][1:].T
+        B = B - np.outer(null, left @ B)
+        A, B, C = rest.T @ A @ rest, rest.T @ B, C @ rest
+    spring = np.array([[-1.0, 1.0]])
+    return Port(np.array([mass]), spring, np.zeros(1), np.array([stiffness]), Impedance(A, B, C, D))
+
+
+class Hand(Protocol):
+    """Whatever can hold a device."""
+
+    def port(self) -> Port:
+        """What the handle feels."""
+        ...
+
+    def voluntary_force(self, t: Array) -> Array:
+        """Force [N] at the times t [s] that contracts the spring-damper `pull` of the port."""
+        ...
+
+
+def chain_port(links: Array) -> Port:
+    """A chain from the handle to the base; links (..., n, 3) are mass, damping and stiffness of each."""
+    n = links.shape[-2]
+    across = np.eye(n, n + 1, 1) - np.eye(n, n + 1)
+    return Port(links[..., 0], across, links[..., 1], links[..., 2])
+
+
+def body_port(hands: int, values: Array) -> Port:
+    """A body on ground, and the hands joined one to the next; values (..., 5) as in Crowd.bodies."""
+    mass, damping, stiffness, cross_damping, cross_stiffness = np.moveaxis(values, -1, 0)[..., None]
+    across = np.eye(hands, hands + 2, 1) - np.eye(hands, hands + 2)
+    across[-1] = 0.0
+    across[-1, hands:] = -1.0, 1.0
+    nothing = np.repeat(np.zeros_like(mass), hands, axis=-1)
+    crossings = hands - 1
+    return Port(
+        np.concatenate([nothing, mass], axis=-1),
+        across,
+        np.concatenate([np.repeat(cross_damping, crossings, axis=-1), damping], axis=-1),
+        np.concatenate([np.repeat(cross_stiffness, crossings, axis=-1), stiffness], axis=-1),
+        handles=hands,
+    )
+
+
+def _freeze(record: object, name: str, values: Any) -> None:
+    """The field as a read-only array of floats."""
+    array = np.array(values, dtype=float)
+    array.setflags(write=False)
+    object.__setattr__(record, name, array)
+
+
+# ----------------------------------------------------------------------------------------------------
+# The project's own humans.
 
 
 class Link(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -70,6 +263,10 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if link.mass == 0:
                 raise ValueError(f"links[{i}].mass is 0: only the mass at the handle may be missing")
 
+    def port(self) -> Port:
+        """The chain as the handle feels it."""
+        return chain_port(np.array([(link.mass, link.damping, link.stiffness) for link in self.links]))
+
     def voluntary_force(self, t: Array) -> Array:
         """k x_eq + b x_eq' [N] on the last mass, at times t [s]."""
         if self.voluntary is None:
@@ -109,17 +306,23 @@ class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         require("damping", self.damping, 0.0, 1e6, "N s/m")
         require("stiffness", self.stiffness, 0.0, 1e9, "N/m")
 
+    def port(self) -> Port:
+        """Body and cross springs as the hands feel them; the arms end on the body, the last point."""
+        cross = self.cross
+        values = (self.mass, self.damping, self.stiffness, cross.damping, cross.stiffness)
+        return body_port(len(self.holds), np.array(values))
 
-def check_holds(persons: Sequence[Person], channels: int) -> None:
-    """Raise ValueError where somebody holds what is not there or what another one holds."""
+
+def check_holds(held_by: Sequence[tuple[int, ...]], channels: int) -> None:
+    """Raise ValueError where a person holds what is not there or what another one holds."""
     held: set[int] = set()
-    for i, person in enumerate(persons):
-        for channel in person.holds:
+    for i, holds in enumerate(held_by):
+        for channel in holds:
             if channel > channels:
                 raise ValueError(f"person[{i}].holds has channel {channel}, allowed are 1 to {channels}")
             if channel in held:
                 raise ValueError(f"person[{i}].holds has channel {channel}, which somebody else holds already")
-        held.update(person.holds)
+        held.update(holds)
 
 
 class Population(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -1,10 +1,10 @@
-"""Many humans for the same devices: one compiled scene, and a row of its parameters for each of them."""
+"""Devices and the humans who hold them as one MuJoCo scene, the same plant as matrices, and many humans at once."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import mujoco
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.device import CompliantDevice, Device
-from models.human import Cross, Human, Link, Person, check_holds
+from models.human import Cross, Hand, Human, Impedance, Link, Person, Port, body_port, chain_port, check_holds
 
 # ----------------------------------------------------------------------------------------------------
 # Devices and humans as one MuJoCo model, and the same plant as matrices, read from that model.
@@ -26,6 +26,10 @@ from models.human import Cross, Human, Link, Person, check_holds
 # Gravity, contacts and constraints are off, but for the Coulomb friction of devices that have some. Inputs are MuJoCo
 # actuators: first the outside forces (voluntary motion and taps), then one motor per device with gear -1, because the
 # device feels -f.
+#
+# A human is a passive port (models.human.Port). Its masses become bodies, a spring-damper that lies between one point
+# and ground belongs to a joint, any other one is a fixed tendon. An impedance (A, B, C, D) is no body: it is kept
+# among the model's custom numbers, from where `plant` takes it, and MuJoCo itself cannot simulate it.
 
 
 Array = NDArray[np.floating[Any]]
@@ -33,6 +37,7 @@ Array = NDArray[np.floating[Any]]
 #: MuJoCo's friction constraint creeps while it sticks; this hard it stops a 0.25 kg device within 1.5e-6 m of where
 #: Coulomb's law does, and creeps at 1e-7 m/s under half its force (MuJoCo's defaults: 7e-5 m and 6e-4 m/s)
 STICK, HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
+_IMPEDANCE = "impedance_"  # custom numbers: joint of the handle, joint of the base or -1, then A, B, C, D row by row
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +49,7 @@ class Scene:
     handles: tuple[int, ...]  # (m,) joint of each handle
     pushed: tuple[int, ...]  # (m,) outside input that reaches the end of each human (voluntary force)
     tapped: tuple[int, ...]  # (m,) outside input that reaches each handle
-    masses: tuple[tuple[int, ...], ...]  # (m, links) joint that each mass of a human moves on
-    springs: tuple[tuple[int, ...], ...]  # (m, links - 1) tendon behind each mass but the last, whose is the joint's;
-    # (m, links) where a body is behind the last
-    bodies: tuple[int, ...]  # (persons,) joint of each body
-    crossings: tuple[tuple[int, ...], ...]  # (persons, hands - 1) tendons from hand to hand
+    points: tuple[tuple[int, ...], ...]  # (m + persons,) joints that the points of each port move on, handles first
 
     @property
     def channels(self) -> int:
@@ -62,72 +63,147 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """x' = A x + B u, y = C x with x = [positions; velocities], u = [outside forces; f], y = encoder positions."""
+    """x' = A x + B u, y = C x with u = [outside forces; f], y = encoder positions.
 
-    A: Array  # (2n, 2n)
-    B: Array  # (2n, outside + m)
-    C: Array  # (m, 2n)
+    x holds n positions, n velocities, and the states of the humans' impedances where there are some.
+    """
+
+    A: Array  # (2n + states, 2n + states)
+    B: Array  # (2n + states, outside + m)
+    C: Array  # (m, 2n + states)
 
 
-def build(devices: Sequence[Device], humans: Sequence[Human], persons: Sequence[Person] = ()) -> Scene:
+def build(devices: Sequence[Device], humans: Sequence[Hand], persons: Sequence[Person] = ()) -> Scene:
     """One scene of devices, each held by its human; `persons` are those who hold several.
 
     Raises ValueError where the numbers of devices and humans differ, or a device is held twice.
     """
-    if len(devices) != len(humans) or not devices:
-        raise ValueError(f"{len(devices)} devices and {len(humans)} humans: each device needs one human")
-    check_holds(persons, len(devices))
-    spec = mujoco.MjSpec()
-    spec.modelname = "haptic loop"
-    _only_what_the_loop_needs(spec, friction=any(device.friction for device in devices))
-    body = {channel: f"body_{p}" for p, person in enumerate(persons, start=1) for channel in person.holds}
-    parts = list(enumerate(zip(devices, humans, strict=True), start=1))
-    chains = [_chain(i, device, human, body.get(i)) for i, (device, human) in parts]
-    _add_masses(spec, devices, humans, persons)
-    for (_, (device, human)), (i, chain) in zip(parts, enumerate(chains, start=1), strict=True):
-        _add_springs(spec, i, device, human, chain)
-
-    handles = [_handle(i, device) for i, device in enumerate(devices, start=1)]
-    crossings = [_add_crossings(spec, p, person, handles) for p, person in enumerate(persons, start=1)]
-    # a voluntary force acts on the last mass, and back on the body that the arm ends on
-    ends = [c.tendons[-1] if i in body else c.joints[-1] for i, c in enumerate(chains, start=1)]
-    reached = list(dict.fromkeys((*handles, *ends)))
-    for name in reached:
-        _add_motor(spec, f"push_{name}", name, gear=-1.0 if name.startswith("link") else 1.0)
-    for i, device in enumerate(devices, start=1):
-        _add_motor(spec, f"force_{i}", f"motor_{i}", gear=-1.0, limit=device.force_limit)
-    model = spec.compile()
-    return Scene(
-        model=model,
-        xml=spec.to_xml(),
-        handles=tuple(model.joint(name).id for name in handles),
-        pushed=tuple(reached.index(name) for name in ends),
-        tapped=tuple(reached.index(name) for name in handles),
-        masses=tuple(
-            tuple(model.joint(name).id for name in c.joints if name != body.get(i))
-            for i, c in enumerate(chains, start=1)
-        ),
-        springs=tuple(tuple(model.tendon(name).id for name in c.tendons) for c in chains),
-        bodies=tuple(model.joint(f"body_{p}").id for p in range(1, len(persons) + 1)),
-        crossings=tuple(tuple(model.tendon(name).id for name in names) for names in crossings),
-    )
+    held = tuple((person.holds, person.port()) for person in persons)
+    return _compiled(devices, _placed(devices, tuple(human.port() for human in humans), held))
 
 
 def plant(model: mujoco.MjModel) -> Plant:
-    """The linear plant that `model` simulates: its mass, damping, stiffness and actuation matrices, no friction."""
+    """The linear plant that `model` simulates: its mass, damping, stiffness and actuation matrices, no friction.
+
+    With the humans' impedances, which MuJoCo does not simulate.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    n, m = model.nv, _motors(model)
-    mass = np.zeros((n, n))
+    mass = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
-    inverse = np.linalg.inv(mass)
     across = tendon_jacobian(model)
     stiffness = np.diag(model.jnt_stiffness.astype(float)) + across.T * model.tendon_stiffness @ across
     damping = np.diag(model.dof_damping) + across.T * model.tendon_damping @ across
-    forces = actuation(model)
-    A = np.block([[np.zeros((n, n)), np.eye(n)], [-inverse @ stiffness, -inverse @ damping]])
-    B = np.vstack([np.zeros_like(forces), inverse @ forces])
-    return Plant(A, B, np.eye(m, 2 * n))
+    inverse = np.linalg.inv(mass)
+    return _plant(
+        lambda matrix: inverse @ matrix, stiffness, damping, actuation(model), _motors(model), _impedances(model)
+    )
+
+
+def impeded(model: mujoco.MjModel) -> bool:
+    """Whether a human of this model has an impedance (A, B, C, D), which MuJoCo leaves out."""
+    return bool(_impedances(model))
+
+
+class _Felt(NamedTuple):
+    """An impedance at its place: the velocity of `row` over the joints goes in, its force acts back along `row`."""
+
+    row: Array  # (n,)
+    Z: Impedance
+
+
+def _plant(
+    solved: Callable[[Array], Array], K: Array, D: Array, forces: Array, motors: int, felt: Sequence[_Felt]
+) -> Plant:
+    """The plant M q'' = -K q - D q' + forces u and the impedances; `solved` multiplies by M^-1."""
+    *many, n, _ = K.shape
+    size = 2 * n + sum(z.order for _, z in felt)
+    A, B = np.zeros((*many, size, size)), np.zeros((*many, size, forces.shape[-1]))
+    A[..., :n, n : 2 * n] = np.eye(n)
+    A[..., n : 2 * n, :n] = -solved(K)
+    A[..., n : 2 * n, n : 2 * n] = -solved(D + sum(np.outer(row, row) * z.D for row, z in felt))
+    B[..., n : 2 * n, :] = solved(forces)
+    first = 2 * n
+    for row, z in felt:
+        mine = slice(first, first + z.order)
+        A[..., mine, n : 2 * n] = z.B * row
+        A[..., mine, mine] = z.A
+        A[..., n : 2 * n, mine] = -solved(row[:, None] * z.C)
+        first += z.order
+    return Plant(A, B, np.eye(motors, size))
+
+
+def _impedances(model: mujoco.MjModel) -> list[_Felt]:
+    """The impedances among the custom numbers of a model."""
+    felt = []
+    for i in range(model.nnumeric):
+        first, size = int(model.numeric_adr[i]), int(model.numeric_size[i])
+        if model.numeric(i).name.startswith(_IMPEDANCE):
+            (handle, base), numbers = model.numeric_data[first : first + 2].astype(int), model.numeric_data[first + 2 :]
+            n = math.isqrt(size - 2) - 1  # (n + 1)^2 numbers
+            whole = numbers[: (n + 1) ** 2].reshape(n + 1, n + 1)
+            row = np.zeros(model.nv)
+            row[handle] = 1.0
+            if base >= 0:
+                row[base] = -1.0
+            felt.append(_Felt(row, Impedance(whole[:n, :n], whole[:n, n:], whole[n:, :n], whole[n:, n:])))
+    return felt
+
+
+def from_mjcf(xml: str, handle: str = "handle", pull: str | None = None) -> Port:
+    """The port of a hand that is drawn in MJCF: bodies that slide along x, with springs and dampers between them.
+
+    The body `handle` is the part of the hand that moves with the handle; the world is the base. The voluntary force
+    contracts the joint or tendon named `pull` (default: the last spring-damper). Gravity and shapes are left out.
+    Raises ValueError for what is no network of masses, springs and dampers.
+    """
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    _check_linear(model, data)
+    names = [model.body(b).name for b in model.jnt_bodyid]
+    if handle not in names:
+        raise ValueError(f"MJCF of a hand: no body {handle!r} that slides; there are {', '.join(map(repr, names))}")
+    order = sorted(range(model.njnt), key=lambda j: names[j] != handle)
+    point = {int(model.jnt_bodyid[j]): k for k, j in enumerate(order)} | {0: model.njnt}
+    mass = np.zeros(model.njnt + 1)
+    np.add.at(mass, [point[int(b)] for b in model.body_weldid], model.body_mass)
+    slides = np.zeros((model.njnt, model.njnt + 1))  # by how much each joint slides, over the points and the base
+    for j, b in enumerate(model.jnt_bodyid):
+        slides[j, point[int(b)]] = 1.0
+        slides[j, point[int(model.body_weldid[model.body_parentid[b]])]] = -1.0
+    across = np.vstack([slides, tendon_jacobian(model) @ slides])
+    damping = np.concatenate([model.dof_damping, model.tendon_damping])
+    stiffness = np.concatenate([model.jnt_stiffness, model.tendon_stiffness])
+    labels = [*(model.joint(j).name for j in range(model.njnt)), *(model.tendon(t).name for t in range(model.ntendon))]
+    if pull is not None and pull not in labels:
+        raise ValueError(f"MJCF of a hand: no joint or tendon {pull!r}; there are {', '.join(map(repr, labels))}")
+    there = [i for i, label in enumerate(labels) if damping[i] or stiffness[i] or label == pull]
+    if not there:
+        raise ValueError("MJCF of a hand: it has no spring and no damper")
+    end = -1 if pull is None else there.index(labels.index(pull))
+    return Port(mass[:-1], across[there], damping[there], stiffness[there], pull=end)
+
+
+def _check_linear(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Raise ValueError unless the model is a network of masses, springs and dampers along x, at rest."""
+    slide, fixed = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtWrap.mjWRAP_JOINT
+    rubbing = ("dof_frictionloss", "tendon_frictionloss", "dof_armature", "tendon_armature")
+    curved = ("jnt_stiffnesspoly", "tendon_stiffnesspoly", "dof_dampingpoly", "tendon_dampingpoly")
+    found = {
+        "a joint that does not slide along x": (model.jnt_type != slide).any()
+        or not np.allclose(data.xaxis, [1.0, 0.0, 0.0]),
+        "several joints in one body": len(set(model.jnt_bodyid)) < model.njnt,
+        "a limit": model.jnt_limited.any() or model.tendon_limited.any(),
+        "friction or armature": any(getattr(model, name).any() for name in rubbing),
+        "a nonlinear spring or damper": any(getattr(model, name).any() for name in curved),
+        "an actuator or a constraint": bool(model.nu or model.neq),
+        "a tendon that is not fixed": (model.wrap_type != fixed).any(),
+        "a spring that is not at rest": model.qpos_spring.any() or model.qpos0.any() or model.tendon_lengthspring.any(),
+    }
+    for what, there in found.items():
+        if there:
+            raise ValueError(f"MJCF of a hand: it has {what}, expected masses, springs and dampers along x, at rest")
 
 
 def tendon_jacobian(model: mujoco.MjModel) -> Array:
@@ -165,83 +241,165 @@ def _handle(i: int, device: Device) -> str:
     return f"handle_{i}" if isinstance(device, CompliantDevice) else f"motor_{i}"
 
 
-def _add_masses(
-    spec: mujoco.MjSpec, devices: Sequence[Device], humans: Sequence[Human], persons: Sequence[Person]
-) -> None:
-    """Masses in the order motors, handles, human masses, bodies, with what joins them to ground."""
-    motors, handles, arms = [], [], []
-    grounded: dict[str, tuple[float, float]] = {}  # damping and stiffness
-    held = {channel for person in persons for channel in person.holds}
-    rubbing: dict[str, float] = {}
-    for i, (device, human) in enumerate(zip(devices, humans, strict=True), start=1):
-        first = human.links[0].mass
+class _Placed(NamedTuple):
+    """A port in the scene."""
+
+    port: Port
+    joints: tuple[str, ...]  # of its points
+    base: str | None  # joint of the body that it ends on; None for ground
+    springs: tuple[str, ...]  # the tendon, or the one joint, that each of its spring-dampers is on
+
+
+def _placed(
+    devices: Sequence[Device], ports: Sequence[Port], held: Sequence[tuple[tuple[int, ...], Port]]
+) -> tuple[_Placed, ...]:
+    """The ports of all channels, then those of the persons who hold several of them.
+
+    Raises ValueError where the numbers of devices and humans differ, or a device is held twice.
+    """
+    if len(devices) != len(ports) or not devices:
+        raise ValueError(f"{len(devices)} devices and {len(ports)} humans: each device needs one human")
+    check_holds([holds for holds, _ in held], len(devices))
+    handles = [_handle(i, device) for i, device in enumerate(devices, start=1)]
+    body = {channel: f"body_{p}" for p, (holds, _) in enumerate(held, start=1) for channel in holds}
+    placed = []
+    for i, port in enumerate(ports, start=1):
+        if port.handles > 1:
+            raise ValueError(f"human[{i - 1}] has {port.handles} handles, expected one: a person holds several")
+        own = (f"human_{i}_{j}" for j in range(2, port.mass.shape[-1] + 1))
+        placed.append(_place(port, (handles[i - 1], *own), body.get(i), f"link_{i}"))
+    for p, (holds, port) in enumerate(held, start=1):
+        extra = port.mass.shape[-1] - len(holds)
+        if port.handles != len(holds) or extra < 1:
+            raise ValueError(f"person[{p - 1}] has {port.handles} handles and {extra} bodies, expected {len(holds)}, 1")
+        own = (f"body_{p}_{j}" for j in range(1, extra))
+        hands = (handles[channel - 1] for channel in holds)
+        placed.append(_place(port, (*hands, *own, f"body_{p}"), None, f"cross_{p}"))
+    return tuple(placed)
+
+
+def _place(port: Port, joints: tuple[str, ...], base: str | None, name: str) -> _Placed:
+    ends = (*joints, base) if base else joints
+    springs = []
+    for j, row in enumerate(port.across, start=1):
+        between = [joint for joint, c in zip(ends, row, strict=False) if c]  # ground is no end
+        springs.append(between[0] if len(between) == 1 and between[0] in joints else f"{name}_{j}")
+    return _Placed(port, joints, base, tuple(springs))
+
+
+class _Amounts(NamedTuple):
+    """Mass, damping and stiffness by the name of a joint or a tendon; arrays where there are many humans."""
+
+    mass: dict[str, Any]  # joints in their order
+    damping: dict[str, Any]
+    stiffness: dict[str, Any]
+
+
+def _amounts(devices: Sequence[Device], placed: Sequence[_Placed]) -> _Amounts:
+    """What devices and humans add up to."""
+    mass: dict[str, Any] = {}
+    damping: dict[str, Any] = {}
+    stiffness: dict[str, Any] = {}
+    for i, device in enumerate(devices, start=1):
+        compliant = isinstance(device, CompliantDevice)
+        mass[f"motor_{i}"] = device.motor_mass if compliant else device.mass
+        damping[f"motor_{i}"], stiffness[f"motor_{i}"] = device.damping, 0.0
+    for i, device in enumerate(devices, start=1):
         if isinstance(device, CompliantDevice):
-            motors.append((f"motor_{i}", device.motor_mass, device.damping))
-            handles.append((f"handle_{i}", device.handle_mass + first, 0.0))
-        else:
-            motors.append((f"motor_{i}", device.mass + first, device.damping))
-        rubbing[f"motor_{i}"] = device.friction
-        arms += [(f"human_{i}_{j}", link.mass, 0.0) for j, link in enumerate(human.links[1:], start=2)]
-        if i not in held:
-            grounded[_chain(i, device, human).joints[-1]] = human.links[-1].damping, human.links[-1].stiffness
-    bodies = [(f"body_{p}", person.mass, 0.0) for p, person in enumerate(persons, start=1)]
-    grounded |= {name: (p.damping, p.stiffness) for (name, *_), p in zip(bodies, persons, strict=True)}
-    for name, mass, damping in (*motors, *handles, *arms, *bodies):
-        body = spec.worldbody.add_body(name=name, mass=mass, ipos=[0, 0, 0], inertia=[1e-3] * 3, explicitinertial=True)
+            mass[f"handle_{i}"] = device.handle_mass
+            damping[f"transmission_{i}"] = device.transmission_damping
+            stiffness[f"transmission_{i}"] = device.transmission_stiffness
+    for port, joints, _, springs in placed:
+        for k, joint in enumerate(joints):
+            mass[joint] = mass.get(joint, 0.0) + port.mass[..., k]
+        for r, name in enumerate(springs):
+            lever = float(port.across[r, joints.index(name)]) ** 2 if name in joints else 1.0
+            damping[name] = damping.get(name, 0.0) + lever * port.damping[..., r]
+            stiffness[name] = stiffness.get(name, 0.0) + lever * port.stiffness[..., r]
+    return _Amounts(mass, damping, stiffness)
+
+
+def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
+    spec = mujoco.MjSpec()
+    spec.modelname = "haptic loop"
+    _only_what_the_loop_needs(spec, friction=any(device.friction for device in devices))
+    mass, damping, stiffness = _amounts(devices, placed)
+    rubbing = {f"motor_{i}": device.friction for i, device in enumerate(devices, start=1)}
+    own = [joint for part in placed for joint in part.joints[part.port.handles :]]
+    order = [name for name in mass if name not in own] + own
+    for name in order:
+        body = spec.worldbody.add_body(
+            name=name, mass=float(mass[name]), ipos=[0, 0, 0], inertia=[1e-3] * 3, explicitinertial=True
+        )
         joint = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
-        joint.damping[0] = damping
+        joint.damping[0], joint.stiffness[0] = float(damping.get(name, 0.0)), float(stiffness.get(name, 0.0))
         if rubbing.get(name):
             joint.frictionloss = rubbing[name]
             joint.solref_friction, joint.solimp_friction = STICK, HARD
-        if name in grounded:
-            joint.damping[0] += grounded[name][0]
-            joint.stiffness[0] = grounded[name][1]
+    for i, device in enumerate(devices, start=1):
+        if isinstance(device, CompliantDevice):
+            amounts = device.transmission_stiffness, device.transmission_damping
+            _add_spring(spec, f"transmission_{i}", {f"handle_{i}": 1.0, f"motor_{i}": -1.0}, *amounts)
+        _add_springs(spec, placed[i - 1], damping, stiffness)
+    for part in placed[len(devices) :]:
+        _add_springs(spec, part, damping, stiffness)
+
+    channels = placed[: len(devices)]
+    handles = [part.joints[0] for part in channels]
+    ends = [_pulled(part) for part in channels]
+    reached = list(dict.fromkeys([*((name, 1.0) for name in handles), *ends]))
+    for name, gear in reached:
+        _add_motor(spec, f"push_{name}", name, gear, joint=name in mass)
+    for i, device in enumerate(devices, start=1):
+        _add_motor(spec, f"force_{i}", f"motor_{i}", gear=-1.0, limit=device.force_limit)
+    number = {name: j for j, name in enumerate(order)}
+    for i, (port, joints, base, _) in enumerate(channels, start=1):
+        if z := port.impedance:
+            numbers = np.block([[z.A, z.B], [z.C, z.D]]).ravel()
+            places = [number[joints[0]], number[base] if base else -1]
+            spec.add_numeric(name=f"{_IMPEDANCE}{i}", data=[*places, *numbers], size=len(numbers) + 2)
+    model = spec.compile()
+    return Scene(
+        model=model,
+        xml=spec.to_xml(),
+        handles=tuple(model.joint(name).id for name in handles),
+        pushed=tuple(reached.index(end) for end in ends),
+        tapped=tuple(reached.index((name, 1.0)) for name in handles),
+        points=tuple(tuple(model.joint(name).id for name in part.joints) for part in placed),
+    )
 
 
-def _add_springs(spec: mujoco.MjSpec, i: int, device: Device, human: Human, chain: _Chain) -> None:
-    """The transmission and the links between the masses of one human, as fixed tendons."""
-    if isinstance(device, CompliantDevice):
-        stiffness, damping = device.transmission_stiffness, device.transmission_damping
-        _add_spring(spec, f"transmission_{i}", f"motor_{i}", f"handle_{i}", stiffness, damping)
-    for j, (name, link) in enumerate(zip(chain.tendons, human.links, strict=False)):
-        _add_spring(spec, name, chain.joints[j], chain.joints[j + 1], link.stiffness, link.damping)
+def _pulled(part: _Placed) -> tuple[str, float]:
+    """What the voluntary force of a human acts on, and its gear: it contracts a spring-damper."""
+    name = part.springs[part.port.pull]
+    if name not in part.joints:
+        return name, -1.0
+    return name, -float(part.port.across[part.port.pull, part.joints.index(name)])
 
 
-def _add_crossings(spec: mujoco.MjSpec, p: int, person: Person, handles: Sequence[str]) -> list[str]:
-    """The springs from hand to hand; returns their names."""
-    names = []
-    for a, b in pairwise(person.holds):
-        names.append(f"cross_{p}_{a}_{b}")
-        _add_spring(spec, names[-1], handles[a - 1], handles[b - 1], person.cross.stiffness, person.cross.damping)
-    return names
+def _add_springs(spec: mujoco.MjSpec, part: _Placed, damping: Mapping[str, Any], stiffness: Mapping[str, Any]) -> None:
+    """The spring-dampers of a port that lie between joints, as fixed tendons."""
+    for name, row in zip(part.springs, part.port.across, strict=True):
+        if name not in part.joints:
+            joints = (*part.joints, part.base) if part.base else part.joints
+            ends = {joint: float(c) for joint, c in zip(joints, row, strict=False) if c}
+            _add_spring(spec, name, ends, float(stiffness[name]), float(damping[name]))
 
 
-class _Chain(NamedTuple):
-    """The joints of a human's masses, with the body that they end on, and the tendons between them."""
-
-    joints: list[str]
-    tendons: list[str]
-
-
-def _chain(i: int, device: Device, human: Human, body: str | None = None) -> _Chain:
-    links = len(human.links)
-    joints = [_handle(i, device), *(f"human_{i}_{j}" for j in range(2, links + 1))]
-    if body:
-        joints.append(body)
-    return _Chain(joints, [f"link_{i}_{j}" for j in range(1, len(joints))])
-
-
-def _add_spring(spec: mujoco.MjSpec, name: str, a: str, b: str, stiffness: float, damping: float) -> None:
+def _add_spring(spec: mujoco.MjSpec, name: str, ends: Mapping[str, float], stiffness: float, damping: float) -> None:
+    """A fixed tendon that lengthens by its factor with each joint."""
     tendon = spec.add_tendon(name=name)
     # entry 0 is the linear term; MuJoCo also knows two nonlinear ones
     tendon.stiffness[0], tendon.damping[0] = stiffness, damping
     tendon.springlength = [0, 0]
-    tendon.wrap_joint(b, 1.0)
-    tendon.wrap_joint(a, -1.0)
+    for joint, factor in sorted(ends.items(), key=lambda end: -end[1]):
+        tendon.wrap_joint(joint, factor)
 
 
-def _add_motor(spec: mujoco.MjSpec, name: str, target: str, gear: float, limit: float | None = None) -> None:
-    kind = mujoco.mjtTrn.mjTRN_TENDON if target.startswith("link") else mujoco.mjtTrn.mjTRN_JOINT
+def _add_motor(
+    spec: mujoco.MjSpec, name: str, target: str, gear: float, limit: float | None = None, joint: bool = True
+) -> None:
+    kind = mujoco.mjtTrn.mjTRN_JOINT if joint else mujoco.mjtTrn.mjTRN_TENDON
     motor = spec.add_actuator(name=name, target=target, trntype=kind)
     motor.set_to_motor()
     motor.gear = [gear, 0, 0, 0, 0, 0]
@@ -283,6 +441,16 @@ class Crowd:
     def __len__(self) -> int:
         return self.links.shape[0]
 
+    @property
+    def ports(self) -> tuple[Port, ...]:
+        """One per device, each with a leading axis over the sets."""
+        return tuple(chain_port(self.links[:, i]) for i in range(self.links.shape[1]))
+
+    @property
+    def held(self) -> tuple[tuple[tuple[int, ...], Port], ...]:
+        """Who holds several devices: which, and the port with a leading axis over the sets."""
+        return tuple((holds, body_port(len(holds), self.bodies[:, p])) for p, holds in enumerate(self.holds))
+
     def humans(self, i: int) -> tuple[Human, ...]:
         """Set i, one human per device."""
         return tuple(Human(tuple(Link(*link) for link in human)) for human in self.links[i].tolist())
@@ -294,11 +462,41 @@ class Crowd:
 
 
 @dataclass(frozen=True, eq=False)
+class HumanSets:
+    """Sets of any humans, one per device, that differ in their numbers only; persons are the same for all sets."""
+
+    sets: tuple[tuple[Hand, ...], ...]  # (nsim, m)
+    people: tuple[Person, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.sets)
+
+    @property
+    def ports(self) -> tuple[Port, ...]:
+        """As of a Crowd. Raises ValueError where two humans of a device are built differently."""
+        return tuple(Port.stack([human.port() for human in column]) for column in zip(*self.sets, strict=True))
+
+    @property
+    def held(self) -> tuple[tuple[tuple[int, ...], Port], ...]:
+        """As of a Crowd."""
+        return tuple((person.holds, Port.stack([person.port()] * len(self))) for person in self.people)
+
+    def humans(self, i: int) -> tuple[Hand, ...]:
+        """Set i, one human per device."""
+        return self.sets[i]
+
+    def persons(self, i: int) -> tuple[Person, ...]:
+        """Set i, those who hold several devices."""
+        return self.people
+
+
+@dataclass(frozen=True, eq=False)
 class Variants:
     """The fields in which the models of a crowd differ, by MuJoCo's names, with one row per set of humans."""
 
     scene: Scene
     fields: dict[str, Array]  # (nsim, bodies | joints | tendons)
+    impedances: tuple[_Felt, ...] = ()  # with a leading axis over the sets; MuJoCo leaves them out
 
     def __len__(self) -> int:
         return self.fields["body_mass"].shape[0]
@@ -310,41 +508,34 @@ class Variants:
     def plants(self) -> Plant:
         """All plants at once, A (nsim, 2n, 2n) and B (nsim, 2n, inputs): the same matrices as of each one's model."""
         model = self.scene.model
-        n, across, forces = model.nv, tendon_jacobian(model), actuation(model)
-        mass = self.fields["body_mass"][:, model.jnt_bodyid, None]
-        A = np.zeros((len(self), 2 * n, 2 * n))
-        A[:, :n, n:] = np.eye(n)
-        for column, joint, tendon in ((0, "jnt_stiffness", "tendon_stiffness"), (n, "dof_damping", "tendon_damping")):
+        across, mass = tendon_jacobian(model), self.fields["body_mass"][:, model.jnt_bodyid]
+
+        def matrix(joint: str, tendon: str) -> Array:
             between = across.T * self.fields[tendon][:, None, :] @ across
-            A[:, n:, column : column + n] = -(between + self.fields[joint][:, :, None] * np.eye(n)) / mass
-        B = np.zeros((len(self), 2 * n, forces.shape[1]))
-        B[:, n:] = forces / mass
-        return Plant(A, B, plant(model).C)
+            return between + self.fields[joint][:, :, None] * np.eye(model.nv)
+
+        K, D = matrix("jnt_stiffness", "tendon_stiffness"), matrix("dof_damping", "tendon_damping")
+        return _plant(
+            lambda matrix: matrix / mass[:, :, None], K, D, actuation(model), self.scene.channels, self.impedances
+        )
 
 
-def variants(devices: Sequence[Device], crowd: Crowd) -> Variants:
+def variants(devices: Sequence[Device], crowd: Crowd | HumanSets) -> Variants:
     """The devices in the hands of every set of humans. Raises ValueError where their numbers differ."""
-    nsim, m, links, _ = crowd.links.shape
-    # a hand without mass, damping or stiffness leaves the devices' own parameters; further masses cannot be zero
-    nobody = Human((Link(0, 0, 0), *(Link(1, 0, 0) for _ in range(links - 1))))
-    scene = build(devices, [nobody] * m, [Person(holds, 1, 0, 0) for holds in crowd.holds])
+    placed = _placed(devices, crowd.ports, crowd.held)
+    first = tuple(part._replace(port=part.port.of(0)) for part in placed)
+    scene = _compiled(devices, first)
     model = scene.model
     names = ("body_mass", "jnt_stiffness", "dof_damping", "tendon_stiffness", "tendon_damping")
-    fields = {name: np.tile(getattr(model, name).astype(float), (nsim, 1)) for name in names}
-    for i, (joints, tendons) in enumerate(zip(scene.masses, scene.springs, strict=True)):
-        mass, damping, stiffness = np.moveaxis(crowd.links[:, i], -1, 0)  # (nsim, links) each
-        bodies = model.jnt_bodyid[list(joints)]
-        fields["body_mass"][:, bodies[0]] += mass[:, 0]
-        fields["body_mass"][:, bodies[1:]] = mass[:, 1:]
-        if len(tendons) < links:  # the last link ends on ground
-            fields["dof_damping"][:, joints[-1]] += damping[:, -1]
-            fields["jnt_stiffness"][:, joints[-1]] = stiffness[:, -1]
-        fields["tendon_damping"][:, list(tendons)] = damping[:, : len(tendons)]
-        fields["tendon_stiffness"][:, list(tendons)] = stiffness[:, : len(tendons)]
-    for p, (joint, crossings) in enumerate(zip(scene.bodies, scene.crossings, strict=True)):
-        mass, damping, stiffness, cross_damping, cross_stiffness = crowd.bodies[:, p].T
-        fields["body_mass"][:, model.jnt_bodyid[joint]] = mass
-        fields["dof_damping"][:, joint], fields["jnt_stiffness"][:, joint] = damping, stiffness
-        fields["tendon_damping"][:, list(crossings)] = cross_damping[:, None]
-        fields["tendon_stiffness"][:, list(crossings)] = cross_stiffness[:, None]
-    return Variants(scene, fields)
+    fields = {name: np.tile(getattr(model, name).astype(float), (len(crowd), 1)) for name in names}
+    mass, damping, stiffness = _amounts(devices, placed)
+    for name, amount in mass.items():
+        fields["body_mass"][:, model.body(name).id] = amount
+    for name, amount in damping.items():
+        joint = name in mass
+        at = model.joint(name).id if joint else model.tendon(name).id
+        fields["dof_damping" if joint else "tendon_damping"][:, at] = amount
+        fields["jnt_stiffness" if joint else "tendon_stiffness"][:, at] = stiffness[name]
+    rows = (row for row, _ in _impedances(model))
+    stacked = (part.port.impedance for part in placed if part.port.impedance)
+    return Variants(scene, fields, tuple(_Felt(row, z) for row, z in zip(rows, stacked, strict=True)))

@@ -1,10 +1,15 @@
-"""Humans as a TOML file, one [[human]] per channel: how a human that was found is kept and replayed."""
+"""What a run is made of, read strictly from TOML: an unknown key or an impossible number never passes.
+
+A scenario holds devices, humans, environment, delays and timing of one loop. Humans may come from a file of their own,
+one [[human]] per channel: how a human that was found is kept and replayed.
+"""
 
 from __future__ import annotations
 
 import difflib
 import hashlib
 import re
+import runpy
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,16 +25,12 @@ from models.device import MOST_DAMPING, Device, passivity_level, require, with_d
 from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
 from sim.files import InputError, write
 
-# ----------------------------------------------------------------------------------------------------
-# What a run is made of, read strictly from TOML: an unknown key or an impossible number never passes.
-
-
 CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
 LONGEST_DELAY = 1000  # [samples]; every one is a state
-Delays = tuple[int, ...]
+_Delays = tuple[int, ...]
 
 
 class Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -51,13 +52,13 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str
     T: float  # sampling period [s]
-    theta: Delays  # transmission delays [samples] (4)
-    psi: Delays  # environment delays [samples] (5)
+    theta: _Delays  # transmission delays [samples] (4)
+    psi: _Delays  # environment delays [samples] (5)
     device: tuple[Device, ...]
     human: tuple[Human, ...]
     environment: Network
     box: Box | None = None  # what else the environment may be
-    lam: Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
+    lam: _Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
     person: tuple[Person, ...] = ()  # those who hold several devices
     tap: Tap | None = None
     duration: float = 15.0  # [s]
@@ -78,7 +79,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if lam > self.theta[i] + self.psi[i]:
                 total = self.theta[i] + self.psi[i]
                 raise ValueError(f"lam[{i}] is {lam}, allowed are 0 to theta + psi = {total} samples")
-        check_holds(self.person, self.channels)
+        check_holds([person.holds for person in self.person], self.channels)
         if self.jitter:
             self._check_jitter(self.jitter)
         if self.box and self.environment.walls:
@@ -126,7 +127,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def digest(self) -> str:
         """SHA-256 over the scenario's contents."""
-        return hashlib.sha256(msgspec.json.encode(self, order="sorted")).hexdigest()
+        return hashlib.sha256(msgspec.json.encode(self, order="sorted", enc_hook=_contents)).hexdigest()
 
     def reference_delays(self, case: str) -> tuple[int, ...]:
         """Lambda of a case: what `lam` says, else 0 in case II and theta + psi otherwise. Raises InputError."""
@@ -151,17 +152,22 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping [N s/m].
 
-        As strict as a file, and what comes out is what a file would have given: lists become tuples.
+        As strict as a file, and what comes out is what a file would have given: lists become tuples. Humans may also
+        be of a user's own class (models.human.Hand), and so may a population with `draw(rng, n)`, n humans.
         Raises InputError naming the field, what came and what is allowed.
         """
         fields = {name: getattr(self, name) for name in self.__struct_fields__} | changes
+        own = {name: fields.pop(name) for name in ("human", "population") if _is_own(name, fields[name])}
         try:
             if delta is not None:
                 damping = _strictly({"delta": delta}, _Damping).delta
                 if len(damping) != self.channels:
                     raise InputError(f"delta has {len(damping)} entries for {self.channels} channels")
                 fields["device"] = tuple(with_damping(d, b) for d, b in zip(self.device, damping, strict=True))
-            return _strictly(fields, type(self))
+            if "human" in own:
+                fields["human"] = [_NOBODY] * len(own["human"])
+            made = _strictly(fields, type(self))
+            return msgspec.structs.replace(made, **{name: _kept(value) for name, value in own.items()})
         except InputError:
             raise
         except ValueError as error:
@@ -174,13 +180,7 @@ def load(source: str | Path = DEFAULT) -> Scenario:
         kind = type(source).__name__
         raise InputError(f"scenario is {source!r} ({kind}), expected a TOML file or one of: {', '.join(built_in())}")
     path = SCENARIOS / f"{source}.toml" if str(source) in built_in() else Path(source)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        names = ", ".join(built_in())
-        raise InputError(f"scenario {source}: {error.strerror}; give a TOML file or one of: {names}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"scenario {source}: not a text file in UTF-8") from None
+    text = _read(path, f"scenario {source}", f"; give a TOML file or one of: {', '.join(built_in())}")
     return parse(text, str(source))
 
 
@@ -188,18 +188,118 @@ def parse(text: str, source: str = "scenario") -> Scenario:
     """A scenario from TOML text. Raises InputError, with the path of the field and the value that came."""
     if not isinstance(text, str):
         raise TypeError(f"text is of type {type(text).__name__}, expected a str: the scenario itself, in TOML")
+    scenario: Scenario = _converted(text, Scenario, source)
+    try:
+        environment(scenario.environment, scenario.T)
+    except ValueError as error:
+        raise InputError(f"{source}: environment: {error}") from None
+    return scenario
+
+
+def built_in() -> list[str]:
+    """Names of the scenarios that come with the program."""
+    return sorted(path.stem for path in SCENARIOS.glob("*.toml"))
+
+
+def require_linear(scenario: Scenario, what: str) -> None:
+    """Raises InputError where a loop has walls or Coulomb friction, for what decides linear loops only."""
+    for i, device in enumerate(scenario.device):
+        if device.friction:
+            instead = "sim.run and sim.zwidth simulate it"
+            raise InputError(f"device[{i}].friction is {device.friction:g} N: {what} decides linear loops; {instead}")
+    if scenario.environment.walls:
+        raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
+
+
+def require_constant_delay(scenario: Scenario, what: str) -> None:
+    """Raises InputError where a scenario's delays vary, for what would not make them vary."""
+    if scenario.jitter is not None:
+        instead = "sim.run simulates it"
+        raise InputError(f"jitter: {what} takes the delays that its link has; take the table out, {instead}")
+
+
+# ---- humans in a file of their own
+
+
+class HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole file."""
+
+    human: tuple[Human, ...]
+    person: tuple[Person, ...] = ()
+
+
+def load_humans(path: str | Path, channels: int) -> HumanFile:
+    """The humans of a file, one per channel, and who holds several devices.
+
+    A Python file is run, and says who they are: `humans`, and `persons` if it likes, of any class (models.human.Hand).
+    Raises InputError with one line that names the file and the field.
+    """
+    what = "[[human]] tables"
+    if Path(path).suffix == ".py":
+        names, what = _run_file(path), "`humans`"
+        people = HumanFile(tuple(names.get("humans", ())), tuple(names.get("persons", ())))
+    else:
+        people = _converted(_read(Path(path), f"--human {path}"), HumanFile, f"--human {path}")
+    if len(people.human) != channels:
+        raise InputError(f"--human {path} has {len(people.human)} {what}, expected {channels} (one per channel)")
+    try:
+        check_holds([person.holds for person in people.person], channels)
+    except ValueError as error:
+        raise InputError(f"--human {path}: {error}") from None
+    return people
+
+
+def _run_file(path: str | Path) -> dict[str, Any]:
+    """The names that a Python file defines. Raises InputError where it cannot be read."""
+    try:
+        return runpy.run_path(str(path))
+    except OSError as error:
+        raise InputError(f"--human {path}: {error.strerror}") from None
+
+
+def save_humans(path: Path, humans: tuple[Any, ...], remark: str, persons: tuple[Person, ...] = ()) -> Path:
+    """Write humans and persons without voluntary motion so that reading gives the same numbers.
+
+    `remark` becomes a comment.
+    """
+    lines = [f"# {line}" for line in remark.splitlines()]
+    for human in humans:
+        rows = (
+            f"    {{ mass = {x.mass!r}, damping = {x.damping!r}, stiffness = {x.stiffness!r} }}," for x in human.links
+        )
+        lines += ["", "[[human]]", "links = [", *rows, "]"]
+    for person in persons:
+        body = [f"{name} = {getattr(person, name)!r}" for name in ("mass", "damping", "stiffness")]
+        cross = f"cross = {{ damping = {person.cross.damping!r}, stiffness = {person.cross.stiffness!r} }}"
+        lines += ["", "[[person]]", f"holds = {list(person.holds)}", *body, cross]
+    return write(path, "\n".join(lines) + "\n")
+
+
+# ---- strictness: what a file may hold, and how its errors are worded
+
+
+def _read(path: Path, name: str, hint: str = "") -> str:
+    """The text of a file that the user named. Raises InputError."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{name}: {error.strerror}{hint}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{name}: not a text file in UTF-8") from None
+
+
+def _converted(text: str, kind: Any, source: str) -> Any:
+    """TOML text as `kind`. Raises InputError with the path of the field and the value that came."""
     try:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{source}: not valid TOML: {error}") from None
     try:
-        scenario = msgspec.convert(raw, Scenario)
-        environment(scenario.environment, scenario.T)
+        return msgspec.convert(raw, kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_located(str(error), raw)}") from None
     except ValueError as error:
-        raise InputError(f"{source}: environment: {error}") from None
-    return scenario
+        raise InputError(f"{source}: {error}") from None
 
 
 class _Damping(msgspec.Struct, frozen=True):
@@ -232,9 +332,31 @@ def _plain(name: str, value: Any) -> Any:
     return msgspec.to_builtins(value, enc_hook=of_numpy)
 
 
-def built_in() -> list[str]:
-    """Names of the scenarios that come with the program."""
-    return sorted(path.stem for path in SCENARIOS.glob("*.toml"))
+_NOBODY = Human((Link(0.0, 0.0, 0.0),))
+
+
+def _is_own(name: str, value: Any) -> bool:
+    """Whether some of these humans, or this population, are of a user's own class, which no file could have given."""
+    if name == "population":
+        return callable(getattr(value, "draw", None)) and not isinstance(value, Population)
+    parts = value if isinstance(value, list | tuple) else ()
+    return any(hasattr(part, "port") and not isinstance(part, Human) for part in parts)
+
+
+def _kept(value: Any) -> Any:
+    """A user's own population as it is, or humans, each of which must be able to hold a device. Raises ValueError."""
+    if not isinstance(value, list | tuple):
+        return value
+    for i, human in enumerate(value):
+        if not (callable(getattr(human, "port", None)) and callable(getattr(human, "voluntary_force", None))):
+            raise ValueError(f"human[{i}] is {human!r}, expected a Human, or what has port() and voluntary_force(t)")
+        human.port()  # raises ValueError where it is not passive
+    return tuple(value)
+
+
+def _contents(part: Any) -> Any:
+    """What a user's own human or population is made of."""
+    return part.tolist() if isinstance(part, np.ndarray | np.generic) else [type(part).__qualname__, vars(part)]
 
 
 def _located(message: str, raw: dict[str, Any]) -> str:
@@ -272,54 +394,3 @@ _STRUCTS = (
     Scenario, Tap, Jitter, Human, Link, Voluntary, Person, Cross, Population, Network, Spring, Wall, Box,
     UncertainSpring, *get_args(Device)
 )  # fmt: skip
-
-
-class HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole file."""
-
-    human: tuple[Human, ...]
-    person: tuple[Person, ...] = ()
-
-
-def load_humans(path: str | Path, channels: int) -> HumanFile:
-    """The humans of a file, one per channel, and who holds several devices.
-
-    Raises InputError with one line that names the file and the field.
-    """
-    try:
-        people = msgspec.convert(tomllib.loads(Path(path).read_text(encoding="utf-8")), HumanFile)
-    except OSError as error:
-        raise InputError(f"--human {path}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"--human {path}: not a text file in UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"--human {path}: not valid TOML: {error}") from None
-    except msgspec.ValidationError as error:
-        raise InputError(f"--human {path}: {error}") from None
-    if len(people.human) != channels:
-        raise InputError(
-            f"--human {path} has {len(people.human)} [[human]] tables, expected {channels} (one per channel)"
-        )
-    try:
-        check_holds(people.person, channels)
-    except ValueError as error:
-        raise InputError(f"--human {path}: {error}") from None
-    return people
-
-
-def save_humans(path: Path, humans: tuple[Human, ...], remark: str, persons: tuple[Person, ...] = ()) -> Path:
-    """Write humans and persons without voluntary motion so that reading gives the same numbers.
-
-    `remark` becomes a comment.
-    """
-    lines = [f"# {line}" for line in remark.splitlines()]
-    for human in humans:
-        rows = (
-            f"    {{ mass = {x.mass!r}, damping = {x.damping!r}, stiffness = {x.stiffness!r} }}," for x in human.links
-        )
-        lines += ["", "[[human]]", "links = [", *rows, "]"]
-    for person in persons:
-        body = [f"{name} = {getattr(person, name)!r}" for name in ("mass", "damping", "stiffness")]
-        cross = f"cross = {{ damping = {person.cross.damping!r}, stiffness = {person.cross.stiffness!r} }}"
-        lines += ["", "[[person]]", f"holds = {list(person.holds)}", *body, cross]
-    return write(path, "\n".join(lines) + "\n")

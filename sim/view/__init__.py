@@ -1,1 +1,5 @@
-"""A window on the running loop. Only stage, live and offscreen know MuJoCo; the rest runs without a display."""
+"""The running loop in a window or as a film.
+
+events (keys, scripts, the loops that they lead to) <- session (clock, forces, mouse) <- stage (shapes, arrows, words)
+<- window (live) and film (pictures in a file). Only window needs a display.
+"""

@@ -1,4 +1,4 @@
-"""What may happen to a running loop: by a key in the window, or by a script at given times."""
+"""What may happen to a running loop, by a key or by a script, and the loop that comes of it, with its certificates."""
 
 from __future__ import annotations
 
@@ -6,15 +6,21 @@ import math
 import re
 from dataclasses import dataclass
 
-from sim.scenario import InputError
+from controller.coupling import Coupling
+from design.certificate import assess, promise_of
+from design.conditions import Requirement
+from design.designs import KINDS
+from sim.couplings import Chosen, choose
+from sim.run import Simulation, assemble
+from sim.scenario import LONGEST_DELAY, InputError, Scenario
+from sim.stability import Mode, worst_mode
 
 #: what a user calls a coupling -> what sim.couplings calls it
 COUPLINGS = {"none": "none", "published": "published", "designed": "spring-damper", "optimal": "optimal", "ccl": "ccl"}
 #: the other way round: a user may say it as the other commands do
 LABELS = {kind: label for label, kind in COUPLINGS.items()}
 GIVEN = "given"  # the coupling of --coupling FILE.json
-DELAYS = ("theta", "psi")
-STRONGEST = 100.0  # [N] a push
+_STRONGEST = 100.0  # [N] a push
 
 
 @dataclass(frozen=True)
@@ -28,7 +34,7 @@ class Couple:
 class Delay:
     """More or fewer samples of delay on every channel; the coupling stays as it is."""
 
-    which: str  # one of DELAYS
+    which: str  # theta or psi
     samples: int
 
 
@@ -69,10 +75,7 @@ def parse_script(text: str, channels: int) -> Script:
     script = []
     for entry in text.split():
         when, colon, what = entry.partition(":")
-        try:
-            time = float(when)
-        except ValueError:
-            time = math.nan
+        time = _number(when)
         if not colon or not 0 <= time <= 3600:
             raise InputError(f"--script: {entry!r}, expected SECONDS:EVENT with 0 to 3600 s")
         script.append((time, _event(entry, what, channels)))
@@ -103,15 +106,84 @@ def _event(entry: str, what: str, channels: int) -> Event:
         return Delay(delay[1], int(delay[2]))
     if push := re.fullmatch(r"push(\d{1,3})=([+-]?[\d.]+)", what):
         channel, force = int(push[1]), _number(push[2])
-        if 1 <= channel <= channels and abs(force) <= STRONGEST:
+        if 1 <= channel <= channels and abs(force) <= _STRONGEST:
             return Push(channel, force)
-        raise InputError(f"--script: {entry!r}, allowed are push1 to push{channels} with up to {STRONGEST:g} N")
+        raise InputError(f"--script: {entry!r}, allowed are push1 to push{channels} with up to {_STRONGEST:g} N")
     allowed = ", ".join((*COUPLINGS, GIVEN, "theta+1", "theta-1", "psi+1", "psi-1", "push1=3", "restart"))
     raise InputError(f"--script: {entry!r} is no event, allowed are {allowed}")
 
 
 def _number(text: str) -> float:
+    """What the text says, infinite where it is no number: that is never allowed."""
     try:
         return float(text)
     except ValueError:
         return math.inf
+
+
+# ----------------------------------------------------------------------------------------------------
+# A loop ready to be entered while another one runs: what a key asks for, with its growth rate and certificates.
+
+
+@dataclass(frozen=True)
+class Menu:
+    """What the keys choose from."""
+
+    case: str
+    condition: str | None = None  # what a coupling is designed for, by default its own
+    given: str | None = None  # the file of --coupling
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedLoop:
+    """A loop, and what can be said of it before it runs."""
+
+    menu: Menu
+    label: str  # as the user calls the coupling
+    chosen: Chosen
+    assembly: Simulation
+    mode: Mode  # of the exact linear loop; before walls, of the worst contact state
+    requirements: dict[str, Requirement]
+    promise: str | None
+
+    @property
+    def scenario(self) -> Scenario:
+        return self.assembly.scenario
+
+    @property
+    def coupling(self) -> Coupling:
+        return self.chosen.coupling
+
+
+def first_loop(menu: Menu, scenario: Scenario, label: str) -> PreparedLoop:
+    """The loop to begin with. Raises InputError, DesignFailed or SingularLoop."""
+    return _prepare(menu, scenario, label, _choose(menu, scenario, label))
+
+
+def changed(prepared: PreparedLoop, event: Couple | Delay) -> PreparedLoop:
+    """The loop after an event. Raises InputError, DesignFailed or SingularLoop; the old loop can go on."""
+    if isinstance(event, Couple):
+        chosen = _choose(prepared.menu, prepared.scenario, event.name)
+        return _prepare(prepared.menu, prepared.scenario, event.name, chosen)
+    delays = tuple(n + event.samples for n in getattr(prepared.scenario, event.which))
+    if not 0 <= min(delays) <= max(delays) <= LONGEST_DELAY:
+        raise InputError(f"{event.which} would be {list(delays)}, allowed are 0 to {LONGEST_DELAY} samples")
+    scenario = prepared.scenario.replace(None, **{event.which: delays})
+    return _prepare(prepared.menu, scenario, prepared.label, prepared.chosen)
+
+
+def _choose(menu: Menu, scenario: Scenario, label: str) -> Chosen:
+    if label == GIVEN:
+        if menu.given is None:
+            raise InputError("there is no coupling from a file (start with --coupling FILE.json)")
+        return choose(scenario, menu.case, menu.given)
+    name = COUPLINGS[label]
+    return choose(scenario, menu.case, name, menu.condition if name in KINDS else None)
+
+
+def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> PreparedLoop:
+    assembly, loop = assemble(scenario, chosen.coupling), scenario.loop(menu.case)
+    requirements = assess(loop, chosen.coupling, chosen.phi)
+    return PreparedLoop(
+        menu, label, chosen, assembly, worst_mode(assembly), requirements, promise_of(requirements, loop)
+    )

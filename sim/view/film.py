@@ -1,32 +1,248 @@
-"""Pictures one after the other as a file: GIF by Pillow, MP4 by ffmpeg where it is installed."""
+"""Pictures of frames, and films of them: by MuJoCo's renderer without a display, or flat without any OpenGL.
+
+The renderer is EGL, or OSMesa in software. A film is a GIF by Pillow, or an MP4 by ffmpeg where that is installed.
+"""
 
 from __future__ import annotations
 
+import importlib
+import os
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import BinaryIO
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 
+from controller.lti import Array
+from models.scene import Scene
 from sim.files import write
+from sim.graphics import asked
 from sim.scenario import InputError
-from sim.view.layout import ALARM, PALETTE, SIZE
+from sim.view.session import HISTORY, Frame
+from sim.view.stage import (
+    ALARM,
+    COLUMNS,
+    GREY,
+    LONGEST,
+    PALETTE,
+    PLOT,
+    SIZE,
+    STEP,
+    WORDS,
+    Colour,
+    Stage,
+    channels,
+    colour,
+    columns,
+    envelope,
+    overlay,
+    places,
+    scale,
+)
 
 Picture = NDArray[np.uint8]  # (height, width, 3)
 
-FORMATS = (".gif", ".mp4")
-COLOURS = 48  # of a GIF: few, so that it stays small
+_FORMATS = (".gif", ".mp4")
+_COLOURS = 48  # of a GIF: few, so that it stays small
+_BACKENDS = ("egl", "osmesa")
+_PATIENCE = 60  # [s] for a driver to say whether it works
+_BLACK, _LIGHT = (0, 0, 0), (205, 205, 205)
+
+_PROBE = "from mujoco.{} import GLContext; c = GLContext(8, 8); c.make_current(); c.free()"
+
+
+def painter(draw: str, scene: Scene, force_limit: Array) -> tuple[Flat | Offscreen, str, list[str]]:
+    """Who draws ("auto", "gl" or "flat"), under which name, and why not OpenGL where that is not there.
+
+    Raises InputError where it is not there and "gl" asks for it.
+    """
+    if draw == "flat":
+        return Flat(scene, force_limit), draw, []
+    try:
+        name = backend()
+    except NoOffscreen as error:
+        if draw == "gl":
+            raise InputError(f"--draw gl: {error}") from None
+        return Flat(scene, force_limit), "flat", [f"{error}: the bodies are drawn flat"]
+    return Offscreen(Stage(scene, force_limit), name), name, []
+
+
+class NoOffscreen(Exception):
+    """There is no OpenGL without a display here; the message says what was tried."""
+
+
+def backend() -> str:
+    """The name of a way to render without a display: what MUJOCO_GL asks for if it is one, else the first that works.
+
+    Each is tried in a process of its own, because a failed one leaves OpenGL unusable for the next. Raises NoOffscreen.
+    """
+    tried = (asked(),) if asked() in _BACKENDS else _BACKENDS
+    reasons = []
+    for name in tried:
+        reason = _failure(name)
+        if reason is None:
+            return name
+        reasons.append(f"{name}: {reason}")
+    raise NoOffscreen(f"no OpenGL without a display here ({'; '.join(reasons)})")
+
+
+class Offscreen:
+    """Renders frames of a stage."""
+
+    def __init__(self, stage: Stage, name: str) -> None:
+        """`name` is what backend() gave."""
+        self.stage = stage
+        width, height = SIZE
+        self._gl = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(stage.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._scene = mujoco.MjvScene(stage.model, 200)
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = 0
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = 0
+        self._option, self._grip, self._camera = mujoco.MjvOption(), mujoco.MjvPerturb(), mujoco.MjvCamera()
+        stage.aim(self._camera, (0.0, 0.0, 0.0), 1.3)
+
+    def picture(self, frame: Frame) -> Picture:
+        """(height, width, 3): what is said of the loop, the scene, the forces, from top to bottom."""
+        stage, (width, height) = self.stage, SIZE
+        stage.show(frame.q)
+        seen = self._option, self._grip, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(stage.model, stage.data, *seen, self._scene)
+        stage.draw(self._scene, frame)
+        below = round(PLOT * height)
+        top = round(WORDS * height)
+        mujoco.mjr_render(mujoco.MjrRect(0, below, width, height - below - top), self._scene, self._context)
+        above = mujoco.MjrRect(0, height - top, width, top)
+        mujoco.mjr_rectangle(above, 0.93, 0.93, 0.93, 1.0)
+        font, corner = mujoco.mjtFont.mjFONT_NORMAL, mujoco.mjtGridPos.mjGRID_TOPLEFT
+        mujoco.mjr_overlay(font, corner, above, *columns(overlay(frame, live=False)), self._context)
+        for place, figure in stage.figures(frame, mujoco.MjrRect(0, 0, width, height)):
+            mujoco.mjr_figure(place, figure, self._context)
+        pixels = np.empty((height, width, 3), dtype=np.uint8)
+        mujoco.mjr_readPixels(pixels, None, mujoco.MjrRect(0, 0, width, height), self._context)
+        return np.flipud(pixels)
+
+    def close(self) -> None:
+        """Free what the driver holds."""
+        self._context.free()
+        self._gl.free()
+
+
+def _failure(name: str) -> str | None:
+    """Why a way to render does not work here, None if it does."""
+    environment = {key: value for key, value in os.environ.items() if key not in ("PYOPENGL_PLATFORM", "MUJOCO_GL")}
+    environment["MUJOCO_GL"] = name
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE.format(name)],
+            capture_output=True,
+            text=True,
+            env=environment,
+            timeout=_PATIENCE,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return f"no answer in {_PATIENCE} s"
+    if done.returncode == 0:
+        return None
+    return (done.stderr.strip().splitlines() or [f"ended with {done.returncode}"])[-1]
+
+
+# ----------------------------------------------------------------------------------------------------
+# Flat pictures: the bodies as shapes on their rails, seen from above, and the forces, by Pillow.
+
+
+class Flat:
+    """Draws frames of a scene."""
+
+    def __init__(self, scene: Scene, force_limit: Array) -> None:
+        self.scene, self.force_limit = scene, force_limit
+        self._font = ImageFont.load_default(12)
+        self._places, self._channels = places(scene), channels(scene)
+
+    def picture(self, frame: Frame) -> Picture:
+        """(height, width, 3): what is said of the loop, the bodies, the forces, from top to bottom."""
+        image = Image.new("RGB", SIZE, "white")
+        pen = ImageDraw.Draw(image)
+        height = SIZE[1]
+        below = round((1 - PLOT) * height)
+        top = 8
+        for label, value in overlay(frame, live=False):
+            pen.text((8, top), label, _BLACK, self._font)
+            pen.text((130, top), value, _BLACK, self._font)
+            top += 15
+        self._bodies(pen, frame, max(top, round(WORDS * height)), below)
+        self._forces(pen, frame, below + 18, height - 18)
+        return np.asarray(image)
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def _bodies(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
+        steps = max(self._places) + 2
+        per_metre = (SIZE[0] - 120) / (steps * STEP + 2 * LONGEST)
+        origin, row = 60 + (LONGEST + STEP) * per_metre, (bottom - top) / self.scene.channels
+        size = min(14.0, 0.3 * row)
+        for i in range(self.scene.channels):
+            y = top + (i + 0.5) * row
+            pen.line((30, y, SIZE[0] - 30, y), _LIGHT, 2)
+        for place, i, q in zip(self._places, self._channels, frame.q, strict=True):
+            x, y = origin + (place * STEP + q) * per_metre, top + (i + 0.5) * row
+            corners = (x - size, y - size, x + size, y + size)
+            if place == 0:
+                pen.ellipse(corners, _rgb(colour(i)))
+                self._force(pen, frame, i, x, y - 0.45 * row, per_metre)
+            else:
+                pen.rectangle(corners, _rgb(GREY))
+
+    def _force(self, pen: ImageDraw.ImageDraw, frame: Frame, i: int, x: float, y: float, per_metre: float) -> None:
+        """The range of the force since the last frame, and its mean; the device feels -f."""
+        reach = per_metre * LONGEST / self.force_limit[i]
+        clipped = max(-frame.low[i], frame.high[i]) >= self.force_limit[i]
+        pen.line((x - frame.high[i] * reach, y, x - frame.low[i] * reach, y), _rgb(ALARM if clipped else colour(i)), 3)
+        pen.line((x, y + 4, x - frame.mean[i] * reach, y + 4), _rgb(colour(i)), 4)
+        if frame.push[i]:
+            pen.line((x, y + 9, x + frame.push[i] * reach, y + 9), _BLACK, 4)
+
+    def _forces(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
+        """One plot per device, side by side."""
+        m, most, middle = self.scene.channels, scale(frame.history), (top + bottom) / 2
+        low, high = envelope(frame.history, COLUMNS, round(HISTORY / frame.prepared.scenario.T))
+        width = (SIZE[0] - 20) / m
+        for i in range(m):
+            left, right = 50 + i * width, (i + 1) * width - 2
+            for value in (-most, 0.0, most):
+                y = middle - value / most * (bottom - top) / 2
+                pen.line((left, y, right, y), _LIGHT)
+                pen.text((left - 40, y - 7), f"{value:+g}" if value else "0", _BLACK, self._font)
+            pen.text((left, bottom + 2), f"force on device {i + 1} [N], last {HISTORY:g} s", _BLACK, self._font)
+            x = np.linspace(left, right, COLUMNS)
+            for j in np.flatnonzero(np.isfinite(low[:, i])):
+                ends = middle - np.array([low[j, i], high[j, i]]) / most * (bottom - top) / 2
+                pen.line((x[j], ends[0], x[j], ends[1] - 1), _rgb(colour(i)), 2)
+
+
+def _rgb(colour: Colour) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * part) for part in colour)
+    return red, green, blue
+
+
+# ----------------------------------------------------------------------------------------------------
+# Films.
 
 
 def check_film(path: Path) -> None:
     """Whether such a film can be written, before any work is done. Raises InputError."""
-    if path.suffix not in FORMATS:
-        raise InputError(f"--video {path}: the name must end in {' or '.join(FORMATS)}")
+    if path.suffix not in _FORMATS:
+        raise InputError(f"--video {path}: the name must end in {' or '.join(_FORMATS)}")
     if path.is_dir():
         raise InputError(f"--video {path}: is a folder, expected a file")
     if not path.parent.is_dir():
@@ -65,7 +281,7 @@ def _palette(first: Picture) -> Image.Image:
     shades = [np.multiply(colour, light) for colour in (*PALETTE, ALARM) for light in (1.0, 0.75, 0.5)]
     strip = np.repeat(np.array(shades) * 255, -(-first.shape[1] // len(shades)), axis=0)[: first.shape[1]]
     later = np.repeat(strip[None].astype(np.uint8), first.shape[0] // 4, axis=0)
-    return Image.fromarray(np.concatenate([first, later])).quantize(COLOURS, dither=Image.Dither.NONE)
+    return Image.fromarray(np.concatenate([first, later])).quantize(_COLOURS, dither=Image.Dither.NONE)
 
 
 def _mp4(path: Path, pictures: Iterable[Picture], fps: float) -> int:

@@ -1,9 +1,14 @@
-"""The running loop behind the window: a clock, keys and pushes go in, frames come out. It knows no display.
+"""The running loop behind the window: a clock, keys, pushes and the mouse go in, frames come out. It knows no display.
 
 When the coupling or a delay is changed while the loop runs, the plant goes on from where it is, position and velocity.
 The new process begins at rest with the devices held where they are, z = A z + B x: its delay lines hold the
 force F(1) x, and nothing starts with a step in x. The force changes to what the new coupling makes of that
 position; what the environment's masses had of motion is lost.
+
+The mouse is a hand: a spring and a damper between the handle and the point that it drags. It is part of the plant, so
+it is held exactly and is as passive as any other human: a certificate that covers every passive human covers this one.
+Only its end moves with the mouse, as in a voluntary motion. A force computed from one picture to the next would be no
+such hand: it comes too late, and sets a certified loop in motion by itself.
 """
 
 from __future__ import annotations
@@ -11,20 +16,79 @@ from __future__ import annotations
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
+from typing import Any
 
 import numpy as np
 
-from controller.lti import Array, Lti
-from controller.process import Tape
-from sim.engines import ExactEngine, outside_forces
-from sim.run import stretch
-from sim.view.events import Couple, Delay, Event, Push, Restart, Script, words
-from sim.view.grip import Grip, gripped
-from sim.view.pace import LONGEST_LAG, Pace
-from sim.view.setting import Setting, attempt, changed
+from controller.lti import Array, Lti, SingularLoop
+from controller.process import StepBuffer
+from design.certificate import certificate_part, finite
+from design.result import DesignFailed
+from models.scene import Plant, Scene, plant
+from sim.engines import ExactEngine, HeldPlant, hold
+from sim.run import outside_forces, run_block
+from sim.scenario import InputError
+from sim.view.events import Couple, Delay, Event, PreparedLoop, Push, Restart, Script, changed, words
 
 HISTORY = 4.0  # [s] of forces that are kept for the picture
-STRETCH = 64  # ticks between two looks at what is due
+_STRETCH = 64  # ticks between two looks at what is due
+LONGEST_LAG = 0.1  # [s] what a window may make up in one go; more is dropped and counted
+STIFFNESS, DAMPING = 200.0, 3.0  # [N/m], [N s/m] of the mouse's hand: as firm as the hands of the default scenario
+
+
+@dataclass
+class Pace:
+    """Ticks of T seconds against a clock that is read from outside and began at 0."""
+
+    T: float  # [s]
+    patience: float = LONGEST_LAG  # [s]
+    done: int = 0  # ticks
+    overruns: int = 0  # how often the loop fell behind by more than `patience`
+    lost: float = 0.0  # [s] clock time that no tick was made for
+
+    def due(self, now: float) -> int:
+        """Ticks to be made now, so that the next one lies in the future; they count as done."""
+        # a clock that is a rounding error short of a tick has reached it
+        ticks = max(0, int((now - self.lost) / self.T + 1e-6) - self.done)
+        most = self.patience / self.T
+        if ticks > most:
+            most = int(most)
+            self.overruns += 1
+            self.lost += (ticks - most) * self.T
+            ticks = most
+        self.done += ticks
+        return ticks
+
+    def factor(self, now: float) -> float:
+        """Simulated over clock time: 1 where nothing was lost."""
+        return self.done * self.T / now if now > self.T else 1.0
+
+
+@dataclass(frozen=True)
+class Grip:
+    """Which handle is held, and where it is drawn to."""
+
+    channel: int  # counted from 0
+    target: float  # [m] displacement of the handle
+
+    @property
+    def pull(self) -> float:
+        """Force [N] of the hand on a handle that rests at 0."""
+        return STIFFNESS * self.target
+
+    def force(self, scene: Scene, s: Array) -> float:
+        """Force [N] of the hand on the handle in the plant state s, positions and velocities."""
+        joint, n = scene.handles[self.channel], scene.model.nq
+        return self.pull - STIFFNESS * float(s[joint]) - DAMPING * float(s[n + joint])
+
+
+def gripped(scene: Scene, channel: int, T: float) -> HeldPlant:
+    """The plant with the hand's spring and damper on a handle, its end at rest."""
+    free, joint, n = plant(scene.model), scene.handles[channel], scene.model.nq
+    A, at_handle = free.A.copy(), free.B[:, scene.tapped[channel]]
+    A[:, joint] -= STIFFNESS * at_handle
+    A[:, n + joint] -= DAMPING * at_handle
+    return hold(Plant(A, free.B, free.C), T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +103,7 @@ class Frame:
     push: Array  # (m,) force of the mouse or the script on each handle [N]
     history: Array  # (ticks, m) force fed back over the last HISTORY seconds [N]
     clipped: int  # ticks with a force at its limit, in `history`
-    setting: Setting
+    prepared: PreparedLoop
     note: str  # what was last asked for and came or did not
     overruns: int
     lost: float  # [s]
@@ -50,29 +114,31 @@ class Session:
     """The closed loop, advanced to wherever the clock is."""
 
     def __init__(
-        self, setting: Setting, executor: Executor, script: Script = (), patience: float = LONGEST_LAG
+        self, prepared: PreparedLoop, executor: Executor, script: Script = (), patience: float = LONGEST_LAG
     ) -> None:
         """`executor` makes what keys ask for, while the loop goes on; a script's loops are made here, beforehand.
 
         The clock begins at 0; what it runs ahead by more than `patience` [s] is not made up.
 
-        Raises what sim.view.setting.changed raises where an event of the script is impossible.
+        Raises what `changed` raises where an event of the script is impossible.
         """
-        self.setting = setting
-        self.pace = Pace(setting.scenario.T, patience)
+        self.prepared = prepared
+        self.pace = Pace(prepared.scenario.T, patience)
         self.keys: SimpleQueue[Event] = SimpleQueue()
         self.clipped = 0  # ticks, since the start
-        self.log: list[tuple[float, str, Setting]] = [(0.0, "start", setting)]  # time [s], what was asked for, the loop
+        self.log: list[tuple[float, str, PreparedLoop]] = [
+            (0.0, "start", prepared)
+        ]  # time [s], what was asked for, the loop
         self.script_ends = script[-1][0] if script else 0.0  # [s]
-        self._executor, self._latest = executor, setting
-        self._wanted: list[tuple[Event, Future[Setting | str]]] = []
-        self._script = _rehearsed(setting, script)
+        self._executor, self._latest = executor, prepared
+        self._wanted: list[tuple[Event, Future[PreparedLoop | str]]] = []
+        self._script = _rehearsed(prepared, script)
         self._tick = 0
-        self._pushed = np.zeros(setting.scenario.channels)  # by the script
-        self._history = np.zeros((max(1, round(HISTORY / setting.scenario.T)), setting.scenario.channels))
+        self._pushed = np.zeros(prepared.scenario.channels)  # by the script
+        self._history = np.zeros((max(1, round(HISTORY / prepared.scenario.T)), prepared.scenario.channels))
         self._grip: Grip | None = None
         self._note = ""
-        self._enter(setting, np.zeros(setting.assembly.plant.A.shape[0]))
+        self._enter(prepared, np.zeros(prepared.assembly.plant.A.shape[0]))
 
     @property
     def t(self) -> float:
@@ -93,11 +159,11 @@ class Session:
         self._run(self.pace.due(now))
         push = self._pushed.copy()
         if grip:
-            push[grip.channel] += grip.force(self.setting.assembly.scene, self.state)
+            push[grip.channel] += grip.force(self.prepared.assembly.scene, self.state)
         made = self._history[-min(self._tick - first, len(self._history)) :] if self._tick > first else None
         recent = self._history[-1:] if made is None else made
         shown = self._history[-max(1, min(self._tick, len(self._history))) :]
-        n, limit = self.setting.assembly.scene.model.nq, self.setting.assembly.process.force_limit
+        n, limit = self.prepared.assembly.scene.model.nq, self.prepared.assembly.process.force_limit
         return Frame(
             t=self.t,
             q=self.state[:n],
@@ -107,7 +173,7 @@ class Session:
             push=push,
             history=shown.copy(),
             clipped=int((np.abs(shown) >= limit).any(axis=1).sum()),
-            setting=self.setting,
+            prepared=self.prepared,
             note=self._note,
             overruns=self.pace.overruns,
             lost=self.pace.lost,
@@ -126,18 +192,19 @@ class Session:
             else:
                 self._happen(event)
 
-    def _make(self, event: Couple | Delay) -> Setting | str:
-        """Runs in the executor, one after the other: each event changes what the one before has made."""
-        outcome = attempt(self._latest, event)
-        if isinstance(outcome, Setting):
-            self._latest = outcome
-        return outcome
+    def _make(self, event: Couple | Delay) -> PreparedLoop | str:
+        """The loop after an event, or why there is none. The executor makes one after the other."""
+        try:
+            self._latest = changed(self._latest, event)
+        except (InputError, DesignFailed, SingularLoop) as error:  # the old loop goes on
+            return " ".join(str(error).split())
+        return self._latest
 
     def _take_finished(self) -> None:
         while self._wanted and self._wanted[0][1].done():
             event, future = self._wanted.pop(0)
             outcome = future.result()
-            if isinstance(outcome, Setting):
+            if isinstance(outcome, PreparedLoop):
                 self._switch(event, outcome)
             else:
                 self._note = f"{words(event)}: {outcome}"
@@ -146,25 +213,25 @@ class Session:
         end = self._tick + ticks
         while self._tick < end:
             while self._script and self._script[0][0] <= self._tick:
-                _, event, setting = self._script.pop(0)
-                if setting is None:
+                _, event, prepared = self._script.pop(0)
+                if prepared is None:
                     self._happen(event)
                 else:
-                    self._latest = setting
-                    self._switch(event, setting)
+                    self._latest = prepared
+                    self._switch(event, prepared)
             until = min(end, self._script[0][0]) if self._script else end
-            self._advance(min(STRETCH, until - self._tick))
+            self._advance(min(_STRETCH, until - self._tick))
 
     def _advance(self, count: int) -> None:
-        tape, scene = self._tape, self.setting.assembly.scene
-        w = outside_forces(self.setting.scenario, scene, self._tick, count)
+        tape, scene = self._tape, self.prepared.assembly.scene
+        w = outside_forces(self.prepared.scenario, scene, self._tick, count)
         for column, force in zip(scene.tapped, self._pushed, strict=True):
             w[:, column] += force
         if self._grip:
             w[:, scene.tapped[self._grip.channel]] += self._grip.pull
         tape.w[:count] = w[:, :, None]
         with np.errstate(over="ignore", invalid="ignore"):  # a process that runs away is noticed below
-            stretch(tape, self._engine, count)
+            run_block(tape, self._engine, count)
         self._tick += count
         if not (np.isfinite(tape.s[: count + 1]).all() and np.isfinite(tape.z[: count + 1]).all()):
             self._happen(Restart())
@@ -180,22 +247,22 @@ class Session:
         if isinstance(event, Push):
             self._pushed[event.channel - 1] = event.force
         elif isinstance(event, Restart):
-            self._enter(self.setting, np.zeros_like(self.state))
+            self._enter(self.prepared, np.zeros_like(self.state))
         self._note = words(event)
 
-    def _switch(self, event: Event, setting: Setting) -> None:
-        self._enter(setting, self.state)
+    def _switch(self, event: Event, prepared: PreparedLoop) -> None:
+        self._enter(prepared, self.state)
         self._note = words(event)
-        self.log.append((self.t, words(event), setting))
+        self.log.append((self.t, words(event), prepared))
 
-    def _enter(self, setting: Setting, s: Array) -> None:
+    def _enter(self, prepared: PreparedLoop, s: Array) -> None:
         """Go on with another process from the plant state s."""
-        process = setting.assembly.process
-        outside = setting.assembly.plant.B.shape[1] - process.channels
-        tape = Tape(process, STRETCH, s.size, outside)
+        process = prepared.assembly.process
+        outside = prepared.assembly.plant.B.shape[1] - process.channels
+        tape = StepBuffer(process, _STRETCH, s.size, outside)
         tape.s[0, :, 0] = s
         tape.z[0, :, 0] = rest(process.F, s[: process.channels])
-        self.setting, self._tape = setting, tape
+        self.prepared, self._tape = prepared, tape
         self._start_engine()
 
     def _hold(self, grip: Grip | None) -> None:
@@ -206,7 +273,7 @@ class Session:
 
     def _start_engine(self) -> None:
         """The plant, with the mouse's hand where there is one, on the present tape."""
-        assembly, held = self.setting.assembly, self._grip
+        assembly, held = self.prepared.assembly, self._grip
         plant = gripped(assembly.scene, held.channel, assembly.scenario.T) if held else assembly.plant
         self._engine = ExactEngine(plant, assembly.process.force_limit)
         self._engine.start(self._tape)
@@ -220,12 +287,34 @@ def rest(F: Lti, x: Array) -> Array:
     return np.asarray(np.linalg.lstsq(np.eye(F.order) - F.A, F.B @ x, rcond=None)[0], dtype=np.float64)
 
 
-def _rehearsed(setting: Setting, script: Script) -> list[tuple[int, Event, Setting | None]]:
+def _rehearsed(prepared: PreparedLoop, script: Script) -> list[tuple[int, Event, PreparedLoop | None]]:
     """The script with the tick of each event and the loop that it leads to."""
     made = []
     for time, event in script:
         into = None
         if isinstance(event, Couple | Delay):
-            into = setting = changed(setting, event)
-        made.append((round(time / setting.scenario.T), event, into))
+            into = prepared = changed(prepared, event)
+        made.append((round(time / prepared.scenario.T), event, into))
     return made
+
+
+def session_report(session: Session) -> dict[str, Any]:
+    """How long it ran, what was changed when, and what could be said of each loop."""
+    return {
+        "scenario": session.prepared.scenario.name,
+        "simulated_s": session.t,
+        "clipped_ticks": session.clipped,
+        "events": [{"t_s": t, "event": what, **_facts(prepared)} for t, what, prepared in session.log],
+    }
+
+
+def _facts(prepared: PreparedLoop) -> dict[str, Any]:
+    return {
+        "coupling": prepared.label,
+        "theta": list(prepared.scenario.theta),
+        "psi": list(prepared.scenario.psi),
+        "exact_growth_rate_per_s": finite(float(prepared.mode.growth)),
+        "exact_frequency_hz": float(prepared.mode.frequency_hz),
+        "certificates": {name: certificate_part(need) for name, need in prepared.requirements.items()},
+        "promise": prepared.promise,
+    }

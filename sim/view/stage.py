@@ -1,38 +1,146 @@
-"""The scene as it is shown: the loop's own bodies with shapes on them, arrows for the forces, and what the mouse holds.
+"""What a picture shows, whoever draws it: where things stand and in which colours, what is said, arrows and plots.
 
-A dressed copy only. What is simulated stays as small as models.scene builds it; the shapes have no mass and touch
-nothing, so both models have the same matrices.
+The scene as it is shown is a dressed copy. What is simulated stays as small as models.scene builds it; the shapes have
+no mass and touch nothing, so both models have the same matrices.
 """
 
 from __future__ import annotations
+
+import textwrap
 
 import mujoco
 import numpy as np
 
 from controller.lti import Array
+from design.conditions import Requirement
 from models.scene import Scene
-from sim.view.grip import Grip
-from sim.view.layout import (
-    ALARM,
-    APART,
-    COLUMNS,
-    GREY,
-    LONGEST,
-    PLOT,
-    SIZE,
-    STEP,
-    channels,
-    colour,
-    envelope,
-    places,
-    scale,
+from sim.view.events import GIVEN, KEYS, Couple, words
+from sim.view.session import HISTORY, Frame, Grip
+
+Colour = tuple[float, float, float]
+Lines = list[tuple[str, str]]
+
+#: Okabe and Ito's palette, one colour per device
+PALETTE: tuple[Colour, ...] = (
+    (0.0, 0.45, 0.70),
+    (0.84, 0.37, 0.0),
+    (0.0, 0.62, 0.45),
+    (0.8, 0.47, 0.65),
+    (0.34, 0.71, 0.91),
+    (0.9, 0.6, 0.0),
 )
-from sim.view.session import HISTORY, Frame
+GREY: Colour = (0.55, 0.55, 0.58)
+ALARM: Colour = (1.0, 0.15, 0.15)  # a force at its limit
+
+_APART = 0.11  # [m] between devices, across their motion
+STEP = 0.09  # [m] between the bodies of one device at rest, along their motion
+LONGEST = 0.12  # [m] arrow of a force at its limit
+SIZE = (640, 640)  # pixels of a video
+WORDS = 0.40  # share of a video's height, at its top, that is left to words
+PLOT = 0.25  # share of the picture's height, at its bottom, that the forces take
+_WIDTH = 60  # characters of a line of words
+COLUMNS = 250  # spans of the plotted forces, each with its least and largest
 
 _BOX, _SPHERE, _ARROW, _BAR = (
     getattr(mujoco.mjtGeom, f"mjGEOM_{name}") for name in ("BOX", "SPHERE", "ARROW", "CAPSULE")
 )
 _MASSLESS = {"mass": 0, "contype": 0, "conaffinity": 0}
+
+
+def colour(channel: int) -> Colour:
+    """The colour of a device, counted from 0."""
+    return PALETTE[channel % len(PALETTE)]
+
+
+def channels(scene: Scene) -> tuple[int, ...]:
+    """The channel (from 0) that each joint belongs to; of a person's body, the first that the person holds."""
+    owner = {motor: motor for motor in range(scene.channels)}
+    for i, (_, *own) in enumerate(scene.points[: scene.channels]):
+        owner |= dict.fromkeys((scene.handles[i], *own), i)
+    for points in scene.points[scene.channels :]:
+        owner |= {joint: owner[points[0]] for joint in points if joint not in owner}
+    return tuple(owner[joint] for joint in range(scene.model.njnt))
+
+
+def places(scene: Scene) -> tuple[int, ...]:
+    """How many steps behind its handle each joint's body stands: 0 the handle, -1 a motor, 1.. a human's arm."""
+    place = dict.fromkeys(range(scene.channels), -1)
+    for points in scene.points[: scene.channels]:
+        place |= {joint: step for step, joint in enumerate(points)}
+    behind = 1 + max(place.values())
+    return tuple(place.get(joint, behind) for joint in range(scene.model.njnt))
+
+
+def scale(history: Array) -> float:
+    """A power of two [N] above every force."""
+    return float(2.0 ** np.ceil(np.log2(max(1.0, 1.05 * np.abs(history).max(initial=0.0)))))
+
+
+def envelope(history: Array, columns: int, ticks: int) -> tuple[Array, Array]:
+    """Least and largest force in `columns` equal spans of the last `ticks` ticks, (columns, m) each.
+
+    Where the history is shorter than that, the spans before it are not-a-number.
+    """
+    padded = np.full((ticks, history.shape[1]), np.nan)
+    recent = history[-ticks:]
+    padded[ticks - len(recent) :] = recent
+    first = np.linspace(0, ticks, columns, endpoint=False).astype(int)
+    return np.fmin.reduceat(padded, first, axis=0), np.fmax.reduceat(padded, first, axis=0)
+
+
+def overlay(frame: Frame, live: bool) -> Lines:
+    """Labels and values; `live` adds the clock, which a video has none of."""
+    prepared, scenario = frame.prepared, frame.prepared.scenario
+    delays = f"theta {_list(scenario.theta)}, psi {_list(scenario.psi)} samples of {1e3 * scenario.T:g} ms"
+    mode, here = prepared.mode, prepared.requirements["closed-loop"]
+    lines = [
+        ("coupling", prepared.label),
+        ("delays", delays),
+        ("growth", f"{mode.growth:+.3g} 1/s at {mode.frequency_hz:.1f} Hz: {mode.verdict}"),
+        ("this environment", _needs(here)),
+        ("any environment", _needs(prepared.requirements["theorem4"])),
+        ("largest force", f"{np.abs(frame.history).max():.2f} N in {HISTORY:g} s, {frame.clipped} ticks at the limit"),
+    ]
+    if np.any(frame.push):
+        lines.append(("push", f"{', '.join(f'{p:+.2f}' for p in frame.push)} N"))
+    clock = f"{frame.t:.1f} s"
+    lines.append(("time", clock if not live else f"{clock}, real time x {frame.factor:.2f}"))
+    if live:
+        lines.append(("clock", f"{frame.overruns} overruns, {frame.lost:.2f} s lost"))
+    if frame.note:
+        first, *rest = textwrap.wrap(frame.note, _WIDTH)
+        lines += [("last", first), *(("", line) for line in rest)]
+    return lines
+
+
+def _needs(requirement: Requirement) -> str:
+    """Required against available damping of the worst channel, and the verdict."""
+    if not np.isfinite(requirement.ratio):
+        return "no certificate"
+    worst = int(np.argmax(np.divide(requirement.required, requirement.available)))
+    need, have = requirement.required[worst], requirement.available[worst]
+    return f"needs {need:.3f} of {have:g} N s/m: {'certified' if requirement.certified else 'NOT certified'}"
+
+
+def keys_help(given: bool) -> Lines:
+    """The keys and what they ask for; `given` where there is a coupling from a file. The mouse comes last."""
+    keys = [(name, words(event)) for name, event in KEYS.values() if given or event != Couple(GIVEN)]
+    return [*keys, ("double click", "take a body"), ("Ctrl+right", "draw it")]
+
+
+def apart(lines: Lines) -> tuple[Lines, Lines]:
+    """The lines, and what was last refused, where that takes several lines."""
+    at = next((i for i, (label, _) in enumerate(lines) if label == "last"), len(lines))
+    return (lines[:at], lines[at:]) if len(lines) - at > 1 else (lines, [])
+
+
+def columns(lines: Lines) -> tuple[str, str]:
+    """Labels and values as MuJoCo's overlays take them."""
+    return "\n".join(label for label, _ in lines), "\n".join(value for _, value in lines)
+
+
+def _list(values: tuple[int, ...]) -> str:
+    return ", ".join(map(str, values))
 
 
 class Stage:
@@ -79,7 +187,7 @@ class Stage:
         """The forces of the last seconds, side by side at the bottom of a picture."""
         m = self.scene.channels
         width, height = picture.width // m, round(PLOT * picture.height)
-        low, high = envelope(frame.history, COLUMNS, round(HISTORY / frame.setting.scenario.T))
+        low, high = envelope(frame.history, COLUMNS, round(HISTORY / frame.prepared.scenario.T))
         top, drawn = scale(frame.history), []
         for i in range(m):
             place = mujoco.MjrRect(picture.left + i * width, picture.bottom, width, height)
@@ -103,18 +211,18 @@ def dressed(scene: Scene, size: tuple[int, int] = SIZE) -> mujoco.MjModel:
     where = places(scene)
     for joint, (place, channel) in enumerate(zip(where, channels(scene), strict=True)):
         body = spec.body(scene.model.joint(joint).name)
-        body.pos = [place * STEP, channel * -APART, 0.03]
+        body.pos = [place * STEP, channel * -_APART, 0.03]
         if place == 0:
             body.add_geom(type=_SPHERE, size=[0.024] * 3, rgba=(*colour(channel), 1.0), **_MASSLESS)
         else:
             body.add_geom(type=_BOX, size=[0.022, 0.026, 0.022], rgba=(*GREY, 1.0), **_MASSLESS)
     deepest = max(1, *where)
-    middle = [(deepest - 1) * STEP / 2, -APART * (scene.channels - 1) / 2, 0.03]
+    middle = [(deepest - 1) * STEP / 2, -_APART * (scene.channels - 1) / 2, 0.03]
     for channel in range(scene.channels):
-        at, rail = [middle[0], -APART * channel, 0.0], [0.5 * STEP * (deepest + 1) + 0.06, 0.012, 0.004]
+        at, rail = [middle[0], -_APART * channel, 0.0], [0.5 * STEP * (deepest + 1) + 0.06, 0.012, 0.004]
         spec.worldbody.add_geom(type=_BOX, pos=at, size=rail, rgba=[0.8, 0.8, 0.8, 1], **_MASSLESS)
     spec.stat.center = middle
-    spec.stat.extent = 0.24 + 0.5 * STEP * deepest + 0.5 * APART * (scene.channels - 1)
+    spec.stat.extent = 0.24 + 0.5 * STEP * deepest + 0.5 * _APART * (scene.channels - 1)
     return spec.compile()
 
 

@@ -16,24 +16,19 @@ from PIL import Image
 
 from cli import view as command
 from controller.coupling import SpringDamper
-from models.human import Human, Link
+from models.human import Human, Link, Person
 from models.scene import build, plant
 from sim.couplings import Chosen
 from sim.engines import hold
-from sim.run import simulate
+from sim.run import run as close_loop
 from sim.scenario import InputError, load
 from sim.stability import close, dominant_mode
-from sim.view import film, offscreen
-from sim.view.events import GIVEN, KEYS, Delay, Push, Restart, parse_script, words
-from sim.view.flat import Flat
-from sim.view.grip import DAMPING, STIFFNESS, Grip, gripped
-from sim.view.layout import COLUMNS, channels, envelope, places, scale
-from sim.view.live import loop, typed
-from sim.view.overlay import apart, keys_help, overlay
-from sim.view.pace import Pace
-from sim.view.session import Session, rest
-from sim.view.setting import Menu, changed, first_setting
-from sim.view.stage import Stage, dressed
+from sim.view import film
+from sim.view.events import GIVEN, KEYS, Delay, Menu, Push, Restart, changed, first_loop, parse_script, words
+from sim.view.film import Flat
+from sim.view.session import DAMPING, STIFFNESS, Grip, Pace, Session, gripped, rest
+from sim.view.stage import COLUMNS, Stage, apart, channels, dressed, envelope, keys_help, overlay, places, scale
+from sim.view.window import loop, typed
 
 SCENARIO = load()
 
@@ -64,16 +59,16 @@ class Later(Executor):
 
 @pytest.fixture(scope="module")
 def none():
-    return first_setting(Menu("I"), SCENARIO, "none")
+    return first_loop(Menu("I"), SCENARIO, "none")
 
 
 @pytest.fixture(scope="module")
 def published():
-    return first_setting(Menu("I"), SCENARIO, "published")
+    return first_loop(Menu("I"), SCENARIO, "published")
 
 
-def session(setting, script="", patience=np.inf):
-    return Session(setting, Inline(), parse_script(script, 2) if script else (), patience)
+def session(prepared, script="", patience=np.inf):
+    return Session(prepared, Inline(), parse_script(script, 2) if script else (), patience)
 
 
 def press(running, *names):
@@ -91,10 +86,10 @@ def test_the_session_is_the_simulation(none):
     for now in np.cumsum(np.random.default_rng(1).uniform(0.001, 0.2, 12)):
         frame = running.frame(now)
     ticks = round(frame.t / SCENARIO.T)
-    record = simulate(none.assembly, "exact", samples=ticks + 1)
-    assert np.array_equal(running.state, record.s[ticks, :, 0])
-    assert np.array_equal(frame.history, record.f[:ticks, :, 0])
-    assert np.array_equal(frame.q, record.s[ticks, : frame.q.size, 0])
+    record = close_loop(none.assembly, "exact", ticks=ticks + 1)
+    assert np.array_equal(running.state, record.s[ticks])
+    assert np.array_equal(frame.history, record.f[:ticks])
+    assert np.array_equal(frame.q, record.s[ticks, : frame.q.size])
 
 
 def test_frames_tell_the_forces_since_the_last_one(none):
@@ -122,10 +117,10 @@ def test_a_switch_keeps_the_plant_and_starts_the_process_at_rest(none):
     running, alone = session(none), session(none)
     before = running.frame(0.5)
     press(running, "7")
-    assert running.frame(0.5).setting.label == "published"
+    assert running.frame(0.5).prepared.label == "published"
     alone.frame(0.5)
     assert np.array_equal(running.state, alone.state)  # position and velocity, although it moves
-    F, x = running.setting.assembly.F, before.q[:2]
+    F, x = running.prepared.assembly.F, before.q[:2]
     force = running.frame(0.5 + 1.01 * SCENARIO.T).history[-1]
     assert np.allclose(force, F.at(1.0 + 0j).real @ x, atol=1e-8)
 
@@ -134,25 +129,25 @@ def test_the_oscillation_starts_and_dies(none):
     """Without coupling and with more delay it grows to the limits; with the published gains and less it decays."""
     running = session(none, "0:theta+2 2.5:theta-3 2.5:published")
     grown = running.frame(2.5 - 1e-3)
-    assert grown.setting.mode.growth > 3
+    assert grown.prepared.mode.growth > 3
     assert grown.clipped > 100
     calm = running.frame(5.0)
-    assert calm.setting.mode.growth < 0
+    assert calm.prepared.mode.growth < 0
     assert np.abs(calm.history[-200:]).max() < 2  # the voluntary motion is still felt
     assert [what for _, what, _ in running.log] == ["start", "theta+2", "theta-3", "published"]
 
 
-def replace_theta(setting, theta):
-    return first_setting(setting.menu, SCENARIO.replace(theta=theta), setting.label)
+def replace_theta(prepared, theta):
+    return first_loop(prepared.menu, SCENARIO.replace(theta=theta), prepared.label)
 
 
 def test_a_process_that_runs_away_starts_again():
     """Soft springs and dampers against an environment with delay are unstable by themselves: radius 1.63."""
     soft = SpringDamper(np.array([879.0, 552.0]), np.array([0.39, 0.52]))  # the design for psi = 0
-    before = first_setting(Menu("I"), SCENARIO, "published")
-    setting = changed(replace(before, chosen=Chosen("spring-damper", soft, "theorem4")), Delay("psi", 1))
-    assert np.abs(setting.assembly.F.poles()).max() > 1.6
-    running = session(setting)
+    before = first_loop(Menu("I"), SCENARIO, "published")
+    prepared = changed(replace(before, chosen=Chosen("spring-damper", soft, "theorem4")), Delay("psi", 1))
+    assert np.abs(prepared.assembly.F.poles()).max() > 1.6
+    running = session(prepared)
     noted = [running.frame(t).note for t in (1.0, 2.0, 3.0)]  # 1.63^k passes 1e308 at k = 1450, 1.7 s
     assert "ran away, beyond all numbers: restarted from rest" in noted[1]
     assert np.isfinite(running.state).all()
@@ -178,11 +173,11 @@ def test_keys_that_cannot_be_met_leave_the_loop_running(none):
     running = session(none)
     press(running, "Down", "Down")  # theta is 1 and 2
     frame = running.frame(0.1)
-    assert frame.setting.scenario.theta == (0, 1)
+    assert frame.prepared.scenario.theta == (0, 1)
     assert frame.note == "theta-1: theta would be [-1, 0], allowed are 0 to 1000 samples"
     press(running, "Insert")
     assert "no coupling from a file" in running.frame(0.2).note
-    assert running.setting.label == "none"
+    assert running.prepared.label == "none"
 
 
 def test_the_loop_goes_on_while_a_coupling_is_made(none):
@@ -190,12 +185,12 @@ def test_the_loop_goes_on_while_a_coupling_is_made(none):
     running = Session(none, later)
     press(running, "7", "Up")
     frame = running.frame(0.1)
-    assert (frame.t > 0.09, frame.setting.label, frame.note) == (True, "none", "theta+1: being made")
+    assert (frame.t > 0.09, frame.prepared.label, frame.note) == (True, "none", "theta+1: being made")
     later.work()
-    made = running.frame(0.2).setting
+    made = running.frame(0.2).prepared
     assert (made.label, made.scenario.theta) == ("published", (1, 2))
     later.work()
-    delayed = running.frame(0.3).setting
+    delayed = running.frame(0.3).prepared
     assert delayed.scenario.theta == (2, 3)
     assert delayed.coupling is made.coupling  # a delay changes under a coupling, not with it
 
@@ -253,7 +248,7 @@ def test_the_mouse_is_one_more_passive_hand(none):
 
 
 def test_the_mouse_draws_the_handle_and_lets_it_go():
-    soft = replace_theta(first_setting(Menu("I"), SCENARIO, "published"), (0, 0))
+    soft = replace_theta(first_loop(Menu("I"), SCENARIO, "published"), (0, 0))
     assert dominant_mode(close(gripped(soft.assembly.scene, 1, SCENARIO.T), soft.assembly.F)).growth < 0
     running, quiet = session(soft), session(soft)
     handle = soft.assembly.scene.handles[1]
@@ -309,6 +304,14 @@ def test_every_body_has_its_place():
         "handle_2": (1, 0),
         "human_1_2": (0, 1),
     }
+
+
+def test_a_person_s_body_stands_behind_both_arms():
+    arm = Human((Link(0.3, 3, 200), Link(1, 2, 300)))
+    scene = build(SCENARIO.device, [arm, SCENARIO.human[1]], [Person((1, 2), 30.0, 80.0, 900.0)])
+    body = scene.model.joint("body_1").id
+    assert (channels(scene)[body], places(scene)[body]) == (0, 2)
+    assert np.array_equal(plant(dressed(scene)).A, plant(scene.model).A)
 
 
 def test_the_overlay_says_growth_and_certificates(none, published):
@@ -419,7 +422,7 @@ def test_keys_come_from_another_thread(none):
     thread = threading.Thread(target=press, args=(running, "Up"))
     thread.start()
     thread.join()
-    assert running.frame(0.1).setting.scenario.theta == (2, 3)
+    assert running.frame(0.1).prepared.scenario.theta == (2, 3)
 
 
 # films
@@ -467,15 +470,15 @@ def test_flat_pictures_show_where_things_are(none):
 @pytest.fixture(scope="module")
 def backend():
     try:
-        return offscreen.backend()
-    except offscreen.NoOffscreen as error:
+        return film.backend()
+    except film.NoOffscreen as error:
         pytest.skip(str(error))
 
 
 def test_pictures_by_opengl(backend, none):
     """The scene above, the forces below; the handles move with the positions."""
     stage = Stage(none.assembly.scene, none.assembly.process.force_limit)
-    painter = offscreen.Offscreen(stage, backend)
+    painter = film.Offscreen(stage, backend)
     try:
         frame = session(none).frame(0.05)
         one, again = painter.picture(frame), painter.picture(frame)
@@ -491,7 +494,7 @@ def test_pictures_by_opengl(backend, none):
 
 
 def test_without_opengl_there_are_flat_pictures_and_a_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(offscreen, "_failure", lambda name: "absent")
+    monkeypatch.setattr(film, "_failure", lambda name: "absent")
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     where = str(tmp_path / "a.gif")
     run("--coupling", "none", "--video", where, "--duration", "0.2")
@@ -502,10 +505,10 @@ def test_without_opengl_there_are_flat_pictures_and_a_line(tmp_path, monkeypatch
 
 
 def test_a_driver_that_fails_says_why(monkeypatch):
-    monkeypatch.setattr(offscreen, "_PROBE", "import sys; sys.exit('no such driver: {}')")
+    monkeypatch.setattr(film, "_PROBE", "import sys; sys.exit('no such driver: {}')")
     monkeypatch.setenv("MUJOCO_GL", "osmesa")  # asked for: nothing else is tried
-    with pytest.raises(offscreen.NoOffscreen, match=r"here \(osmesa: no such driver: osmesa\)"):
-        offscreen.backend()
+    with pytest.raises(film.NoOffscreen, match=r"here \(osmesa: no such driver: osmesa\)"):
+        film.backend()
 
 
 def test_an_interrupted_film_is_as_long_as_it_got(tmp_path, monkeypatch):
@@ -555,9 +558,9 @@ BAD = [
     (("--video", "a.png"), "--video a.png: the name must end in .gif or .mp4"),
     (("--video", "nowhere/a.gif"), "the folder nowhere does not exist"),
     (("--video", "/proc/a.gif"), "--video /proc/a.gif: cannot write to /proc"),
-    (("--video", "a.gif", "--fps", "12"), "--fps is 12, allowed are 1 to 100, and for a .gif only what divides 100"),
-    (("--video", "a.gif", "--duration", "0"), "--duration is 0, allowed are more than 0 and up to 3600 s"),
-    (("--video", "a.gif", "--duration", "-1"), "--duration is -1, allowed are more than 0 and up to 3600 s"),
+    (("--video", "a.gif", "--fps", "12"), "--fps is 12, allowed for a .gif are the numbers that divide 100"),
+    (("--video", "a.gif", "--duration", "0"), "--duration is 0, allowed are 0.001 to 3600 s"),
+    (("--video", "a.gif", "--duration", "-1"), "--duration is -1, allowed are 0.001 to 3600 s"),
     (
         ("--coupling", "soft"),
         "'soft', allowed are none, published, spring-damper, optimal, ccl, designed or a FILE.json",

@@ -1,0 +1,342 @@
+"""Energy budgets: forces are scaled so that no passive hand can be given more energy than was set aside for it.
+
+Three nets that stand under any controller, linear or not, proved or not, and two classics to compare them with:
+
+    EnergyBudget        before the delays, at the port of the devices
+    Shell               at the port of the environment, behind a coupling that is certified for any environment
+    PassivityControl    Hannaford & Ryu 2002, at each device: a baseline
+    EnergyBounding      Kim & Ryu 2010, per channel and for no delay: a baseline
+
+*The guarantee of the budget.* A device with its passive hand has sum -a'dx >= sum dx' Delta dx/T - E0, where a[k] is
+the force that acts in [kT, (k+1)T) (the device feels -a) and dx[k] = x[k+1] - x[k]. With delta' = (1 - eps) delta
+the budget keeps
+
+    W[k+1] = min(cap, W[k] + a[k]'dx[k] + dx[k]' Delta' dx[k]/T).
+
+For every dx the increment of a tick is at least -r(a), r(a) = sum_i T a_i^2/(4 delta'_i), by completing a square. So
+if the forces on their way may lose at most R, and R <= W, then W stays nonnegative until they have acted. A packet
+is sent as s times the wanted force with the largest s in [0, 1] that keeps R <= W. With s = 0 the new R is the old one
+less what the last tick may have lost, which W lost at most: so there is always such an s, and W >= 0 for ever. Since
+the cap only lowers W, sum (-a'dx - dx' Delta' dx/T) <= W0 - W <= W0 at every tick: beyond what the devices
+dissipate, devices and hands receive at most W0; and sum_i delta_i sum dx_i^2 <= (W0 + E0) T/eps.
+
+*Delays.* Tick t may use any packet of age lo to hi, and, where packets are lost, up to hold ticks older: then the
+device must drop its force to zero. So tick t may lose the largest r of these packets, channel by channel, and R is
+the sum over the ticks to come. Where delays do not vary the budget knows which force acted; else the device tells, and
+what it has not told yet is booked as the largest loss.
+
+*Encoder steps.* Positions rounded to steps q err by e, |e| <= q/2. Summed by parts, sum a'de costs at most q/2 for
+every newton by which the acting force changes, and |dx| is at least the measured one less q. So a tick with the
+measured dx is worth a dx + delta' max(0, |dx| - q)^2/T - q/2 (|a - a_-| + |a| - |a_-|) per channel, and loses r(a) +
+2 q |a| at most: the same argument with these two. A force that is held costs nothing, wherever the encoder dithers.
+
+Not covered: a device whose damping is less than delta, a hand that works. A period that varies is covered with T the
+largest period. docs/energy-budget.md has the proofs, and says when the budget never acts. The arrays are (m, nsim):
+channels and simulations.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from controller.lti import Array, Lti
+
+UNTOLD = 4096  # ticks that wait for the device's word; older ones stay booked as their largest loss
+HUGE = 1e12  # [N], from which a force is no number any more
+SHAVE = 1 - 1e-12  # of a scaled force, so that rounding takes nothing from the reserve
+
+
+class _Net:
+    """What budgets have in common: W of every simulation, its cap, and how often the net acted."""
+
+    def __init__(self, start: float, cap: float, nsim: int) -> None:
+        if not 0 <= start < np.inf:
+            raise ValueError(f"the budget starts with {start:g} J, expected a finite energy >= 0")
+        if not start <= cap:
+            raise ValueError(f"the budget's cap is {cap:g} J, expected at least its start, {start:g} J")
+        self.energy = np.full(nsim, float(start))  # (nsim,) W [J]
+        self.ticks = 0
+        self.limited = np.zeros(nsim, dtype=np.int64)  # (nsim,) ticks in which the wanted force was made smaller
+        self.least = np.ones(nsim)  # (nsim,) the smallest scale so far
+        self._cap = float(cap)
+
+    def _earn(self, increment: Array) -> None:
+        np.minimum(self.energy + increment, self._cap, out=self.energy)
+
+    def _count(self, scale: Array, spoilt: NDArray[np.bool_]) -> None:
+        self.ticks += 1
+        scale = np.where(spoilt, 0.0, scale)
+        self.limited += scale < 1
+        np.minimum(self.least, scale, out=self.least)
+
+
+class EnergyBudget(_Net):
+    """Scales the forces that are sent to the devices; see the head of this file.
+
+    A tick is one call of `limit`, which gives the force to send. Where delays vary, or packets are lost, the devices
+    tell which forces acted: at once (`acted`), later (`tell`) or never, which is safe and makes the budget poor.
+    """
+
+    def __init__(
+        self,
+        delta: ArrayLike,
+        T: float,
+        lo: ArrayLike,
+        hi: ArrayLike | None = None,
+        *,
+        hold: int = 0,
+        encoder_step: ArrayLike = 0.0,
+        eps: float = 0.05,
+        start: float = 0.0,
+        cap: float = np.inf,
+        nsim: int = 1,
+    ) -> None:
+        """`delta` (m,) damping that the devices guarantee [N s/m], `T` the (largest) period [s].
+
+        Packets take `lo` to `hi` (m,) samples (default: always lo); `hold` is for how many ticks more a device holds
+        a force whose successors are lost. `encoder_step` (m,) or one for all [m]: positions are rounded to it. `eps` is
+        the share of the damping that the budget leaves alone, `start` and `cap` are W0 and the most that W may be [J].
+        Raises ValueError for numbers out of range.
+        """
+        super().__init__(start, cap, nsim)
+        delta = np.array(delta, dtype=float)
+        lo = np.array(lo, dtype=np.int64)
+        oldest = (lo if hi is None else np.array(hi, dtype=np.int64)) + hold
+        if delta.ndim != 1 or lo.shape != delta.shape or oldest.shape != delta.shape:
+            shapes = f"{delta.shape}, {lo.shape} and {oldest.shape}"
+            raise ValueError(f"delta, lo and hi have the shapes {shapes}, expected one number per channel each")
+        if not ((delta > 0) & (delta < np.inf)).all() or not 0 < T < np.inf:
+            raise ValueError(f"delta is {delta.tolist()} and T is {T:g}, expected positive numbers")
+        if not 0 < eps < 1:
+            raise ValueError(f"eps is {eps:g}, expected a share between 0 and 1")
+        if hold < 0 or not ((lo >= 0) & (lo <= oldest - hold)).all():
+            given = f"{lo.tolist()} to {(oldest - hold).tolist()} samples, held for {hold} more"
+            raise ValueError(f"delays are {given}, expected 0 <= lo <= hi and hold >= 0")
+        steps = np.broadcast_to(np.array(encoder_step, dtype=float), delta.shape)
+        if not ((steps >= 0) & (steps < np.inf)).all():
+            raise ValueError(f"encoder_step is {steps.tolist()}, expected steps >= 0 in m")
+        damping = (1 - eps) * delta[:, None]
+        self._step, self._coarse = steps[:, None], bool(steps.any())
+        self._damping, self._square = damping / T, T / (4 * damping)  # of dx^2 and of a^2
+        #: (depth, m, nsim) the most that this tick and those after it may lose [J], by the packets sent so far
+        self._reserve = np.zeros((int(oldest.max()) + 1, delta.size, nsim))
+        ahead = np.arange(len(self._reserve))[:, None]
+        self._reached = (lo <= ahead) & (ahead <= oldest)  # (depth, m) by a packet that is sent now
+        self._channel = np.nonzero(self._reached)[1]
+        self._delay = lo if (lo == oldest).all() else None
+        self._sent = np.zeros_like(self._reserve)  # the force of tick k is row k % depth
+        self._untold: dict[int, tuple[Array, Array]] = {}  # by tick: dx, and what was booked
+        self._last = (-1, np.zeros((delta.size, nsim)))  # the newest tick of which it is known what acted, and that
+        self.surprises = 0  # ticks in which a device told of a force larger than any that could have been in use
+
+    @property
+    def reserved(self) -> Array:
+        """(nsim,) what the packets on their way may lose [J]: never more than `energy`."""
+        return self._reserve.sum(axis=(0, 1))
+
+    def limit(self, wanted: ArrayLike, dx: ArrayLike, acted: ArrayLike | None = None) -> Array:
+        """The force to send now, (m, nsim) [N]: s times the wanted one, s in [0, 1] the same for all channels.
+
+        `dx` [m] is the displacement since the last call and `acted` [N] the force that acted meanwhile (default: what
+        was sent, if delays are constant; else not known yet). At the first call both are ignored. The device must be
+        able to apply what is sent: clip what is wanted. What is not a number, or beyond all bounds, is sent as zero.
+        """
+        if self.ticks:
+            self._book(np.asarray(dx, dtype=float), None if acted is None else np.asarray(acted, dtype=float))
+        wanted, spoilt = _finite(wanted)
+        scale = self._scale(wanted)
+        sent = scale * wanted
+        np.maximum(self._reserve, self._loss(sent), out=self._reserve, where=self._reached[:, :, None])
+        self._sent[self.ticks % len(self._sent)] = sent
+        self._count(scale, spoilt)
+        return sent
+
+    def tell(self, tick: int, acted: ArrayLike) -> None:
+        """The devices' word for a tick (counted from 0) that was booked as its largest loss: what acted, (m, nsim)."""
+        if tick not in self._untold:
+            raise ValueError(f"tick {tick} does not wait for the devices' word")
+        self._settle(tick, np.asarray(acted, dtype=float), *self._untold.pop(tick))
+
+    def _book(self, dx: Array, acted: Array | None) -> None:
+        """W after the tick that has just ended."""
+        tick, most = self.ticks - 1, self._reserve[0].copy()
+        self._reserve[:-1] = self._reserve[1:]
+        self._reserve[-1] = 0.0
+        if acted is None and self._delay is not None:
+            acted = self._sent[(tick - self._delay) % len(self._sent), np.arange(self._delay.size)]
+        self._earn(-most.sum(axis=0))
+        if acted is not None:
+            self._settle(tick, acted, dx, most)
+            return
+        self._untold.pop(tick - UNTOLD, None)
+        self._untold[tick] = dx.copy(), most
+
+    def _settle(self, tick: int, acted: Array, dx: Array, most: Array) -> None:
+        """What a tick brought, in place of its largest loss."""
+        self.surprises += int((self._loss(acted) > most * (1 + 1e-9)).any())
+        if not self._coarse:
+            self._earn((acted * dx + self._damping * dx**2 + most).sum(axis=0))
+            return
+        sure = np.maximum(np.abs(dx) - self._step, 0.0)
+        before = self._last[1] if self._last[0] == tick - 1 else -acted  # unknown: as costly as it can be
+        change = np.abs(acted - before) + np.abs(acted) - np.abs(before)
+        self._earn((acted * dx + self._damping * sure**2 - self._step / 2 * change + most).sum(axis=0))
+        if tick > self._last[0]:
+            self._last = (tick, acted.copy())
+
+    def _loss(self, force: Array) -> Array:
+        """The most that a force can lose while it is held for a tick [J], per channel."""
+        square = self._square * force**2
+        return square + 2 * self._step * np.abs(force) if self._coarse else square
+
+    def _scale(self, wanted: Array) -> Array:
+        """(nsim,) the largest s for which the reserve with the packet s f is there.
+
+        The ticks that the packet reaches then reserve max(M, s^2 r + s b) each, M what they reserve now. Their sum is
+        within the energy exactly if sum (s^2 r + s b) <= room + sum M over every set of them; the sets that decide
+        have the ticks in which the packet overtakes M first.
+        """
+        room = np.maximum(self.energy - self.reserved, 0.0)
+        scale, now = np.ones_like(room), self._reserve[self._reached]  # (ticks that the packet reaches, nsim)
+        square, linear = (self._square * wanted**2)[self._channel], (2 * self._step * np.abs(wanted))[self._channel]
+        short = np.maximum(square + linear - now, 0.0).sum(axis=0) > room
+        if short.any():
+            parts = [part[:, short] for part in (square, linear, now)]
+            order = np.argsort(_root(*parts), axis=0)
+            square, linear, now = (np.take_along_axis(part, order, axis=0).cumsum(axis=0) for part in parts)
+            most = _root(square, linear, room[short] + now).min(axis=0)
+            scale[short] = np.minimum(most, 1.0) * SHAVE
+        return scale
+
+
+class Shell(_Net):
+    """Makes whatever computes the environment's force passive, behind a coupling V with u = x - V f.
+
+    W[k+1] = min(cap, W[k] + f'(u - u_-)) and f = s f_wanted with the largest s in [0, 1] that keeps it nonnegative. V
+    answers within the tick, u = u0 - D_V f, so that W is a concave parabola in s, nonnegative at 0: s is its upper
+    root. Then sum f'(u - u_-) >= -W0 at every tick: the environment is passive, and a coupling that is certified for
+    any environment with psi = 0 makes the loop safe with it. A tick is `free`, then `limit`.
+    """
+
+    def __init__(self, V: Lti, *, start: float = 0.0, cap: float = np.inf, nsim: int = 1) -> None:
+        """Raises ValueError where V is not square, or where its direct part could give energy."""
+        super().__init__(start, cap, nsim)
+        if V.inputs != V.outputs:
+            raise ValueError(f"the coupling has {V.inputs} inputs and {V.outputs} outputs, expected as many")
+        if np.linalg.eigvalsh((V.D + V.D.T) / 2).min() < -1e-12 * max(1e-300, float(np.abs(V.D).max())):
+            raise ValueError(f"the coupling's direct part {V.D.tolist()} is not passive")
+        self._V = V
+        self._state = np.zeros((V.order, nsim))
+        self._before = self._free = np.zeros((V.outputs, nsim))
+
+    def free(self, x: ArrayLike) -> Array:
+        """u0, (m, nsim) [m]: where the port would be at device positions x (m, nsim) if f were zero in this tick."""
+        self._free = np.asarray(x, dtype=float) - self._V.C @ self._state
+        return self._free.copy()
+
+    def limit(self, wanted: ArrayLike) -> tuple[Array, Array]:
+        """f = s f_wanted [N] and the port's displacement u [m] with it, (m, nsim) each; ends the tick."""
+        wanted, spoilt = _finite(wanted)
+        linear = (wanted * (self._free - self._before)).sum(axis=0)
+        square = np.maximum((wanted * (self._V.D @ wanted)).sum(axis=0), 0.0)
+        scale = self._scale(linear, square)
+        force = scale * wanted
+        u = self._free - self._V.D @ force
+        self._earn((force * (u - self._before)).sum(axis=0))
+        self._state = self._V.A @ self._state + self._V.B @ force
+        self._before = u
+        self._count(scale, spoilt)
+        return force, u.copy()
+
+    def _scale(self, linear: Array, square: Array) -> Array:
+        """(nsim,) the largest s in [0, 1] with W + linear s - square s^2 >= 0."""
+        W = np.maximum(self.energy, 0.0)
+        scale = np.ones_like(W)
+        short = W + linear - square < 0
+        W, b, c = W[short], linear[short], square[short]
+        root = np.sqrt(b**2 + 4 * c * W)
+        gains = b > 0  # either form of the upper root, free of cancellation; where b > 0, so is c
+        upper = np.divide(np.where(gains, b + root, 2 * W), np.where(gains, 2 * c, root - b), out=0 * W, where=root > 0)
+        scale[short] = np.minimum(upper, 1.0) * SHAVE
+        return scale
+
+
+class PassivityControl:
+    """Passivity observer and series passivity controller at the devices: a baseline, without a guarantee here.
+
+    After Hannaford & Ryu, *Time-domain passivity control of haptic interfaces*, IEEE Trans. Robotics and Automation
+    18 (2002) 1-10, for the impedance causality: the observer adds up f dx of the newest force and the displacement
+    just measured, and where the sum E is negative a damper alpha = -E T/dx^2 for that one tick returns it. Written
+    anew from the published idea. Ours are the credit E + delta dx^2/T for what the device dissipates, and the observer
+    for all devices together, with one alpha for all: an observer at each device takes what users pass on to each other
+    for a fault. The force acts in the tick to come, whose displacement is another: so E is no bound on what hands
+    receive. It stands at the devices, behind the delays.
+    """
+
+    def __init__(
+        self,
+        m: int,
+        T: float,
+        *,
+        delta: ArrayLike | None = None,
+        together: bool = False,
+        strongest: float = np.inf,
+        nsim: int = 1,
+    ) -> None:
+        """`delta` (m,) [N s/m] is credited where given; `strongest` [N s/m] is the most that alpha may be."""
+        self._credit = (np.zeros((m, 1)) if delta is None else np.array(delta, dtype=float)[:, None]) / T
+        self._sums = np.ones((m, m)) if together else np.eye(m)  # whose energies count together
+        self._strongest = strongest / T
+        self.energy = np.zeros((m, nsim))  # [J] observed at each device, its dampers' share included
+        self.ticks = 0
+        self.limited = np.zeros(nsim, dtype=np.int64)  # (nsim,) ticks in which a damper was on
+
+    def limit(self, wanted: Array, dx: Array) -> Array:
+        """The force to apply, (m, nsim) [N], given the arriving one and the displacement of the last tick [m]."""
+        self.energy += wanted * dx + self._credit * dx**2
+        missing = np.maximum(-(self._sums @ self.energy), 0.0)
+        moved = self._sums @ dx**2
+        damper = np.minimum(np.divide(missing, moved, out=np.zeros_like(moved), where=moved > 0), self._strongest)
+        self.energy += damper * dx**2
+        self.ticks += 1
+        self.limited += (damper > 0).any(axis=0)
+        return wanted + damper * dx
+
+
+class EnergyBounding:
+    """The energy bounding algorithm, channel by channel: a baseline, whose guarantee is for loops without delay.
+
+    After Kim & Ryu, *Robustly stable haptic interaction control using an energy-bounding algorithm*, Int. J. Robotics
+    Research 29 (2010) 666-679: f = f_- + b dx with b between -c1 - 2 f_-/dx and c1, held where dx = 0. Re-derived here
+    with c1 = 2 delta/T, the most that the damping allows: the bounds say |f| <= |f_- + c1 dx|, that is
+    r(f) <= r(f_-) + f_- dx + delta dx^2/T. So it is the energy budget for theta = 0 that saves nothing: whatever W
+    exceeds r(f) is thrown away in the same tick.
+    """
+
+    def __init__(self, delta: ArrayLike, T: float, *, nsim: int = 1) -> None:
+        self._c1 = 2 * np.array(delta, dtype=float)[:, None] / T
+        self._force = np.zeros((self._c1.size, nsim))
+        self.ticks = 0
+        self.limited = np.zeros(nsim, dtype=np.int64)  # (nsim,) ticks in which the wanted force was changed
+
+    def limit(self, wanted: Array, dx: Array) -> Array:
+        """The force to apply, (m, nsim) [N], given the wanted one and the displacement of the last tick [m]."""
+        most = np.abs(self._force + self._c1 * dx)
+        self._force = np.where(dx == 0, self._force, np.clip(wanted, -most, most))
+        self.ticks += 1
+        self.limited += (self._force != wanted).any(axis=0)
+        return self._force.copy()
+
+
+def _root(square: Array, linear: Array, most: Array) -> Array:
+    """The largest s >= 0 with square s^2 + linear s <= most, all >= 0; inf where there is none."""
+    slope = linear + np.sqrt(linear**2 + 4 * square * most)
+    return np.divide(2 * most, slope, out=np.where(square + linear > 0, 0.0, np.inf), where=slope > 0)
+
+
+def _finite(wanted: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
+    """The force with zero where it is no finite number, and in which simulations that was so."""
+    wanted = np.asarray(wanted, dtype=float)
+    good = np.abs(wanted) < HUGE
+    return np.where(good, wanted, 0.0), np.asarray(~good.all(axis=0))

@@ -1,0 +1,275 @@
+"""A human is a passive port: what is not passive cannot be built, and every way of writing a hand gives one physics."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from models.device import CompliantDevice, RigidDevice
+from models.human import Cross, Human, Impedance, Link, Person, Port, state_space
+from models.scene import Crowd, HumanSets, build, from_mjcf, plant, variants
+
+DEVICE = RigidDevice(mass=0.2, damping=0.9)
+
+
+class Own:
+    """A user's own hand, whatever its port."""
+
+    def __init__(self, port):
+        self._port = port
+
+    def port(self):
+        return self._port
+
+    def voluntary_force(self, t):
+        return np.zeros_like(t)
+
+
+def felt(port, w, device=DEVICE):
+    """The impedance at the device's motor [N s/m] from the plant's matrices: force over velocity."""
+    scene = build([device], [Own(port)])
+    linear = plant(scene.model)
+    x = np.linalg.solve(1j * w * np.eye(len(linear.A)) - linear.A, -linear.B[:, -1])
+    return 1 / x[scene.model.nv]
+
+
+# passivity of an impedance
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.integers(0, 10**6), st.integers(1, 5))
+def test_every_frequency_is_decided_without_a_grid(seed, n):
+    """Random stable impedances, moved by their least real part over a dense sweep: above it passive, below it not."""
+    rng = np.random.default_rng(seed)
+    A = rng.normal(size=(n, n))
+    A -= (np.linalg.eigvals(A).real.max() + 0.3) * np.eye(n)
+    B, C = rng.normal(size=(n, 1)), rng.normal(size=(1, n))
+    sweep = np.concatenate([[0.0], np.geomspace(1e-3, 1e3, 4000)])
+    real = [(C @ np.linalg.solve(1j * w * np.eye(n) - A, B)).item().real for w in sweep]
+    least = min(*real, 0.0)  # at infinity it is 0
+    size = np.abs(real).max()
+    assert Impedance(A, B, C, [[-least + 1e-3 * size]]).order == n
+    with pytest.raises(ValueError, match="not passive, Re Z is -"):
+        Impedance(A, B, C, [[-least - 1e-2 * size]])
+
+
+def test_what_lags_is_passive_and_what_lags_twice_is_not():
+    """g/(1 + tau s) has the real part g/(1 + (tau w)^2); its square turns negative above w = 1/tau."""
+    assert Impedance([[-20.0]], [[20.0]], [[3.0]], [[0.0]]).order == 1
+    twice = [[-20.0, 0.0], [20.0, -20.0]], [[20.0], [0.0]], [[0.0, 3.0]], [[0.0]]
+    with pytest.raises(ValueError, match=r"not passive, Re Z is -.* N s/m at .* Hz"):
+        Impedance(*twice)
+    # its least real part is -g/8, at w = sqrt(3)/tau: that much damping beside it is just enough
+    assert Impedance(*twice[:3], [[3.0 / 8]]).order == 2
+    with pytest.raises(ValueError, match=r"at 5\.\d* Hz"):
+        Impedance(*twice[:3], [[0.999 * 3.0 / 8]])
+
+
+def test_a_lossless_impedance_is_no_rounding_victim():
+    """A resonance of 30 rad/s that hardly decays: Re Z is zero but for rounding at most frequencies."""
+    assert Impedance([[-1e-3, -30.0], [30.0, -1e-3]], [[1.0], [0.0]], [[1.0, 0.0]], [[0.0]]).order == 2
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (([[1.0]], [[1.0]], [[1.0]], [[0.0]]), "expected what decays"),
+        (([[0.0]], [[1.0]], [[1.0]], [[0.0]]), "expected what decays"),
+        (([[-1.0]], [[1.0]], [[1.0]], [[-0.1]]), "not passive"),
+        (([[-1.0]], [[1.0]], [[-1.0]], [[0.0]]), "not passive"),
+        (([[-1.0]], [[1.0, 2.0]], [[1.0]], [[0.0]]), r"B has the shape \(1, 2\), expected \(1, 1\)"),
+    ],
+)
+def test_what_is_no_passive_impedance_is_refused(parts, message):
+    with pytest.raises(ValueError, match=message):
+        Impedance(*parts)
+
+
+# hands by their state space
+
+
+def test_a_spring_inside_the_matrices_is_split_off():
+    """k/s + b + g/(1 + tau s) in coordinates that hide it, against the sum written out."""
+    k, b, g, tau, mass = 250.0, 4.0, 12.0, 0.05, 0.3
+    T = np.array([[1.0, 2.0], [-1.5, 0.5]])
+    A, B, C = np.diag([0.0, -1 / tau]), np.array([[1.0], [g / tau]]), np.array([[k, 1.0]])
+    port = state_space(T @ A @ np.linalg.inv(T), T @ B, C @ np.linalg.inv(T), b, mass)
+    assert port.stiffness[0] == pytest.approx(k, rel=1e-12)
+    assert port.impedance.order == 1
+    for w in (0.3, 7.0, 200.0):
+        s = 1j * w
+        hand = mass * s + k / s + b + g / (1 + tau * s)
+        assert felt(port, w) == pytest.approx(DEVICE.mass * s + DEVICE.damping + hand, rel=1e-9)
+
+
+def test_a_pure_spring_and_damper_is_a_link():
+    """A = 0 of any scale is one spring; nothing is left of the impedance but its damping."""
+    for A, link in (([[0.0]], Link(0.3, 4.0, 250.0)), (np.zeros((0, 0)), Link(0.3, 4.0, 0.0))):
+        n = len(A)
+        port = state_space(A, np.full((n, 1), 50.0), np.full((1, n), 5.0), 4.0, 0.3)
+        for w in (1.0, 30.0):
+            assert felt(port, w) == pytest.approx(felt(Human((link,)).port(), w), rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        (([[0.0, 1.0], [0.0, 0.0]], [[0.0], [1.0]], [[1.0, 0.0]], 1.0), "double eigenvalue at zero"),
+        (([[0.0]], [[1.0]], [[-1.0]], 1.0), "stiffness has a negative"),
+    ],
+)
+def test_no_spring_of_the_wrong_kind_is_split_off(parts, message):
+    with pytest.raises(ValueError, match=message):
+        state_space(*parts)
+
+
+# hands by masses, springs and dampers
+
+
+def hill(elastic=400.0, damping=9.0, tissue=0.004, parallel=150.0, mass=0.25):
+    """A muscle after Hill: a series elastic part, the contractile part's damping, a parallel spring, and masses."""
+    across = [[-1, 1, 0], [0, -1, 1], [-1, 0, 1]]
+    return Port([mass, tissue], across, [0.0, damping, 0.5], [elastic, 0.0, parallel], pull=1)
+
+
+def test_a_port_is_its_matrices():
+    port, d = hill(), DEVICE
+    got = plant(build([d], [Own(port)]).model)
+    K = np.array([[400 + 150, -400], [-400, 400.0]])
+    D = np.array([[0.9 + 0.5, 0], [0, 9.0]])
+    M = np.diag([0.2 + 0.25, 0.004])
+    np.testing.assert_allclose(got.A[2:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
+    # the voluntary force contracts the contractile part: it pulls the tissue towards the base
+    scene = build([d], [Own(port)])
+    np.testing.assert_allclose(M @ got.B[2:, scene.pushed[0]], [0, 1], atol=1e-12)
+
+
+def test_a_lever_moves_what_it_should():
+    """A spring on a lever lengthens by 2 x_2 - x_1 / 2; another one by 3 x_2 alone."""
+    port = Port([0.1, 0.5], [[-0.5, 2, 0], [0, 3, 0]], [1.0, 2.0], [100.0, 50.0])
+    got, M = plant(build([DEVICE], [Own(port)]).model), np.diag([0.3, 0.5])
+    row, other = np.array([-0.5, 2.0]), np.array([0.0, 3.0])
+    K = 100 * np.outer(row, row) + 50 * np.outer(other, other)
+    D = 1 * np.outer(row, row) + 2 * np.outer(other, other) + np.diag([0.9, 0])
+    np.testing.assert_allclose(got.A[2:], -np.linalg.solve(M, np.hstack([K, D])), rtol=1e-12)
+
+
+def test_the_same_hand_as_bodies_and_as_a_state_space():
+    """The muscle's own coordinates as states: tension's length e and the tissue's speed u, e' = v - u."""
+    tissue, elastic, damping = 0.004, 400.0, 9.0
+    A = [[0.0, -1.0], [elastic / tissue, -damping / tissue]]
+    port = state_space(A, [[1.0], [0.0]], [[elastic, 0.0]], 0.0)
+    assert port.stiffness[0] == 0
+    bodies = Port([0.0, tissue], [[-1, 1, 0], [0, -1, 1]], [0.0, damping], [elastic, 0.0])
+    for device in (DEVICE, CompliantDevice()):
+        for w in np.geomspace(0.1, 3000, 12):
+            assert felt(port, w, device) == pytest.approx(felt(bodies, w, device), rel=1e-9)
+
+
+MJCF = """<mujoco><worldbody>
+  <body name="arm"><inertial pos="0 0 0" mass="1.2" diaginertia="1 1 1"/>
+    <joint name="shoulder" type="slide" axis="1 0 0" stiffness="150" damping="8"/>
+    <body name="handle"><inertial pos="0 0 0" mass="0.1" diaginertia="1 1 1"/>
+      <joint name="wrist" type="slide" axis="1 0 0" stiffness="800" damping="5"/>
+      <body name="ring"><inertial pos="0 0 0" mass="0.05" diaginertia="1 1 1"/></body>
+    </body>
+  </body>
+</worldbody></mujoco>"""
+
+
+def test_a_hand_drawn_in_mjcf_is_the_chain_that_it_shows():
+    """The arm carries the wrist, on whose far side is the handle; the ring is welded to it."""
+    port = from_mjcf(MJCF, pull="shoulder")
+    chain = Human((Link(0.15, 5.0, 800.0), Link(1.2, 8.0, 150.0)))
+    for w in np.geomspace(0.1, 300, 8):
+        assert felt(port, w) == pytest.approx(felt(chain.port(), w), rel=1e-9)
+    mine, theirs = (plant(build([DEVICE], [hand]).model) for hand in (Own(port), chain))
+    pushed = build([DEVICE], [chain]).pushed[0]
+    np.testing.assert_allclose(np.abs(mine.B[:, build([DEVICE], [Own(port)]).pushed[0]]), theirs.B[:, pushed])
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "message"),
+    [
+        ('axis="1 0 0" stiffness="150"', 'axis="0 1 0" stiffness="150"', "does not slide along x"),
+        ('type="slide" axis="1 0 0" stiffness="800"', 'type="hinge" axis="1 0 0"', "does not slide along x"),
+        ('damping="8"', 'damping="8" armature="0.1"', "friction or armature"),
+        ('damping="8"', 'damping="8" frictionloss="0.1"', "friction or armature"),
+        ('damping="8"', 'damping="8" springref="0.1"', "not at rest"),
+        ('damping="8"', 'damping="8" range="-1 1" limited="true"', "a limit"),
+        ('name="handle"', 'name="grip"', "no body 'handle' that slides; there are 'arm', 'grip'"),
+        ("</mujoco>", '<actuator><motor joint="wrist"/></actuator></mujoco>', "an actuator"),
+    ],
+)
+def test_mjcf_that_is_no_passive_network_is_refused(was, now, message):
+    assert was in MJCF
+    with pytest.raises(ValueError, match=message):
+        from_mjcf(MJCF.replace(was, now))
+
+
+# persons
+
+
+def test_a_person_s_arms_may_be_of_any_kind():
+    """Against the nodal equations of the hands and the body, with an arm that lags and a cross spring."""
+    g, tau, person = 12.0, 0.05, Person((1, 2), 3.0, 20.0, 700.0, Cross(1.0, 40.0))
+    lags, link = state_space([[-1 / tau]], [[g / tau]], [[1.0]], 0.5, mass=0.25), Link(0.3, 3.0, 200.0)
+    scene = build([DEVICE] * 2, [Own(lags), Human((link,))], [person])
+    linear, n = plant(scene.model), scene.model.nv
+    for w in (0.5, 5.0, 30.0):
+        s = 1j * w
+        ends = {(0, 2): g / (1 + tau * s) + 0.5, (1, 2): 3.0 + 200 / s, (0, 1): 1.0 + 40 / s}
+        Z = np.diag([0.45 * s + 0.9, 0.5 * s + 0.9, 3 * s + 20 + 700 / s])
+        for (a, b), between in ends.items():
+            row = np.eye(3)[a] - np.eye(3)[b]
+            Z += between * np.outer(row, row)
+        x = np.linalg.solve(s * np.eye(len(linear.A)) - linear.A, -linear.B[:, -2:])[n : n + 2]
+        np.testing.assert_allclose(x, np.linalg.inv(Z)[:2, :2], rtol=1e-9)
+
+
+# many hands at once
+
+
+def test_many_hands_of_any_class_are_each_one_s_matrices():
+    rng = np.random.default_rng(5)
+    devices = [CompliantDevice(), DEVICE]
+
+    def lagging():
+        tau, g = rng.uniform(0.01, 0.1), rng.uniform(1, 9)
+        return Own(state_space([[-1 / tau]], [[1 / tau]], [[g]], rng.uniform(0, 2), rng.uniform(0.1, 1)))
+
+    sets = [(Own(hill(elastic=k)), lagging()) for k in rng.uniform(100, 900, 6)]
+    together = variants(devices, HumanSets(tuple(sets))).plants()
+    for i, hands in enumerate(sets):
+        alone = plant(build(devices, hands).model)
+        # one is divided by masses, the other multiplied by their inverse
+        np.testing.assert_allclose(together.A[i], alone.A, rtol=1e-14)
+        np.testing.assert_allclose(together.B[i], alone.B, rtol=1e-14)
+
+
+def test_chains_are_the_same_by_their_numbers_and_by_their_classes():
+    links = np.exp(np.random.default_rng(1).uniform(-1, 4, (5, 2, 2, 3)))
+    bodies = np.exp(np.random.default_rng(2).uniform(-1, 4, (5, 1, 5)))
+    crowd = Crowd(links, ((1, 2),), bodies)
+    fast = variants([DEVICE] * 2, crowd)
+    for i in range(5):
+        one = variants([DEVICE] * 2, HumanSets((crowd.humans(i),), crowd.persons(i)))
+        for name, rows in fast.fields.items():
+            np.testing.assert_array_equal(rows[i], one.fields[name][0])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: Port([0.1], [[-1, 1]], [-1.0], [0.0]), "damping has a negative or infinite entry"),
+        (lambda: Port([0.1, 0.0], [[-1, 1, 0]], [1.0], [0.0]), "a point that is no handle has no mass"),
+        (lambda: Port([0.1], [[0, 1]], [1.0], [0.0]), "touch a point each"),
+        (lambda: Port([0.1], np.zeros((0, 2)), [], []), "touch a point each"),
+        (lambda: Port([0.1], [[-1, 1]], [1.0, 2.0], [0.0]), r"damping has the shape \(2,\), expected \(1,\)"),
+        (lambda: Port.stack([hill(), Human((Link(1, 1, 1),)).port()]), "the same points"),
+        (lambda: build([DEVICE], [Own(Person((1, 2), 1, 1, 1).port())]), "has 2 handles, expected one"),
+    ],
+)
+def test_ports_that_cannot_be_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()

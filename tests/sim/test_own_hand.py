@@ -1,0 +1,174 @@
+"""A user's own hand, written in this file, in the whole chain: both engines, verdicts, random draws."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from cli.run import main
+from design.result import CASE_I
+from models.human import Human, Link, Person, Port, state_space
+from sim import load, simulate, validate
+from sim.crowds import Validation
+from sim.run import assemble
+from sim.scenario import InputError
+from sim.stability import close, dominant_mode
+
+AGREE = 1e-6  # RK4 at 0.2 rad of the fastest mode in a step: 0.2^5/120 in each, of which most decays
+SCENARIO = load().replace(duration=1.5)
+
+
+@dataclass(frozen=True)
+class Muscle:
+    """A hand with a muscle after Hill: the contractile part's damping behind a series elastic part, so that its force
+    lags behind the motion by damping / elastic; a parallel spring; the tissue between them weighs something."""
+
+    mass: float = 0.25  # [kg]
+    elastic: float = 400.0  # [N/m]
+    damping: float = 9.0  # [N s/m]
+    parallel: float = 150.0  # [N/m]
+    tissue: float = 0.02  # [kg]
+    skin: float = 0.0  # [N s/m] beside the parallel spring
+    pull: float = 1.5  # [N]
+
+    def port(self):
+        across = [[-1, 1, 0], [0, -1, 1], [-1, 0, 1]]  # points: hand, tissue, base
+        damping, stiffness = [0, self.damping, self.skin], [self.elastic, 0, self.parallel]
+        return Port([self.mass, self.tissue], across, damping, stiffness, pull=2)
+
+    def voluntary_force(self, t):
+        return self.pull * np.sin(2 * np.pi * 0.7 * t)
+
+
+class MuscleBySpace(Muscle):
+    """The same hand as velocity -> force; states: the elastic part's length, the tissue's speed, the hand's place."""
+
+    def port(self):
+        k, b, m = self.elastic, self.damping, self.tissue
+        A = [[0, -1, 0], [k / m, -b / m, 0], [0, 0, 0]]
+        return state_space(A, [[1], [0], [1]], [[k, 0, self.parallel]], self.skin, mass=self.mass)
+
+
+class Light(Muscle):
+    """Without the tissue's mass: g/(1 + tau s), one state. A body cannot weigh nothing, so MuJoCo has no such hand."""
+
+    def port(self):
+        tau = self.damping / self.elastic
+        A, C = [[-1 / tau, 0], [0, 0]], [[self.damping, self.parallel]]
+        return state_space(A, [[1 / tau], [1]], C, self.skin, mass=self.mass)
+
+
+def held_by(*hands):
+    return SCENARIO.replace(human=hands)
+
+
+def rms(a, b):
+    return np.sqrt(np.mean(np.square(a - b)) / np.mean(np.square(b)))
+
+
+def test_both_engines_simulate_it_and_agree():
+    scenario = held_by(Muscle(), Muscle(elastic=900.0, tissue=0.03))
+    exact, mujoco = (simulate(scenario, CASE_I, engine=engine) for engine in ("exact", "mujoco"))
+    assert np.abs(exact.x).max() > 2e-3  # the muscles move the devices
+    assert rms(mujoco.x, exact.x) < AGREE
+    for record in (exact, mujoco):
+        assert record.meta["stability"]["verdict"] == "stable"
+
+
+def test_its_matrices_give_the_run_that_its_bodies_give():
+    """No body, but the same hand: only the exact engine, and the same trace to rounding."""
+    bodies, space = (simulate(held_by(hand, hand), CASE_I, engine="exact") for hand in (Muscle(), MuscleBySpace()))
+    # the sum of 1250 ticks' rounding
+    assert rms(space.x, bodies.x) < 1e-9
+    assert rms(space.v_handle, bodies.v_handle) < 1e-9
+    assert rms(space.f, bodies.f) < 1e-9
+
+
+def test_the_tissue_s_mass_goes_to_nothing():
+    """Half the mass, half the difference to the hand without it."""
+    light = simulate(held_by(Light(), Light()), CASE_I, engine="exact").x
+    off = [
+        rms(simulate(held_by(h, h), CASE_I, engine="exact").x, light)
+        for h in (Muscle(tissue=1e-3), Muscle(tissue=5e-4))
+    ]
+    assert off[0] < 1e-2
+    assert off[0] / off[1] == pytest.approx(2.0, abs=0.1)
+
+
+def test_mujoco_refuses_what_it_cannot_simulate_in_one_line():
+    message = r"an impedance \(A, B, C, D\), which MuJoCo does not simulate: use the exact engine"
+    with pytest.raises(InputError, match=message):
+        simulate(held_by(Light(), Muscle()), CASE_I)
+    with pytest.raises(InputError, match=message):
+        validate(held_by(Light(), Muscle()).replace(population=Muscles(Light)), CASE_I, humans=4, duration=0)
+
+
+@dataclass(frozen=True)
+class Muscles:
+    """A user's own population."""
+
+    kind: type[Muscle] = Muscle
+
+    def draw(self, rng, n):
+        low, high = np.log([[0.02, 50, 0.5, 5, 5e-3, 0.1], [2.0, 2000, 30, 800, 0.1, 30]])
+        return [self.kind(*np.exp(rng.uniform(low, high))) for _ in range(n)]
+
+
+def test_a_population_of_such_hands_is_validated_in_both_engines():
+    """Uncoupled, some of the hands set the loop off; the engines agree on which, and repeats repeat."""
+    scenario = SCENARIO.replace(population=Muscles())
+    found = validate(scenario, None, humans=40, duration=0.5)
+    assert 0 < (found.exact > 0).sum() < 40
+    assert not found.disagreements.any()
+    np.testing.assert_allclose(found.mujoco, found.exact, atol=2e-2, rtol=1e-3)
+    again = validate(scenario, None, humans=10, duration=0.0, engine="exact")
+    np.testing.assert_array_equal(again.exact, found.exact[:10])
+    assert found.mass.shape == (40,)
+    assert (found.damping == 0).all()  # the elastic part has none
+
+
+def test_its_verdicts_are_those_of_each_hand_alone():
+    scenario = SCENARIO.replace(population=Muscles(Light))
+    found = validate(scenario, CASE_I, humans=6, duration=0.0, engine="exact")
+    for i in (0, 5):
+        hands = Validation(scenario, CASE_I, 0, 20, 1, "exact", 0.0).crowd(i).humans(0)
+        assembly = assemble(scenario.replace(human=hands), CASE_I)
+        assert found.exact[i] == pytest.approx(dominant_mode(close(assembly.plant, assembly.F)).growth, abs=1e-9)
+
+
+def test_a_person_may_hold_with_such_hands():
+    person = Person((1, 2), 20.0, 15.0, 900.0)
+    scenario = held_by(Muscle(), Human((Link(0.3, 3.0, 200.0),))).replace(person=(person,))
+    exact, mujoco = (simulate(scenario, CASE_I, engine=engine) for engine in ("exact", "mujoco"))
+    assert rms(mujoco.x, exact.x) < AGREE
+    alone = simulate(scenario.replace(person=()), CASE_I, engine="exact")
+    assert rms(exact.x, alone.x) > 1e-3
+
+
+def test_a_scenario_keeps_it_and_says_what_is_none():
+    scenario = held_by(Muscle(), Human((Link(0.3, 3.0, 200.0),)))
+    assert scenario.replace(theta=(2, 2)).human == scenario.human
+    assert len({held_by(Muscle(mass=m), Muscle()).digest for m in (0.2, 0.3, 0.3)}) == 2
+    with pytest.raises(InputError, match="human has 1 entries"):
+        held_by(Muscle())
+    with pytest.raises(InputError, match=r"human\[1\] is None, expected a Human, or what has port\(\)"):
+        held_by(Muscle(), None)
+    with pytest.raises(InputError, match="damping has a negative"):
+        held_by(Muscle(), Muscle(damping=-1.0))
+
+
+def test_the_command_takes_hands_from_a_python_file(tmp_path, capsys):
+    hands = tmp_path / "hands.py"
+    hands.write_text(
+        "from models.human import Port\n"
+        "class Soft:\n"
+        "    def port(self): return Port([0.2], [[-1, 1]], [2.0], [90.0])\n"
+        "    def voluntary_force(self, t): return 0 * t\n"
+        "humans = (Soft(), Soft())\n"
+    )
+    words = ("--case", "none", "--duration", "0.2", "--no-plot", "--out", str(tmp_path / "out"))
+    assert main([*words, "--human", str(hands)]) == 0
+    assert "unstable" in capsys.readouterr().out
+    hands.write_text("humans = ()")
+    with pytest.raises(InputError, match="has 0 `humans`, expected 2"):
+        main([*words, "--human", str(hands)])

@@ -1,0 +1,208 @@
+"""What is drawn is what was reported: lines, marks and legends of every picture, looked at before it is written."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from matplotlib import pyplot as plt
+
+from sim import plots
+from sim.trace import Trace
+
+
+@pytest.fixture
+def drawn(monkeypatch, tmp_path):
+    """Draws, and returns the axes; the picture is written, too, and no figure is left open."""
+    seen = []
+    save = plots._save
+
+    def look(figure, path, dpi=130):
+        seen.append(figure)
+        assert save(figure, path, dpi).read_bytes()[:4] == b"\x89PNG"
+        assert not plt.get_fignums()
+        return path
+
+    monkeypatch.setattr(plots, "_save", look)
+
+    def draw(function, *arguments, **keywords):
+        assert function(*arguments, path=tmp_path / "a.png", **keywords) == tmp_path / "a.png"
+        return seen[-1]
+
+    return draw
+
+
+def legend(figure):
+    (box,) = figure.legends
+    return [text.get_text() for text in box.get_texts()]
+
+
+def lines(axis):
+    return {line.get_label(): line.get_xydata() for line in axis.lines}
+
+
+T = 1e-3
+
+
+def trace(f, x=None):
+    f = np.asarray(f, dtype=float)
+    x = 1e-3 * f if x is None else x
+    return Trace(T * np.arange(len(f)), x, f, x, x, np.zeros((len(f), 1)), {})
+
+
+def test_a_run_is_drawn_whole_and_where_it_turns():
+    t = np.arange(4000)
+    f = np.stack([np.sin(t / 300), np.sin(t / 300 + 1)], axis=1)
+    f[2500:2600, 1] += 0.2 * np.sin(np.arange(100) * 2 * np.pi / 12)  # 83 Hz
+    near = plots._sharpest(trace(f), 83.0)
+    assert 2480 <= near.start < near.stop <= 2620
+    assert near.stop - near.start == 72  # six periods
+    # where nothing turns, the whole is shown as it is
+    assert plots._sharpest(trace(f[:20]), 83.0) == slice(0, 20)
+
+
+def test_every_sample_of_a_run_is_on_the_picture(drawn):
+    f = np.random.default_rng(0).normal(size=(400, 3)).cumsum(axis=0)
+    f[:, 1] = 0.01 * np.arange(400)  # calm: drawn last, so that it stays visible
+    figure = drawn(plots.plot_run, trace(f), title="t", frequency_hz=80.0, ideal=(2 * f, 12.34))
+    whole = lines(figure.axes[2])
+    for i in range(3):
+        np.testing.assert_array_equal(whole[f"device {i + 1}"][:, 1], f[:, i])
+        np.testing.assert_allclose(lines(figure.axes[0])[f"device {i + 1}"][:, 1], f[:, i])  # mm of 1e-3 m a newton
+    assert [line.get_label() for line in figure.axes[2].lines][2] == "device 2"
+    assert legend(figure) == ["device 1", "device 2", "device 3", "pale: ideal environment (asked force 12 % off)"]
+
+
+def test_a_figure_is_closed_where_it_cannot_be_written(tmp_path):
+    with pytest.raises((OSError, ValueError)):
+        plots.plot_run(trace(np.zeros((9, 1))), tmp_path / "absent" / "a.png", "t", 1.0)
+    assert not plt.get_fignums()
+
+
+def test_wrong_verdicts_are_crossed(drawn):
+    names = "integrator", "substeps", "wall_s_per_simulated_s", "position_relative_rms", "growth_rate_error"
+    rows = [("RK4", 1, 0.1, 1e-6, -1e-3), ("RK4", 4, 0.3, 1e-8, 1e-5), ("Euler", 1, 0.05, 0.0, 2.0)]
+    rows = [dict(zip(names, row, strict=True)) | {"verdict_correct": row[0] == "RK4"} for row in rows]
+    rows.append({"integrator": None, "position_relative_rms": 0.0, "growth_rate_error": 0.0})
+    position, growth = drawn(plots.plot_accuracy, rows).axes
+    np.testing.assert_array_equal(lines(growth)["RK4"], [(0.1, 1e-3), (0.3, 1e-5)])
+    assert not lines(position)["Euler"].size  # no error to be drawn on a logarithmic axis
+    assert [line.get_xydata().tolist() for line in growth.lines if line.get_marker() == "x"] == [[[0.05, 2.0]]]
+
+
+def test_every_human_is_a_point(drawn):
+    mass, damping, growth = np.array([0.1, 1.0, 2.0]), np.array([3.0, 2.0, 1.0]), np.array([-1.0, 0.0, 2.0])
+    figure = drawn(plots.plot_population, mass, damping, growth, title="t")
+    assert legend(figure) == ["stable: 2", "unstable: 1"]
+    stable, unstable = (part.get_offsets().tolist() for part in figure.axes[1].collections)
+    assert stable == [[3.0, -1.0], [2.0, 0.0]]
+    assert unstable == [[1.0, 2.0]]
+
+
+def test_who_was_found_is_told_from_who_was_not(drawn):
+    rows = [("a", 0.01, False, None), ("a", 0.05, True, 0.3), ("b", 0.02, True, 0.1)]
+    names = "loop", "short", "found", "growth_rate_per_s"
+    (axis,) = drawn(plots.plot_tightness, [dict(zip(names, row, strict=True)) for row in rows]).axes
+    marks = [(line.get_marker(), *line.get_xydata()[0]) for line in axis.lines if len(line.get_xydata()) == 1]
+    assert ("o", 1.0, 0.0) in marks
+    assert ("^", 5.0, 0.3) in marks
+    assert ("^", 2.0, 0.1) in marks
+    np.testing.assert_array_equal(lines(axis)["a"], [(1.0, 0.0), (5.0, 0.3)])
+
+
+HZ = [1.0, 10.0, 100.0]
+
+
+def coupling(name, ratio, at):
+    part = {"ratio": ratio, "demand": [0.1, ratio / 2, ratio], "binding_frequency_hz": at}
+    none = {"ratio": None, "demand": None, "binding_frequency_hz": None, "reason": "no V"}
+    felt = {"stiffness": [[1.0, 9.0], [-5.0, 9.0], [7.0, 9.0]], "damping": [[0.1, 2.0]] * 3}
+    sigma = {"sigma_F": [[3.0, 1.0]] * 3, "sigma_M": [[0.0, 0.0]] * 3}
+    return {"name": name, "closed-loop": part, "theorem4": none, "perceived": felt} | sigma
+
+
+def report(available=(1.37, 1.37), psi=(0, 0)):
+    felt = {"stiffness": [[2.0, 2.0]] * 3, "damping": [[0.0, 0.0]] * 3}
+    couplings = [coupling("soft", 0.5, 100.0), coupling("stiff", 40.0, 0.0)]
+    data = {"frequency_hz": HZ, "available_damping": list(available), "psi": list(psi), "ideal": felt}
+    return data | {"sigma_E": [[4.0, 2.0]] * 3, "couplings": couplings}
+
+
+def test_what_binds_is_marked_on_its_curve_or_above_the_picture(drawn):
+    here, anywhere = drawn(plots.plot_required_damping, report()).axes
+    np.testing.assert_allclose(lines(here)["soft"], np.transpose([HZ, 1.37 * np.array([0.1, 0.25, 0.5])]))
+    marks = {line.get_marker(): line.get_xydata()[0] for line in here.lines if line.get_marker() in "o^"}
+    np.testing.assert_allclose(marks["o"], (100.0, 0.5 * 1.37))
+    np.testing.assert_allclose(marks["^"], (1.0, 20 * 1.37))  # at 0 Hz, and 40 times what there is
+    assert here.get_title() == "this environment"
+    assert here.get_ylabel() == "required damping [N s/m]"
+    assert "soft (no curve: see the notes)" in lines(anywhere)
+    here, anywhere = drawn(plots.plot_required_damping, report((1.0, 2.0), (1, 0))).axes
+    assert here.get_ylabel() == "required damping over available damping"
+    assert anywhere.get_title() == "any passive environment (with a multiplier of this one)"
+
+
+def test_singular_values_and_what_is_felt_stand_as_reported(drawn):
+    figure = drawn(plots.plot_singular_values, report())
+    assert [axis.get_title() for axis in figure.axes] == ["soft", "stiff"]
+    assert legend(figure) == ["E, the environment", "F, what the devices see", "M, the mismatch"]
+    assert [text.get_text() for text in figure.axes[0].texts] == ["M = 0"]
+    np.testing.assert_array_equal(lines(figure.axes[0])["E, the environment"], np.transpose([HZ, [4.0] * 3]))
+    figure = drawn(plots.plot_perceived, report())
+    np.testing.assert_array_equal(lines(figure.axes[0])["soft"], np.transpose([HZ, [1.0, -5.0, 7.0]]))
+    np.testing.assert_array_equal(lines(figure.axes[3])["stiff"], np.transpose([HZ, [2.0] * 3]))
+    assert legend(figure) == ["ideal: E itself", "soft", "stiff"]
+
+
+def k_b_map():
+    B, K = np.array([0.0, 1.0, 2.0]), np.array([10.0, 20.0])
+    growth = np.array([-1.0, -1.0, 1.0, 1.0, np.nan, -1.0])
+    ratio = {"theorem4": np.array([0.5, 0.5, 2, 2, 2, 2.0]), "closed-loop": np.array([0.5, 0.5, 2, 2, 2, 2.0])}
+    return SimpleNamespace(grid=SimpleNamespace(B=B, K=K, scale="linear", shape=(2, 3)), growth=growth, ratio=ratio)
+
+
+def told(**changes):
+    def point(B, K, verdict, differs=False):
+        return {"B": B, "K": K, "verdict": verdict, "differs_from_linear": differs}
+
+    effects = {"encoder_step_m": [1e-5, 0.0], "friction_n": [0.0, 0.0], "force_limit_n": None}
+    points = [point(0, 10, "rests"), point(2, 20, "oscillates", True), point(1, 20, plots.UNDECIDED)]
+    simulation = {"points": points, "effects": effects, "nonlinear": True}
+    head = {"axes": "coupling", "rigid": True, "coupling": None, "one_sided": False, "population": {"humans": 7}}
+    loop = {"theta": [1, 1], "psi": [0, 1], "T": 1e-3, "delta": [1.37, 2.0], "velocity_filter_hz": None}
+    return head | loop | {"simulation": simulation, "marks": [{"K": 15.0, "B": 0.5}]} | changes
+
+
+def test_a_map_shows_verdicts_edges_and_points(drawn):
+    figure = drawn(plots.plot_zwidth, k_b_map(), told())
+    (axis,) = figure.axes
+    cells = axis.collections[0].get_array()
+    np.testing.assert_array_equal(cells.mask.ravel(), [False] * 4 + [True, False])
+    assert cells.compressed().tolist() == [0, 0, 1, 1, 0]
+    edges = axis.collections[1:3]  # the same edge twice: the broken one is drawn last
+    assert [edge.get_linewidth()[0] for edge in edges] == [3.6, 1.8]
+    assert legend(figure) == [
+        "exact: stable with all of 7 humans",
+        "exact: unstable with some",
+        "this environment: certified below this edge",
+        "any passive environment: certified below this edge",
+        "MuJoCo: rests (1)",
+        "MuJoCo: oscillates (1)",
+        f"MuJoCo: {plots.UNDECIDED} (1)",
+        "unlike the linear loop (1)",
+    ]
+    title = "rigid wall: theta 1, T 1 ms, delta 1.37, 2 N s/m\npsi 0, 1, encoder step 10 um"
+    assert figure.get_suptitle() == title
+
+
+def test_a_map_of_an_environment_shows_what_was_designed_for(drawn):
+    springs = {"contact_springs": [{"B": 1.0, "K": 15.0}, {"B": 9.0, "K": 15.0}]}
+    empty = {"points": [], "effects": told()["simulation"]["effects"], "nonlinear": False}
+    figure = drawn(plots.plot_zwidth, k_b_map(), told(axes="environment", designed_for=springs, simulation=empty))
+    marks = [line.get_xydata().tolist() for line in figure.axes[0].lines if line.get_marker() == "P"]
+    assert marks == [[[1.0, 15.0]]]  # the other one is not on the map
+    assert "this environment: certified inside this edge" in legend(figure)
+
+
+def test_lines_are_told_apart_without_colours():
+    styles = [str(style["linestyle"]) for style in plots._STYLES]
+    assert len(set(styles)) == len(styles)

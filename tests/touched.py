@@ -1,0 +1,45 @@
+"""The tests of what a change touches: `make check` runs them.
+
+A file of a package is tested by the file or the folder of its name under tests/; changed tests are run themselves.
+What has changed is what git sees as different from HEAD, or the last commit where nothing does.
+"""
+
+import subprocess
+from pathlib import Path
+
+PACKAGES = ("models", "controller", "design", "sim", "hw", "cli")
+
+
+def changed() -> list[str]:
+    """Paths that differ from HEAD, files that git does not track among them; those of the last commit where none do."""
+    seen = _git("diff", "--name-only", "HEAD") + _git("ls-files", "--others", "--exclude-standard")
+    return seen or _git("diff", "--name-only", "HEAD~1")
+
+
+def tests_of(paths: list[str]) -> list[str]:
+    """What to hand to pytest."""
+    found = {"tests/project/test_layers.py"}
+    for path in paths:
+        top, _, rest = path.partition("/")
+        if top in PACKAGES and (folder := _mirror(path, top)):
+            found.add(folder)
+        elif (
+            top == "tests" and Path(path).name.startswith("test_") and Path(path).exists() and "benchmarks" not in rest
+        ):
+            found.add(path)
+    return sorted(found)
+
+
+def _mirror(path: str, package: str) -> str | None:
+    """The file of the same name, else the folder of the package."""
+    own = Path("tests") / package / f"test_{Path(path).stem}.py"
+    folder = Path("tests") / package
+    return str(own) if own.exists() else str(folder) if folder.is_dir() else None
+
+
+def _git(*words: str) -> list[str]:
+    return subprocess.run(["git", *words], capture_output=True, text=True, check=True).stdout.split()
+
+
+if __name__ == "__main__":
+    print(*tests_of(changed()))
