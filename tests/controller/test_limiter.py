@@ -7,20 +7,20 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Wall, environment
 from controller.loop import force_map
 from controller.lti import Lti, SingularLoop
-from controller.process import BoxProblem, Limiter, Process, Tape, contact, limited
+from controller.process import BoxProblem, Limiter, Process, StepBuffer, contact, limited
 
 T = 1.2e-3
 STIFF = SpringDamper([7806.0, 3137.0], [0.105, 1.68])
 LIMITS = (12.0, 5.657)
 
 
-def drive(process: Process, x: np.ndarray) -> Tape:
-    """The tape after displacements (ticks, m, nsim)."""
-    tape = Tape(process, len(x), x.shape[1], nsim=x.shape[2])
+def drive(process: Process, x: np.ndarray) -> StepBuffer:
+    """The buffer after displacements (ticks, m, nsim)."""
+    buffer = StepBuffer(process, len(x), x.shape[1], nsim=x.shape[2])
     for k, row in enumerate(x):
-        tape.x[k] = row
-        tape.tick(k)
-    return tape
+        buffer.x[k] = row
+        buffer.tick(k)
+    return buffer
 
 
 def closed(limiter: Limiter) -> Process:
@@ -149,10 +149,10 @@ def test_the_limited_loop_obeys_its_definition(network, theta):
     """f_e within the box and e in its normal cone; the linear loop driven by x - e sends f_e + rho (e - e_-)."""
     x, limit, rho = wander(600, 2, 4), np.array([3.0, 1.5]), np.array([11.0, 7.0])
     limiter = limited(network, STIFF, theta, (0, 0), T, limit, rho)
-    tape = drive(closed(limiter), x)
-    e = limiter.slips(tape.z)
+    buffer = drive(closed(limiter), x)
+    e = limiter.slips(buffer.z)
     n = max(theta)
-    f_e = np.stack([tape.f[theta[i] : 600 - n + theta[i], i] for i in range(2)], axis=1)
+    f_e = np.stack([buffer.f[theta[i] : 600 - n + theta[i], i] for i in range(2)], axis=1)
     e = e[: 600 - n]
     assert (np.abs(f_e) <= limit[:, None]).all()
     np.testing.assert_array_equal(f_e * e, limit[:, None] * np.abs(e))  # exactly at the limit where it slips

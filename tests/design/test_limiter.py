@@ -10,7 +10,7 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Box, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled, taps
-from controller.process import Limiter, Process, Tape, limited
+from controller.process import Limiter, Process, StepBuffer, limited
 from design.certificate import (
     LimiterCertificate,
     NotProved,
@@ -301,15 +301,15 @@ def taken(limiter: Limiter, delta, pushed: np.ndarray, greed: float) -> tuple[np
     """
     ticks, m, nsim = pushed.shape
     process = Process(limiter.open, np.full(m, np.inf), np.zeros(m), limiter)
-    tape, D = Tape(process, ticks + 1, m, nsim=nsim), np.array(delta)[:, None] / limiter.sent.T
+    buffer, D = StepBuffer(process, ticks + 1, m, nsim=nsim), np.array(delta)[:, None] / limiter.sent.T
     energy = []
     for k in range(ticks):
-        tape.tick(k)
-        f = tape.f[k]
+        buffer.tick(k)
+        f = buffer.f[k]
         dx = pushed[k] - greed * f / (2 * D)
-        tape.x[k + 1] = tape.x[k] + dx
+        buffer.x[k + 1] = buffer.x[k] + dx
         energy.append((f * dx + D * dx**2).sum(axis=0))
-    return np.cumsum(energy, axis=0), float((limiter.slips(tape.z)[:ticks] != 0).mean())
+    return np.cumsum(energy, axis=0), float((limiter.slips(buffer.z)[:ticks] != 0).mean())
 
 
 def pushes(rng, ticks: int, stop: int) -> np.ndarray:
