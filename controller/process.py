@@ -496,6 +496,15 @@ class Process:
     def channels(self) -> int:
         return self.F.inputs
 
+    @property
+    def walls(self) -> tuple[Wall, ...]:
+        return self.contact.walls if self.contact else ()
+
+    @property
+    def limiter(self) -> Limiter | None:
+        """What limits the forces before they are sent; None where the actuators clip them."""
+        return self.contact if isinstance(self.contact, Limiter) else None
+
     def measured(self, x: Array) -> Array:
         """Positions (.., m) as the encoders give them: rounded to whole steps, or x itself where none is coarse."""
         coarse = self.encoder_step > 0

@@ -386,6 +386,41 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
     return (0.0,) * loop.channels if covered else None
 
 
+@dataclass(frozen=True)
+class Limits:
+    """Whether a guarantee holds while forces are at their limits, and the limiter that it is about."""
+
+    rho: tuple[float, ...] | None  # (m,) [N/m] of the limiter; None: no guarantee, so the tick clips
+    reason: str  # why it holds, or why it does not
+    requirement: Requirement | None = None  # by the condition `limiter`, where it was asked
+    c: tuple[tuple[float, ...], ...] = ()  # its multiplier
+
+    def part(self, force_limit: Sequence[float]) -> dict[str, Any]:
+        """As plain data."""
+        asked = self.requirement and certificate_part(self.requirement)
+        rho = None if self.rho is None else list(self.rho)
+        limit = [finite(f) for f in force_limit]
+        return {"rho": rho, "force_limit": limit, "reason": self.reason, "certificate": asked, "c": self.c}
+
+
+def covered_limits(loop: Loop, coupling: Coupling, requirements: Mapping[str, Requirement]) -> Limits:
+    """The limiter that a coupling may have: of no lag under any-environment, else that of its own condition."""
+    if loop.jitter:
+        return Limits(None, str(limiter_refusal(loop)))
+    if requirements["theorem4"].certified and not any(loop.psi):
+        return Limits((0.0,) * loop.channels, "any-environment covers limited forces")
+    found = limiter_requirement(loop, coupling)
+    requirement = found.requirement
+    if not requirement.certified:
+        needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
+        return Limits(None, requirement.reason or needs, requirement, found.c)
+    try:
+        prove_limiter(loop, coupling, c=found.c)
+    except NotProved as refused:
+        return Limits(found.rho, f"swept, not proved: {refused}", requirement, found.c)
+    return Limits(found.rho, "proved with its own block", replace(requirement, proof="rational"), found.c)
+
+
 def covers_lag(requirement: Requirement, beta: float) -> bool:
     """Whether any-environment (psi = 0) still holds behind a limiter of lag beta delta/T > 0."""
     return beta <= LARGEST_BETA and requirement.ratio <= 1 - 3 * beta
