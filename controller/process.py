@@ -405,10 +405,18 @@ class Limiter:
         lines = m + step.order + np.concatenate([[0], np.cumsum(self.theta)[:-1]]).astype(int)
         sent = np.where(np.array(self.theta) == 0, np.arange(m), lines)
         limit, solve = self.limit[:, None], self.problem.solve
+        finite = [(i, most) for i, most in zip(sent.tolist(), self.limit.tolist(), strict=True) if most < np.inf]
         if not w:
 
             def tick(before: Array, after: Array) -> None:
                 linear(before, after)
+                if after.shape[1] == 1:  # a single simulation spends its time in calls: look without numpy
+                    item = after.item
+                    for place, most in finite:
+                        if not -most <= item(place) <= most:
+                            break
+                    else:
+                        return
                 free = after.take(sent, axis=0)
                 touched = np.abs(free) > limit
                 if not touched.any():
