@@ -63,14 +63,15 @@ def test_exact_engine(benchmark):
     assert assembly.scenario.samples == 12500
 
 
-def test_the_limiter_costs_nothing_to_speak_of_while_no_force_is_limited(benchmark):
-    """The exact engine's loop with the limiter beside the one that clips, in turns: median ratio of their times."""
+@pytest.mark.parametrize("engine", ["exact", "mujoco"])
+def test_what_the_limiter_costs_while_no_force_is_limited(benchmark, engine):
+    """The loop with the limiter beside the one that clips, in turns: median ratio of their times."""
     coupling, ratios = SpringDamper((5832.0, 2545.0), (0.187, 1.386)), []
     limited, clipped = (assemble(load(), coupling, lag) for lag in ((11.4167, 11.4167), None))
 
     def once():
-        ratios.append(seconds(lambda: run(limited, "exact")) / seconds(lambda: run(clipped, "exact")))
+        ratios.append(seconds(lambda: run(limited, engine)) / seconds(lambda: run(clipped, engine)))
 
     benchmark.pedantic(once, rounds=9, iterations=1, warmup_rounds=1)
-    print(f"\nlimited / clipped {np.median(ratios):.2f} (median of {len(ratios)})")
+    print(f"\n{engine}: limited / clipped {np.median(ratios):.2f} (median of {len(ratios)})")
     assert not run(limited, "exact").clipped(limited.process.force_limit).any()

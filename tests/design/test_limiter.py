@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from cli.design import main as design_main
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Box, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
@@ -31,6 +32,7 @@ from design.lmi import Specification
 from design.result import CASE_I
 from design.spring_damper import design
 from design.transparency import transparency
+from sim.scenario import InputError
 
 T, DELTA = 1.2e-3, (1.37, 1.37)
 LOOP = Loop(T, (1, 2), (0, 0), (1, 2), DELTA, FIGURE_4)
@@ -361,3 +363,13 @@ def test_any_environment_covers_the_limiter_without_lag():
         pushed = pushes(rng, 700, 700 if greed == 0 else 150)
         energy, _ = taken(limits, [1.01 * d for d in needed], pushed, greed)
         assert energy.min() >= -1e-12
+
+
+def test_the_command_stores_a_coupling_that_is_proved_with_limited_forces(tmp_path):
+    out = tmp_path / "limited.json"
+    assert design_main(["--condition", "this-environment", "--limiter", "--out", str(out)]) == 0
+    stored = load(out)
+    assert verify(stored).proved
+    assert lag(stored.loop, stored.certificate) == LAG
+    with pytest.raises(InputError, match="--limiter is for --coupling spring-damper, not optimal"):
+        design_main(["--coupling", "optimal", "--limiter", "--out", str(out)])
