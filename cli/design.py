@@ -19,6 +19,7 @@ from design.certificate import (
     NotProved,
     Stored,
     assess,
+    lag,
     promise_of,
     prove,
     save,
@@ -26,6 +27,7 @@ from design.certificate import (
     switching_promise,
     switching_requirement,
 )
+from design.conditions import BETA
 from design.designs import KINDS, compare_methods, design_by_kind
 from design.optimal import FILTERS, OBJECTIVES
 from design.ranges import SAMPLES, SetCheck, check_set, cost_part, price, set_part, set_rows
@@ -64,7 +66,7 @@ def main(argv: list[str]) -> int:
         "objective_name": design.figure,
         "sdps": design.sdps,
         "wall_s": design.wall_s,
-        "stored": _store(loop, design, whole, out),
+        "stored": _store(loop, design, whole, out, BETA if args.limiter else None),
         "jitter_proof": _switching_figures(loop, design),
     }
     if args.compare:
@@ -83,6 +85,8 @@ def _parser() -> options.Parser:
     options.add_condition_option(parser, "what to certify")
     jitter = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"
     parser.add_argument("--jitter", type=options.delay_ranges, metavar="LO,HI", help=jitter)
+    limiter = "spring-damper for this-environment, proved also while forces are limited (any-environment is anyway)"
+    parser.add_argument("--limiter", action="store_true", help=limiter)
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
     ccl.add_argument("--method", choices=METHODS, help="complementarity is as printed (default inner)")
@@ -123,6 +127,7 @@ def _number_or_none(text: str) -> float | str:
 
 #: options of a design -> the couplings that take them
 OPTIONS = {
+    "limiter": ("spring-damper",),
     "order": ("ccl",),
     "method": ("ccl",),
     "compare": ("ccl",),
@@ -162,7 +167,7 @@ def _for_switching(args: argparse.Namespace) -> bool:
     return args.coupling in ("spring-damper", "optimal") and condition == "closed-loop"
 
 
-def _asked(args: argparse.Namespace) -> dict[str, Any]:
+def _asked(args: argparse.Namespace, loop: Loop) -> dict[str, Any]:
     """The arguments of the design's own function. Raises InputError for options of another coupling."""
     given = {name: getattr(args, name) for name in OPTIONS}
     given = {name: value for name, value in given.items() if value is not None and value is not False}
@@ -171,6 +176,8 @@ def _asked(args: argparse.Namespace) -> dict[str, Any]:
             allowed = " or ".join(OPTIONS[name])
             raise InputError(f"--{name.replace('_', '-')} is for --coupling {allowed}, not {args.coupling}")
     given.pop("compare", None)
+    if args.limiter and loop.box:
+        raise InputError("--limiter and [box]: limited forces are proved for one environment, not for ranges")
     if given.get("high_gain") == "none":
         given["high_gain"] = None
     if given.pop("full", False):
@@ -180,7 +187,7 @@ def _asked(args: argparse.Namespace) -> dict[str, Any]:
 
 def _design(args: argparse.Namespace, loop: Loop) -> Design:
     """Raises InputError for a request that contradicts itself, DesignFailed where there is no such coupling."""
-    asked = _asked(args)
+    asked = _asked(args, loop)
     if loop.jitter and _for_switching(args):
         asked["switching"] = (loop.jitter.lo, loop.jitter.hi)
     try:
@@ -209,15 +216,15 @@ def _robustness_loss(args: argparse.Namespace, loop: Loop, design: Design) -> li
     if args.coupling == "optimal":
         couplings = {"whole set": design.coupling}
         try:
-            alone = design_by_kind(loop.at(loop.environment), "optimal", None, **_asked(args))
+            alone = design_by_kind(loop.at(loop.environment), "optimal", None, **_asked(args, loop))
             couplings = {"nominal only": alone.coupling, **couplings}
         except DesignFailed:  # the set is given another basis by default
             pass
     return [cost_part(row) for row in price(loop, couplings)]
 
 
-def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path) -> dict[str, Any]:
-    """Save the coupling with the proof of its condition, or without where there is none yet.
+def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path, beta: float | None = None) -> dict[str, Any]:
+    """Save the coupling with the proof of its condition, with `beta` also of limited forces, or without a proof.
 
     What is not proved for a whole set, or for switching delays, is kept as what it is: a coupling for the nominal
     environment, or for constant delays.
@@ -226,27 +233,28 @@ def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path) -> dic
         certificate, reason = whole.certificate, None
     else:
         loop = loop if design.condition == "theorem4" else loop.at(loop.environment)
-        certificate, reason = _proved(loop, design)
+        certificate, reason = _proved(loop, design, beta)
     switching = None
     if loop.jitter:
         proof = certificate.proof if certificate else None
         switching = {"promise": f"{switching_promise(loop.jitter)}, in {HERE}", "proof": proof, "reason": reason}
         if certificate is None:
             loop = loop.switching(None)
-            certificate, reason = _proved(loop, design)
+            certificate, reason = _proved(loop, design, beta)
     try:
         save(Stored.of(loop, design.coupling, certificate), out)
     except OSError as error:
         raise InputError(f"--out {out}: {error.strerror}") from None
     proof = certificate.proof if certificate else None
-    return {"file": str(out), "proof": proof, "reason": reason, "switching": switching}
+    limited = proof is not None and lag(loop, certificate) is not None
+    return {"file": str(out), "proof": proof, "reason": reason, "switching": switching, "limited_forces": limited}
 
 
-def _proved(loop: Loop, design: Design) -> tuple[Certificate | None, str | None]:
+def _proved(loop: Loop, design: Design, beta: float | None) -> tuple[Certificate | None, str | None]:
     """The certificate of all that the loop claims, or why there is none."""
     try:
         phi = None if design.phi is None else design.phi.tolist()
-        return prove(loop, design.coupling, design.condition, phi), None
+        return prove(loop, design.coupling, design.condition, phi, beta), None
     except NotProved as error:
         return None, str(error)
 
@@ -283,6 +291,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("damping, any switching", proof and _switching_words(proof)),
         *(set_rows(outcome["set"]) if outcome["set"] else []),
         ("guarantee", outcome["promise"] or "none"),
+        ("guarantee, forces", "holds also while forces are limited" if stored["limited_forces"] else None),
         ("guarantee, delays", switching["promise"] if switching.get("proof") else None),
         (outcome["objective_name"], f"{outcome['objective']:.5g}"),
         ("transparency error", render.transparency_error(transparent)),

@@ -10,7 +10,7 @@ from typing import Any
 
 from cli import options, render
 from controller.loop import Loop
-from design.certificate import assess, promise_of
+from design.certificate import Limits, assess, covered_limits, promise_of
 from design.ranges import SetCheck, check_set, set_part, set_rows
 from design.result import listed
 from design.transparency import transparency
@@ -37,8 +37,9 @@ def main(argv: list[str]) -> int:
     with render.progress("searching the ranges") as move:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)
 
-    done = _run(args, simulated, chosen)
-    requirements = assess(done.loop(args.case), chosen.coupling, chosen.phi)
+    requirements = assess(simulated.loop(args.case), chosen.coupling, chosen.phi)
+    limits = _limits(args, simulated, chosen, requirements)
+    done = _run(args, simulated, chosen, limits.rho)
     outcome = {
         "case": args.case,
         "scenario": scenario.name,
@@ -48,6 +49,7 @@ def main(argv: list[str]) -> int:
         "transparency": report.transparency_part(transparency(done.simulation.felt, done.simulation.E, loop.lam)),
         **_stability(chosen, done, any(requirement.certified for requirement in requirements.values())),
         "run": _settings(args, done, loop.lam) | {"environment": environment},
+        "limiter": limits.part([device.force_limit for device in simulated.device]),
     }
     outcome["error"] = position_error(done.trace, done.exact, done.simulation, _unstable(outcome))
     outcome["reproducibility"] = report.beside_the_paper(done.simulation.scenario, args.case, outcome)
@@ -74,6 +76,8 @@ def _parser() -> options.Parser:
     parser.add_argument("--duration", type=options.number(), metavar="SECONDS", help="default: the scenario's")
     who = "other humans: [[human]] per channel in a .toml, or `humans` in a .py"
     parser.add_argument("--human", metavar="FILE", help=who)
+    clip = "clip forces at the devices' limits, in place of the limiter that a guarantee covers"
+    parser.add_argument("--no-limiter", action="store_true", help=clip)
     vertex = "simulate at this vertex of the scenario's ranges (default 0: nominal)"
     parser.add_argument("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
     options.add_output_options(parser, picture=True)
@@ -122,9 +126,18 @@ class _Run:
         return self.simulation.scenario.loop(case)
 
 
-def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> _Run:
+def _limits(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, requirements: dict[str, Any]) -> Limits:
+    """The limiter of this run: where a guarantee covers one and the command does not ask for clipping."""
+    if args.no_limiter:
+        return Limits(None, "forces are clipped, as asked")
+    if scenario.jitter:
+        return Limits(None, "limiter: limited forces are proved for constant delays")
+    return covered_limits(scenario.loop(args.case), chosen.coupling, requirements)
+
+
+def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tuple[float, ...] | None) -> _Run:
     """Close the loop. Raises InputError for settings that cannot be."""
-    simulation, period = assemble(scenario, chosen.coupling), None
+    simulation, period = assemble(scenario, chosen.coupling, lag), None
     if args.engine == "exact" and simulation.friction:
         raise InputError("--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco")
     if scenario.switches:
@@ -262,10 +275,18 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         *(render.delay_rows(jitter) if jitter else []),
         *(_contact_rows(contact, run["samples"]) if contact else []),
         ("simulated in", run["environment"] if outcome["set"] else None),
-        ("clipped ticks", f"{stability['clipped_ticks']} of {run['samples']}"),
+        ("force limits", _limiter(outcome["limiter"])),
+        ("limited ticks", f"{stability['clipped_ticks']} of {run['samples']}"),
         ("speed", speed),
         ("position error", position),
     ]
+
+
+def _limiter(part: dict[str, Any]) -> str:
+    limits = f"{listed(part['force_limit'], 4)} N"
+    if part["rho"] is None:
+        return f"clipped at {limits}: not covered ({part['reason']})"
+    return f"the guarantee holds also while forces are limited to {limits} ({part['reason']})"
 
 
 def _force_error(part: dict[str, Any]) -> str:

@@ -23,8 +23,11 @@ from controller.environment import Member, frozen_states
 from controller.loop import DelayRange, Loop
 from controller.lti import Array, Lti, SingularLoop, rational
 from design.conditions import (
+    BETA,
     Condition,
     JitterProof,
+    Lags,
+    LimiterProof,
     Requirement,
     WallsProof,
     any_environment,
@@ -36,6 +39,9 @@ from design.conditions import (
     encoder_friction,
     jitter_proof,
     jitter_refusal,
+    limiter,
+    limiter_demand,
+    limiter_lag,
     refusal,
     switching_block,
     this_environment,
@@ -69,6 +75,17 @@ class SwitchingProof(Strict, frozen=True):
     P: tuple[tuple[Rational, ...], ...]  # rationals "p/q"
 
 
+class LimiterCertificate(Strict, frozen=True):
+    """What proves this-environment also while forces are limited, by the limiter of controller.process."""
+
+    beta: float  # rho = beta delta/T, to six digits
+    rho: tuple[float, ...]  # (m,) lag of the limiter [N/m]; the tick must use these
+    c: tuple[tuple[float, ...], ...]  # (m, lags) multiplier
+    required: tuple[float, ...]  # (m,) [N s/m] with this multiplier, from a refined sweep
+    margin: float  # available / required
+    P: tuple[tuple[Rational, ...], ...]  # rationals "p/q"
+
+
 class Certificate(Strict, frozen=True):
     """What is claimed of a coupling in its loop, and what proves it."""
 
@@ -83,6 +100,7 @@ class Certificate(Strict, frozen=True):
     versions: dict[str, str]
     seal: str = ""  # digest of all other fields
     switching: SwitchingProof | msgspec.UnsetType = msgspec.UNSET  # of a loop with jitter; left out of other files
+    limiter: LimiterCertificate | msgspec.UnsetType = msgspec.UNSET  # where it was proved; left out of other files
 
 
 class Stored(Strict, frozen=True):
@@ -365,6 +383,147 @@ def _margin(found: JitterProof) -> float:
 
 
 # ----------------------------------------------------------------------------------------------------
+# An exact proof that a coupling is safe in this environment also while its forces are limited: made, stored, proved
+# again. F(1) is exactly symmetric and positive semidefinite, and design.conditions.limiter_demand is strictly
+# positive real. any-environment without delay in the environment needs no proof of its own: with rho = 0 the limiter
+# and the environment together are a passive environment.
+
+
+LARGEST_BETA = 0.05  # up to which any-environment is claimed beside it
+
+
+def limiter_refusal(loop: Loop) -> str | None:
+    """Why the limiter's own condition has nothing to say of a loop, or None."""
+    if loop.jitter:
+        return "limiter: forces that are limited are proved for constant delays, not for delays that switch"
+    if loop.environment.walls:
+        return "limiter: with walls only any-environment covers limited forces (no delay in the environment)"
+    if loop.box:
+        return "limiter: limited forces are proved for one environment, not for ranges"
+    if loop.latency:
+        return "limiter: limited forces are proved for forces that latch at ticks, not for a latency"
+    return None
+
+
+def limiter_requirement(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | None = None) -> LimiterProof:
+    """What this-environment asks with the limiter of rho = beta delta/T, at the multiplier `c` or the best one.
+
+    `proof` of the requirement is "sampled"; `prove` gives the exact one.
+    """
+    rho = limiter_lag(loop.delta, loop.T, beta)
+    reason = limiter_refusal(loop)
+    try:
+        if reason is None:
+            return limiter(loop.sent(coupling), loop.theta, loop.delta, rho, c, T_max=loop.T_max)
+    except SingularLoop as error:
+        reason = str(error)
+    return LimiterProof(refusal("limiter", loop.delta, reason), rho, ((),) * loop.channels, math.inf)
+
+
+def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None:
+    """rho (m,) [N/m] of the limiter that the certificate covers, or None where limited forces are not covered."""
+    if certificate is None:
+        return None
+    if certificate.limiter is not msgspec.UNSET:
+        return certificate.limiter.rho
+    covered = certificate.condition == "theorem4" and not any(loop.psi) and loop.jitter is None
+    return (0.0,) * loop.channels if covered else None
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Whether a guarantee holds while forces are at their limits, and the limiter that it is about."""
+
+    rho: tuple[float, ...] | None  # (m,) [N/m] of the limiter; None: no guarantee, so the tick clips
+    reason: str  # why it holds, or why it does not
+    requirement: Requirement | None = None  # by the condition `limiter`, where it was asked
+    c: tuple[tuple[float, ...], ...] = ()  # its multiplier
+
+    def part(self, force_limit: Sequence[float]) -> dict[str, Any]:
+        """As plain data."""
+        asked = self.requirement and certificate_part(self.requirement)
+        rho = None if self.rho is None else list(self.rho)
+        limit = [finite(f) for f in force_limit]
+        return {"rho": rho, "force_limit": limit, "reason": self.reason, "certificate": asked, "c": self.c}
+
+
+def covered_limits(loop: Loop, coupling: Coupling, requirements: Mapping[str, Requirement]) -> Limits:
+    """The limiter that a coupling may have: of no lag under any-environment, else that of its own condition."""
+    if loop.jitter:
+        return Limits(None, str(limiter_refusal(loop)))
+    if requirements["theorem4"].certified and not any(loop.psi):
+        return Limits((0.0,) * loop.channels, "any-environment covers limited forces")
+    found = limiter_requirement(loop, coupling)
+    requirement = found.requirement
+    if not requirement.certified:
+        needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
+        return Limits(None, requirement.reason or needs, requirement, found.c)
+    try:
+        prove_limiter(loop, coupling, c=found.c)
+    except NotProved as refused:
+        return Limits(found.rho, f"swept, not proved: {refused}", requirement, found.c)
+    return Limits(found.rho, "proved with its own block", replace(requirement, proof="rational"), found.c)
+
+
+def covers_lag(requirement: Requirement, beta: float) -> bool:
+    """Whether any-environment (psi = 0) still holds behind a limiter of lag beta delta/T > 0."""
+    return beta <= LARGEST_BETA and requirement.ratio <= 1 - 3 * beta
+
+
+def prove_limiter(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | None = None) -> LimiterCertificate:
+    """An exact proof with the multiplier `c` or the best one. Raises NotProved with the reason."""
+    found = limiter_requirement(loop, coupling, beta, c)
+    requirement = found.requirement
+    if not requirement.certified:
+        needed, have = (", ".join(f"{d:.6g}" for d in side) for side in (requirement.required, requirement.available))
+        reason = requirement.reason or f"limiter: needs {needed} N s/m of damping, has {have}"
+        raise NotProved(reason, requirement)
+    P, refused = find_storage(limiter_block(loop, coupling, found.rho, found.c))
+    if P is None:
+        raise NotProved(f"limiter: {refused}; the sweep asks {requirement.ratio:.9f} of the damping", requirement)
+    return LimiterCertificate(beta, found.rho, found.c, requirement.required, _limiter_margin(found), rows_of(P))
+
+
+def limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: Lags) -> Lti:
+    """The exact block that must be strictly positive real. Raises NotProved."""
+    try:
+        G = loop.sent(coupling, exact=True)
+        _require_size(G.order + 2 * loop.channels + sum(max(n, len(row)) for n, row in zip(loop.theta, c, strict=True)))
+        demand = limiter_demand(G, loop.theta, loop.delta, rho, c, loop.T_max)
+    except (SingularLoop, ValueError) as error:
+        raise NotProved(f"limiter: {error}") from None
+    _require_static("F(1)", demand.static["F(1)"])
+    return demand.gain + demand.free
+
+
+def _refuted_limiter(loop: Loop, coupling: Coupling, certificate: Certificate) -> str | None:
+    """Why what is on file does not prove the limited loop, or None if it does or claims nothing."""
+    proof = certificate.limiter
+    if proof is msgspec.UNSET:
+        return None
+    if certificate.condition != "closed-loop":
+        return "limiter: any-environment needs no proof of its own, and one is on file"
+    if reason := limiter_refusal(loop):
+        return reason
+    if any(not (0 <= v < math.inf) for v in (*proof.rho, *(v for row in proof.c for v in row))):
+        return "limiter: rho and c must be numbers >= 0"
+    if proof.rho != limiter_lag(loop.delta, loop.T, proof.beta) or len(proof.c) != loop.channels:
+        return f"limiter: rho is {list(proof.rho)}, expected beta delta/T with beta = {proof.beta:g}, one row of c each"
+    found = limiter_requirement(loop, coupling, proof.beta, proof.c)
+    required = found.requirement.required
+    if len(proof.required) != len(required) or not np.allclose(proof.required, required, rtol=CLAIM_TOLERANCE):
+        return f"limiter: required is {list(proof.required)}, the sweep finds {list(required)}"
+    if not np.isclose(proof.margin, _limiter_margin(found), rtol=CLAIM_TOLERANCE):
+        return f"limiter: margin is {proof.margin:.9g}, the sweep finds {_limiter_margin(found):.9g}"
+    reason = refuted_rows("P", limiter_block(loop, coupling, proof.rho, proof.c), proof.P)
+    return reason and f"limiter: {reason}"
+
+
+def _limiter_margin(found: LimiterProof) -> float:
+    return 1 / max(found.requirement.ratio, 1e-12)
+
+
+# ----------------------------------------------------------------------------------------------------
 # What a report says of delays that vary: the jitter-proof requirement beside that of the playout buffer.
 
 
@@ -449,11 +608,21 @@ class Verdict:
     reason: str | None = None
 
 
-def prove(loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[float] | None = None) -> Certificate:
+def prove(
+    loop: Loop,
+    coupling: Coupling,
+    condition: Condition,
+    phi: Sequence[float] | None = None,
+    beta: float | None = None,
+) -> Certificate:
     """A certificate with an exact proof of the condition; `phi` [N s/m] is Theorem 4's multiplier where psi >= 1.
 
-    Raises NotProved with the reason.
+    With `beta` also of forces that are limited, by a limiter of rho = beta delta/T under this-environment; under
+    any-environment without delay in the environment rho is 0 and the certificate is the same. Raises NotProved with
+    the reason.
     """
+    if beta is not None and condition == "theorem4" and any(loop.psi):
+        raise NotProved("limiter: any-environment with delay in the environment does not cover limited forces")
     if condition == "closed-loop" and loop.environment.walls:
         phi = walls_of(loop, coupling).g
     multiplier = None if phi is None else [rational(float(p)) for p in phi]
@@ -486,6 +655,7 @@ def prove(loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[fl
             scenario=digest(loop, coupling.form()),
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
             switching=_switching(loop, coupling, requirement),
+            limiter=msgspec.UNSET if beta is None or condition == "theorem4" else prove_limiter(loop, coupling, beta),
         )
     )
 
@@ -700,7 +870,7 @@ def _refuted_proof(loop: Loop, coupling: Coupling, certificate: Certificate) -> 
     for name, real in blocks.items():
         if reason := refuted_rows(name, real, certificate.matrices[name]):
             return f"{_place_certificate(loop, certificate.condition, name)}{reason}"
-    return refuted(loop, coupling, certificate.switching)
+    return refuted(loop, coupling, certificate.switching) or _refuted_limiter(loop, coupling, certificate)
 
 
 def _multiplier_name(loop: Loop, condition: Condition) -> str:

@@ -12,6 +12,7 @@ any-environment    Lemma 4 of the paper for Psi = I and any passive environment 
 switching          this-environment for delays of the forces that vary within lo..hi at every tick
 latency            this-environment for forces that latch a fraction of a sample after the tick, anew at every tick
 walls              this-environment for walls that make and break contact
+limiter            this-environment for forces that leave through the limiter of controller.process
 
 The period may vary from tick to tick, up to T_max, in all of them: `even_damping` is where it enters.
 """
@@ -19,13 +20,13 @@ The period may vary from tick to tick, up to T_max, in all of them: `even_dampin
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
-from scipy.optimize import minimize, minimize_scalar
+from scipy.optimize import linprog, minimize, minimize_scalar
 
 from controller.delay import delay, moving_sum
 from controller.lti import (
@@ -56,7 +57,10 @@ from design.frequency import (
 #: as files and options of today name them: theorem4 is any-environment, closed-loop is this-environment
 Condition = Literal["closed-loop", "theorem4"]
 
-C = TypeVar("C", bound=str)  # a Condition, or "jitter-proof"
+C = TypeVar("C", bound=str)  # a Condition, "jitter-proof" or "limiter"
+
+#: c_ij >= 0 of the limiter's multiplier: for every channel i a weight per lag j = 1, 2, ..; none is zero
+Lags = Sequence[Sequence[Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,6 +209,40 @@ def _halves(lo: int, hi: int) -> list[Number]:
     return [Fraction((i == lo) + (i == hi), 2) for i in range(hi + 1)]
 
 
+def limiter_demand(
+    G: Block, theta: Sequence[int], delta: Any, rho: Sequence[Any], c: Lags, T_max: float | None = None
+) -> Demand[Block]:
+    """The limiter's block on (dx - de, de), the steps of what the environment follows and of the slip.
+
+    G are the forces as they leave without the limiter, rho (m,) [N/m] its lag, fixed numbers that the damping does
+    not scale, and c the multiplier. With df_e = G (dx - de) - rho (1 - 1/z) de, the steps of the limited forces, the
+    block is [Theta/(z-1); N] df_e + s Delta_D/T [1, 0; 2, 1], where
+    N_i = -(1 + .. + z^-theta_i) - sum_j c_ij (j + (j-1)/z + .. + z^-(j-1)).
+    """
+    m, T = len(theta), G.T
+    damping = np.diag(even_damping(delta, T, T_max) / T)
+    lines = Lti.diag(*(_delay_and_weights(n, row, T) for n, row in zip(theta, c, strict=True)))
+    lines = lines.rows([*range(0, 2 * m, 2), *range(1, 2 * m, 2)])
+    difference = Lti.diag(*(taps([1, -1], T) for _ in theta))
+    steps: Any = hstack(G, as_like(G, difference @ np.diag(-numbers(rho, T))))
+    both = as_like(G, lines) @ steps
+    static, ramp = both.rows(slice(None, m)).split_at_one()  # [F(1), 0]: the slip's steps have no mean
+    zero = np.zeros((m, m), dtype=int)
+    free = vstack(ramp - static / 2, both.rows(slice(m, None)))
+    gain = np.block([[damping, zero], [2 * damping, damping]])
+    return Demand(free, constant_like(G, gain), {"F(1)": static[..., :m]}, ("F(1)",))
+
+
+def _delay_and_weights(theta: int, c: Sequence[Any], T: Number) -> Lti:
+    """[z^-theta; N] of one channel, over one line of delays."""
+    lags = range(1, len(c) + 1)
+    size = max(theta + 1, len(c))
+    late = [int(k == theta) for k in range(size)]
+    weights = [-sum([numbers(c[j - 1], T) * (j - k) for j in lags if j > k], int(k <= theta)) for k in range(size)]
+    first, second = taps(late, T), taps(weights, T)
+    return Lti(first.A, first.B, np.vstack([first.C, second.C]), np.vstack([first.D, second.D]), T)
+
+
 def delayed_environment_block(delayed: Lti, phi: Sequence[Any]) -> tuple[Array, Lti]:
     """E(1), and E-hat + Phi without its pole, which must be positive real; `delayed` is Psi E.
 
@@ -235,7 +273,7 @@ def delayed_coupling_block(
     delta = even_damping(delta, T, T_max)
     if len(phi) != len(delta) or not all(0 <= p < d for p, d in zip(phi, delta, strict=True)):
         raise ValueError("the multiplier Phi is not between 0 and the device damping on every channel")
-    H = V - np.diag(T / (2 * delta)) @ moving_sum(theta, T)
+    H = V - np.diag(T / (2 * numbers(delta, T))) @ moving_sum(theta, T)
     H1, R = H.split_at_one()
     excess = [(1 / p - 1 / d) * (1 - STRICT) if p else UNLIMITED / d for p, d in zip(phi, delta, strict=True)]
     m = len(delta)
@@ -825,6 +863,151 @@ class _Search:
             options={"maxiter": 200, "ftol": 1e-12},
         )
         return np.exp(found.x[1:]), float(found.x[0])
+
+
+# the limiter: the best multiplier
+#
+# The block is affine in (s, c), so s(c) is convex, and each direction u at a frequency gives a linear bound:
+# u*(free(c) + s gain)u >= 0. The worst of them are collected, a linear program finds the least s that they allow, and
+# the search ends where the sweep attains it (Kelley's cutting planes).
+
+BETA = 0.01  # of a limiter's lag under this-environment unless another is asked for
+LARGEST_WEIGHT = 10.0  # that a search gives a c_ij
+HOPELESS = 1e6  # times the available damping
+SPARE = 0.02  # of rho: what the block keeps, however large the damping, so that c may be rounded and the proof exact
+LIMITER_SETTLED = 1e-6  # relative gap between the sweep at the best c and the bound that no c beats
+
+
+@dataclass(frozen=True)
+class LimiterProof:
+    """What the limiter asks of the devices."""
+
+    requirement: Requirement  # condition "limiter"
+    rho: tuple[float, ...]  # (m,) [N/m] the lag of the limiter that is asked about
+    c: tuple[tuple[float, ...], ...]  # (m, lags) the multiplier that shows it
+    bound: float  # what the search proved of all c that keep SPARE of rho; the ratio itself where c was given
+
+
+def limiter_lag(delta: Sequence[float], T: float, beta: float) -> tuple[float, ...]:
+    """rho = beta delta/T [N/m] of a limiter under this-environment, to six digits."""
+    return tuple(float(f"{beta * d / T:.6g}") for d in delta)
+
+
+def limiter(
+    G: Lti,
+    theta: Sequence[int],
+    delta: Sequence[float],
+    rho: Sequence[float],
+    c: Lags | None = None,
+    lags: int = 1,
+    T_max: float | None = None,
+) -> LimiterProof:
+    """The least common factor on `delta` [N s/m] with which the limiter's block is positive real, at the best c.
+
+    G is the force map without Theta, rho (m,) [N/m] the limiter's lag. With `c` given its figure is that of the
+    refined sweep at this multiplier; otherwise the best with so many lags per channel is searched.
+    """
+    available, m = dampings(delta, G.inputs), G.inputs
+    if len(theta) != m or len(rho) != m or (c is not None and len(c) != m):
+        raise ValueError(f"theta, rho and c need one entry for each of {m} channels")
+    if not all(0 <= r < np.inf for r in rho) or any(not 0 <= v < np.inf for row in c or () for v in row):
+        raise ValueError(f"rho is {list(rho)} and c is {c}, expected numbers >= 0")
+    none = tuple((0.0,) * lags for _ in theta) if c is None else tuple(tuple(float(v) for v in row) for row in c)
+    linear = this_environment(
+        delay(theta, G.T) @ G, available, T_max
+    )  # the slip at rest: its rows are among the block's
+    if not np.isfinite(linear.ratio):
+        reason = linear.reason or "the loop without limiter is not covered"
+        return LimiterProof(refusal("limiter", available, reason), tuple(rho), none, np.inf)
+    search = _LimiterSearch(G, theta, available, rho, lags)
+    if c is not None:
+        ratio, w = search.swept(none)
+        return LimiterProof(search.requirement(ratio, w), tuple(rho), none, ratio)
+    best, ratio, w, bound = search.least()
+    return LimiterProof(search.requirement(ratio, w), tuple(rho), best, bound)
+
+
+class _LimiterSearch:
+    """s(c) by the refined sweep, and its least over c >= 0."""
+
+    def __init__(self, G: Lti, theta: Sequence[int], delta: tuple[float, ...], rho: Sequence[float], lags: int) -> None:
+        self._loop, self._delta, self._shape = (G, theta, delta, rho), delta, (len(theta), lags)
+        self._grid, self._lag = np.concatenate([[0.0], frequencies(G)]), np.diag([*rho, *rho])
+
+    def requirement(self, ratio: float, w: float) -> Requirement:
+        T = self._loop[0].T
+        if np.isinf(ratio):
+            reason = f"no damping is enough for the limiter at {w / (2 * np.pi * T):.4g} Hz with this multiplier"
+            return refusal("limiter", self._delta, reason)
+        return from_ratio("limiter", max(ratio, 0.0), self._delta, w / (2 * np.pi * T))
+
+    def demand(self, c: Lags) -> Demand[Lti]:
+        G, theta, delta, rho = self._loop
+        return limiter_demand(G, theta, delta, rho, c, T_max)
+
+    def swept(self, c: Lags, spare: float = 0.0) -> tuple[float, float]:
+        """(s(c), w [rad/sample]) by a sweep that is refined between its samples, with so much of rho to spare."""
+        demand = self.demand(c)
+        demand = replace(demand, free=demand.free - spare * self._lag)
+        return supremum(lambda w: least_scale(demand, w), self._grid)
+
+    def least(self) -> tuple[tuple[tuple[float, ...], ...], float, float, float]:
+        """(c, s(c), where it binds, a lower bound on s over all c that have something to spare)."""
+        m, lags = self._shape
+        c, bound = np.zeros(m * lags), -np.inf
+        best: tuple[Array, float, float] = (c, np.inf, 0.0)
+        parts, cuts = self._parts(self._grid), np.zeros((0, m * lags + 2))
+        for _ in range(MOST_ROUNDS):
+            found, top = self._cuts(c, *parts)
+            if top <= bound + LIMITER_SETTLED * abs(bound):  # settled on the samples: look between them
+                ratio, w = self.swept(self._rows(c), SPARE)
+                best = min(best, (c, ratio, w), key=lambda found: found[1])
+                if best[1] <= bound + 10 * LIMITER_SETTLED * abs(bound):
+                    break
+                between = self._parts(np.array([w]))
+                parts = tuple(np.concatenate(pair, axis=-3) for pair in zip(parts, between, strict=True))
+                found = np.concatenate([found, self._cuts(c, *between)[0]])
+            cuts = np.concatenate([cuts, found])
+            lowest = linprog(
+                np.eye(c.size + 1)[-1],
+                A_ub=-cuts[:, 1:],
+                b_ub=cuts[:, 0],
+                bounds=[*[(0.0, LARGEST_WEIGHT)] * c.size, (0.0, None)],
+            )
+            if lowest.x is None:  # no c within the bounds makes the block positive, however large the damping
+                return self._rows(c), np.inf, self.swept(self._rows(c), SPARE)[1], np.inf
+            c, bound = np.maximum(lowest.x[:-1], 0.0), float(lowest.x[-1])
+        if np.isinf(best[1]):
+            best = (c, *self.swept(self._rows(c), SPARE))
+        c = np.round(best[0], 6)
+        return self._rows(c), *self.swept(self._rows(c)), bound
+
+    def _rows(self, c: Array) -> tuple[tuple[float, ...], ...]:
+        """c (m lags,) as a row per channel."""
+        return tuple(tuple(row) for row in c.reshape(self._shape).tolist())
+
+    def _parts(self, w: Array) -> tuple[Complex, Complex, Complex]:
+        """The Hermitian parts at w (k,) of the block without c, (1, k, p, p), of its slopes in c, and of the gain."""
+        z, m = on_circle(w), len(self._delta)
+        none = self.demand(np.zeros(self._shape).tolist())
+        free, gain = hermitian(none.free.at(z)), hermitian(none.gain.at(z))
+        units = np.eye(int(np.prod(self._shape)))
+        slopes = [hermitian(self.demand(self._rows(unit)).free.at(z)) - free for unit in units]
+        return (free - SPARE * self._lag)[None], np.array(slopes).reshape(-1, w.size, 2 * m, 2 * m), gain[None]
+
+    def _cuts(self, c: Array, free: Complex, slopes: Complex, gain: Complex) -> tuple[Array, float]:
+        """(rows, s): the bounds value + slope.c + s gain >= 0 at the worst peaks, and the worst s there."""
+        block, gain = free[0] + np.tensordot(c, slopes, axes=1), gain[0]
+        needed = least_multiple(block, gain)
+        padded = np.concatenate([[-np.inf], needed, [-np.inf]])
+        peaks = np.flatnonzero((needed >= padded[:-2]) & (needed >= padded[2:]))
+        peaks = peaks[np.argsort(needed[peaks])[-MOST_PEAKS:]]
+        # beyond any damping the worst direction is sought at one so large that only the null space of the gain counts
+        s = np.where(np.isinf(needed[peaks]), HOPELESS, needed[peaks])
+        u = np.linalg.eigh(block[peaks] + s[:, None, None] * gain[peaks])[1][:, :, 0]
+        terms = np.concatenate([free, slopes, gain[None]])[:, peaks]
+        rows = np.einsum("ka,tkab,kb->kt", u.conj(), terms, u).real
+        return rows / np.abs(rows).max(axis=1, keepdims=True), float(needed.max())
 
 
 def half_widths(lo: Sequence[int], hi: Sequence[int]) -> Array:

@@ -26,7 +26,7 @@ KINDS = {"spring-damper": ("theorem4", "closed-loop"), "ccl": ("theorem4",), "op
 
 #: kind -> what else can be asked of it, in words of design.api.Options
 OPTIONS = {
-    "spring-damper": ("switching",),
+    "spring-damper": ("switching", "limiter"),
     "ccl": ("order", "method", "diagonal"),
     "optimal": ("functions", "filter", "diagonal", "objective", "high_gain", "margin", "switching"),
 }
@@ -116,6 +116,7 @@ class Options(TypedDict, total=False):
     method: str  # ccl: complementarity, inner or fixed-poles
     diagonal: bool  # ccl, optimal: no gain across channels
     switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of delays that vary
+    limiter: bool  # spring-damper, this-environment: covered also while forces are limited
     functions: int  # optimal: basis functions per entry of Q
     filter: str  # optimal: where the poles of the basis are
     objective: Literal["rms", "sup"]  # optimal: of the mismatch relative to the environment

@@ -19,14 +19,20 @@ from controller.delay import delay
 from controller.loop import force_map
 from controller.lti import Array, Sampled
 from design.conditions import (
+    BETA,
+    Lags,
+    LimiterProof,
     Requirement,
     any_environment,
     any_environment_delayed,
     half_widths,
     jitter_proof,
+    limiter_demand,
+    limiter_lag,
     switching_block,
     this_environment,
 )
+from design.conditions import limiter as limiter_proof
 from design.frequency import frequencies, hermitian, on_circle, peaks
 from design.lmi import RESERVE, Complex, Shaping, Specification, affine_lmis, gain_lmi, shortage, solve, solved
 from design.result import Design, DesignFailed, Infeasible
@@ -203,6 +209,7 @@ def _tangent(spec: Specification, shaping: Shaping, at: Array, norm: float, w: A
 SAMPLED_RESERVE = 1.5 * RESERVE
 SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
 CLOSEST_POLE = 1e-5  # from the unit circle
+MOST_WEIGHT = 5.0  # of the limiter's multiplier
 STUCK = 1e-3  # a search that leaves the sampled condition violated by this has no feasible point nearby
 MOST_ROUNDS_FROZEN_ENVIRONMENT = 8
 
@@ -401,6 +408,73 @@ def _safe_optimum(sampled: SwitchingLoop, start: SpringDamper) -> tuple[SpringDa
     return None, MOST_ROUNDS_FROZEN_ENVIRONMENT
 
 
+# ----------------------------------------------------------------------------------------------------
+# Spring-damper gains that are safe also while forces are limited: the same search with the limiter's block
+# (design.conditions.limiter_demand) in the place of the linear one, and its multiplier among the unknowns.
+
+
+class LimiterLoop(SampledLoop):
+    """As Sampled, with x = (log K, B/delta, c) and one weight c per channel, of the lag 1."""
+
+    def __init__(self, spec: Specification) -> None:
+        self.rho = limiter_lag(spec.delta, spec.T, BETA)
+        super().__init__(spec)
+
+    def coupling(self, x: Array) -> SpringDamper:
+        return super().coupling(self._gains(x))
+
+    def point(self, coupling: SpringDamper) -> Array:
+        """The gains with their best multiplier."""
+        found = self.proof(coupling)
+        return np.concatenate([super().point(coupling), np.array(found.c)[:, 0]])
+
+    def proof(self, coupling: SpringDamper, c: Lags | None = None) -> LimiterProof:
+        """What the limiter asks at the multiplier `c` or the best one, by the refined sweep."""
+        spec = self.spec
+        G = force_map(spec.environment, coupling, (0,) * spec.channels, spec.psi)
+        return limiter_proof(G, spec.theta, spec.delta, self.rho, c)
+
+    def force(self, x: Array, loop: tuple[Complex, Complex, Complex]) -> Complex:
+        return super().force(self._gains(x), loop)
+
+    def room(self, x: Array) -> Array:
+        """The least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency."""
+        spec, (D, E, _) = self.spec, self.loop_at_conditions
+        now = np.broadcast_to(np.eye(spec.channels, dtype=complex), E.shape)
+        G = Sampled(on_circle(self.conditions)[None], self.force(x, (D, E, now))[None], spec.T)
+        demand = limiter_demand(G, spec.theta, spec.delta, self.rho, self.weights(x))
+        block = hermitian(demand.free.G[0] + (1 - SAMPLED_RESERVE) * demand.gain.G[0])
+        root = np.tile(self.root, 2)
+        room = np.linalg.eigvalsh(root[:, None] * block * root)[:, 0].astype(float)
+        return np.append(room, self.stability(x)) if any(spec.psi) else room
+
+    def search(self, x: Array) -> OptimizeResult:
+        return self.minimised(x, [(0.0, MOST_WEIGHT)] * self.spec.channels)
+
+    def weights(self, x: Array) -> list[list[float]]:
+        """c, a row of one lag per channel."""
+        return np.maximum(x[2 * self.spec.channels :, None], 0.0).tolist()
+
+    def _gains(self, x: Array) -> Array:
+        return x[: 2 * self.spec.channels]
+
+
+def _limited_optimum(spec: Specification, start: SpringDamper) -> tuple[SpringDamper | None, int]:
+    """(a local optimum that passes the limiter's refined sweep or None, searches)."""
+    sampled = LimiterLoop(spec)
+    x = sampled.point(start)
+    for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
+        x = sampled.search(x).x
+        coupling = sampled.coupling(x)
+        requirement = sampled.proof(coupling, sampled.weights(x)).requirement
+        if requirement.ratio <= 1 - RESERVE:
+            return coupling, searches
+        if sampled.room(x).min() < -STUCK or requirement.frequency_hz is None:
+            return None, searches
+        sampled.add(max(2 * np.pi * spec.T * requirement.frequency_hz, 1e-6))
+    return None, MOST_ROUNDS_FROZEN_ENVIRONMENT
+
+
 #: The sequence stops when a step improves the norm by less than this, relatively.
 SETTLED = 1e-6
 MOST_STEPS = 60
@@ -413,18 +487,22 @@ def design(
     condition: str = "theorem4",
     starts: Sequence[SpringDamper] = (),
     switching: tuple[Sequence[int], Sequence[int]] | None = None,
+    limiter: bool = False,
 ) -> Design:
     """The best spring-damper under `condition`; by default the starts are chosen, a start need not be feasible.
 
     any-environment: minimises ||W1 L W2||_inf (23) over the exact set; the result does not depend on the start.
     closed-loop: minimises the rms mismatch in this environment from every start, local optima only; with
-    `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it (`switching_block`).
+    `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it, with `limiter` also
+    while forces are limited (any-environment is anyway, at no cost).
     Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for closed-loop.
     """
     if condition == "theorem4" and switching is None:
         return _for_any_environment(spec, starts[0] if starts else None)
     if condition == "closed-loop":
-        return _for_this_environment(spec, starts, switching)
+        if switching and limiter:
+            raise ValueError("limiter and switching: limited forces are proved for constant delays, ask for one")
+        return _for_this_environment(spec, starts, switching, limiter)
     if switching:
         raise ValueError("delays that vary are designed for by the closed-loop condition only")
     raise ValueError(f"condition is {condition!r}, expected 'any_environment' or 'closed-loop'")
@@ -451,15 +529,22 @@ def _for_any_environment(spec: Specification, start: SpringDamper | None) -> Des
 
 
 def _for_this_environment(
-    spec: Specification, starts: Sequence[SpringDamper], switching: tuple[Sequence[int], Sequence[int]] | None
+    spec: Specification,
+    starts: Sequence[SpringDamper],
+    switching: tuple[Sequence[int], Sequence[int]] | None,
+    limiter: bool,
 ) -> Design:
     started, starts = time.perf_counter(), starts or _default_starts(spec)
     search = partial(least_rms_switching, spec, *switching) if switching else partial(least_rms, spec)
+    if limiter:
+        search = partial(least_rms, spec, optimum=partial(_limited_optimum, spec))
     coupling, rms, searches = search(starts)
     if coupling is None:
         certifies = "the closed-loop condition certifies"
         if switching:
             certifies += f" under any switching from {tuple(switching[0])} to {tuple(switching[1])} samples"
+        if limiter:
+            certifies += " while forces are limited"
         line = (
             f"no spring-damper was found that {certifies} for theta = {spec.theta}, psi = {spec.psi}, "
             f"delta = {spec.delta}: use more device damping, less delay, or other starts"

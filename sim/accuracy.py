@@ -186,13 +186,14 @@ class ForceError:
 def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> ForceError:
     """The run's forces before their limits, and those of Lambda E, for the displacements that the encoders gave.
 
-    Where delays switch, the forces are those that arrived, within their limits. Of walls there is no linear ideal.
+    Where delays switch or a limiter stands before them, the forces are those that arrived, within their limits. Of
+    walls there is no linear ideal.
     """
     process = simulation.process
-    if process.contact:
+    if process.walls:
         return ForceError(trace.f, trace.f, "walls have no linear ideal to compare with")
     F = process.F
-    asked = trace.f if process.delays is not None else trace.z @ F.C.T + trace.x @ F.D.T
+    asked = trace.f if process.delays is not None or process.limiter else trace.z @ F.C.T + trace.x @ F.D.T
     return ForceError(asked, response(delay(lam, F.T) @ simulation.E, trace.x))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.lti import Array, Lti
-from controller.process import Process, StepBuffer
+from controller.process import Contact, Process, StepBuffer
 from models.device import Device
 from models.human import Population
 from models.scene import Crowd, Scene, variants
@@ -348,7 +348,7 @@ def _linear(processes: Sequence[Process]) -> _Transition:
 
 def _one_wall(processes: Sequence[Process]) -> _Transition:
     """Contact.transition for one wall each, whose complementarity problem is p = max(0, q)/M."""
-    contacts = [p.contact for p in processes if p.contact]
+    contacts = [p.contact for p in processes if isinstance(p.contact, Contact)]
     m, order = contacts[0].channels, contacts[0].block.order
     linear = _linear(processes)
     reach = _last_axis([np.concatenate([c.block.C[m], [0.0], c.block.D[m, :m]]) for c in contacts])

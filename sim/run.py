@@ -8,7 +8,7 @@ controller.process for the order of these steps and sim.engines for what advance
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -19,7 +19,7 @@ from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.environment import environment, held
 from controller.loop import force_map
 from controller.lti import Array, Lti
-from controller.process import Process, StepBuffer, contact
+from controller.process import Process, StepBuffer, contact, limited
 from models.scene import Scene, build, plant
 from sim.engines import (
     EXPONENTIAL,
@@ -76,8 +76,8 @@ class Simulation:
         return list(self.process.frozen().values())[-1] if self.process.contact else self.F
 
 
-def assemble(scenario: Scenario, coupling: Coupling) -> Simulation:
-    """Build both sides of the loop.
+def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None = None) -> Simulation:
+    """Build both sides of the loop; with `lag`, rho (m,) [N/m], forces leave through a limiter and are not clipped.
 
     Raises SingularLoop where the algebraic loop of environment and coupling has no solution, InputError for walls that
     no compliance V stands before.
@@ -87,9 +87,12 @@ def assemble(scenario: Scenario, coupling: Coupling) -> Simulation:
     if network.walls and not isinstance(coupling, NoCoupling | SpringDamper | Compliance):
         raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
     E = environment(held(network), scenario.T)
-    walled = contact(network, coupling, *delays, scenario.T) if network.walls else None
-    F = walled.open if walled else force_map(E, coupling, *delays)
     limits, steps = (np.array([getattr(d, of) for d in scenario.device]) for of in ("force_limit", "encoder_step"))
+    if lag is not None:
+        walled = limited(network, coupling, *delays, scenario.T, limits, lag)
+    else:
+        walled = contact(network, coupling, *delays, scenario.T) if network.walls else None
+    F = walled.open if walled else force_map(E, coupling, *delays)
     scene = build(scenario.device, scenario.human, scenario.person)
     return Simulation(scenario, E, F, Process(F, limits, steps, walled), scene, hold(plant(scene.model), scenario.T))
 

@@ -154,15 +154,17 @@ def exact_growth(simulation: Simulation) -> float:
     return float(worst_mode(simulation).growth)
 
 
-def measured_growth(loop: ClosedLoop, trace: Trace, force_limit: Array) -> tuple[float | None, str | None]:
+def measured_growth(
+    loop: ClosedLoop, trace: Trace, force_limit: Array, ahead: int = 0
+) -> tuple[float | None, str | None]:
     """The growth rate [1/s] of the loop's dominant mode in a trace, or None with the reason.
 
     The trace is projected on the left eigenvector, y = left* xi, which no other mode of the exact loop touches.
     With the known outside force subtracted, y[k+1] - left* B w[k] = lambda y[k]; lambda is the least-squares
-    fit over the ticks before the first clipped one.
+    fit over the ticks before the first clipped one, less `ahead`, by which a limiter acts before its force arrives.
     """
     clipped = trace.clipped(force_limit)
-    usable = int(np.argmax(clipped)) if clipped.any() else clipped.size - 1
+    usable = max(int(np.argmax(clipped)) - ahead, 0) if clipped.any() else clipped.size - 1 - ahead
     if usable < _SHORTEST_TRACE:
         which = "ticks before the first clipped one" if clipped.any() else "ticks"
         return None, f"only {max(usable, 0)} {which}; a growth rate needs {_SHORTEST_TRACE}"
@@ -178,14 +180,15 @@ def measured_growth(loop: ClosedLoop, trace: Trace, force_limit: Array) -> tuple
 
 def stability_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
     """Measured on the trace, and from the eigenvalues of the exact loop; of walls, in the worst contact state."""
-    contact = _contact_part(simulation, trace) if simulation.process.contact else {}
+    contact = _contact_part(simulation, trace) if simulation.process.walls else {}
     if contact.get("ticks"):
         growth, reason = None, f"contact was made {contact['made']} times, and a growth rate is of one linear loop"
     elif simulation.friction:
         growth, reason = None, "with Coulomb friction there is no growth rate; the eigenvalues are those without it"
     else:
         loop = close(simulation.plant, simulation.F)
-        growth, reason = measured_growth(loop, trace, simulation.process.force_limit)
+        ahead = max(simulation.scenario.theta) if simulation.process.limiter else 0
+        growth, reason = measured_growth(loop, trace, simulation.process.force_limit, ahead)
     if trace.diverged:
         reason = "the simulation left the range of finite numbers: reported as unstable"
     part: dict[str, Any] = {

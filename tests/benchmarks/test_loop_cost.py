@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from controller.coupling import SpringDamper
 from design.result import CASE_I
 from sim.engines import discretised, profiler_off
 from sim.run import assemble, make_engine, run
@@ -60,3 +61,17 @@ def test_exact_engine(benchmark):
     median = benchmark.stats.stats.median if benchmark.stats else float("nan")
     print(f"\nexact: {assembly.scenario.duration / median:.0f} x real time, the reference for errors")
     assert assembly.scenario.samples == 12500
+
+
+@pytest.mark.parametrize("engine", ["exact", "mujoco"])
+def test_what_the_limiter_costs_while_no_force_is_limited(benchmark, engine):
+    """The loop with the limiter beside the one that clips, in turns: median ratio of their times."""
+    coupling, ratios = SpringDamper((5832.0, 2545.0), (0.187, 1.386)), []
+    limited, clipped = (assemble(load(), coupling, lag) for lag in ((11.4167, 11.4167), None))
+
+    def once():
+        ratios.append(seconds(lambda: run(limited, engine)) / seconds(lambda: run(clipped, engine)))
+
+    benchmark.pedantic(once, rounds=9, iterations=1, warmup_rounds=1)
+    print(f"\n{engine}: limited / clipped {np.median(ratios):.2f} (median of {len(ratios)})")
+    assert not run(limited, "exact").clipped(limited.process.force_limit).any()

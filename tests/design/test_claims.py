@@ -16,7 +16,8 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.loop import force_map
 from controller.lti import Lti
-from design.conditions import any_environment, this_environment
+from controller.process import limited
+from design.conditions import any_environment, limiter_lag, this_environment
 from design.lmi import Infeasible, Shaping, Specification, least_multiplier
 from design.result import CASE_I, CASE_II, PRINTED_TAU_DB
 from design.spring_damper import step
@@ -387,6 +388,11 @@ def test_saturation_is_outside_every_certificate():
     assert np.abs(late(calmer)).max() < 0.01
     unlimited = replace(assembly, process=replace(assembly.process, force_limit=np.full(2, np.inf)))
     assert np.abs(late(unlimited)).max() < 0.01
+    for beta in (0.0, 0.01):  # the limiter in the place of clipping: every start comes to rest
+        rho = limiter_lag((DELTA, DELTA), T, beta)
+        limits = limited(base.environment, STIFF, base.theta, base.psi, T, (12.0, 5.657), rho)
+        limiting = replace(assembly, process=replace(assembly.process, F=limits.open, contact=limits))
+        assert np.abs(late(limiting)).max() < 0.01
 
 
 def test_what_the_multiplier_costs():

@@ -9,19 +9,17 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-MENTION = re.compile(r"tests/(test_\w+\.py)::(\w+)")
+MENTION = re.compile(r"tests/(?:\w+/)*(test_\w+\.py)::(\w+)")
 DOCS = ("theory.md", "reproducibility.md")
 #: Sections that introduce words and claim nothing
 DEFINITIONS = ("The loop and its symbols",)
 
 
 def defined_in(name: str) -> set[str]:
-    """Names of the test functions that a file defines, without importing it."""
-    path = ROOT / "tests" / name
-    if not path.exists():
-        return set()
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    return {node.name for node in tree.body if isinstance(node, ast.FunctionDef) and node.name.startswith("test_")}
+    """Names of the test functions that the files of this name define, without importing them."""
+    trees = [ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "tests").rglob(name)]
+    nodes = [node for tree in trees for node in tree.body if isinstance(node, ast.FunctionDef)]
+    return {node.name for node in nodes if node.name.startswith("test_")}
 
 
 def sections(text: str) -> dict[str, str]:

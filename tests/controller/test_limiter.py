@@ -1,0 +1,210 @@
+"""The limiter's tick: the box problem, one channel by hand, walls beside limits, and what it gives back."""
+
+import numpy as np
+import pytest
+
+from controller.coupling import NoCoupling, SpringDamper
+from controller.environment import FIGURE_4, GROUND, Network, Wall, environment
+from controller.loop import force_map
+from controller.lti import Lti, SingularLoop
+from controller.process import BoxProblem, Limiter, Process, StepBuffer, contact, limited
+
+T = 1.2e-3
+STIFF = SpringDamper([7806.0, 3137.0], [0.105, 1.68])
+LIMITS = (12.0, 5.657)
+
+
+def drive(process: Process, x: np.ndarray) -> StepBuffer:
+    """The buffer after displacements (ticks, m, nsim)."""
+    buffer = StepBuffer(process, len(x), x.shape[1], nsim=x.shape[2])
+    for k, row in enumerate(x):
+        buffer.x[k] = row
+        buffer.tick(k)
+    return buffer
+
+
+def closed(limiter: Limiter) -> Process:
+    return Process(limiter.open, np.full(limiter.channels, np.inf), np.zeros(limiter.channels), limiter)
+
+
+def unlimited(network: Network, theta) -> Process:
+    walls = contact(network, STIFF, theta, (0, 0), T) if network.walls else None
+    F = walls.open if walls else force_map(environment(network, T), STIFF, theta, (0, 0))
+    return Process(F, np.full(2, np.inf), np.zeros(2), walls)
+
+
+def wander(ticks: int, channels: int, nsim: int, step: float = 1e-3, seed: int = 0) -> np.ndarray:
+    return np.cumsum(np.random.default_rng(seed).normal(size=(ticks, channels, nsim)), axis=0) * step
+
+
+def passive(n: int, rng: np.random.Generator) -> np.ndarray:
+    """Positive definite but not symmetric: all principal minors are positive."""
+    root, turn = rng.normal(size=(2, n, n))
+    return np.diag(rng.uniform(0.01, 1, n)) + root @ root.T + turn - turn.T
+
+
+def check(problem: BoxProblem, q: np.ndarray) -> None:
+    """The definition, to 1e-11 of what is subtracted."""
+    v, f = problem.solve(q)
+    low, high = problem.lower[:, None], problem.upper[:, None]
+    scale = 1e-11 * (np.abs(q) + np.abs(problem.M) @ np.abs(v))
+    np.testing.assert_array_less(np.abs(q - problem.M @ v - f), scale + 1e-300)
+    assert ((low <= f) & (f <= high)).all()
+    assert (f[v > 0] == np.broadcast_to(high, f.shape)[v > 0]).all()
+    assert (f[v < 0] == np.broadcast_to(low, f.shape)[v < 0]).all()
+    assert 0 < (v != 0).mean() < 1
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4, 6, 8])
+def test_the_forces_solve_the_box_problem(n):
+    rng = np.random.default_rng(n)
+    for _ in range(10):
+        upper = rng.uniform(0.5, 3, n)
+        check(BoxProblem(passive(n, rng), -upper, upper), rng.normal(size=(n, 60)) * 4)
+    lower = np.where(np.arange(n) % 2, -np.inf, -1.0)  # one-sided ones among them, as of walls
+    check(BoxProblem(passive(n, rng), lower, np.ones(n)), rng.normal(size=(n, 60)) * 4)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_pivoting_finds_what_the_list_finds(n):
+    rng = np.random.default_rng(n)
+    for _ in range(20):
+        problem = BoxProblem(passive(n, rng), -np.ones(n), np.ones(n))
+        q = rng.normal(size=(n, 40)) * 4
+        np.testing.assert_allclose(problem._pivoted(q), problem._listed(q), atol=1e-9)
+
+
+def test_two_channels_by_hand():
+    upper = np.array(LIMITS)
+    e, f = BoxProblem(np.array([[1000.0, -900.0], [-900.0, 1000.0]]), -upper, upper).solve(np.array([[20.0], [5.0]]))
+    np.testing.assert_allclose(f[:, 0], LIMITS)
+    np.testing.assert_allclose(e[:, 0], [0.038993, 0.034437], atol=1e-6)
+    nothing_holds = BoxProblem(np.array([[1000.0, -1000.0], [-1000.0, 1000.0]]), -upper, upper)
+    e, f = nothing_holds.solve(np.array([[20.0], [-20.0]]))
+    np.testing.assert_allclose(f[:, 0], [5.657, -5.657])
+    np.testing.assert_allclose(e[:, 0], [0, -0.014343], atol=1e-9)
+
+
+def test_four_contacts_that_nothing_holds():
+    """A chain of springs without ground: its stiffness matrix is singular, the forces are unique all the same."""
+    K = 1000.0 * np.array([[1, -1, 0, 0], [-1, 2, -1, 0], [0, -1, 2, -1], [0, 0, -1, 1.0]])
+    problem = BoxProblem(K, -np.ones(4), np.array([1.0, 2.0, 3.0, 1.0]))
+    q = K @ np.random.default_rng(0).normal(size=(4, 200)) * 1e-2
+    e, f = problem.solve(q)
+    assert np.abs(f.sum(axis=0)).max() < 1e-6  # action and reaction; pivoting grounds by 1e-10
+    np.testing.assert_allclose(q - K @ e, f, atol=1e-6)
+
+
+def test_a_matrix_with_a_negative_minor_is_refused():
+    with pytest.raises(SingularLoop, match=r"limited forces \[1, 2\] are not determined"):
+        BoxProblem(np.array([[1.0, 2.0], [2.0, 1.0]]), -np.ones(2), np.ones(2))
+    with pytest.raises(ValueError, match="expected lower < upper"):
+        BoxProblem(np.eye(1), np.ones(1), np.ones(1))
+
+
+def test_a_spring_by_hand():
+    """G = 1000, L = 1, rho = 20, theta = 0."""
+    limiter = Limiter(Lti.constant([[1000.0]], 1.0), (0,), np.ones(1), np.array([20.0]))
+    x = np.array([0, 0.0005, 0.002, 0.003, 0.002, 0.0005, 0, -0.002])
+    f = drive(closed(limiter), x[:, None, None]).f[: x.size, 0, 0]
+    np.testing.assert_allclose(f, [0, 0.5, 1, 1, 1, 0.520384, 0, -1], atol=5e-7)
+    assert (np.abs(f) <= 1).all()
+
+
+def test_with_lag_a_limited_spring_can_give_energy():
+    """Without delay and under any-environment the lag must be 0: this cycle gives 0.0051 J for ever with rho = 0.05."""
+    x = np.tile([-1.048, -0.998, 1.028, 1.049, 1.069, 0.996], 20)
+    taken = []
+    for rho in (0.05, 0.0):
+        limiter = Limiter(Lti.constant([[1.0]], 1.0), (0,), np.ones(1), np.array([rho]))
+        f = drive(closed(limiter), x[:, None, None]).f[: x.size, 0, 0]
+        dx = np.diff(np.append(x, x[0]))
+        taken.append((f * dx + 0.5 * dx**2)[-6:].sum())
+    np.testing.assert_allclose(taken, [-0.00513229, 0.005869], atol=1e-6)
+
+
+WALLED = Network(
+    FIGURE_4.contacts,
+    FIGURE_4.springs,
+    FIGURE_4.masses,
+    (Wall(("mass", GROUND), 5000.0, 3.0, 1e-3), Wall((GROUND, "mass"), 4000.0, 0.0, 2e-3)),
+)
+
+
+@pytest.mark.parametrize("network", [FIGURE_4, WALLED], ids=["linear", "walls"])
+def test_out_of_reach_nothing_changes(network):
+    x = wander(500, 2, 3)
+    limiter = limited(network, STIFF, (0, 2), (0, 0), T, (1e6, 1e6), (10.0, 20.0))
+    limiting, without = drive(closed(limiter), x), drive(unlimited(network, (0, 2)), x)
+    np.testing.assert_allclose(limiting.f[:500], without.f[:500], atol=1e-9)
+    w = len(network.walls)
+    np.testing.assert_allclose(limiter.depths(limiting.z), without.z[1:, without.z.shape[1] - w :], atol=1e-12)
+    assert not limiter.slips(limiting.z).any()
+    assert len(limiter.frozen()) == 2**w
+
+
+@pytest.mark.parametrize("network", [FIGURE_4, WALLED], ids=["linear", "walls"])
+@pytest.mark.parametrize("theta", [(0, 0), (1, 2)])
+def test_the_limited_loop_obeys_its_definition(network, theta):
+    """f_e within the box and e in its normal cone; the linear loop driven by x - e sends f_e + rho (e - e_-)."""
+    x, limit, rho = wander(600, 2, 4), np.array([3.0, 1.5]), np.array([11.0, 7.0])
+    limiter = limited(network, STIFF, theta, (0, 0), T, limit, rho)
+    buffer = drive(closed(limiter), x)
+    e = limiter.slips(buffer.z)
+    n = max(theta)
+    f_e = np.stack([buffer.f[theta[i] : 600 - n + theta[i], i] for i in range(2)], axis=1)
+    e = e[: 600 - n]
+    assert (np.abs(f_e) <= limit[:, None]).all()
+    np.testing.assert_array_equal(f_e * e, limit[:, None] * np.abs(e))  # exactly at the limit where it slips
+    assert 0.1 < (e != 0).mean() < 0.9
+    linear = unlimited(network, (0, 0))
+    slips = np.diff(np.concatenate([np.zeros((1, 2, 4)), e]), axis=0)
+    expected = drive(linear, x[: len(e)] - e).f[: len(e)] - rho[:, None] * slips
+    np.testing.assert_allclose(f_e, expected, atol=1e-8)
+
+
+def test_many_simulations_are_as_many_runs_of_one():
+    x = wander(300, 2, 5)
+    process = closed(limited(WALLED, STIFF, (1, 0), (0, 0), T, (3.0, 1.5), (0.0, 0.0)))
+    together = drive(process, x).f[:300]
+    alone = np.concatenate([drive(process, x[..., i : i + 1]).f[:300] for i in range(5)], axis=2)
+    np.testing.assert_allclose(together, alone, atol=1e-9)
+
+
+def test_limiter_and_environment_are_passive_without_lag():
+    """sum f_e (u_k - u_{k-1}) with u = x - V f_e, walls and limits included, never falls below its start."""
+    x = wander(2000, 2, 10)
+    f = drive(closed(limited(WALLED, NoCoupling(), (0, 0), (0, 0), T, (3.0, 1.5), (0.0, 0.0))), x).f[:2000]
+    energy = np.cumsum((f * np.diff(x, axis=0, prepend=0.0)).sum(axis=1), axis=0)
+    assert energy.min() >= -1e-9
+    assert energy.max() > 0.5
+
+
+def test_a_clipped_cycle_gives_energy_however_slow_and_a_limited_one_does_not():
+    """Two hands around a circle of 4 cm: clipping each force by itself gives 0.616 J a turn whatever the speed."""
+    coupling, rho = SpringDamper([5832.0, 2545.0], [0.187, 1.386]), (11.4167, 11.4167)
+    limit = np.array(LIMITS)[:, None]
+    linear = Process(force_map(environment(FIGURE_4, T), coupling, (1, 2), (0, 0)), np.full(2, np.inf), np.zeros(2))
+    for turn_s, dissipated in ((5.0, 0.0173), (10.0, 0.00865)):
+        ticks = round(turn_s / T)
+        angle = 2 * np.pi * np.arange(2 * ticks) / ticks
+        x = 0.04 * np.stack([np.cos(angle), -np.sin(angle)], axis=1)[..., None]
+        dx = np.diff(x, axis=0)[-ticks:]
+        assert (1.37 * dx**2 / T).sum() == pytest.approx(dissipated, rel=1e-2)
+        clipped = np.clip(drive(linear, x).f[: 2 * ticks], -limit, limit)
+        assert (clipped[-ticks - 1 : -1] * dx).sum() == pytest.approx(-0.616, abs=0.005)
+        f = drive(closed(limited(FIGURE_4, coupling, (1, 2), (0, 0), T, LIMITS, rho)), x).f[: 2 * ticks]
+        assert abs((f[-ticks - 1 : -1] * dx).sum()) < 0.1 * dissipated  # delay and friction of the environment
+        assert (np.abs(f).max(axis=0) <= limit).all()
+
+
+def test_bad_limits_are_named():
+    G = Lti.constant(np.eye(2), T)
+    with pytest.raises(ValueError, match="rho has 1 entries for 2 channels"):
+        Limiter(G, (0, 0), np.ones(2), np.ones(1))
+    with pytest.raises(ValueError, match="expected positive forces"):
+        Limiter(G, (0, 0), np.zeros(2), np.ones(2))
+    with pytest.raises(ValueError, match="expected stiffnesses >= 0"):
+        Limiter(G, (0, 0), np.ones(2), -np.ones(2))
+    with pytest.raises(ValueError, match="a block of 2 x 2 cannot serve 3 channels"):
+        Limiter(G, (0, 0, 0), np.ones(3), np.ones(3))

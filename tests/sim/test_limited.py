@@ -1,0 +1,72 @@
+"""Runs whose forces are limited: where a guarantee covers them, what the report says, and both engines."""
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+
+from cli.run import main
+from controller.coupling import SpringDamper
+from design.certificate import assess, covered_limits
+from sim.run import assemble, run
+from sim.scenario import load
+
+BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # covered with limited forces in this environment
+SOFT = SpringDamper((878.0, 551.0), (0.386, 0.521))  # certified for any environment
+
+
+def weak(*limits):
+    """The default scenario with motors of these largest forces [N]."""
+    base = load()
+    devices = tuple(msgspec.structs.replace(d, force_limit=f) for d, f in zip(base.device, limits, strict=True))
+    return base.replace(device=devices, duration=2.0)
+
+
+def test_which_limiter_a_coupling_may_have():
+    scenario = weak(12.0, 5.657)
+    loop = scenario.loop("I")
+    any_environment = covered_limits(loop, SOFT, assess(loop, SOFT))
+    assert any_environment.rho == (0.0, 0.0)
+    own = covered_limits(loop, BUILT, assess(loop, BUILT))
+    assert own.rho == pytest.approx((11.4167, 11.4167))
+    assert own.requirement.proof == "rational"
+    stiff = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
+    refused = covered_limits(loop, stiff, assess(loop, stiff))
+    assert refused.rho is None
+    assert "needs 1.385" in refused.reason
+
+
+@pytest.mark.parametrize(("coupling", "rho"), [(SOFT, (0.0, 0.0)), (BUILT, (11.4167, 11.4167))])
+def test_both_engines_agree_on_limited_forces(coupling, rho):
+    """To 1e-9 of the motion of 3 cm, with forces at their limits a good part of the time; |f| never exceeds them."""
+    limits = np.array([0.3, 0.2])
+    simulation = assemble(weak(*limits), coupling, rho)
+    exact, own = (run(simulation, engine) for engine in ("exact", "mujoco"))
+    np.testing.assert_allclose(own.x, exact.x, atol=3e-11)
+    assert (np.abs(exact.f) <= limits).all()
+    assert 0.2 < exact.clipped(limits).mean() < 0.95
+    assert simulation.process.limiter is not None
+    assert np.abs(simulation.process.limiter.slips(exact.z)).max() > 1e-4
+
+
+def test_limited_and_clipped_runs_agree_while_no_force_is_at_its_limit():
+    scenario = weak(1e3, 1e3)
+    limited, clipped = (run(assemble(scenario, BUILT, lag), "exact") for lag in ((11.4167, 11.4167), None))
+    np.testing.assert_allclose(limited.f, clipped.f, atol=1e-10)
+    np.testing.assert_allclose(limited.x, clipped.x, atol=1e-13)
+
+
+def test_the_report_says_which_guarantee_holds(tmp_path):
+    def report(*options) -> dict:
+        where = ["--no-plot", "--duration", "1", "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]
+        assert main([*options, *where]) == 0
+        return json.loads((tmp_path / "r.json").read_text())
+
+    covered = report("--case", "I")["limiter"]
+    assert covered["rho"] == [0.0, 0.0]
+    assert covered["force_limit"] == [12.0, 12.0]
+    assert report("--case", "I", "--no-limiter")["limiter"]["rho"] is None
+    uncovered = report("--case", "I", "--condition", "closed-loop")["limiter"]
+    assert uncovered["rho"] is None
+    assert uncovered["certificate"]["required_damping"][0] > 1.37
