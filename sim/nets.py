@@ -9,17 +9,18 @@ forces that the actuators can apply; the passivity controller stands behind it, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from controller.budget import EnergyBounding, EnergyBudget, PassivityControl
+from controller.budget import EnergyBounding, EnergyBudget, PassivityControl, Shell
 from controller.coupling import Coupling
 from controller.delay import LOST, Ticks, ages
 from controller.loop import DelayRange
-from controller.lti import Array
+from controller.lti import Array, Lti
 from controller.process import Net, Process, contact
 from design.conditions import Requirement
 from sim.run import Simulation
@@ -60,9 +61,18 @@ class Classic:
     name: str
 
 
-def netted(
-    simulation: Simulation, coupling: Coupling, wanted: EnergyNet | Classic, ticks: int | None = None
-) -> Simulation:
+@dataclass(frozen=True, eq=False)
+class Plugged:
+    """Anything in place of the environment, behind the coupling and a shell that makes it passive."""
+
+    force: Callable[[Array], Array]  # where the port would be, (m,) [m], once a tick -> force fed back (m,) [N]
+    start: float = 0.0  # W0 [J]
+
+
+Wanted = EnergyNet | Classic | Plugged
+
+
+def netted(simulation: Simulation, coupling: Coupling, wanted: Wanted, ticks: int | None = None) -> Simulation:
     """The same loop with a net under it, for runs of up to `ticks` (default: the scenario's).
 
     What is linear about a loop, such as certificates and modes, ask the simulation without. Delays that vary are those
@@ -80,7 +90,10 @@ def netted(
             process = replace(process, F=walled.open, contact=walled)
     else:
         spans = scenario.delay_range
-    make = partial(_budget if isinstance(wanted, EnergyNet) else _classic, wanted, scenario, process, spans)
+    if isinstance(wanted, Plugged):
+        make = partial(_shelled, wanted, coupling.compliance(scenario.T), process)
+    else:
+        make = partial(_budget if isinstance(wanted, EnergyNet) else _classic, wanted, scenario, process, spans)
     make(1)  # raises for numbers that cannot be
     return replace(simulation, process=replace(process, net=make))
 
@@ -102,6 +115,14 @@ def _classic(wanted: Classic, scenario: Scenario, process: Process, spans: Delay
         return _Bounded(EnergyBounding(delta, scenario.T, nsim=nsim), wanted.name, limit)
     credit = delta if wanted.name.endswith(":delta") else None
     return _Damped(PassivityControl(len(delta), scenario.T, delta=credit, nsim=nsim), wanted.name, limit)
+
+
+def _shelled(wanted: Plugged, V: Lti | None, process: Process, nsim: int) -> Net:
+    if V is None:
+        raise ValueError("an environment of your own needs a coupling with a compliance V before it")
+    if (process.encoder_step > 0).any():
+        raise ValueError("an environment of your own needs ideal encoders: no shell is known for coarse ones")
+    return _Shelled(Shell(V, start=wanted.start, nsim=nsim), wanted, process.force_limit)
 
 
 def idle(simulation: Simulation, any_environment: Requirement, part: dict[str, Any]) -> str | None:
@@ -169,6 +190,36 @@ class _Budgeted(_InLoop):
             "reserved_J": float(budget.reserved.max()),
             "dropped_ticks": self._dropped,
             "surprises": budget.surprises,
+        }
+
+
+class _Shelled(_InLoop):
+    """An environment of the user's own, its force within the actuators' limits, and the shell."""
+
+    def __init__(self, shell: Shell, asked: Plugged, limit: Array) -> None:
+        super().__init__(limit)
+        self._shell, self._asked = shell, asked
+
+    def send(self, x: Array, force: Array, /) -> None:
+        free = self._shell.free(x)
+        wanted = np.stack([np.asarray(self._asked.force(u), dtype=float) for u in free.T], axis=1)
+        force[...], _ = self._shell.limit(self._within(wanted))
+
+    def apply(self, k: int, force: Array, /) -> None:
+        pass
+
+    def part(self) -> dict[str, Any]:
+        shell, start = self._shell, self._asked.start
+        given = f"more than {start:g} J" if start else "any energy"
+        return {
+            "start_J": start,
+            "cap_J": None,
+            "guarantee": f"behind a coupling certified for any environment, no passive hand is given {given} "
+            "beyond what the devices dissipate, whatever computes the force",
+            "ticks": shell.ticks,
+            "limited_ticks": int(shell.limited.max()),
+            "smallest_scale": float(shell.least.min()),
+            "energy_J": float(shell.energy.min()),
         }
 
 
