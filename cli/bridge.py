@@ -22,6 +22,7 @@ from cli.options import (
     DONE,
     INTERRUPTED,
     Parser,
+    add_energy_budget_option,
     add_loop_options,
     add_output_options,
     out_folder,
@@ -61,9 +62,10 @@ def main(argv: list[str]) -> int:
     seconds = number(args, "duration", 0.1, LONGEST, scenario.duration)
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
-    session = session_for(
-        scenario, replace(settings, rereference=not args.no_rereference), **limits_from(args, scenario)
-    )
+    if args.energy_budget and not args.energy_budget[0]:
+        raise InputError("--energy-budget is 0 J: encoders are tested by a small force at arming, give it 0.01 or so")
+    settings = replace(settings, rereference=not args.no_rereference, energy_budget=args.energy_budget)
+    session = session_for(scenario, settings, **limits_from(args, scenario))
     session.record = recorder = Recorder(scenario.channels)
     out = out_folder(args, "bridge")
 
@@ -102,6 +104,7 @@ def _parser() -> argparse.ArgumentParser:
     names = ", ".join(NAMES)
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
+    add_energy_budget_option(parser)
     parser.add_argument("--duration", metavar="SECONDS", help="of forces at full gain (default: the scenario's)")
     parser.add_argument("--no-plot", action="store_true", help="write no picture")
     add_output_options(parser)
@@ -154,6 +157,9 @@ def print_session(report: dict[str, Any], console: Console) -> None:
         )
     for i, part in enumerate(report["growth"], start=1):
         console.print(f"growth at full gain, arming {i}, {format_growth(part, report['run']['T_s'])}")
+    for i, part in enumerate(report["energy_budget"] or [], start=1):
+        console.print(f"energy budget, arming {i}: limited {part['limited_ticks']} of {part['ticks']} ticks")
+        console.print(f"  {part['guarantee']}")
     counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link["counters"].items() if n)
     console.print(f"counted: {counted or 'nothing'}")
     console.print(f"[dim]·[/] {CAVEATS}")

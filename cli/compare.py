@@ -29,6 +29,7 @@ from design.optimal import Wish
 from design.result import CONDITION_NAMES, DesignFailed
 from design.transparency import transparency
 from sim import report
+from sim.baselines import PAIRS, SECONDS, SLOW, Rival, rivals
 from sim.couplings import NAMES, Chosen, choose
 from sim.scenario import InputError, Scenario
 
@@ -41,6 +42,8 @@ def main(argv: list[str]) -> int:
     args = parser.parse_args(argv)
     scenario = options.scenario_from(args)
     _check_mode(args, parser)
+    if args.baselines:
+        return _baselines(args, scenario)
     if args.ladder:
         return _ladder(args, scenario)
     return _limits(args, scenario) if args.over else _couplings(args, scenario)
@@ -49,6 +52,7 @@ def main(argv: list[str]) -> int:
 def _parser() -> options.Parser:
     example = """python -m design.compare --coupling published,spring-damper:any-environment,optimal
   python -m design.compare --ladder
+  python -m design.compare --baselines
   python -m design.compare --over damping=0.7:10,delay --points 5"""
     what = "Compare couplings over frequency, all designs as a ladder, or the best coupling along an axis of the loop."
     parser = options.Parser("design.compare", what, example)
@@ -58,6 +62,8 @@ def _parser() -> options.Parser:
     options.add_condition_option(parser, "of designs that name none")
     short = "every design side by side, cases I and II (full: minutes)"
     parser.add_argument("--ladder", nargs="?", const="short", choices=tuple(LADDERS), help=short)
+    classics = "on the same runs: no coupling, the classics (PO/PC, energy bounding), the energy budget, our designs"
+    parser.add_argument("--baselines", action="store_true", help=classics)
     axes, names = ",".join(AXES), "damping, delay, period, order"
     over = f"the best coupling along these axes: {names} (default: all of them)"
     parser.add_argument("--over", nargs="?", const=axes, metavar="NAME[=LOW:HIGH],..", help=over)
@@ -83,7 +89,7 @@ def _beside(text: str) -> tuple[str, ...]:
 MODES = {
     "coupling": ("",),
     "condition": ("",),
-    "no_plot": ("", "--over"),
+    "no_plot": ("", "--over", "--baselines"),
     **dict.fromkeys(("points", "keep", "beside", "functions", "filter"), ("--over",)),
     **dict.fromkeys(("objective", "high_gain", "margin", "diagonal"), ("--over",)),
 }
@@ -91,9 +97,10 @@ MODES = {
 
 def _check_mode(args: argparse.Namespace, parser: options.Parser) -> None:
     """Raises InputError where an option is given that this comparison would have to ignore."""
-    mode = "--ladder" if args.ladder else "--over" if args.over else ""
-    if args.ladder and args.over:
-        raise InputError("--over with --ladder: give one of them")
+    asked = [f"--{name}" for name in ("over", "ladder", "baselines") if getattr(args, name)]
+    if len(asked) > 1:
+        raise InputError(f"{' with '.join(asked)}: give one of them")
+    mode = "".join(asked)
     if args.ladder and args.case != parser.get_default("case"):
         raise InputError(f"--ladder shows both cases: leave out --case {args.case}")
     if mode and args.case == "none":
@@ -302,6 +309,47 @@ def _rung(row: dict[str, Any]) -> tuple[str, ...]:
     if row["reason"] and row["required_damping"] is None:
         need, errors = "-", ["-", "-"]
     return row["design"], need, *errors, row["proof"] or "-", f"{row['wall_s']:.2f}"
+
+
+# ----------------------------------------------------------------------------------------------------
+# The classics beside ours.
+
+
+def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
+    if scenario.box or scenario.switches:
+        raise InputError("--baselines compares in one environment with constant delays: leave out [box] and jitter")
+    if any(device.friction for device in scenario.device):
+        raise InputError("--baselines runs in the exact plant, which has no Coulomb friction; the devices have")
+    out, rows, interrupted = options.out_folder(args, "compare"), [], False
+    begin = time.perf_counter()
+    with render.progress("comparing") as move:
+        try:
+            rows.extend(rivals(scenario, args.case, move))
+        except KeyboardInterrupt:
+            interrupted = True
+    outcome: dict[str, Any] = {"scenario": scenario.name, "case": args.case, "seed": args.seed}
+    outcome |= {"rows": [asdict(row) for row in rows], "hands": PAIRS, "hands_s": SECONDS, "start_m_s": SLOW}
+    outcome |= {"wall_s": time.perf_counter() - begin, "interrupted": interrupted}
+    files = []
+    if rows and not args.no_plot:
+        from sim.plots import plot_baselines
+
+        files.append(plot_baselines(outcome, out / "baselines.png"))
+    heads = ("", "error %", "> 40 Hz N", "peak N", "acted %", "hands", "m/s", "guarantee")
+    cells = [_rival(row) for row in rows]
+    shown = [render.grid(f"on the same runs · {scenario.name}, case {args.case}", heads, cells, left=(0, 7))]
+    lines = [f"* baseline {row.name}: {row.source}." for row in rows if row.source]
+    lines.append(f"hands: of {PAIRS} lossless pairs, faster after {SECONDS:g} s than the {SLOW:g} m/s they began with.")
+    lines += sorted({f"error: {row.reason}." for row in rows if row.reason})
+    render.publish(args, outcome, shown, [*lines, f"{outcome['wall_s']:.1f} s"], out, files)
+    return options.INTERRUPTED if interrupted else options.DONE
+
+
+def _rival(row: Rival) -> tuple[str, ...]:
+    error = render.optional(row.error_percent, "{:.2f}")
+    figures = f"{row.fast_n:.3f}", f"{row.peak_n:.1f}", f"{row.acted_percent:.0f}", str(row.moving)
+    short = "energy" if row.name == "energy budget" else row.guarantee or "none"
+    return f"{row.name}{' *' if row.baseline else ''}", error, *figures, f"{row.fastest_m_s:.3f}", short
 
 
 # ----------------------------------------------------------------------------------------------------

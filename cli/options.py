@@ -87,6 +87,15 @@ def pair(text: str) -> tuple[float, float]:
     return first, second
 
 
+def energy_budget(text: str) -> tuple[float, float]:
+    """'W0' or 'W0,CAP' [J]: what a budget starts with and the most that it saves (inf where no cap is given)."""
+    values = several(float, 0, unit="J")(text)
+    start, cap = (*values, math.inf)[:2]
+    if len(values) > 2 or not start <= cap or start == math.inf:
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected W0 or W0,CAP in J, W0 finite and at most CAP")
+    return start, cap
+
+
 def delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
     """'1,2' as one range for all channels, '1-2,0-3' as one per channel [samples]."""
     parts = [part.split("-") for part in text.split(",")]
@@ -215,6 +224,12 @@ def add_condition_option(parser: argparse._ActionsContainer, what: str = "that t
     names = ",".join(CONDITION_NAMES.values())
     help_ = f"{what}: {' or '.join(CONDITION_NAMES.values())} (default: the coupling's own)"
     parser.add_argument("--condition", type=condition, metavar=f"{{{names}}}", help=help_)
+
+
+def add_energy_budget_option(parser: argparse._ActionsContainer) -> None:
+    """--energy-budget."""
+    what = "scale forces so that no passive hand is given more than W0 [J]; save at most CAP of what users put in"
+    parser.add_argument("--energy-budget", type=energy_budget, metavar="W0[,CAP]", help=what)
 
 
 def add_output_options(

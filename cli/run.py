@@ -19,6 +19,7 @@ from sim.accuracy import ForceError, force_error, position_error
 from sim.couplings import NAMES, Chosen, choose
 from sim.engines import INTEGRATORS, default_integrator
 from sim.files import write
+from sim.nets import BASELINES, Classic, EnergyNet, idle, netted
 from sim.run import ENGINES, Simulation, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, load_humans
 from sim.stability import stability_part
@@ -31,7 +32,7 @@ def main(argv: list[str]) -> int:
     """Simulate and report. 0: the run was completed, stable or not; 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "run")
-    chosen = choose(scenario, args.case, args.coupling, args.condition)
+    chosen = _chosen(args, scenario)
     loop = scenario.loop(args.case)
     environment, simulated = _environment(args, scenario)
     with render.progress("searching the ranges") as move:
@@ -53,8 +54,9 @@ def main(argv: list[str]) -> int:
     }
     outcome["error"] = position_error(done.trace, done.exact, done.simulation, _unstable(outcome))
     outcome["reproducibility"] = report.beside_the_paper(done.simulation.scenario, args.case, outcome)
-    alike = force_error(done.simulation, done.trace, loop.lam)
+    alike = force_error(done.ran, done.trace, loop.lam)
     outcome["ideal_force"] = alike.part()
+    outcome |= _net(done, requirements)
     outcome["remarks"] = [*done.warnings, *chosen.notes, *report.remarks(outcome)]
     files = _save(args, out, done, alike, outcome)
     render.publish(args, outcome, _tables(outcome), outcome["remarks"], out, files)
@@ -67,7 +69,8 @@ def _parser() -> options.Parser:
     )
     options.add_loop_options(parser)
     options.add_varying_delay_options(parser)
-    options.add_coupling_options(parser, ", ".join(NAMES))
+    options.add_coupling_options(parser, f"{', '.join(NAMES)}, as baselines {', '.join(BASELINES)}")
+    options.add_energy_budget_option(parser)
     parser.add_argument("--engine", choices=ENGINES, default="mujoco", help="MuJoCo, or the exact solution")
     steppers = "of MuJoCo (default exponential, RK4 where devices rub)"
     parser.add_argument("--integrator", choices=tuple(INTEGRATORS), help=steppers)
@@ -82,6 +85,16 @@ def _parser() -> options.Parser:
     parser.add_argument("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
     options.add_output_options(parser, picture=True)
     return parser
+
+
+def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
+    """The coupling; with a baseline there is none, and the note says whose that is. Raises InputError."""
+    if args.coupling not in BASELINES:
+        return choose(scenario, args.case, args.coupling, args.condition)
+    if args.energy_budget:
+        raise InputError(f"--energy-budget with --coupling {args.coupling}: give one of them")
+    note = f"baseline, without a guarantee here: {BASELINES[args.coupling]}; no coupling besides."
+    return replace(choose(scenario, args.case, "none", args.condition), kind=args.coupling, notes=(note,))
 
 
 def _scenario(args: argparse.Namespace) -> Scenario:
@@ -113,6 +126,7 @@ class _Run:
     """One run of a scenario, and the exact engine's beside it."""
 
     simulation: Simulation
+    ran: Simulation  # the same, with the net that was asked for
     period: Period | None  # of the worst switching found, where the delays switch
     integrator: str | None  # None for the exact engine, and so are the substeps
     substeps: int | None
@@ -143,15 +157,34 @@ def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tupl
     if scenario.switches:
         simulation, period = switching(simulation, chosen.coupling, args.seed, scenario.samples)
     integrator, substeps, warnings = _steps(args, simulation)
-    engine = make_engine(simulation, args.engine, integrator, substeps)
+    engine, ran = make_engine(simulation, args.engine, integrator, substeps), simulation
+    if args.coupling in BASELINES:
+        ran = netted(simulation, chosen.coupling, Classic(args.coupling))
+    elif args.energy_budget:
+        ran = _budgeted(simulation, chosen, *args.energy_budget)
     with render.progress("simulating") as move:
         begin = time.perf_counter()
-        trace = run(simulation, engine, progress=move)
+        trace = run(ran, engine, progress=move)
         wall = time.perf_counter() - begin
     exact = trace
     if args.engine != "exact":
-        exact = None if simulation.friction else run(simulation, "exact", ticks=trace.t.size)
-    return _Run(simulation, period, integrator, substeps, warnings, trace, exact, wall)
+        exact = None if simulation.friction else run(ran, "exact", ticks=trace.t.size)
+    return _Run(simulation, ran, period, integrator, substeps, warnings, trace, exact, wall)
+
+
+def _budgeted(simulation: Simulation, chosen: Chosen, start: float, cap: float) -> Simulation:
+    try:
+        return netted(simulation, chosen.coupling, EnergyNet(start, cap))
+    except ValueError as error:
+        raise InputError(f"--energy-budget: {error}") from None
+
+
+def _net(run: _Run, requirements: dict[str, Any]) -> dict[str, Any]:
+    """What the net under the controller did; the part is null where there is none."""
+    part = run.trace.net.part() if run.trace.net else None
+    if part is None or part["guarantee"] is None:
+        return {"energy_budget": None, "baseline": part}
+    return {"energy_budget": part | {"idle": idle(run.simulation, requirements["theorem4"], part)}, "baseline": None}
 
 
 def _steps(args: argparse.Namespace, simulation: Simulation) -> tuple[str | None, int | None, list[str]]:
@@ -270,6 +303,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("transparency error", render.transparency_error(transparent)),
         ("force error", _force_error(outcome["ideal_force"])),
         ("rendered stiffness", rendered or "-"),
+        *_net_rows(outcome),
         ("growth, eigenvalues", _growth(stability)),
         (how, f"{measured}: {render.verdict(stability['verdict'])}"),
         *(render.delay_rows(jitter) if jitter else []),
@@ -287,6 +321,17 @@ def _limiter(part: dict[str, Any]) -> str:
     if part["rho"] is None:
         return f"clipped at {limits}: not covered ({part['reason']})"
     return f"the guarantee holds also while forces are limited to {limits} ({part['reason']})"
+
+
+def _net_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
+    part = outcome["energy_budget"] or outcome["baseline"]
+    if not part:
+        return []
+    acted = f"limited {part['limited_ticks']} of {part['ticks']} ticks"
+    if outcome["baseline"]:
+        return [("baseline", f"{part['name']}, {acted.replace('limited', 'acted in')}; no guarantee")]
+    why = f" ({part['idle']})" if part["idle"] else ""
+    return [("energy budget", f"{acted}{why}"), ("", part["guarantee"])]
 
 
 def _force_error(part: dict[str, Any]) -> str:

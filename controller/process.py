@@ -19,6 +19,7 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -470,15 +471,35 @@ def limited(
     return Limiter(sent, tuple(theta), np.asarray(limit), np.asarray(rho), network.walls)
 
 
+class Net(Protocol):
+    """A nonlinear step between the forces of F and the devices, with a memory of its own; one for every record.
+
+    Both methods change forces (m, nsim) [N] in place, at every tick, in this order; packets travel in between.
+    """
+
+    def send(self, x: Array, force: Array, /) -> None:
+        """Before the delays, given the positions (m, nsim) [m] as the encoders give them."""
+        ...
+
+    def apply(self, k: int, force: Array, /) -> None:
+        """Behind them, at tick k."""
+        ...
+
+    def part(self) -> dict[str, Any]:
+        """What it did so far, as plain data."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Process:
-    """The linear block F with what wraps around it: force limits, encoder steps, and delays that vary."""
+    """The linear block F with what wraps around it: force limits, encoder steps, delays that vary, and a net."""
 
     F: Lti
     force_limit: Array  # (m,) [N], inf where there is none
     encoder_step: Array  # (m,) [m], 0 for an ideal encoder
     contact: Contact | Limiter | None = None  # walls and limits that F, which knows them open, is joined with
     delays: Ticks | None = None  # (ticks, m, nsim or 1) of every packet behind F [samples]; None where none varies
+    net: Callable[[int], Net] | None = None  # a fresh one for so many simulations; F is then without Theta
 
     def __post_init__(self) -> None:
         for name in ("force_limit", "encoder_step"):
@@ -563,13 +584,19 @@ class StepBuffer:
         self._transition = process.transition()
         self._quantised = bool((process.encoder_step > 0).any())
         self._line = None if process.delays is None else HeldLine(process.delays, nsim)
+        self.net = process.net(nsim) if process.net else None
         self._rewound = 0  # ticks before row 0
 
     def tick(self, k: int) -> None:
         """Steps 1, 2, 3 and 5 for row k, whose plant state has been written: f[k] and z[k + 1]."""
-        self._transition(self.seen(k), self._output[k])
+        seen = self.seen(k)
+        self._transition(seen, self._output[k])
+        if self.net is not None:
+            self.net.send(seen[-self.process.channels :], self.force[k])
         if self._line is not None:
             self._line.carry(self._rewound + k, self.force[k])
+        if self.net is not None:
+            self.net.apply(self._rewound + k, self.force[k])
 
     def seen(self, k: int) -> Array:
         """[z; x] of row k with x as the encoders give it, (order + m, nsim); the plant's own positions stay."""

@@ -913,13 +913,12 @@ def limiter(
     if not all(0 <= r < np.inf for r in rho) or any(not 0 <= v < np.inf for row in c or () for v in row):
         raise ValueError(f"rho is {list(rho)} and c is {c}, expected numbers >= 0")
     none = tuple((0.0,) * lags for _ in theta) if c is None else tuple(tuple(float(v) for v in row) for row in c)
-    linear = this_environment(
-        delay(theta, G.T) @ G, available, T_max
-    )  # the slip at rest: its rows are among the block's
+    # the slip at rest: its rows are among the block's
+    linear = this_environment(delay(theta, G.T) @ G, available, T_max)
     if not np.isfinite(linear.ratio):
         reason = linear.reason or "the loop without limiter is not covered"
         return LimiterProof(refusal("limiter", available, reason), tuple(rho), none, np.inf)
-    search = _LimiterSearch(G, theta, available, rho, lags)
+    search = _LimiterSearch(G, theta, available, rho, lags, T_max)
     if c is not None:
         ratio, w = search.swept(none)
         return LimiterProof(search.requirement(ratio, w), tuple(rho), none, ratio)
@@ -930,7 +929,16 @@ def limiter(
 class _LimiterSearch:
     """s(c) by the refined sweep, and its least over c >= 0."""
 
-    def __init__(self, G: Lti, theta: Sequence[int], delta: tuple[float, ...], rho: Sequence[float], lags: int) -> None:
+    def __init__(
+        self,
+        G: Lti,
+        theta: Sequence[int],
+        delta: tuple[float, ...],
+        rho: Sequence[float],
+        lags: int,
+        T_max: float | None = None,
+    ) -> None:
+        self._T_max = T_max
         self._loop, self._delta, self._shape = (G, theta, delta, rho), delta, (len(theta), lags)
         self._grid, self._lag = np.concatenate([[0.0], frequencies(G)]), np.diag([*rho, *rho])
 
@@ -943,7 +951,7 @@ class _LimiterSearch:
 
     def demand(self, c: Lags) -> Demand[Lti]:
         G, theta, delta, rho = self._loop
-        return limiter_demand(G, theta, delta, rho, c, T_max)
+        return limiter_demand(G, theta, delta, rho, c, self._T_max)
 
     def swept(self, c: Lags, spare: float = 0.0) -> tuple[float, float]:
         """(s(c), w [rad/sample]) by a sweep that is refined between its samples, with so much of rho to spare."""

@@ -7,6 +7,7 @@ as the link is no slower, and longer ones where it is.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from controller.budget import EnergyBudget
 from controller.coupling import Coupling
 from controller.environment import environment
 from controller.loop import force_map
@@ -78,6 +80,79 @@ def fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tupl
     return [*line, tuple(x)]
 
 
+@dataclass(frozen=True)
+class BudgetPlan:
+    """An energy budget for one arming, as plain data: what a replay needs to know."""
+
+    start: float  # W0 [J]
+    cap: float | None  # [J], None where there is none
+    delta: tuple[float, ...]  # (m,) [N s/m]
+    encoder_step: tuple[float, ...]  # (m,) [m]
+    force_step: tuple[float, ...]  # (m,) [N]
+    theta: int  # [ticks]
+    longer: int  # ticks for which an older force may act beyond theta
+    T: float  # [s]
+
+    @classmethod
+    def of(cls, start: float, cap: float, delta: Sequence[float], units: Units, config: Config, T: float) -> BudgetPlan:
+        """For a device of this configuration.
+
+        It holds a force for `hold` missed ticks and lets go of it in a ramp. Limited by its slew rate, a force is
+        for so many ticks that are not missed as large as older ones, and then within what was sent since.
+        """
+        slews = max(math.ceil(cap / slew) for cap, slew in zip(config.cap, config.slew, strict=True))
+        longer = slews * (config.hold + 1) + config.ramp
+        most = None if math.isinf(cap) else cap
+        return cls(start, most, tuple(delta), units.encoder_step, units.force_step, config.theta, longer, T)
+
+
+class SentBudget:
+    """The energy budget between the shaped forces and the line. Forces are whole steps, so it rounds towards zero."""
+
+    def __init__(self, plan: BudgetPlan) -> None:
+        m, cap = len(plan.delta), math.inf if plan.cap is None else plan.cap
+        given: dict[str, Any] = {"encoder_step": plan.encoder_step, "start": plan.start, "cap": cap}
+        lo = np.full(m, plan.theta)
+        self.plan = plan
+        self._budget = EnergyBudget(plan.delta, plan.T, lo, hold=plan.longer, **given)
+        self._unit = -np.array(plan.force_step)  # the wire carries -f
+        self._before = self._applied = np.zeros(m)
+        self._nothing = np.zeros((m, 1))
+
+    def limit(self, steps: Sequence[int], x: Sequence[float], applied: Array, missed: int) -> tuple[int, ...]:
+        """What to send instead of `steps`, at x (m,) [m]; f = `applied` (m,) [N] acts from this tick on.
+
+        Of `missed` ticks before this one nothing was received, and nothing was sent in them: what moved in them is
+        not known, so that they are booked as the most that they may have lost.
+        """
+        now, wanted = np.array(x), (np.array(steps) * self._unit)[:, None]
+        for _ in range(missed):
+            self._budget.limit(self._nothing, self._nothing)
+        moved = (now - self._before)[:, None]
+        sent = self._budget.limit(wanted, moved, None if missed else self._applied[:, None])[:, 0]
+        self._before, self._applied = now, applied
+        whole = np.where(sent == wanted[:, 0], steps, np.trunc(sent / self._unit))
+        return tuple(int(n) for n in whole)
+
+    def part(self) -> dict[str, Any]:
+        """What it did since it was armed, as plain data."""
+        budget = self._budget
+        given = f"more than {self.plan.start:g} J" if self.plan.start else "any energy"
+        return {
+            "start_J": self.plan.start,
+            "cap_J": self.plan.cap,
+            "eps": 0.05,
+            "guarantee": f"no passive hand is given {given} in an arming beyond what the devices dissipate, "
+            "whatever computes the forces",
+            "ticks": budget.ticks,
+            "limited_ticks": int(budget.limited[0]),
+            "smallest_scale": float(budget.least[0]),
+            "energy_J": float(budget.energy[0]),
+            "reserved_J": float(budget.reserved[0]),
+            "surprises": budget.surprises,
+        }
+
+
 class TraceRow(NamedTuple):
     """One tick of a trace. Where `state` is None no STATE came: x is filled in and nothing was sent."""
 
@@ -104,6 +179,7 @@ class Drive:
         counters: Counters,
         record: Callable[[TraceRow], None],
         arming: int = 0,
+        budget: SentBudget | None = None,
     ) -> None:
         self.controller, self.units, self.config, self.limits = controller, units, config, limits
         self.T = T = controller.T
@@ -111,6 +187,7 @@ class Drive:
         self.force = (0.0,) * config.axes  # [N] the last one sent
         self.x: tuple[float, ...] | None = None  # [m] of the last STATE
         self.reference: tuple[int, ...] | None = None  # [counts] that positions are counted from
+        self._budget = budget
         self._rereference = settings.rereference
         self._test = EncoderTest(limits.cap, T) if settings.test_encoders else None
         self._encoders, self._heat = EncoderMonitor(units.encoder_step, units.force_step, T), Heat(limits, T)
@@ -152,10 +229,15 @@ class Drive:
         elif direction < 0:
             self.gain.fall(ticks)
         shaped = shape(asked.tolist(), self.force, self.gain.value, self.limits, self.T, test)
-        self._before, self.x, self.force = self.x if ticks == 1 else None, x, shaped.force
+        force, steps = shaped.force, self.units.steps(shaped.force, self.config.cap)
+        if self._budget:
+            whole = self._budget.limit(steps, x, np.array(self.units.forces(state.applied)), ticks - 1)
+            if whole != steps:
+                force, steps = self.units.forces(whole), whole
+                self._counters.limited += 1
+        self._before, self.x, self.force = self.x if ticks == 1 else None, x, force
         self._counters.clipped += shaped.clipped
         self._counters.slowed += shaped.slowed
-        steps = self.units.steps(shaped.force, self.config.cap)
         self._commands.tell(state.tick, steps)
         self._record(TraceRow(state.tick, x, asked, self.gain.value, steps, state, self._arming, test))
         return steps

@@ -43,6 +43,7 @@ class LinkSettings:
     late: float = 0.1  # part of late answers above which the coupling is too fast for the link
     missed: float = 0.2  # part of missing answers above which nothing is certified: mean-square stability ends there
     test_encoders: bool = True  # by a small force at every arming
+    energy_budget: tuple[float, float] | None = None  # W0 and cap [J]
     rereference: bool = True  # positions count from where the handles are at arming
 
 
@@ -136,6 +137,7 @@ class Counters:
     device_errors: int = 0  # frames that the device rejected
     clipped: int = 0  # forces at the cap
     slowed: int = 0  # forces at the slew limit
+    limited: int = 0  # ticks in which the energy budget made forces smaller
     unlike: int = 0  # ticks at which the device applied another force than it was sent in time
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from controller.coupling import Form
 from controller.lti import Array
-from hw.control import CertifiedCoupling, LinearController, Program, TraceRow, host_controller
+from hw.control import BudgetPlan, CertifiedCoupling, LinearController, Program, SentBudget, TraceRow, host_controller
 from hw.limits import Fault, Limits, Units, shape
 from hw.protocol import NO_MARGIN, Config
 from hw.session import Session
@@ -252,7 +252,8 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
         },
     }
     trace = result_of(recorder, session.units, session.scenario.T, report) if loop else None
-    return report | {"growth": [one.part() for one in growths(trace)] if trace else []}
+    budgets = [budget.part() for budget in session.budgets] or None
+    return report | {"growth": [one.part() for one in growths(trace)] if trace else [], "energy_budget": budgets}
 
 
 def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
@@ -284,7 +285,9 @@ def save(out: Path, session: Session, recorder: Recorder, report: dict[str, Any]
     """The trace (where forces acted), its picture, and the report."""
     files = []
     if len(recorder):
-        replay = [_recipe_of(session, program, config) for program, config in session.armings]
+        plans = [asdict(budget.plan) for budget in session.budgets] or [None] * len(session.armings)
+        armings = zip(session.armings, plans, strict=True)
+        replay = [_recipe_of(session, *arming) | {"energy_budget": plan} for arming, plan in armings]
         result = result_of(recorder, session.units, session.scenario.T, report | {"replay": replay})
         files += [save_npz(out / "trace.npz", result, recorder), result.save_csv(out / "trace.csv")]
         if plot:
@@ -322,6 +325,7 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     limits: Limits
     force_step: tuple[float, ...]
     cap: tuple[int, ...]
+    energy_budget: BudgetPlan | None = None
 
     def __post_init__(self) -> None:
         """Raises ValueError naming what no session can have written."""
@@ -339,6 +343,17 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """F as the host ran it. Raises InputError where nothing can have run."""
         try:
             return host_controller(self.scenario, self.coupling.build(self.scenario.T), self.link_delay)
+        except ValueError as error:
+            raise InputError(f"the trace cannot be replayed: {error}") from None
+
+    def budget(self) -> SentBudget | None:
+        """The energy budget at its start, where there was one. Raises InputError where none can be so."""
+        if self.energy_budget is None:
+            return None
+        try:
+            if len(self.energy_budget.delta) != self.scenario.channels:
+                raise ValueError(f"the budget is for {len(self.energy_budget.delta)} channels")
+            return SentBudget(self.energy_budget)
         except ValueError as error:
             raise InputError(f"the trace cannot be replayed: {error}") from None
 
@@ -401,9 +416,11 @@ def _again(
     )
     force: Sequence[float] = (0.0,) * len(recipe.cap)
     asked, sent = into
+    budget, missed = recipe.budget(), 0
     for k in ticks:
         asked[k] = controller.step(result.x[k].tolist())
         if not link["received"][k]:
+            missed += 1
             continue
         try:
             gain = float(link["gain"][k])
@@ -411,4 +428,10 @@ def _again(
             force = shape(asked[k].tolist(), force, gain, recipe.limits, recipe.scenario.T, test).force
         except Fault as fault:
             raise InputError(f"the trace cannot be replayed: tick {k}: {fault}") from None
-        sent[k] = units.steps(force, recipe.cap)
+        steps = units.steps(force, recipe.cap)
+        if budget:
+            whole = budget.limit(steps, result.x[k].tolist(), result.f[k], missed)
+            if whole != steps:
+                force, steps = units.forces(whole), whole
+            missed = 0
+        sent[k] = steps

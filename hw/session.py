@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from hw.control import Drive, Program, TraceRow
+from hw.control import BudgetPlan, Drive, Program, SentBudget, TraceRow
 from hw.limits import (
     DRIVING,
     ENDED,
@@ -83,6 +83,7 @@ class Session:
         self.program: Program | None = None
         self.drive: Drive | None = None  # the coupling at work, from one arming to the next end
         self.armings: list[tuple[Program, Config]] = []  # what forces came from, arming by arming
+        self.budgets: list[SentBudget] = []  # arming by arming, where the settings ask for one
         self.record: Callable[[TraceRow], None] = lambda row: None
         self.listen: Callable[[Event], None] = lambda event: None
         self.missed_while_driving = 0  # ticks
@@ -141,10 +142,20 @@ class Session:
                 self.counters,
                 self.record,
                 len(self.armings),
+                self._fresh_budget(),
             )
             self.armings.append((self.program, self.config))
             self._enter(Stage.ARMING, "asked to")
         return b""
+
+    def _fresh_budget(self) -> SentBudget | None:
+        if self.settings.energy_budget is None:
+            return None
+        assert self.config
+        scenario = self.scenario
+        plan = BudgetPlan.of(*self.settings.energy_budget, scenario.delta, self.units, self.config, scenario.T)
+        self.budgets.append(SentBudget(plan))
+        return self.budgets[-1]
 
     def stop(self, cause: str, now: int) -> bytes:
         """The planned end: by a ramp where forces act, at once where none do."""

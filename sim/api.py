@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 from controller.coupling import Coupling, NoCoupling
+from controller.lti import Array
 from design.result import COUPLING, Design, bare, number, of_kind, one_of, whole
 from sim import crowds
 from sim.engines import INTEGRATORS
+from sim.nets import EnergyNet, Plugged, netted
 from sim.run import ENGINES, Progress, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, require_linear
 from sim.stability import stability_part
@@ -26,12 +29,19 @@ def simulate(
     integrator: str | None = None,
     substeps: int | None = None,
     seed: int = 0,
+    environment: Callable[[Array], Array] | None = None,
+    energy_budget: float | None = None,
 ) -> Trace:
     """The scenario's run, from rest, for `scenario.duration` seconds.
 
     `coupling` None is the loop without one; `engine` is "mujoco" or "exact" (the linear loop, no Coulomb friction);
     `integrator` of MuJoCo, None for "exponential", or "RK4" where a device has Coulomb friction; `substeps` steps per
     period, None for what the plant asks; `seed` draws delays that vary.
+
+    `environment` takes the place of the scenario's: anything that answers, once a tick, where its port would be if it
+    gave no force, (m,) [m], with a force fed back (m,) [N]. A shell makes it passive, which may give `energy_budget`
+    [J] (default 0) in all; a coupling certified for any environment, with psi = 0, makes the loop safe then. Without
+    `environment`, `energy_budget` is that of the devices. `meta["energy_budget"]` says how often forces were limited.
 
     Returns a Trace of N samples and m channels: t (N,) [s], x (N, m) and x_handle (N, m) [m], v_handle (N, m) [m/s],
     f (N, m) [N] (the devices feel -f) and `meta`, with the scenario's digest and `meta["stability"]`: growth rates
@@ -52,7 +62,12 @@ def simulate(
     if scenario.switches:
         simulation, _ = switching(simulation, alone, seed, scenario.samples)
     integrator, substeps, remarks = settle(simulation, engine, integrator, substeps)
-    trace = run(simulation, make_engine(simulation, engine, integrator, substeps))
+    ran = simulation
+    if environment is not None:
+        ran = netted(simulation, alone, Plugged(environment, energy_budget or 0.0))
+    elif energy_budget is not None:
+        ran = netted(simulation, alone, EnergyNet(energy_budget))
+    trace = run(ran, make_engine(simulation, engine, integrator, substeps))
     meta = {
         "scenario": scenario.name,
         "scenario_digest": scenario.digest,
@@ -60,8 +75,9 @@ def simulate(
         "integrator": integrator,
         "substeps": substeps,
         "seed": seed,
-        "stability": None if scenario.switches else stability_part(simulation, trace),
+        "stability": None if scenario.switches or environment else stability_part(simulation, trace),
         "remarks": remarks,
+        "energy_budget": trace.net.part() if trace.net else None,
     }
     return replace(trace, meta=meta)
 

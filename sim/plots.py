@@ -346,6 +346,26 @@ def plot_limits(outcome: dict[str, Any], path: Path) -> Path:
     return _save(figure, path)
 
 
+def plot_baselines(outcome: dict[str, Any], path: Path) -> Path:
+    """Bars, a row per rival: force error, force above 40 Hz, the fastest of the lossless hands that are left alone."""
+    rows = outcome["rows"]
+    title = f"Classics and ours on the same runs: {outcome['scenario']}, case {outcome['case']}"
+    figure, axes = _panels(title, 1, 3, (12.0, 0.4 * len(rows) + 1.8), sharey=True)
+    labels = [f"{row['name']} (baseline)" if row["baseline"] else row["name"] for row in rows]
+    colours = ["tab:orange" if row["baseline"] else "tab:blue" if row["guarantee"] else "tab:grey" for row in rows]
+    panels = (("error_percent", "force error [%]"), ("fast_n", "force rms above 40 Hz [N]"))
+    for axis, (name, label) in zip(axes[0], (*panels, ("fastest_m_s", "fastest lossless hand [m/s]")), strict=True):
+        axis.barh(labels, [row[name] or 0.0 for row in rows], color=colours)
+        axis.set_xlabel(label)
+    axes[0, 1].set_xscale("symlog", linthresh=1e-3)
+    axes[0, 2].set_xscale("log")
+    axes[0, 2].axvline(outcome["start_m_s"], color="black", linestyle=":")
+    axes[0, 0].invert_yaxis()
+    names = {"baseline": "tab:orange", "with a guarantee": "tab:blue", "without": "tab:grey"}
+    _legend(figure, {name: Patch(color=colour) for name, colour in names.items()}, 3)
+    return _save(figure, path)
+
+
 def _here(name: str, outcome: dict[str, Any]) -> float:
     """Where the scenario stands on this axis, in the unit drawn."""
     here = outcome["here"]

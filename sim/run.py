@@ -19,7 +19,7 @@ from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.environment import environment, held
 from controller.loop import force_map
 from controller.lti import Array, Lti
-from controller.process import Process, StepBuffer, contact, limited
+from controller.process import Net, Process, StepBuffer, contact, limited
 from models.scene import Scene, build, plant
 from sim.engines import (
     EXPONENTIAL,
@@ -117,10 +117,12 @@ def run(
     ticks = scenario.samples if ticks is None else ticks
     start = np.zeros((simulation.plant.A.shape[0], 1)) if start is None else start
     blocks: list[tuple[Array, ...]] = []
+    net: Net | None = None
     diverged = interrupted = False
 
     def keep(buffer: StepBuffer, first: int, count: int) -> bool:
-        nonlocal diverged
+        nonlocal diverged, net
+        net = buffer.net
         finite = np.isfinite(buffer.s[:count]).all(axis=(1, 2)) & np.isfinite(buffer.f[:count]).all(axis=(1, 2))
         diverged = engine.troubled() or not finite.all()
         count = count if finite.all() else int(np.argmin(finite))
@@ -147,6 +149,7 @@ def run(
         s=s,
         diverged=diverged,
         interrupted=interrupted,
+        net=net,
     )
 
 

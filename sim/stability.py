@@ -185,6 +185,8 @@ def stability_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
         growth, reason = None, f"contact was made {contact['made']} times, and a growth rate is of one linear loop"
     elif simulation.friction:
         growth, reason = None, "with Coulomb friction there is no growth rate; the eigenvalues are those without it"
+    elif trace.net:
+        growth, reason = None, "a net stands between forces and devices; the eigenvalues are those of the loop without"
     else:
         loop = close(simulation.plant, simulation.F)
         ahead = max(simulation.scenario.theta) if simulation.process.limiter else 0

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.lti import Array, frozen
+from controller.process import Net
 from sim.files import InputError, write
 
 _MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # axes of what files keep
@@ -54,6 +55,7 @@ class Trace:
     s: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, 2n) of the plant: positions [m], velocities [m/s]
     diverged: bool = False  # the engine gave up, or a number stopped being finite, soon after the last tick
     interrupted: bool = False  # stopped from the keyboard
+    net: Net | None = None  # that stood under the controller, as the run left it
 
     def __post_init__(self) -> None:
         for name, ndim in (_MEASURED | _STATES).items():

@@ -639,3 +639,48 @@ def test_result_of_holds_the_last_known_force(trace):
     result = result_of(recorder, Units((1e-6,) * 2, (4e-4,) * 2, (0.1,) * 2), 1.2e-3, {})
     k = int(np.flatnonzero(~link["received"])[0])
     np.testing.assert_array_equal(result.f[k], result.f[k - 1])
+
+
+class _Thief:
+    """A controller that pushes along the motion, as far from a certificate as can be."""
+
+    def __init__(self, T):
+        self.T, self._before = T, np.zeros(2)
+
+    def step(self, x):
+        way, self._before = np.array(x) - self._before, np.array(x)
+        return -2.0 * np.sign(way)
+
+
+def test_a_budget_under_the_bridge_stands_by_while_the_coupling_is_certified_and_replays(scenario, rungs, tmp_path):
+    recorder = Recorder(2)
+    settings = LinkSettings(measure=100, energy_budget=(0.05, np.inf))
+    run = rehearsal_of(scenario, rungs, recorder=recorder, settings=settings)
+    run.run_to_the_end(5.0)
+    (part,) = outcome("I", run.session, recorder, 0)["energy_budget"]
+    assert part["limited_ticks"] == part["surprises"] == 0
+    assert part["ticks"] == len(recorder)
+    assert "no passive hand is given more than 0.05 J" in part["guarantee"]
+    assert part["reserved_J"] <= part["energy_J"]
+
+
+@pytest.mark.parametrize("faults", [(), ("down:drop=0.02@0.5",)], ids=["clean", "lossy"])
+def test_a_thief_under_the_bridge_is_limited_and_hands_get_no_more_than_the_budget(
+    scenario, rungs, monkeypatch, faults
+):
+    monkeypatch.setattr(CertifiedCoupling, "controller", lambda self: _Thief(self.scenario.T))
+    taken = {}
+    for budget in (0.01, 10.0):
+        recorder = Recorder(2)
+        settings = LinkSettings(measure=100, test_encoders=False, energy_budget=(budget, np.inf))
+        run = rehearsal_of(scenario, rungs, *faults, recorder=recorder, settings=settings)
+        run.run_to_the_end(5.0)
+        (part,) = outcome("I", run.session, recorder, 0)["energy_budget"]
+        trace = result_of(recorder, run.session.units, scenario.T, {})
+        dx = np.diff(trace.x, axis=0)
+        lost = (dx**2 * np.array(scenario.delta)).sum(axis=1) / scenario.T
+        taken[budget] = np.cumsum(-(trace.f[:-1] * dx).sum(axis=1) - lost).max()
+        assert part["surprises"] == 0
+        assert part["limited_ticks"] > 50 or budget > 1
+        assert taken[budget] <= budget + 1e-5
+    assert taken[10.0] > 2 * 0.01

@@ -1,4 +1,4 @@
-"""The five examples run as a newcomer would run them, and say what they should."""
+"""The six examples run as a newcomer would run them, and say what they should."""
 
 import os
 import re
@@ -15,6 +15,12 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 SAYS = {
     "audit": ["closed-loop: needs 1.3987, 1.3987 of 1.37 N s/m: not certified", "the gains times 0.8995"],
     "compare_couplings": ["any passive environment", "closed-loop +1.36.. ", r"-16.6. .*-29.5. .*this environment"],
+    "neural_environment": [
+        r"budget 1e\+09 J: limited 0 of 5000",
+        r"budget 0.01 J: limited [34]\d{3} of 5000",
+        "holds for any passive environment",
+        "no passive hand is given more than 0.01 J",
+    ],
     "simulate_and_plot": [r"no coupling: growth \+1.48. 1/s at 84.0 Hz", "designed coupling: growth -1.726 1/s"],
     "monte_carlo": [r"no coupling: 4\d\d of 500 unstable", "designed coupling: 0 of 500 unstable; .* 0.6 %"],
     "your_own_device": ["certified = True", "ended finished", r"zero force 10\d.. ms after the stop"],

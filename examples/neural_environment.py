@@ -1,0 +1,49 @@
+"""A recurrent network of random neurons as the environment: no model, no proof, and hands that are safe with it.
+
+A coupling that is certified for any passive environment stands before it, and a shell makes it passive: it scales the
+network's forces so that they never give more energy than the budget. Put a physics engine or a trained network there.
+"""
+
+import sys
+
+import numpy as np
+
+from design import certify, design_coupling, promise
+from sim import InputError, load, simulate
+
+BUDGET, SECONDS, NEURONS = 0.01, 6.0, 32  # [J], [s]
+
+
+class Network:
+    """Forces (2,) [N] from where its two contacts are, (2,) [m]; what it remembers it makes up by itself."""
+
+    def __init__(self, seed: int = 3) -> None:
+        rng = np.random.default_rng(seed)
+        self.inward, self.outward = rng.normal(size=(NEURONS, 2)), rng.normal(size=(2, NEURONS))
+        self.weights = 1.5 * rng.normal(size=(NEURONS, NEURONS)) / np.sqrt(NEURONS)  # above 1: it never comes to rest
+        self.activity = np.zeros(NEURONS)
+
+    def __call__(self, u: np.ndarray) -> np.ndarray:
+        self.activity = 0.9 * self.activity + 0.1 * np.tanh(self.weights @ self.activity + 200 * self.inward @ u)
+        return self.outward @ self.activity
+
+
+def main() -> None:
+    scenario = load("omega-pair").replace(duration=SECONDS)
+    design = design_coupling(scenario.loop("I"), "spring-damper", "theorem4")
+    covered = promise(scenario.loop("I"), certify(scenario.loop("I"), design))
+    for budget in (1e9, BUDGET):
+        trace = simulate(scenario, design, environment=Network(), energy_budget=budget)
+        net, speed = trace.meta["energy_budget"], np.abs(trace.v_handle[trace.t > SECONDS - 2]).max()
+        print(
+            f"budget {budget:g} J: limited {net['limited_ticks']} of {net['ticks']} ticks, hands up to {speed:.3f} m/s"
+        )
+    print(f"the coupling holds for {covered}")
+    print(f"guarantee: {net['guarantee']}")
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except InputError as error:
+        sys.exit(f"error: {error}")

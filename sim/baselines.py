@@ -1,0 +1,145 @@
+"""The classics, the energy budget and our couplings on the same runs: `python -m design.compare --baselines`.
+
+Each row is the scenario's own motion in the exact plant, with its force limits and encoders, and then 100 random pairs
+of lossless hands that are started at 0.1 m/s and left alone for ten seconds: a ladder of one or two masses and springs
+at every handle, the same for all rows. A hand that hangs softly behind a spring moves on by itself for long, also with
+certified couplings; what counts is whether something is faster at the end than at the start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.coupling import Coupling, NoCoupling
+from controller.lti import Array
+from controller.process import StepBuffer
+from design.designs import design_by_kind
+from design.result import DesignFailed
+from models.scene import Crowd, variants
+from sim.accuracy import force_error
+from sim.engines import ExactBatchEngine, hold
+from sim.nets import BASELINES, Classic, EnergyNet, netted
+from sim.run import Simulation, assemble, run, run_blocks
+from sim.scenario import Scenario
+
+PAIRS, SECONDS, SLOW = 100, 10.0, 0.1  # of lossless hands, their time [s], their speed at the start [m/s]
+AUDIBLE = 40.0  # [Hz] above which a force is felt as buzzing
+_SEED = 1
+
+_DESIGNS = (("spring-damper", "theorem4"), ("spring-damper", "closed-loop"), ("optimal", "closed-loop"))
+_GUARANTEES = {"theorem4": "any passive environment", "closed-loop": "this environment"}
+
+
+@dataclass(frozen=True)
+class Rival:
+    """One row of the comparison."""
+
+    name: str
+    baseline: bool  # published by others
+    guarantee: str | None  # None where there is none in this loop
+    source: str | None  # the paper of a baseline
+    error_percent: float | None  # rms of the applied force less Lambda E's, over the latter
+    fast_n: float  # rms of the applied force above AUDIBLE [N]
+    peak_n: float
+    acted_percent: float  # of the ticks, while the users move
+    moving: int  # of PAIRS: faster in the last second than at the start
+    fastest_m_s: float  # in the last second
+    reason: str | None = None  # why a figure does not exist
+
+
+def rivals(
+    scenario: Scenario, case: str, progress: Callable[[int, int], None] = lambda done, total: None
+) -> Iterator[Rival]:
+    """No coupling but its limits, every baseline, the budget, and our designs where there are such.
+
+    Raises ValueError for Coulomb friction, which the exact plant has not.
+    """
+    nets = [None, *map(Classic, BASELINES), EnergyNet(0.0)]
+    total = len(nets) + len(_DESIGNS)
+    for done, net in enumerate(nets):
+        progress(done, total)
+        yield _judged(scenario, case, NoCoupling(), net, None)
+    for done, (kind, condition) in enumerate(_DESIGNS, start=len(nets)):
+        progress(done, total)
+        try:
+            coupling = design_by_kind(scenario.loop(case), kind, condition).coupling
+        except DesignFailed:
+            continue
+        yield _judged(scenario, case, coupling, None, (kind, condition))
+
+
+def _judged(
+    scenario: Scenario,
+    case: str,
+    coupling: Coupling,
+    net: Classic | EnergyNet | None,
+    design: tuple[str, str] | None,
+) -> Rival:
+    simulation = assemble(scenario, coupling)
+    most = max(scenario.samples, round(SECONDS / scenario.T))
+    with_net = netted(simulation, coupling, net, most) if net else simulation
+    trace = run(with_net, "exact")
+    # of the force within its limits: what acted, whatever computed it
+    error = force_error(with_net, trace, scenario.loop(case).lam)
+    apart = _apart(trace.f, error.ideal) if not scenario.environment.walls else None
+    part = trace.net.part() if trace.net else {"limited_ticks": 0}
+    moving, fastest = _left_alone(with_net)
+    name = net.name if isinstance(net, Classic) else "energy budget" if net else "none, clipped"
+    guarantee = net.guarantee if isinstance(net, EnergyNet) else None
+    if design:
+        name, guarantee = f"{design[0]}, {_GUARANTEES[design[1]]}", _GUARANTEES[design[1]]
+    return Rival(
+        name,
+        isinstance(net, Classic),
+        guarantee,
+        BASELINES[net.name] if isinstance(net, Classic) else None,
+        apart,
+        _fast(trace.f, scenario.T),
+        float(np.abs(trace.f).max(initial=0.0)),
+        100 * part["limited_ticks"] / max(1, len(trace.t)),
+        moving,
+        fastest,
+        "walls have no linear ideal to compare with" if apart is None else None,
+    )
+
+
+def _apart(f: Array, ideal: Array) -> float | None:
+    size = float(np.sqrt(np.mean(ideal**2)))
+    return 100 * float(np.sqrt(np.mean((f - ideal) ** 2))) / size if size > 0 else None
+
+
+def _fast(f: Array, T: float) -> float:
+    """rms of what is above AUDIBLE [N]."""
+    spectrum = np.fft.rfft(f, axis=0)
+    spectrum[np.fft.rfftfreq(len(f), T) < AUDIBLE] = 0
+    return float(np.sqrt(np.mean(np.fft.irfft(spectrum, len(f), axis=0) ** 2)))
+
+
+def _left_alone(simulation: Simulation) -> tuple[int, float]:
+    """How many pairs of lossless hands are faster in the last second than at the start, and the largest speed then."""
+    scenario, process = simulation.scenario, simulation.process
+    rng, m = np.random.default_rng(_SEED), scenario.channels
+    mass, stiffness = (
+        np.exp(rng.uniform(np.log(r[0]), np.log(r[1]), (PAIRS, m, 2))) for r in ((0.01, 3.0), (1.0, 1e4))
+    )
+    crowd = variants(scenario.device, Crowd(np.stack([mass, np.zeros_like(mass), stiffness], axis=-1)))
+    plants = hold(crowd.plants(), scenario.T)
+    states = plants.A.shape[-1]
+    start = np.zeros((states, PAIRS))
+    start[states // 2 :] = SLOW * rng.choice([-1.0, 1.0], (1, PAIRS))
+    ticks = round(SECONDS / scenario.T)
+    last, fastest = ticks - round(1 / scenario.T), np.zeros(PAIRS)
+
+    def look(buffer: StepBuffer, first: int, count: int) -> bool:
+        if first >= last:
+            speed = np.abs(buffer.s[:count, states // 2 :]).max(axis=(0, 1))
+            np.maximum(fastest, np.where(np.isfinite(speed), speed, np.inf), out=fastest)
+        return False
+
+    outside = plants.B.shape[-1] - m
+    engine = ExactBatchEngine(plants, process.force_limit)
+    run_blocks(process, engine, lambda first, count: np.zeros((count, outside)), ticks, start, look)
+    return int((fastest > SLOW).sum()), float(fastest.max())

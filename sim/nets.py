@@ -1,0 +1,269 @@
+"""Nets under a simulated controller: the energy budget, and the classics that it is compared with.
+
+    traced = run(netted(simulation, coupling, EnergyNet(0.01)), "exact").net.part()
+
+With a net, Theta is no part of the linear block: the forces of G = (I + Psi E V)^-1 Psi E go through the net, then
+through a line that holds them, constant delays or not. The budget and energy bounding stand before the line, and see
+forces that the actuators can apply; the passivity controller stands behind it, at the devices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from controller.budget import EnergyBounding, EnergyBudget, PassivityControl, Shell
+from controller.coupling import Coupling
+from controller.delay import LOST, Ticks, ages
+from controller.loop import DelayRange
+from controller.lti import Array, Lti
+from controller.process import Net, Process, contact
+from design.conditions import Requirement
+from sim.run import Simulation
+from sim.scenario import Scenario
+from sim.switching import with_delays
+
+EPS = 0.05  # the share of the damping that the budget leaves alone
+HELD = 4  # ticks for which a device goes on holding a force, beyond the largest delay, where packets are lost
+
+_HANNAFORD = "Hannaford and Ryu, IEEE Trans. Robotics and Automation 18 (2002)"
+_KIM = "Kim and Ryu, Int. J. Robotics Research 29 (2010)"
+#: the classics by the names that commands have for them -> what they are, and whose
+BASELINES = {
+    "po-pc": f"passivity observer and controller at each device, after {_HANNAFORD}",
+    "po-pc:delta": f"the same with our credit for the devices' damping, after {_HANNAFORD}",
+    "eba": f"energy bounding on each channel, made for no delay, re-derived after {_KIM}",
+}
+
+
+@dataclass(frozen=True)
+class EnergyNet:
+    """The energy budget as a run is asked for it."""
+
+    start: float  # W0 [J]
+    cap: float = np.inf  # the most that it may save [J]
+
+    @property
+    def guarantee(self) -> str:
+        """In one line."""
+        given = f"more than {self.start:g} J" if self.start else "any energy"
+        return f"no passive hand is given {given} beyond what the devices dissipate, whatever computes the forces"
+
+
+@dataclass(frozen=True)
+class Classic:
+    """One of BASELINES."""
+
+    name: str
+
+
+@dataclass(frozen=True, eq=False)
+class Plugged:
+    """Anything in place of the environment, behind the coupling and a shell that makes it passive."""
+
+    force: Callable[[Array], Array]  # where the port would be, (m,) [m], once a tick -> force fed back (m,) [N]
+    start: float = 0.0  # W0 [J]
+
+
+Wanted = EnergyNet | Classic | Plugged
+
+
+def netted(simulation: Simulation, coupling: Coupling, wanted: Wanted, ticks: int | None = None) -> Simulation:
+    """The same loop with a net under it, for runs of up to `ticks` (default: the scenario's).
+
+    What is linear about a loop, such as certificates and modes, ask the simulation without. Delays that vary are those
+    that it has. Raises ValueError for numbers that no budget can have.
+    """
+    scenario, process = simulation.scenario, simulation.process
+    delays, spans = process.delays, DelayRange(scenario.theta, scenario.theta)
+    if delays is None:
+        samples = scenario.samples if ticks is None else ticks
+        constant = np.broadcast_to(np.array(scenario.theta)[None, :, None], (samples, process.channels, 1))
+        process = with_delays(simulation, coupling, constant).process
+        if scenario.environment.walls:
+            undelayed = (0,) * process.channels
+            walled = contact(scenario.environment, coupling, undelayed, scenario.psi, scenario.T)
+            process = replace(process, F=walled.open, contact=walled)
+    else:
+        spans = scenario.delay_range
+    if isinstance(wanted, Plugged):
+        make = partial(_shelled, wanted, coupling.compliance(scenario.T), process)
+    else:
+        make = partial(_budget if isinstance(wanted, EnergyNet) else _classic, wanted, scenario, process, spans)
+    make(1)  # raises for numbers that cannot be
+    return replace(simulation, process=replace(process, net=make))
+
+
+def _budget(wanted: EnergyNet, scenario: Scenario, process: Process, spans: DelayRange, nsim: int) -> Net:
+    assert process.delays is not None
+    lost = bool((process.delays == LOST).any())
+    hold, delta = HELD if lost else 0, scenario.delta
+    given: dict[str, Any] = {"eps": EPS, "start": wanted.start, "cap": wanted.cap, "nsim": nsim, "hold": hold}
+    given["encoder_step"] = process.encoder_step
+    budget = EnergyBudget(delta, scenario.T, spans.lo, spans.hi, **given)
+    late = ages(process.delays) if lost else None
+    return _Budgeted(budget, wanted, process.force_limit, late, np.array(spans.hi) + hold)
+
+
+def _classic(wanted: Classic, scenario: Scenario, process: Process, spans: DelayRange, nsim: int) -> Net:
+    delta, limit = np.array(scenario.delta), process.force_limit
+    if wanted.name == "eba":
+        return _Bounded(EnergyBounding(delta, scenario.T, nsim=nsim), wanted.name, limit)
+    credit = delta if wanted.name.endswith(":delta") else None
+    return _Damped(PassivityControl(len(delta), scenario.T, delta=credit, nsim=nsim), wanted.name, limit)
+
+
+def _shelled(wanted: Plugged, V: Lti | None, process: Process, nsim: int) -> Net:
+    if V is None:
+        raise ValueError("an environment of your own needs a coupling with a compliance V before it")
+    if (process.encoder_step > 0).any():
+        raise ValueError("an environment of your own needs ideal encoders: no shell is known for coarse ones")
+    return _Shelled(Shell(V, start=wanted.start, nsim=nsim), wanted, process.force_limit)
+
+
+def idle(simulation: Simulation, any_environment: Requirement, part: dict[str, Any]) -> str | None:
+    """Why the budget never acts in this run from rest; None where it may, or where no proof says so."""
+    scenario = simulation.scenario
+    if (
+        part["cap_J"] is not None
+        or any(scenario.psi)
+        or scenario.switches
+        or (simulation.process.encoder_step > 0).any()
+    ):
+        return None
+    within = zip(any_environment.required, scenario.delta, strict=True)
+    if not any_environment.certified or not all(needed <= (1 - EPS) * delta for needed, delta in within):
+        return None
+    return f"it never acts from rest: certified for any environment with {100 * EPS:g} % of the damping to spare"
+
+
+class _InLoop:
+    """What the nets have in common: forces within the actuators' limits, and how far the devices went meanwhile."""
+
+    def __init__(self, limit: Array) -> None:
+        self._limit = limit[:, None]
+        self._before: Array | None = None
+
+    def _moved(self, x: Array) -> Array:
+        dx = np.zeros_like(x) if self._before is None else x - self._before
+        self._before = x.copy()
+        return dx
+
+    def _within(self, force: Array) -> Array:
+        return np.clip(force, -self._limit, self._limit)
+
+
+class _Budgeted(_InLoop):
+    """The budget; behind it devices that let go of a force that is too old."""
+
+    def __init__(self, budget: EnergyBudget, asked: EnergyNet, limit: Array, late: Ticks | None, oldest: Array) -> None:
+        super().__init__(limit)
+        self._budget, self._asked, self._late, self._oldest = budget, asked, late, oldest[:, None]
+        self._acted: Array | None = None
+        self._dropped = 0
+
+    def send(self, x: Array, force: Array, /) -> None:
+        force[...] = self._budget.limit(self._within(force), self._moved(x), self._acted)
+
+    def apply(self, k: int, force: Array, /) -> None:
+        if self._late is not None:
+            gone = np.broadcast_to(self._late[k] > self._oldest, force.shape)
+            self._dropped += int(gone.any())
+            force[gone] = 0.0
+        self._acted = force.copy()
+
+    def part(self) -> dict[str, Any]:
+        budget, cap = self._budget, self._asked.cap
+        return {
+            "start_J": self._asked.start,
+            "cap_J": cap if np.isfinite(cap) else None,
+            "eps": EPS,
+            "guarantee": self._asked.guarantee,
+            "ticks": budget.ticks,
+            "limited_ticks": int(budget.limited.max()),
+            "smallest_scale": float(budget.least.min()),
+            "energy_J": float(budget.energy.min()),
+            "reserved_J": float(budget.reserved.max()),
+            "dropped_ticks": self._dropped,
+            "surprises": budget.surprises,
+        }
+
+
+class _Shelled(_InLoop):
+    """An environment of the user's own, its force within the actuators' limits, and the shell."""
+
+    def __init__(self, shell: Shell, asked: Plugged, limit: Array) -> None:
+        super().__init__(limit)
+        self._shell, self._asked = shell, asked
+
+    def send(self, x: Array, force: Array, /) -> None:
+        free = self._shell.free(x)
+        wanted = np.stack([np.asarray(self._asked.force(u), dtype=float) for u in free.T], axis=1)
+        force[...], _ = self._shell.limit(self._within(wanted))
+
+    def apply(self, k: int, force: Array, /) -> None:
+        pass
+
+    def part(self) -> dict[str, Any]:
+        shell, start = self._shell, self._asked.start
+        given = f"more than {start:g} J" if start else "any energy"
+        return {
+            "start_J": start,
+            "cap_J": None,
+            "guarantee": f"behind a coupling certified for any environment, no passive hand is given {given} "
+            "beyond what the devices dissipate, whatever computes the force",
+            "ticks": shell.ticks,
+            "limited_ticks": int(shell.limited.max()),
+            "smallest_scale": float(shell.least.min()),
+            "energy_J": float(shell.energy.min()),
+        }
+
+
+class _Bounded(_InLoop):
+    """Energy bounding, at the computer."""
+
+    def __init__(self, bounding: EnergyBounding, name: str, limit: Array) -> None:
+        super().__init__(limit)
+        self._net, self._name = bounding, name
+
+    def send(self, x: Array, force: Array, /) -> None:
+        force[...] = self._net.limit(self._within(force), self._moved(x))
+
+    def apply(self, k: int, force: Array, /) -> None:
+        pass
+
+    def part(self) -> dict[str, Any]:
+        return _classic_part(self._name, self._net)
+
+
+class _Damped(_InLoop):
+    """The passivity controller, at the devices."""
+
+    def __init__(self, control: PassivityControl, name: str, limit: Array) -> None:
+        super().__init__(limit)
+        self._net, self._name = control, name
+        self._dx: Array = np.zeros(())
+
+    def send(self, x: Array, force: Array, /) -> None:
+        self._dx = self._moved(x)
+        force[...] = self._within(force)
+
+    def apply(self, k: int, force: Array, /) -> None:
+        force[...] = self._net.limit(force, self._dx)
+
+    def part(self) -> dict[str, Any]:
+        return _classic_part(self._name, self._net)
+
+
+def _classic_part(name: str, net: PassivityControl | EnergyBounding) -> dict[str, Any]:
+    return {
+        "name": name,
+        "what": BASELINES[name],
+        "guarantee": None,
+        "ticks": net.ticks,
+        "limited_ticks": int(net.limited.max()),
+    }

@@ -1,0 +1,160 @@
+"""Nets in the simulated loop: the energy budget and the shell end to end, and the classics beside them."""
+
+import json
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from cli.compare import main as compare
+from cli.run import main as run_command
+from controller.coupling import NoCoupling
+from controller.delay import packet_delays
+from design import design_coupling
+from sim import load, simulate
+from sim.nets import BASELINES, Classic, EnergyNet, Plugged, netted
+from sim.run import assemble, run
+from sim.switching import with_delays
+
+SHORT = load().replace(duration=1.5)
+
+
+def stiffer(scenario, factor):
+    network = scenario.environment
+    springs = tuple(msgspec.structs.replace(s, stiffness=factor * s.stiffness) for s in network.springs)
+    return scenario.replace(environment=msgspec.structs.replace(network, springs=springs))
+
+
+def given(simulation, trace):
+    """The most [J] that passive hands were given: by the forces, less what delta of the motion's dissipation is."""
+    s, dx = trace.s[:, : simulation.process.channels], np.diff(trace.s[:, : simulation.process.channels], axis=0)
+    assert len(s) == len(trace.f)
+    lost = (dx**2 * np.array(simulation.scenario.delta)).sum(axis=1) / simulation.scenario.T
+    return float(np.cumsum(-(trace.f[:-1] * dx).sum(axis=1) - lost).max(initial=0.0))
+
+
+@pytest.mark.parametrize("engine", ["exact", "mujoco"])
+def test_a_budget_that_does_not_act_changes_nothing(engine):
+    """Certified for any environment at 95 % of the damping, from rest, without cap and without a joule."""
+    weaker = SHORT.replace(delta=tuple(0.95 * d for d in SHORT.delta)).loop("I")
+    coupling = design_coupling(weaker, "spring-damper", "theorem4").coupling
+    with_budget = simulate(SHORT, coupling, engine, energy_budget=0.0)
+    alone = simulate(SHORT, coupling, engine)
+    part = with_budget.meta["energy_budget"]
+    assert part["limited_ticks"] == part["surprises"] == 0
+    assert part["ticks"] == len(alone.t)
+    assert np.abs(with_budget.f - alone.f).max() < 1e-9
+    assert np.abs(alone.f).max() > 0.1
+
+
+@pytest.mark.parametrize("vary", [False, True], ids=["constant", "switching and lost"])
+@pytest.mark.parametrize("start", [0.0, 0.01])
+def test_no_hand_is_given_more_than_the_budget_by_a_hostile_loop(start, vary):
+    """The optimal coupling on springs 2.5 times stiffer; the users' work does not count, so nobody is given more."""
+    coupling = design_coupling(load().loop("I"), "optimal", "closed-loop").coupling
+    scenario = stiffer(load().replace(duration=4.0), 2.5)
+    simulation = assemble(scenario, coupling)
+    if vary:
+        rng = np.random.default_rng(7)
+        scenario = scenario.replace(jitter={"lo": (0, 1), "hi": (2, 3), "loss": 0.05})
+        delays = rng.integers((0, 1), (3, 4), (scenario.samples, 2))
+        delays = np.where(rng.random(delays.shape) < 0.05, -1, delays)
+        delays[500:530] = -1  # a gap that the device must not hold through
+        simulation = replace(assemble(scenario, coupling), scenario=scenario)
+        simulation = with_delays(simulation, coupling, packet_delays(delays[:, :, None]))
+    guarded = netted(simulation, coupling, EnergyNet(start))
+    trace = run(guarded, "exact")
+    part = trace.net.part()
+    assert part["limited_ticks"] > 100
+    assert part["surprises"] == 0
+    assert given(guarded, trace) <= start + 1e-9
+    assert (part["dropped_ticks"] > 0) == vary
+    if not vary:
+        assert given(simulation, run(simulation, "exact")) > 0.1
+        assert np.abs(trace.f).max() < 0.5 * np.abs(run(simulation, "exact").f).max()
+
+
+def test_walls_stand_behind_a_budget_too():
+    """With room enough it changes nothing, also of contact; with none it limits, and keeps its word."""
+    scenario = load("one-wall").replace(duration=1.5)
+    simulation = assemble(scenario, NoCoupling())
+    alone, rich, poor = (
+        run(one, "exact")
+        for one in (simulation, *(netted(simulation, NoCoupling(), EnergyNet(W0)) for W0 in (1e3, 0.0)))
+    )
+    assert np.abs(alone.f).max() > 0.1
+    assert np.abs(rich.f - alone.f).max() < 1e-9
+    assert given(simulation, poor) <= 1e-9
+
+
+def test_the_shell_bounds_what_an_environment_of_ones_own_gives():
+    """A force that pushes along the motion: without shell it drives the hands, with it it gives 2 mJ at most."""
+    coupling = design_coupling(SHORT.loop("I"), "spring-damper", "theorem4").coupling
+    V, energies = coupling.compliance(SHORT.T), {}
+
+    def thief():
+        before = np.zeros(2)
+
+        def force(u):
+            nonlocal before
+            way, before = u - before, u.copy()
+            return -3.0 * np.sign(way)
+
+        return force
+
+    for start in (0.002, 1e9):
+        simulation = assemble(SHORT, coupling)
+        trace = run(netted(simulation, coupling, Plugged(thief(), start)), "exact")
+        energies[start] = given(simulation, trace)
+        assert trace.net.part()["limited_ticks"] > 100 or start > 1
+    assert V is not None
+    assert energies[0.002] <= 0.002
+    assert energies[1e9] > 10 * 0.002
+    with pytest.raises(ValueError, match="needs a coupling"):
+        netted(assemble(SHORT, NoCoupling()), NoCoupling(), Plugged(lambda u: u))
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_a_classic_acts_in_the_loop_and_is_marked_as_a_baseline(name, tmp_path):
+    options = ["--coupling", name, "--duration", "1", "--no-plot", "--out", str(tmp_path), "--engine", "exact"]
+    assert run_command([*options, "--json", str(tmp_path / "r.json")]) == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["baseline"]["name"] == name
+    assert report["baseline"]["limited_ticks"] > 0
+    assert report["energy_budget"] is report["baseline"]["guarantee"] is None
+    assert any("baseline" in line and "(20" in line for line in report["remarks"])
+
+
+def test_energy_bounding_sends_what_its_law_says():
+    simulation = assemble(SHORT, NoCoupling())
+    trace = run(netted(simulation, NoCoupling(), Classic("eba")), "exact")
+    sent = np.stack([trace.f[n : len(trace.f) - 2 + n, i] for i, n in enumerate((1, 2))], axis=1)
+    dx = np.diff(trace.x, axis=0)
+    c1 = 2 * np.array(SHORT.delta) / SHORT.T
+    k = np.arange(1, len(sent))
+    most = np.abs(sent[k - 1] + c1 * dx[k - 1])
+    assert (np.abs(sent[k]) <= np.where(dx[k - 1] == 0, np.abs(sent[k - 1]), most) + 1e-12).all()
+
+
+def test_the_report_of_a_run_says_what_the_budget_did(tmp_path):
+    options = ["--energy-budget", "0,0.0005", "--duration", "1.5", "--no-plot", "--out", str(tmp_path)]
+    assert run_command([*options, "--json", str(tmp_path / "r.json")]) == 0
+    part = json.loads((tmp_path / "r.json").read_text())["energy_budget"]
+    assert (part["start_J"], part["cap_J"], part["idle"]) == (0, 0.0005, None)
+    assert part["limited_ticks"] > 100
+    assert part["guarantee"].startswith("no passive hand is given any energy beyond")
+
+
+def test_baselines_are_compared_in_one_table_and_one_picture(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sim.baselines.SECONDS", 3.0)
+    monkeypatch.setattr("sim.baselines.PAIRS", 20)
+    monkeypatch.setattr("cli.compare.options.scenario_from", lambda args: load().replace(duration=3.0))
+    assert compare(["--baselines", "--out", str(tmp_path / "out"), "--json", str(tmp_path / "r.json")]) == 0
+    rows = {row["name"]: row for row in json.loads((tmp_path / "r.json").read_text())["rows"]}
+    assert [name for name, row in rows.items() if row["baseline"]] == list(BASELINES)
+    assert rows["eba"]["acted_percent"] > 10
+    assert rows["optimal, this environment"]["error_percent"] < 2
+    assert rows["energy budget"]["fastest_m_s"] < rows["none, clipped"]["fastest_m_s"]
+    assert (tmp_path / "out/baselines.png").is_file()
+    assert "baseline po-pc" in capsys.readouterr().out
