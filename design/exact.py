@@ -399,8 +399,10 @@ def rows_of(M: Matrix) -> Rows:
 def refuted_rows(name: str, block: Lti, rows: Sequence[Sequence[str]]) -> str | None:
     """Why the matrix of this name does not prove that the block is strictly positive real, or None if it does."""
     n = block.order
-    if len(rows) != n or any(len(row) != n for row in rows):
+    if len(rows) != n:
         return f"{name} has {len(rows)} rows, the model has {n} states"
+    if ragged := [len(row) for row in rows if len(row) != n]:
+        return f"{name} has a row of {ragged[0]} entries, the model has {n} states"
     try:
         P = Matrix.of(rows, (n, n))
     except (ValueError, ZeroDivisionError) as error:
