@@ -377,15 +377,43 @@ def environment(network: Network, T: Number) -> Lti:
 
     Internal nodes obey M (v - v-)/T + D v + K q + (coupling to the contacts) = 0 with q = q- + T v, solved
     for v at every tick. The states are q- and v- of the internal nodes, and what the contact dampers and
-    masses need of the past. In the arithmetic of T. Raises ValueError if an internal node is held by nothing.
+    masses need of the past; see `_adrift` for bodies without a place of rest. In the arithmetic of T. Raises ValueError
+    if an internal node is held by nothing.
     """
-    return Lti(*realise(_solvable(network, T), len(network.contacts), T), T)
+    return Lti(*realise(_solvable(network, T), len(network.contacts), T, adrift=_adrift(network, network.springs)), T)
 
 
 def walled_environment(network: Network, T: Number) -> Lti:
     """[x; p] -> [f; y]: as `environment`, wall forces p [N] put in and displacements y [m] across walls out."""
     across = network.across(network.walls)
-    return Lti(*realise(_solvable(network, T), len(network.contacts), T, across), T)
+    adrift = _adrift(network, (*network.springs, *network.walls))
+    return Lti(*realise(_solvable(network, T), len(network.contacts), T, across, adrift), T)
+
+
+def _adrift(network: Network, springs: Sequence[Spring | Wall]) -> list[list[int]]:
+    """The bodies that no spring joins to a contact or to the ground, as lists of their internal nodes' indices.
+
+    Only dampers drag such a body, so it may come to rest anywhere, and no force tells where: the place of one of its
+    nodes would be a state that integrates for ever and is never seen. The places of its nodes are kept relatively to
+    the first one.
+    """
+    names = network.nodes()
+    body = {name: name for name in (*names, GROUND)}  # each points to another node of its body, in the end to one
+
+    def head(name: str) -> str:
+        while body[name] != name:
+            name = body[name]
+        return name
+
+    for spring in springs:
+        if spring.stiffness > 0:
+            body[head(spring.between[0])] = head(spring.between[1])
+    held, inner = {head(name) for name in (*network.contacts, GROUND)}, names[len(network.contacts) :]
+    groups: dict[str, list[int]] = {}
+    for i, name in enumerate(inner):
+        if head(name) not in held:
+            groups.setdefault(head(name), []).append(i)
+    return list(groups.values())
 
 
 def _solvable(network: Network, T: Number) -> tuple[Array, Array, Array]:
@@ -404,11 +432,13 @@ def realise(
     c: int,
     T: Any,
     across: NDArray[np.int64] | None = None,
+    adrift: Sequence[Sequence[int]] = (),
 ) -> tuple[Array, Array, Array, Array]:
     """A, B, C, D of the network (M, D, K) whose first `c` nodes are contacts; see `environment`.
 
     With `across` (w, nodes) there are w more inputs, forces that push the displacements `across q` back, and w more
-    outputs, these displacements. The arithmetic is that of the entries.
+    outputs, these displacements. The places of internal nodes in a group of `adrift` are kept relatively to its first.
+    The arithmetic is that of the entries.
     """
     M, D, K = matrices
     cc, ci, ic, ii = _quarters(c)
@@ -418,6 +448,8 @@ def realise(
     n, w = M.shape[0] - c, 0 if across is None else len(across)
     signals = np.eye(3 * c + w + 2 * n, dtype=M.dtype)
     x, p, q_old, v_old, x_old, vx_old = np.split(signals, np.cumsum([c, w, n, n, c]))
+    for group in adrift:
+        q_old[group[0]] = 0
     vx = (x - x_old) / T
     push = M[ii] / T @ v_old - K[ii] @ q_old - D[ic] @ vx - K[ic] @ x
     if across is not None:
@@ -428,6 +460,8 @@ def realise(
     if across is not None:
         force = np.vstack([force + across[:, :c].T @ p, across[:, :c] @ x + across[:, c:] @ q])
 
+    for group in adrift:
+        q[list(group)] = q[list(group)] - q[group[0]]
     after, inputs = np.vstack([q, v, x, vx]), c + w
     keep = _remembered(after, force, inputs)
     kept = after[keep]

@@ -30,6 +30,7 @@ from controller.lti import (
     Complex,
     Lti,
     Number,
+    SingularLoop,
     as_like,
     constant_like,
     hstack,
@@ -206,7 +207,10 @@ def this_environment(F: Lti, delta: Sequence[float]) -> Requirement:
     radius = float(np.abs(F.poles()).max(initial=0.0))
     if radius >= 1:
         return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
-    demand = this_environment_demand(F, available)
+    try:
+        demand = this_environment_demand(F, available)
+    except SingularLoop as error:  # a radius that rounding has kept below one
+        return refused(f"the force map is singular in floating point: {error}")
     F1 = demand.static["F(1)"]
     # rounding in F(1) is relative to what F is elsewhere: a free mass has F(1) = 0 out of large numbers
     scale = max(float(np.abs(F1).max()), float(np.abs(F.D).max()), float(np.abs(F.at(-1.0)).max()), 1e-12)
