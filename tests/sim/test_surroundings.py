@@ -15,7 +15,7 @@ from models.scene import variants
 from sim.couplings import choose
 from sim.crowds import crowds
 from sim.scenario import load
-from sim.stability import dominant_modes, exact_loops
+from sim.stability import dominant_mode, exact_loops
 from sim.zwidth import MODEL_KEPT, Surroundings, holders
 
 PAIR, STAR = load("omega-pair"), load("three-rigid")
@@ -117,7 +117,7 @@ def test_the_population_meets_the_pair_of_the_cell(optimal):
     for i, stable in ((0, True), (1, False)):
         growth = crowd.growth(F[i])[0]
         for index, some in crowds(ground.population, 2, 1, range(12), 1):
-            modes = dominant_modes(exact_loops(variants(ground.devices, some), F[i]))
+            modes = dominant_mode(exact_loops(variants(ground.devices, some), F[i]))
             np.testing.assert_allclose(growth[index], modes.growth, atol=1e-6)
         assert (growth < 0).all() == stable
 
@@ -139,7 +139,7 @@ def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
     for name in report["conditions"]:
         missing = any(value is None for row in report[name]["required_over_available"] for value in row)
         assert missing == ("reason" in report[name])
-    for words in ("promise: this environment", "for its environment alone", "model set to the cell's environment"):
+    for words in ("guarantee: this environment", "for its environment alone", "model set to the cell's environment"):
         assert words in " ".join(text.split())
     assert (tmp_path / "zwidth.png").read_bytes().startswith(b"\x89PNG")
 
@@ -166,7 +166,7 @@ def test_null_cells_say_why_and_what_pushes_outwards_runs_away(tmp_path):
         (["--coupling", "optimal", "--rigid"], "--rigid with --coupling optimal: it is about a map of spring-dampers"),
         (["--coupling", "none", "--velocity-filter", "50"], "--velocity-filter with --coupling none"),
         (["--coupling", "optimal", "--condition", "theorem4"], "for optimal allowed are closed-loop"),
-        (["--condition", "theorem4"], "--condition theorem4: without --coupling nothing is designed"),
+        (["--condition", "theorem4"], "--condition any-environment: without --coupling nothing is designed"),
         (["--coupling", "optimal", "--scenario", "one-wall"], "an optimal coupling holds a linear model"),
         (["--coupling", "published", "--scenario", "one-wall"], "the paper prints gains for 2 channels"),
     ],
