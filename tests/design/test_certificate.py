@@ -427,7 +427,7 @@ def random_network(rng: np.random.Generator) -> Network:
 
 
 def test_the_proof_succeeds_exactly_where_the_sweep_says_so_on_any_network():
-    """Of 500 and 1000 such networks, with other seeds, none disagreed."""
+    """Of 500 drawn in this way from another seed none disagreed."""
     rng, outcomes = np.random.default_rng(11), []
     while len(outcomes) < 100:
         try:
