@@ -381,9 +381,11 @@ def environment(network: Network, T: Number) -> Lti:
 
     Internal nodes obey M (v - v-)/T + D v + K q + (coupling to the contacts) = 0 with q = q- + T v, solved
     for v at every tick. The states are q- and v- of the internal nodes, and what the contact dampers and
-    masses need of the past. In the arithmetic of T. Raises ValueError if an internal node is held by nothing.
+    masses need of the past; see `_adrift` for bodies without a place of rest. In the arithmetic of T. Raises ValueError
+    if an internal node is held by nothing.
     """
-    return environment_of(_solvable(network, T), len(network.contacts), T)
+    adrift = _adrift(network, network.springs)
+    return Lti(*_realise(_solvable(network, T), len(network.contacts), T, adrift=adrift), T)
 
 
 #: mass [kg], damping [N s/m] and stiffness [N/m], (..., nodes, nodes) each, as Network.matrices gives them
@@ -408,7 +410,34 @@ def sampled_environment(matrices: Matrices, contacts: int, z: Complex, T: float)
 def walled_environment(network: Network, T: Number) -> Lti:
     """[x; p] -> [f; y]: as `environment`, wall forces p [N] put in and displacements y [m] across walls out."""
     across = network.across(network.walls)
-    return Lti(*_realise(_solvable(network, T), len(network.contacts), T, across), T)
+    adrift = _adrift(network, (*network.springs, *network.walls))
+    return Lti(*_realise(_solvable(network, T), len(network.contacts), T, across, adrift), T)
+
+
+def _adrift(network: Network, springs: Sequence[Spring | Wall]) -> list[list[int]]:
+    """The bodies that no spring joins to a contact or to the ground, as lists of their internal nodes' indices.
+
+    Only dampers drag such a body, so it may come to rest anywhere, and no force tells where: the place of one of its
+    nodes would be a state that integrates for ever and is never seen. The places of its nodes are kept relatively to
+    the first one.
+    """
+    names = network.nodes()
+    body = {name: name for name in (*names, GROUND)}  # each points to another node of its body, in the end to one
+
+    def head(name: str) -> str:
+        while body[name] != name:
+            name = body[name]
+        return name
+
+    for spring in springs:
+        if spring.stiffness > 0:
+            body[head(spring.between[0])] = head(spring.between[1])
+    held, inner = {head(name) for name in (*network.contacts, GROUND)}, names[len(network.contacts) :]
+    groups: dict[str, list[int]] = {}
+    for i, name in enumerate(inner):
+        if head(name) not in held:
+            groups.setdefault(head(name), []).append(i)
+    return list(groups.values())
 
 
 def _solvable(network: Network, T: Number) -> Matrices:
@@ -427,11 +456,13 @@ def _realise(
     c: int,
     T: Any,
     across: NDArray[np.int64] | None = None,
+    adrift: Sequence[Sequence[int]] = (),
 ) -> tuple[Array, Array, Array, Array]:
     """A, B, C, D of the network (M, D, K) whose first `c` nodes are contacts; see `environment`.
 
     With `across` (w, nodes) there are w more inputs, forces that push the displacements `across q` back, and w more
-    outputs, these displacements. The arithmetic is that of the entries.
+    outputs, these displacements. The places of internal nodes in a group of `adrift` are kept relatively to its first.
+    The arithmetic is that of the entries.
     """
     (Mcc, _, _, Mii), (Dcc, Dci, Dic, Dii), (Kcc, Kci, Kic, Kii) = (
         [part[(..., *quarter)] for quarter in _quarters(c)] for part in matrices
@@ -443,6 +474,8 @@ def _realise(
     n, w = M.shape[-1] - c, 0 if across is None else len(across)
     signals = np.eye(3 * c + w + 2 * n, dtype=M.dtype)
     x, p, q_old, v_old, x_old, vx_old = np.split(signals, np.cumsum([c, w, n, n, c]))
+    for group in adrift:
+        q_old[group[0]] = 0
     vx = (x - x_old) / T
     push = Mii / T @ v_old - Kii @ q_old - Dic @ vx - Kic @ x
     if across is not None:
@@ -453,6 +486,8 @@ def _realise(
     if across is not None:
         force = np.vstack([force + across[:, :c].T @ p, across[:, :c] @ x + across[:, c:] @ q])
 
+    for group in adrift:
+        q[list(group)] = q[list(group)] - q[group[0]]
     inputs = c + w
     after = np.concatenate([np.broadcast_to(part, (*M.shape[:-2], *part.shape[-2:])) for part in (q, v, x, vx)], -2)
     keep = _remembered(after, force, inputs)

@@ -189,7 +189,7 @@ class Lti:
     def split_at_one(self) -> tuple[Array, Lti]:
         """G(1), and (G(z) - G(1))/(z - 1): stable where G is, so G/(z - 1) without its pole at z = 1.
 
-        Raises SingularLoop where an exact A has the eigenvalue one.
+        Raises SingularLoop where A has the eigenvalue one.
         """
         C = -np.swapaxes(_solve(np.swapaxes(_identity(self) - self.A, -1, -2), np.swapaxes(self.C, -1, -2)), -1, -2)
         return self.D - C @ self.B, Lti(self.A, self.B, C, np.zeros_like(self.D), self.T)
@@ -457,7 +457,10 @@ def inverse(M: Array) -> Array:
 
 def _solve(M: Array, right: Array) -> Array:
     if M.dtype != object:
-        return np.linalg.solve(M, right)
+        try:
+            return np.linalg.solve(M, right)
+        except np.linalg.LinAlgError:
+            raise SingularLoop(f"a {M.shape[-2]} x {M.shape[-1]} matrix is singular: a pole at z = 1") from None
     return solve_exactly(M, right)
 
 

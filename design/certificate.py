@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import math
 import os
 import platform
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -49,7 +50,8 @@ from design.conditions import (
     walls_demand,
     walls_proof,
 )
-from design.exact import Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
+from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
+from design.frequency import frequencies, on_circle, rounding
 
 # ----------------------------------------------------------------------------------------------------
 # The file in which a coupling is kept: the loop it was made for, its coefficients and its certificate, as JSON.
@@ -59,7 +61,7 @@ from design.exact import Matrix, definiteness, find_storage, refuted_rows, rows_
 
 
 Rows = tuple[tuple[float, ...], ...]
-Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=4000)]
+Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=1000)]
 
 
 class BadFile(ValueError):
@@ -138,15 +140,47 @@ def sealed(certificate: Certificate) -> Certificate:
 
 def load(path: str | Path) -> Stored:
     """Read a stored coupling. Raises BadFile with one line that names the field, OSError if there is no file."""
-    content = Path(path).read_bytes()
+    content = _content(Path(path))
     if not content.strip():
         raise BadFile(f"{path}: is empty, expected a coupling as python -m design stores it")
     try:
-        return msgspec.json.decode(content, type=Stored)
+        stored = msgspec.json.decode(content, type=Stored)
+        json.loads(content, object_pairs_hook=_once)
+        return stored
+    except _Twice as error:
+        raise BadFile(f"{path}: names {str(error)!r} twice in one object") from None
     except msgspec.ValidationError as error:
         raise BadFile(f"{path}: is no stored coupling: {' '.join(str(error).split())}") from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise BadFile(f"{path}: {_place(content, str(error))}{' '.join(str(error).split())}") from None
+
+
+MOST_BYTES = 50_000_000  # of a file: a proof over 200 states takes a tenth of it
+
+
+def _content(path: Path) -> bytes:
+    """The bytes of a regular file of at most MOST_BYTES. Raises BadFile, OSError."""
+    if path.exists() and not path.is_file():
+        kind = "a directory" if path.is_dir() else "no regular file"
+        raise BadFile(f"{path}: is {kind}, expected a coupling as python -m design stores it")
+    with path.open("rb") as file:
+        content = file.read(MOST_BYTES + 1)
+    if len(content) > MOST_BYTES:
+        raise BadFile(f"{path}: is larger than {MOST_BYTES // 10**6} MB, expected a coupling as design stores it")
+    return content
+
+
+class _Twice(Exception):
+    """A name that an object of a file gives two values."""
+
+
+def _once(pairs: list[tuple[str, Any]]) -> None:
+    """Of the last value JSON readers speak, of the first one a person who reads the file."""
+    names: set[str] = set()
+    for name, _ in pairs:
+        if name in names:
+            raise _Twice(name)
+        names.add(name)
 
 
 def _place(content: bytes, message: str) -> str:
@@ -621,6 +655,7 @@ def prove(
     any-environment without delay in the environment rho is 0 and the certificate is the same. Raises NotProved with
     the reason.
     """
+    _require_limits(loop, coupling, condition)
     if beta is not None and condition == "theorem4" and any(loop.psi):
         raise NotProved("limiter: any-environment with delay in the environment does not cover limited forces")
     if condition == "closed-loop" and loop.environment.walls:
@@ -633,6 +668,8 @@ def prove(
         reason = requirement.reason or f"needs {needed} N s/m of damping, has {have}"
         place = f"P{worst(in_each(loop, coupling, loop.members()))}" if loop.box else "P"
         raise NotProved(f"{_place_certificate(loop, condition, place)}{reason}", requirement)
+    if reason := _another_system(loop, coupling):
+        raise NotProved(reason, requirement)
     proof: dict[str, Matrix] = {}
     for name, real in _blocks(loop, coupling, condition, multiplier).items():
         _require_size(real.order, requirement)
@@ -657,6 +694,63 @@ def prove(
             switching=_switching(loop, coupling, requirement),
             limiter=msgspec.UNSET if beta is None or condition == "theorem4" else prove_limiter(loop, coupling, beta),
         )
+    )
+
+
+#: More delays, states or digits than these are not looked at: a proof would take minutes.
+MOST_BITS = 400  # of the denominator of a coefficient: a decimal of 120 places
+MOST_COST = 8  # environments of a set, each as many as LARGEST states are
+
+
+def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:
+    """Raises NotProved, in a moment, where a sweep or a proof would take minutes."""
+    late = sum(loop.delays.hi) + sum(loop.psi)
+    _require_size(late)
+    for value in _coefficients(msgspec.to_builtins((loop, coupling.form()))):
+        if rational(value).denominator.bit_length() > MOST_BITS:
+            raise NotProved(f"the coefficient {value:g} has too many digits for exact arithmetic")
+    try:
+        states = loop.sent(coupling).order
+    except SingularLoop:
+        return  # the sweep says where
+    states += sum(loop.theta) if condition == "closed-loop" else 0
+    _require_size(states)
+    members = len(loop.members()) if condition == "closed-loop" else 1
+    if members * states**3 > MOST_COST * LARGEST**3:
+        raise NotProved(f"a proof in {members} environments over {states} states each takes long")
+
+
+def _coefficients(value: Any) -> Iterator[float]:
+    """Every number in plain data."""
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, dict | list | tuple):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from _coefficients(part)
+
+
+MOST_LOST = 1e-6  # of the largest force, or of the damping's Delta_D/T
+
+
+def _another_system(loop: Loop, coupling: Coupling) -> str | None:
+    """Why the block that a tick runs in floating point is not the system that is proved over the rationals, or None.
+
+    Their responses may differ, and rounding move them, by MOST_LOST on the whole circle: more where terms cancel that
+    are far larger than the forces, and more yet where they cancel in decimals only.
+    """
+    try:
+        running, exact = loop.sent(coupling), loop.sent(coupling, exact=True)
+    except SingularLoop as error:
+        return str(error)
+    z = on_circle(frequencies(running))
+    response = running.at(z)
+    lost = rounding(running, z) + float(np.abs(response - exact.floats().at(z)).max())
+    scale = max(float(np.abs(response).max()), min(loop.delta) / loop.T)
+    if lost <= MOST_LOST * scale:
+        return None
+    return (
+        f"in floating point the forces may be off by {lost / scale:.1e} of themselves, allowed is {MOST_LOST:g}: "
+        "what runs would not be what is proved"
     )
 
 
@@ -847,6 +941,7 @@ def _refuted_claims(loop: Loop, coupling: Coupling, certificate: Certificate) ->
         return f"{certificate.condition} does not promise {certificate.promise!r}"
     if certificate.available != loop.delta:
         return f"available is {list(certificate.available)}, the loop has delta = {list(loop.delta)}"
+    _require_limits(loop, coupling, certificate.condition)
     requirement = required_damping(loop, coupling, certificate.condition, _multiplier(loop, certificate))
     if len(certificate.required) != len(loop.delta) or not np.allclose(
         certificate.required, requirement.required, rtol=CLAIM_TOLERANCE_CERTIFICATE
@@ -854,7 +949,9 @@ def _refuted_claims(loop: Loop, coupling: Coupling, certificate: Certificate) ->
         return f"required is {list(certificate.required)}, the sweep finds {list(requirement.required)}"
     if not np.isclose(certificate.margin, 1 / max(requirement.ratio, 1e-12), rtol=CLAIM_TOLERANCE_CERTIFICATE):
         return f"margin is {certificate.margin:.9g}, the sweep finds {1 / max(requirement.ratio, 1e-12):.9g}"
-    return None
+    if not requirement.certified:
+        return f"the sweep asks {requirement.ratio:.6g} times the available damping, whatever the matrices prove"
+    return _another_system(loop, coupling)
 
 
 def _refuted_proof(loop: Loop, coupling: Coupling, certificate: Certificate) -> str | None:

@@ -36,6 +36,7 @@ from controller.lti import (
     Lti,
     Number,
     Sampled,
+    SingularLoop,
     as_like,
     constant_like,
     hstack,
@@ -50,6 +51,7 @@ from design.frequency import (
     hermitian,
     largest_eigenvalue,
     on_circle,
+    rounding,
     suprema,
     supremum,
 )
@@ -367,12 +369,21 @@ def this_environment(
     radius = float(np.abs(F.poles()).max(initial=0.0))
     if radius >= 1:
         return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
-    skew, least = _static_errors(F.dc(), F.D, F.at(-1.0))
-    if skew > STATIC:
+    try:
+        demand = this_environment_demand(F, available, T_max, latency)
+    except SingularLoop as error:  # a radius that rounding has kept below one
+        return refused(f"the force map is singular in floating point: {error}")
+    F1, end = F.dc(), F.at(-1.0)
+    skew, least = _static_errors(F1, F.D, end)
+    slack = STATIC
+    if max(skew, -least) > slack:  # of a map that is nothing but rounding
+        size = max(float(np.abs(part).max()) for part in (F1, F.D, end))
+        allowed = min(rounding(F, on_circle(frequencies(F))), STATIC * min(available) / F.T)
+        slack = max(slack, allowed / max(size, 1e-12))
+    if skew > slack:
         return refused("the static stiffness F(1) is not symmetric: a slow closed path could extract energy")
-    if least < -STATIC:
+    if least < -slack:
         return refused("the static stiffness F(1) has a negative direction: it pushes outwards")
-    demand = this_environment_demand(F, available, T_max, latency)
     ratio, w = supremum(lambda w: least_scale(demand, w), np.concatenate([[0.0], frequencies(F)]))
     return from_ratio("closed-loop", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
 

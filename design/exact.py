@@ -246,6 +246,7 @@ def _whitening(W: Floats) -> Integers | None:
 
 
 LARGEST = 200  # states of a model that a proof is tried for: 0.1 s at 50, 0.5 s at 100, up to 10 s at 200
+MOST_BITS = 4000  # of the common denominator of a stored P, a power of two of some hundred bits when we made it
 STORED_BITS = 44  # of each entry of P, relative to its diagonal
 UNIT = 2.0**-53  # of double precision
 
@@ -399,9 +400,16 @@ def rows_of(M: Matrix) -> Rows:
 def refuted_rows(name: str, block: Lti, rows: Sequence[Sequence[str]]) -> str | None:
     """Why the matrix of this name does not prove that the block is strictly positive real, or None if it does."""
     n = block.order
-    if len(rows) != n or any(len(row) != n for row in rows):
+    if len(rows) != n:
         return f"{name} has {len(rows)} rows, the model has {n} states"
+    if ragged := [len(row) for row in rows if len(row) != n]:
+        return f"{name} has a row of {ragged[0]} entries, the model has {n} states"
     try:
+        common = 1
+        for value in (value for row in rows for value in row):
+            common = math.lcm(common, int(value.partition("/")[2] or 1))
+            if common.bit_length() > MOST_BITS:
+                return f"{name} has a common denominator of more than {MOST_BITS} bits: testing it would take minutes"
         P = Matrix.of(rows, (n, n))
     except (ValueError, ZeroDivisionError) as error:
         return f"{name} has an entry that is not a rational number: {error}"

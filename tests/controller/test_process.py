@@ -45,6 +45,12 @@ def test_three_ticks_by_hand():
     np.testing.assert_allclose(f[:, 0], [0.0, 3.0, 5.0, -1.25], atol=1e-12)
 
 
+def test_forces_end_at_their_limit_in_both_directions():
+    """Against 1000 N/m with a limit of 5 N: 12 mm, 5 mm and 4 mm to either side."""
+    f = drive(process(wall(1000.0), limit=5.0), 1e-3 * np.array([[12.0], [5.0], [4.0], [-4.0], [-5.0], [-12.0]]))
+    np.testing.assert_allclose(f[:, 0], [5.0, 5.0, 4.0, -4.0, -5.0, -5.0], atol=1e-12)
+
+
 @pytest.mark.parametrize(("theta", "psi"), [(0, 0), (2, 0), (0, 1), (3, 2)])
 def test_without_coupling_both_delays_only_shift(theta, psi):
     x = np.random.default_rng(0).normal(size=(30, 1))

@@ -10,6 +10,7 @@ from controller.delay import delay, moving_sum
 from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.loop import force_map
 from controller.lti import Lti, SingularLoop, inverse, numbers, rational
+from design import exact
 from design.exact import Matrix, block_diag, definiteness, prove_positive_real, strictly_positive
 
 T = 1.2e-3
@@ -86,6 +87,31 @@ def test_a_matrix_definite_by_less_than_the_rounding_is_not_proved():
     assert not strictly_positive(S)
 
 
+@pytest.mark.parametrize("bits", [16, 24, 40])
+def test_what_rounding_makes_definite_is_not_proved(monkeypatch, bits):
+    """J + u M with |M| <= 1/2: rounded to multiples of u it is J + u I, which is definite; as it is, it is not."""
+    monkeypatch.setattr(exact, "BITS", bits)
+    u, less = Fraction(1, 2**bits), Fraction(499, 1000)
+    M = [[Fraction(1, 2), -less, less], [-less, Fraction(1, 2), less], [less, less, Fraction(1, 2)]]
+    S = Matrix.of([[1 + u * entry for entry in row] for row in M])
+    assert not definiteness(S).semidefinite
+    assert not strictly_positive(S)
+    assert strictly_positive(Matrix.of([[1 + 8 * u * (i == j) for j in range(3)] for i in range(3)]))
+
+
+def test_coarse_rounding_never_proves_what_elimination_refuses(monkeypatch):
+    monkeypatch.setattr(exact, "BITS", 10)
+    rng, proved = np.random.default_rng(5), 0
+    for _ in range(400):
+        n = int(rng.integers(2, 6))
+        half = rng.integers(-9, 10, (n, n))
+        S = half @ half.T * 1000 + np.diag(rng.integers(0, 60, n)) - int(rng.integers(0, 400)) * np.eye(n, dtype=int)
+        if strictly_positive(Matrix.of(S.tolist())):
+            assert definiteness(Matrix.of(S.tolist())).definite
+            proved += 1
+    assert proved > 50
+
+
 def test_entries_beyond_all_proportion_prove_nothing_and_say_so_quietly(recwarn):
     for size in (10**200, 10**400, 10**4000):
         assert not strictly_positive(Matrix.of([[1, size], [size, 1]]))
@@ -154,6 +180,10 @@ def test_a_wrong_storage_matrix_proves_nothing():
     G = Lti(*([[v]] for v in (0.5, 1.0, 0.5, 1.0)), Fraction(1))
     assert prove_positive_real(G, Matrix.of([["1/2"]])) is None
     assert "negative direction" in prove_positive_real(G, Matrix.of([[5]]))
+    # with P = 1 the matrix is diag(3/4, 2 D - 1): 1e-30 below zero, or zero, is beyond floating point
+    for D, reason in ((Fraction(1, 2) + Fraction(1, 10**30), None), (Fraction(1, 2), "the KYP matrix is not positive")):
+        told = prove_positive_real(Lti(*([[v]] for v in (0.5, 1, 0.5, D)), Fraction(1)), Matrix.of([[1]]))
+        assert told is reason or told.startswith(reason)
     # unstable: P < 0 may satisfy the second inequality alone, and only P > 0 refuses it
     unstable = Lti(*([[v]] for v in (2, 1, 0, 5)), Fraction(1))
     assert prove_positive_real(unstable, Matrix.of([[-1]])) == (

@@ -111,6 +111,21 @@ def test_unequal_devices_need_a_common_factor():
     assert one.ratio == pytest.approx(2 * two.ratio, rel=1e-9)
 
 
+def test_the_needier_channel_decides():
+    """Without damping any-environment asks K T n^2/2 of a channel: 1.08 of 2 N s/m and 0.96 of 0.9 N s/m."""
+    coupling = SpringDamper([1800.0, 400.0], [0.0, 0.0])
+    for order in (slice(None), slice(None, None, -1)):
+        channels, theta, delta = coupling.channels(T)[order], (0, 1)[order], (2.0, 0.9)[order]
+        found = any_environment_per_channel(channels, theta, delta)
+        assert found.required == pytest.approx((1.08, 0.96)[order], rel=1e-9)
+        assert found.ratio == pytest.approx(0.96 / 0.9, rel=1e-9)
+        assert not found.certified
+    lossy, lossless = SpringDamper([400.0], [3.0]).channels(T) + SpringDamper([400.0], [0.0]).channels(T)
+    alone = any_environment(lossy, (1,), (0.9,))
+    for channels, delta in (([lossy, lossless], (0.9, 2.0)), ([lossless, lossy], (2.0, 0.9))):
+        assert any_environment_per_channel(channels, (1, 1), delta).frequency_hz == alone.frequency_hz > 100
+
+
 @pytest.mark.parametrize("mass", [0.3, 1.0, 3.0, 30.0, 300.0, 1000.0])
 def test_a_free_mass_is_not_refused_by_rounding(mass):
     """Its F(1) is exactly 0; a heavy one asks what a rigid wall asks."""

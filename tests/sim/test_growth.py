@@ -37,6 +37,16 @@ def test_a_known_rate_comes_back(frequency, rate):
     assert found.trend == ("grows" if rate > 0 else "decays")
 
 
+def test_the_error_of_a_rate_is_its_scatter():
+    """Over traces that differ by noise alone: the root mean square of the reported errors, within a third."""
+    rng, truth = np.random.default_rng(3), 0.3
+    clean = motion(6.0, (4e-4, 60.0, truth))
+    found = [growth(clean + 1e-4 * rng.normal(size=clean.shape), T, STEP) for _ in range(60)]
+    rates = np.array([one.growth_rate_per_s for one in found])
+    errors = np.array([one.error_per_s for one in found])
+    assert np.sqrt(np.mean(errors**2)) == pytest.approx(np.std(rates), rel=1 / 3)
+
+
 def test_a_person_and_an_encoder_are_no_oscillation():
     found = growth(motion(6.0), T, STEP)
     assert found.growth_rate_per_s is None

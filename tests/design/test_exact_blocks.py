@@ -1,0 +1,464 @@
+"""The exact blocks and the search for their proofs, without the sweep that usually speaks first.
+
+Each family of blocks is built over Fractions at a damping just above and just below a limit that is computed here, by
+a closed form or by a dense sweep of formulas written out here: above it a proof is found, below it the same proof is
+refused and none is found. Then `prove` and `verify` with their sweep disarmed, and forgeries.
+"""
+
+from collections.abc import Callable
+from fractions import Fraction
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.optimize import minimize_scalar
+
+from controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
+from controller.environment import FIGURE_4, Box, Network, Spring, UncertainSpring
+from controller.loop import DelayRange, Loop
+from controller.lti import Lti, rational
+from design import certificate
+from design.certificate import NotProved, Stored, condition_block, digest, prove, sealed, verify
+from design.conditions import (
+    JitterProof,
+    any_environment_demand,
+    delayed_coupling_block,
+    delayed_environment_block,
+    from_ratio,
+    switching_block,
+    this_environment_demand,
+)
+from design.exact import find_storage, prove_positive_real
+
+T = 1.2e-3
+CLOSE = 1e-6  # relative, on either side of a limit
+change = msgspec.structs.replace
+STIFF = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
+
+
+def assert_limit(block: Callable[[float], Lti], limit: float) -> None:
+    """The block is proved strictly positive real just above the limit and not just below."""
+    above, below = block(limit * (1 + CLOSE)), block(limit * (1 - CLOSE))
+    P, reason = find_storage(above)
+    assert P is not None, reason
+    assert prove_positive_real(above, P) is None
+    assert prove_positive_real(below, P) is not None
+    assert find_storage(below)[0] is None
+
+
+def highest(value: Callable[[np.ndarray], np.ndarray]) -> float:
+    """The supremum over the circle of value(w), (k,) -> (k,), by a dense grid and a search around its best points."""
+    grid = np.unique(np.concatenate([np.geomspace(1e-4, np.pi, 20_000), np.linspace(1e-4, np.pi, 20_000)]))
+    values = value(grid)
+    best = float(values.max())
+    for i in np.argsort(values)[-3:]:
+        low, high = grid[max(i - 1, 0)], grid[min(i + 1, grid.size - 1)]
+        found = minimize_scalar(lambda w: -value(np.array([w]))[0], bounds=(low, high), options={"xatol": 1e-11})
+        best = max(best, -found.fun)
+    return best
+
+
+def he(G):
+    return (G + np.conj(np.swapaxes(G, -1, -2))) / 2
+
+
+def figure_4(z):
+    """E(z) of Figure 4 by hand: 800 N/m and 700 N/m with 1 N s/m each, and 1 kg between."""
+    s = (1 - 1 / z) / T
+    p, q = 800 + s, 700 + s
+    return np.moveaxis(
+        np.array([[p, 0 * p], [0 * p, q]]) - np.array([[p * p, p * q], [p * q, q * q]]) / (s**2 + p + q), -1, 0
+    )
+
+
+def late(z, steps):
+    return z[:, None, None] ** -np.array(steps, dtype=float)[:, None] * np.eye(len(steps))
+
+
+def sent(z, coupling, psi=(0, 0)):
+    """(I + Psi E V)^-1 Psi E by hand."""
+    s = (1 - 1 / z) / T
+    V = np.array([1 / (k + b * s) for k, b in zip(coupling.K, coupling.B, strict=True)]).T[:, :, None] * np.eye(2)
+    X = late(z, psi) @ figure_4(z)
+    return np.linalg.solve(np.eye(2) + X @ V, X)
+
+
+def loop(network: Network, theta, psi=None, delta=None, period=T) -> Loop:
+    m = len(theta)
+    return Loop(period, theta, psi or (0,) * m, theta, delta or (1.0,) * m, network)
+
+
+def to_ground(*stiffness: float, damping: float = 0.0) -> Network:
+    springs = tuple(Spring((f"tip {i}", "ground"), k, damping) for i, k in enumerate(stiffness))
+    return Network(tuple(f"tip {i}" for i in range(len(stiffness))), springs)
+
+
+def both(demand):
+    return demand.free + demand.gain
+
+
+# this-environment
+
+
+@pytest.mark.parametrize("theta", [0, 1, 4])
+def test_this_environment_against_a_spring(theta):
+    """(theta + 1/2) K T."""
+    F = loop(to_ground(1000.0), (theta,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    assert_limit(lambda d: both(this_environment_demand(F, [d])), (theta + 0.5) * 1000 * T)
+
+
+def test_this_environment_against_a_spring_and_a_damper():
+    """K T/2 + B."""
+    F = loop(to_ground(700.0, damping=0.9), (0,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    assert_limit(lambda d: both(this_environment_demand(F, [d])), 700 * T / 2 + 0.9)
+
+
+def test_this_environment_over_two_channels_that_are_joined():
+    """(theta + 1/2) T times the largest eigenvalue of K relatively to the dampings."""
+    K, ratio = np.array([[900.0, -300.0], [-300.0, 400.0]]), np.array([1.0, 0.37])
+    springs = (Spring(("a", "b"), 300.0), Spring(("a", "ground"), 600.0), Spring(("b", "ground"), 100.0))
+    F = loop(Network(("a", "b"), springs), (2, 2)).F(Compliance(Lti.constant(np.zeros((2, 2)), T)), exact=True)
+    top = np.linalg.eigvalsh(K / np.sqrt(ratio[:, None] * ratio)).max()
+    assert_limit(lambda d: both(this_environment_demand(F, [d, 0.37 * d])), 2.5 * T * top)
+
+
+@pytest.mark.parametrize(("theta", "psi"), [((1, 2), (0, 0)), ((0, 1), (1, 0))])
+def test_this_environment_against_a_dense_sweep(theta, psi):
+    def needed(w):
+        z = np.exp(1j * w)
+        F = late(z, theta) @ sent(z, STIFF, psi)
+        return np.linalg.eigvalsh(-T * he(F / (z - 1)[:, None, None])).max(axis=1)
+
+    F = loop(FIGURE_4, theta, psi).F(STIFF, exact=True)
+    assert_limit(lambda d: both(this_environment_demand(F, [d, d])), highest(needed))
+
+
+# any-environment, psi = 0
+
+
+def any_environment_limit(K: float, B: float, theta: int) -> float:
+    """sup |K T (1 + .. + z^-theta) + B (1 - z^-n)|^2 / (4 (K T/2 + B)): He[1/c] = Re c/|c|^2 with
+    c = K T/(1 - 1/z) + B."""
+
+    def needed(w):
+        z = np.exp(1j * w)
+        window = sum(z**-k for k in range(theta + 1))
+        return np.abs(K * T * window + B * (1 - z ** -(theta + 1.0))) ** 2 / (4 * (K * T / 2 + B))
+
+    return highest(needed)
+
+
+@pytest.mark.parametrize("theta", [0, 1, 3])
+@pytest.mark.parametrize(("K", "B"), [(900.0, 0.0), (900.0, 0.4), (50.0, 2.0)])
+def test_any_environment_of_one_spring_damper(K, B, theta):
+    V = SpringDamper([K], [B]).compliance(rational(T))
+    limit = any_environment_limit(K, B, theta)
+    if not B:
+        assert limit == pytest.approx(K * T * (theta + 1) ** 2 / 2, rel=1e-7)
+    if not theta:
+        assert limit == pytest.approx(K * T / 2 + B)
+    assert_limit(lambda d: both(any_environment_demand(V, (theta,), [d])), limit)
+
+
+def test_any_environment_of_a_full_compliance():
+    """Spring-dampers along rotated axes: the needier of the two decides."""
+    turn = np.array([[Fraction(3, 5), Fraction(-4, 5)], [Fraction(4, 5), Fraction(3, 5)]])
+    V = turn @ SpringDamper([900.0, 700.0], [0.4, 0.3]).compliance(rational(T)) @ turn.T
+    limit = max(any_environment_limit(900.0, 0.4, 1), any_environment_limit(700.0, 0.3, 1))
+    assert_limit(lambda d: both(any_environment_demand(V, (1, 1), [d, d])), limit)
+
+
+# any-environment, psi >= 1
+
+
+@pytest.mark.parametrize("psi", [1, 2, 5])
+def test_the_multiplier_that_a_delayed_spring_asks(psi):
+    """Phi > (psi - 1/2) K T: He[z^-psi z/(z-1)] = 1/2 - (1 + cos w + .. + cos (psi-1) w)."""
+    E = loop(to_ground(1000.0), (0,), (psi,))
+    delayed = E.sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    assert_limit(lambda phi: delayed_environment_block(delayed, [phi])[1], (psi - 0.5) * 1000 * T)
+
+
+def test_the_multiplier_that_a_delayed_spring_and_damper_ask():
+    """K T/2 + B, at w = 0 no, at w = pi yes."""
+    E = loop(to_ground(700.0, damping=0.9), (0,), (1,))
+    delayed = E.sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    assert_limit(lambda phi: delayed_environment_block(delayed, [phi])[1], 700 * T / 2 + 0.9)
+
+
+def test_the_multiplier_of_figure_4_against_a_dense_sweep():
+    def short(w):
+        z = np.exp(1j * w)
+        return np.linalg.eigvalsh(-T * he((z / (z - 1))[:, None, None] * (late(z, (1, 2)) @ figure_4(z)))).max(axis=1)
+
+    delayed = loop(FIGURE_4, (0, 0), (1, 2)).sent(Compliance(Lti.constant(np.zeros((2, 2)), T)), exact=True)
+    assert_limit(lambda phi: delayed_environment_block(delayed, [phi, phi])[1], highest(short))
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.45])
+def test_a_spring_behind_delay_with_its_multiplier(share):
+    """theta = 1: T/(2 delta) < (T/phi - 2/K)/(K (4 T/phi - 6/K)) at w = 0, and < (T/phi - 2/K)/2 at w = pi."""
+    K, a = 900.0, 1 / 900.0
+    phi = share * K * T / 2
+    least = min(a * (T / phi - 2 * a) / (4 * T / phi - 6 * a), (T / phi - 2 * a) / 2)
+    V, multiplier = SpringDamper([K], [0.0]).compliance(rational(T)), [rational(phi)]
+    assert_limit(lambda d: delayed_coupling_block(V, (1,), multiplier, [rational(d)])[1], T / (2 * least))
+
+
+def test_a_spring_damper_behind_delay_with_its_multiplier():
+    K, B, phi, theta = 900.0, 0.4, 0.2, 2
+    w = np.concatenate([np.geomspace(1e-3, np.pi, 20_000), np.linspace(1e-3, np.pi, 20_000)])
+    z = np.exp(1j * w)
+
+    def holds(delta):
+        window = sum(z**-k for k in range(theta + 1))
+        hat = (1 - 1 / z) / T * (1 / (K + B * (1 - 1 / z) / T) - T / (2 * delta) * window)
+        return (hat.real / (1 - np.cos(w)) > np.abs(hat) ** 2 / (1 / phi - 1 / delta) / (1 - np.cos(w))).all()
+
+    low, high = phi, 100.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    V, multiplier = SpringDamper([K], [B]).compliance(rational(T)), [rational(phi)]
+    assert_limit(lambda d: delayed_coupling_block(V, (theta,), multiplier, [rational(d)])[1], high)
+
+
+# switching
+
+
+@pytest.mark.parametrize(("lo", "hi"), [(0, 1), (1, 3)])
+@pytest.mark.parametrize("weight", [0.5, 1.0, 3.0])
+def test_switching_against_a_spring(lo, hi, weight):
+    """alpha/2 + h^2 K^2/(2 alpha) + K ((lo + hi)/2 + 1/2), times T: with alpha = h K it is (hi + 1/2) K T."""
+    K, h = 1000.0, (hi - lo) / 2
+    alpha = weight * h * K
+    G = loop(to_ground(K), (0,)).sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    limit = T * (alpha / 2 + (h * K) ** 2 / (2 * alpha) + K * ((lo + hi) / 2 + 0.5))
+    if weight == 1:
+        assert limit == pytest.approx((hi + 0.5) * K * T)
+    assert_limit(lambda d: switching_block(G, [lo], [hi], [d], [alpha])[0], limit)
+
+
+@pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((0, 2), (3, 2))])
+def test_switching_against_a_dense_sweep(lo, hi):
+    alpha = np.array([500.0, 300.0]) * (np.array(lo) < np.array(hi))
+    h = (np.array(hi) - np.array(lo)) / 2
+
+    def needed(w):
+        z = np.exp(1j * w)
+        G = sent(z, STIFF)
+        nominal = (late(z, lo) + late(z, hi)) / 2 @ G / (z - 1)[:, None, None]
+        error = (h[:, None] * G)[:, h > 0]
+        cost = np.conj(np.swapaxes(error, 1, 2)) @ (error / (2 * alpha[h > 0])[:, None])
+        return np.linalg.eigvalsh(T * (np.diag(alpha / 2) + cost - he(nominal))).max(axis=1)
+
+    G = loop(FIGURE_4, (0, 0)).sent(STIFF, exact=True)
+    assert_limit(lambda d: switching_block(G, lo, hi, [d, d], alpha.tolist())[0], highest(needed))
+
+
+# prove and verify, with the sweep saying yes to everything
+
+
+@pytest.fixture
+def disarmed(monkeypatch):
+    """The sweeps find half of the damping enough, whatever the loop."""
+
+    def content(asked: Loop, coupling, condition, phi=None):
+        return from_ratio(condition, 0.5, asked.delta, 1.0)
+
+    def switching(asked: Loop, coupling, alpha=None):
+        return JitterProof(from_ratio("jitter-proof", 0.5, asked.delta, 1.0), alpha or ALPHA, 0.5)
+
+    monkeypatch.setattr(certificate, "required_damping", content)
+    monkeypatch.setattr(certificate, "swept", switching)
+
+
+ALPHA = (500.0, 250.0)
+EITHER: list = ["closed-loop", "theorem4"]
+
+
+def proves(asked: Loop, coupling, condition, phi=None) -> bool:
+    try:
+        made = prove(asked, coupling, condition, phi)
+    except NotProved:
+        return False
+    assert verify(Stored.of(asked, coupling, made)).proved
+    return True
+
+
+def assert_loop_limit(asked: Loop, coupling, condition, limit: float, phi=None) -> None:
+    for factor, expected in ((1 + CLOSE, True), (1 - CLOSE, False)):
+        assert proves(change(asked, delta=(limit * factor,) * asked.channels), coupling, condition, phi) == expected
+
+
+@pytest.mark.usefixtures("disarmed")
+def test_each_condition_is_proved_by_its_own_block():
+    asked, coupling = loop(to_ground(1000.0), (1,)), SpringDamper((800.0,), (0.0,))
+    assert_loop_limit(asked, coupling, "theorem4", 800 * T * 2)
+    joined = 1 / (1 / 800 + 1 / 1000)
+    assert_loop_limit(asked, coupling, "closed-loop", 1.5 * joined * T)
+
+
+@pytest.mark.usefixtures("disarmed")
+def test_every_vertex_of_a_range_is_proved():
+    """The stiffest spring decides, and is named."""
+    asked = change(loop(to_ground(1000.0), (1,)), box=Box((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),)))
+    assert_loop_limit(asked, NoCoupling(), "closed-loop", 1.5 * 1600 * T)
+    with pytest.raises(NotProved, match=r"^vertex 2 \(tip 0-ground 1600 N/m, 0 N s/m\): the condition is violated"):
+        prove(change(asked, delta=(1.5 * 1600 * T * (1 - CLOSE),)), NoCoupling(), "closed-loop")
+
+
+@pytest.mark.usefixtures("disarmed")
+def test_delay_in_the_environment_is_proved_with_its_multiplier():
+    K, environment_needs = 900.0, 0.5 * 100 * T
+    asked, coupling, a = loop(to_ground(100.0), (1,), (1,)), SpringDamper((K,), (0.0,)), 1 / 900.0
+    phi = environment_needs * (1 + CLOSE)
+    limit = T / (2 * min(a * (T / phi - 2 * a) / (4 * T / phi - 6 * a), (T / phi - 2 * a) / 2))
+    assert_loop_limit(asked, coupling, "theorem4", limit, [phi])
+    enough = change(asked, delta=(2 * limit,))
+    assert proves(enough, coupling, "theorem4", [phi])
+    assert not proves(enough, coupling, "theorem4", [environment_needs * (1 - CLOSE)])
+
+
+@pytest.mark.usefixtures("disarmed")
+def test_a_range_of_delays_is_proved_by_its_own_block():
+    K = 1000.0
+    asked = loop(to_ground(K, K), (1, 1)).switching(DelayRange((0, 0), (1, 1)))
+    limits = [T * (a / 2 + (K / 2) ** 2 / (2 * a) + K) for a in ALPHA]
+    assert limits[1] > 1.01 * limits[0]
+    assert limits[0] == pytest.approx(1.5 * K * T)  # where the sharper multiplier asks no more than theta = 1 does
+    assert_loop_limit(asked, NoCoupling(), "closed-loop", limits[1])
+
+
+# forgeries: everything that a forger can repair is repaired
+
+
+def forged(asked: Loop, coupling, made, **changes) -> str | None:
+    """Why the certificate with these fields is refused, its digests made good."""
+    fields = {"scenario": digest(asked, coupling.form())} | changes
+    return verify(Stored.of(asked, coupling, sealed(change(made, **fields)))).reason
+
+
+NEGATIVE = "the KYP matrix has a negative direction, beyond the error bound of floating point"
+
+
+def test_the_proof_of_one_condition_does_not_serve_the_other():
+    asked, coupling = loop(to_ground(1000.0), (1,), delta=(2.0,)), SpringDamper((800.0,), (0.0,))
+    here, anywhere = (prove(asked, coupling, condition) for condition in ("closed-loop", "theorem4"))
+    assert len(here.matrices["P"]) == len(anywhere.matrices["P"])  # it is not the size that gives it away
+    assert forged(asked, coupling, anywhere) is None
+    assert forged(asked, coupling, anywhere, matrices=here.matrices) == NEGATIVE
+    assert "does not promise" in forged(asked, coupling, here, promise="any passive environment")
+    soft = change(asked, environment=to_ground(100.0))  # any-environment's proof is far from this environment's need
+    assert forged(soft, coupling, prove(soft, coupling, "closed-loop"), matrices=anywhere.matrices) is not None
+
+
+def test_the_proof_of_the_nominal_environment_does_not_serve_a_vertex():
+    asked = loop(to_ground(1000.0), (1,), delta=(1.5 * 1600 * T * 1.001,))
+    asked = change(asked, box=Box((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),)))
+    made = prove(asked, NoCoupling(), "closed-loop")
+    assert made.required == pytest.approx((1.5 * 1600 * T,), rel=1e-9)  # of the neediest vertex
+    nominal = made.matrices["P"]
+    assert forged(asked, NoCoupling(), made) is None
+    reason = forged(asked, NoCoupling(), made, matrices={"P": nominal, "P1": nominal, "P2": nominal})
+    assert reason == f"vertex 2 (tip 0-ground 1600 N/m, 0 N s/m): {NEGATIVE}"
+    assert forged(asked, NoCoupling(), made, matrices={"P": nominal}) == "matrices are P, expected P, P1, P2"
+
+
+@pytest.mark.parametrize(("condition", "name"), [("closed-loop", "F(1)"), ("theorem4", "H(1)")])
+def test_a_static_part_that_is_asymmetric_by_1e_12_is_refused(condition, name):
+    asked = loop(to_ground(900.0, 700.0), (1, 0), delta=(3.0, 3.0))
+
+    def crossed(other):
+        return Compliance(Lti.constant([[2e-3, 1e-4], [other, 2e-3]], T))
+
+    made = prove(asked, crossed(1e-4), condition)
+    skew = crossed(1e-4 * (1 + 1e-12))
+    assert forged(asked, crossed(1e-4), made) is None
+    assert forged(asked, skew, made) == f"{name} is not exactly symmetric"
+
+
+def test_an_asymmetry_of_1e_12_is_refused_behind_delay_and_for_switching_too():
+    asked = loop(to_ground(100.0, 80.0), (0, 0), (1, 1), delta=(5.0, 5.0))
+    phi = [0.1, 0.1]
+
+    def crossed(other):
+        return Compliance(Lti.constant([[2e-3, 1e-4], [other, 2e-3]], T))
+
+    made = prove(asked, crossed(1e-4), "theorem4", phi)
+    skew = crossed(1e-4 * (1 + 1e-12))
+    assert forged(asked, skew, made) == "H(1) is not exactly symmetric"
+    switching = change(asked, psi=(0, 0)).switching(DelayRange((0, 0), (1, 1)))
+    assert condition_block(switching, crossed(1e-4), ALPHA).order
+    with pytest.raises(ValueError, match="not exactly symmetric and positive semidefinite"):
+        condition_block(switching, skew, ALPHA)
+
+
+def test_a_static_stiffness_that_is_indefinite_by_1e_12_is_refused():
+    """1000 N/m less 1000^2 (0.001 + 1e-18): nothing of it is left in floating point."""
+    asked = loop(to_ground(1000.0, 1000.0), (0, 0), delta=(2.0, 2.0))
+
+    def model(tap):
+        return InternalModel([0.0], [[[0.0, 0.0], [0.0, 0.001]], [[0.0, 0.0], [0.0, tap]]])
+
+    made = prove(asked, model(0.0), "closed-loop")
+    assert forged(asked, model(0.0), made) is None
+    assert forged(asked, model(1e-18), made).startswith("F(1) is not positive semidefinite")
+    switching = asked.switching(DelayRange((0, 0), (1, 1)))
+    assert condition_block(switching, model(0.0), ALPHA).order
+    with pytest.raises(ValueError, match="not exactly symmetric and positive semidefinite"):
+        condition_block(switching, model(1e-18), ALPHA)
+
+
+def test_a_multiplier_is_below_the_damping_and_covers_the_environment(monkeypatch):
+    K, a = 900.0, 1 / 900.0
+    asked, coupling, phi = loop(to_ground(100.0), (1,), (1,), (4.0,)), SpringDamper((K,), (0.0,)), 0.1
+    made = prove(asked, coupling, "theorem4", [phi])
+    assert forged(asked, coupling, made) is None
+    claimed = from_ratio("theorem4", made.required[0] / 4.0, (4.0,), 1.0)
+    monkeypatch.setattr(certificate, "required_damping", lambda *_: claimed)  # the figures on file, for any Phi
+
+    def with_phi(value: str) -> str | None:
+        return forged(asked, coupling, made, matrices=made.matrices | {"Phi": ((value,),)})
+
+    assert T / (2 * (a * (T / phi - 2 * a) / (4 * T / phi - 6 * a))) < 4
+    assert with_phi("4") == "the multiplier Phi is not between 0 and the device damping on every channel"
+    assert with_phi("2") == NEGATIVE
+    assert with_phi("1/100") == NEGATIVE
+    assert with_phi("-1/10") == "the multiplier Phi is not between 0 and the device damping on every channel"
+
+
+def test_figures_are_held_to_a_millionth():
+    asked = loop(FIGURE_4, (1, 2), delta=(1.37, 1.37))
+    made = prove(asked, STIFF, "closed-loop")
+    for factor, sound in ((1 + 2e-6, False), (1 - 2e-6, False), (1 + 5e-7, True)):
+        required = tuple(d * factor for d in made.required)
+        one = (made.required[0], made.required[1] * factor)
+        for reason in (forged(asked, STIFF, made, required=r) for r in (required, one)):
+            assert (reason is None) == sound
+            assert sound or reason.startswith("required is [1.3632")
+        reason = forged(asked, STIFF, made, margin=made.margin * factor)
+        assert (reason is None) == sound
+    assert forged(asked, STIFF, made, margin=2 * made.margin).startswith(f"margin is {2 * made.margin:.9g}, the sweep")
+
+
+def test_the_figures_of_switching_are_held_to_a_millionth():
+    soft = SpringDamper((878.767, 551.883), (0.386476, 0.521984))
+    asked = loop(FIGURE_4, (1, 2), delta=(1.37, 1.37)).switching(DelayRange((1, 1), (2, 2)))
+    made = prove(asked, soft, "closed-loop")
+    for factor, sound in ((1 + 2e-6, False), (1 - 2e-6, False), (1 + 5e-7, True)):
+        for name in ("required", "margin"):
+            value = np.multiply(getattr(made.switching, name), factor).tolist()
+            value = tuple(value) if name == "required" else value
+            reason = forged(asked, soft, made, switching=change(made.switching, **{name: value}))
+            assert (reason is None) == sound
+            assert sound or f": {name} is " in reason
+
+
+def test_a_ragged_proof_is_refused():
+    asked = loop(FIGURE_4, (1, 2), delta=(1.37, 1.37))
+    made = prove(asked, STIFF, "closed-loop")
+    P = made.matrices["P"]
+    ragged = (P[0][:-1], *P[1:])
+    assert forged(asked, STIFF, made, matrices={"P": ragged}) == "P has a row of 8 entries, the model has 9 states"
+    assert forged(asked, STIFF, made, matrices={"P": P[:-1]}) == "P has 8 rows, the model has 9 states"
