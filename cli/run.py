@@ -15,7 +15,7 @@ from design.ranges import SetCheck, check_set, set_part, set_rows
 from design.result import listed
 from design.transparency import transparency
 from sim import report
-from sim.accuracy import ForceError, force_error, position_error
+from sim.accuracy import ForceError, credible_part, force_error, position_error
 from sim.couplings import NAMES, Chosen, choose
 from sim.engines import INTEGRATORS, default_integrator
 from sim.files import write
@@ -50,6 +50,7 @@ def main(argv: list[str]) -> int:
     }
     outcome["error"] = position_error(done.trace, done.exact, done.simulation, _unstable(outcome))
     outcome["reproducibility"] = report.beside_the_paper(done.simulation.scenario, args.case, outcome)
+    outcome["credible"] = credible_part(done.simulation, done.trace)
     alike = force_error(done.simulation, done.trace, loop.lam)
     outcome["ideal_force"] = alike.part()
     outcome["remarks"] = [*done.warnings, *chosen.notes, *report.remarks(outcome)]
@@ -205,11 +206,14 @@ def _save(args: argparse.Namespace, out: Path, run: _Run, alike: ForceError, out
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
     files.append(write(out / "scene.xml", run.simulation.scene.xml))
     if not args.no_plot and result.t.size:
-        from sim.plots import plot_run
+        from sim.plots import Onset, plot_run
 
         apart, hertz = outcome["ideal_force"]["error_percent"], outcome["stability"]["exact_frequency_hz"]
         ideal = None if apart is None else (alike.ideal, apart)
-        files.append(plot_run(result, out / "figure.png", _title(args, outcome), hertz, ideal))
+        grows = outcome["stability"]["exact_verdict"] == "unstable" and run.exact is not None
+        growth = outcome["stability"]["exact_growth_rate_per_s"] if grows and _unstable(outcome) is None else None
+        onset = Onset(growth, outcome["run"]["steady_ticks"][0][1], outcome["credible"]["until_s"])
+        files.append(plot_run(result, out / "figure.png", _title(args, outcome), hertz, ideal, onset))
     return files
 
 
