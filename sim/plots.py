@@ -6,6 +6,7 @@ returns its path.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -178,13 +179,13 @@ def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...]) ->
                 axis.plot(result.t[part], handle, label=label, linewidth=2.2 * width, **style)
 
 
-def _grey_out(axes: Array, result: Trace, until: float) -> None:
-    """What is beyond the devices, under a veil."""
+def _grey_out(axes: Array | list[Axes], result: Trace, until: float) -> None:
+    """What is the linear model's motion and no device's, under a veil."""
     for axis in axes:
         axis.axvspan(until, result.t[-1], color="0.85", alpha=0.75, zorder=5, linewidth=0)
-    where: dict[str, Any] = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
-    text = "grey: the linear model's motion,\nbeyond what the devices declare credible"
-    axes[0].annotate(text, (until, 1.0), (5, -5), va="top", fontsize=9, zorder=6, **where)
+    text = "grey: beyond what the\ndevices declare credible"
+    where: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "right", "va": "top"}
+    axes[0].annotate(text, (1.0, 1.0), (-6, -5), fontsize=9, zorder=6, **where)
 
 
 def _draw_onset(axis: Axes, result: Trace, hertz: float, onset: Onset) -> None:
@@ -259,6 +260,50 @@ def _turns(f: Array) -> int:
     """How often the force that does so most turns round; (k, m)."""
     signs = (np.sign(column[column != 0]) for column in np.diff(f, axis=0).T)
     return max((int(np.count_nonzero(np.diff(sign))) for sign in signs), default=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One of several runs with the same hands."""
+
+    title: str
+    trace: Trace
+    ideal: Array  # (N, m) forces of the ideal environment [N]
+    until: float | None = None  # [s] as of an onset
+
+
+def plot_side_by_side(panels: Sequence[Panel], path: Path) -> Path:
+    """The forces of several couplings on the same axes, each over the force that should be felt (pale).
+
+    The axes are those of the forces that should be felt, as far as they are credible; what oscillates leaves them.
+    """
+    columns = 2 if len(panels) > 1 else 1
+    rows = -(-len(panels) // columns)
+    figure, axes = _panels(
+        "the same devices and hands", rows, columns, (11, 3.1 * rows + 0.6), sharex=True, sharey=True
+    )
+    calm = [panel.ideal for panel in panels if panel.until is None] or [panel.ideal for panel in panels]
+    most = 1.5 * max(float(np.abs(force).max(initial=1e-9)) for force in calm)
+    for axis, panel in zip(axes.flat, panels, strict=False):
+        axis.set_ylim(-most, most)
+        for i in _calmest_last(panel.trace.f):
+            style = _STYLES[i % len(_STYLES)]
+            ideal = panel.ideal[:, i]
+            axis.plot(panel.trace.t, ideal, color=style["color"], alpha=0.3, linewidth=5, zorder=1)
+            axis.plot(panel.trace.t, panel.trace.f[:, i], label=f"device {i + 1}", linewidth=1.1, **style)
+        if panel.until is not None:
+            _grey_out([axis], panel.trace, panel.until)
+        axis.set_title(panel.title, fontsize=10)
+        axis.margins(x=0.01)
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("force [N]")
+    for axis in axes[-1]:
+        axis.set_xlabel("time [s]")
+    axes[0, 0].plot([], [], color="#BBBBBB", linewidth=5, label="pale: the force that should be felt")
+    _legend(figure, dict(sorted(_entries(axes[0, 0]).items())), 6)
+    return _save(figure, path)
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -76,16 +76,15 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
     """What a reader must know to read the figures rightly."""
     lines = []
     certificates = {name: outcome["certificates"][name] for name in ("theorem4", "closed-loop")}
-    for name, part in certificates.items():
-        if part["certified"] or "reason" in part:
-            continue
+    name = "theorem4" if outcome["certificate"]["condition"] == "theorem4" else "closed-loop"
+    part = certificates[name]
+    if not part["certified"] and "reason" not in part:
         worst = max(n / a for n, a in zip(part["required_damping"], part["available_damping"], strict=True))
         condition = f"the {CONDITION_NAMES[name]} condition" + (
             " (the paper's Theorem 4)" if name == "theorem4" else ""
         )
-        lines.append(
-            f"These gains fail {condition}: they need {worst:.3g} times the damping that the devices guarantee."
-        )
+        what = "The loop without coupling fails" if outcome["coupling"]["kind"] == "none" else "This coupling fails"
+        lines.append(f"{what} {condition}: it needs {worst:.3g} times the damping that the devices guarantee.")
     if "contact" in outcome["stability"]:
         covered = "any-environment covers" if outcome["promise"] == ANY else "no certificate covers"
         frozen = "this-environment is about frozen contact states"
