@@ -293,7 +293,7 @@ def _beside(others: list[Alternative], outcome: dict[str, Any]) -> Any:
         if other.reason:
             cells.append((other.name, "", "", f"not possible: {other.reason}", "", ""))
             continue
-        needs = (_share(other.needs(condition), "no limit") for condition in render.ORDER)
+        needs = (_share(other.needs(condition), "never") for condition in render.ORDER)
         grows = other.growth is None or other.growth > MARGINAL
         error = "grows" if grows else render.optional(other.error_percent, "{:.3g} %")
         cells.append((other.name + mark, *needs, other.promise or "none", _share(other.rendered, "-"), error))

@@ -185,7 +185,7 @@ def _grey_out(axes: Array | list[Axes], result: Trace, until: float) -> None:
         axis.axvspan(until, result.t[-1], color="0.85", alpha=0.75, zorder=5, linewidth=0)
     text = "grey: beyond what the\ndevices declare credible"
     where: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "right", "va": "top"}
-    axes[0].annotate(text, (1.0, 1.0), (-6, -5), fontsize=9, zorder=6, **where)
+    axes[0].annotate(text, (1.0, 1.0), (-6, -5), fontsize=8, zorder=6, **where)
 
 
 def _draw_onset(axis: Axes, result: Trace, hertz: float, onset: Onset) -> None:
