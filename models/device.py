@@ -38,8 +38,8 @@ class CompliantDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, t
     friction: float = 0.0  # [N] Coulomb friction at the motor, assumed 0; only MuJoCo models it
     delta: float | None = None  # [N s/m] guaranteed damping; `damping` unless an identification bounds it lower
     credible_force: float | None = None  # [N] in the transmission: more is the model's alone, see `credible_force`
-    credible_speed: float = 2.0  # [m/s] likewise; assumed: three times the 0.7 m/s that teleoperators' masters exceed in
-    # a fifth of the fast part of a tapping task (the abstract of such a study says so; not a figure of this device)
+    credible_speed: float = 2.0  # [m/s] likewise; assumed: three times the 0.7 m/s that teleoperation masters exceed
+    # in a fifth of the fast part of a tapping task (the abstract of such a study says so; not a figure of this device)
 
     def __post_init__(self) -> None:
         _check_common(self, ("motor_mass", "handle_mass"))
