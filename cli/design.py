@@ -28,7 +28,7 @@ from design.certificate import (
     switching_requirement,
 )
 from design.conditions import BETA
-from design.designs import KINDS, compare_methods, design_by_kind
+from design.designs import KINDS, compare_methods, design_by_kind, usual_condition
 from design.optimal import FILTERS, OBJECTIVES
 from design.ranges import SAMPLES, SetCheck, check_set, cost_part, price, set_part, set_rows
 from design.result import CONDITION_NAMES, METHODS, Design, DesignFailed, listed
@@ -143,6 +143,7 @@ OPTIONS = {
 def _loop(args: argparse.Namespace) -> Loop:
     """The scenario's loop with the range of delays that --jitter gives. Raises InputError."""
     loop = options.scenario_from(args).loop(args.case)
+    args.condition = args.condition or usual_condition(loop, args.coupling)
     if args.jitter is not None:
         if not _for_switching(args):
             raise InputError("--jitter is for --coupling optimal, or spring-damper with --condition this-environment")

@@ -11,18 +11,20 @@ from typing import Any
 from cli import options, render
 from controller.loop import Loop
 from design.certificate import Limits, assess, covered_limits, promise_of
+from design.designs import usual_condition
 from design.ranges import SetCheck, check_set, set_part, set_rows
 from design.result import listed
 from design.transparency import transparency
 from sim import report
-from sim.accuracy import ForceError, force_error, position_error
+from sim.accuracy import ForceError, credible_part, force_error, position_error
+from sim.alternatives import Alternative, alternatives
 from sim.couplings import NAMES, Chosen, choose
 from sim.engines import INTEGRATORS, default_integrator
 from sim.files import write
 from sim.nets import BASELINES, Classic, EnergyNet, idle, netted
 from sim.run import ENGINES, Simulation, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, load_humans
-from sim.stability import stability_part
+from sim.stability import MARGINAL, stability_part
 from sim.stepping import MOST, check_substeps, default_substeps
 from sim.switching import Period, switching
 from sim.trace import Trace
@@ -32,8 +34,8 @@ def main(argv: list[str]) -> int:
     """Simulate and report. 0: the run was completed, stable or not; 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "run")
-    chosen = _chosen(args, scenario)
     loop = scenario.loop(args.case)
+    chosen = _chosen(args, scenario)
     environment, simulated = _environment(args, scenario)
     with render.progress("searching the ranges") as move:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)
@@ -54,12 +56,17 @@ def main(argv: list[str]) -> int:
     }
     outcome["error"] = position_error(done.trace, done.exact, done.simulation, _unstable(outcome))
     outcome["reproducibility"] = report.beside_the_paper(done.simulation.scenario, args.case, outcome)
+    outcome["credible"] = credible_part(done.simulation, done.trace)
     alike = force_error(done.ran, done.trace, loop.lam)
     outcome["ideal_force"] = alike.part()
     outcome |= _net(done, requirements)
+    others = _alternatives(args, scenario, done)
+    outcome["alternatives"] = [other.part() for other in others]
     outcome["remarks"] = [*done.warnings, *chosen.notes, *report.remarks(outcome)]
     files = _save(args, out, done, alike, outcome)
-    render.publish(args, outcome, _tables(outcome), outcome["remarks"], out, files)
+    if args.side_by_side:
+        files.append(_side_by_side(others, out / "couplings.png"))
+    render.publish(args, outcome, _tables(outcome, others), outcome["remarks"], out, files)
     return options.INTERRUPTED if done.trace.interrupted else options.DONE
 
 
@@ -84,13 +91,17 @@ def _parser() -> options.Parser:
     vertex = "simulate at this vertex of the scenario's ranges (default 0: nominal)"
     parser.add_argument("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
     options.add_output_options(parser, picture=True)
+    beside = parser.add_argument_group("the same devices and hands with other couplings")
+    beside.add_argument("--no-alternatives", action="store_true", help="no table of them, which takes a second or two")
+    beside.add_argument("--side-by-side", action="store_true", help="draw their forces, too, as couplings.png")
     return parser
 
 
 def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
     """The coupling; with a baseline there is none, and the note says whose that is. Raises InputError."""
     if args.coupling not in BASELINES:
-        return choose(scenario, args.case, args.coupling, args.condition)
+        usual = None if args.case == "none" else usual_condition(scenario.loop(args.case), args.coupling)
+        return choose(scenario, args.case, args.coupling, args.condition or usual)
     if args.energy_budget:
         raise InputError(f"--energy-budget with --coupling {args.coupling}: give one of them")
     note = f"baseline, without a guarantee here: {BASELINES[args.coupling]}; no coupling besides."
@@ -202,6 +213,37 @@ def _steps(args: argparse.Namespace, simulation: Simulation) -> tuple[str | None
         raise InputError(f"--integrator {integrator}: {error}") from None
 
 
+def _alternatives(args: argparse.Namespace, scenario: Scenario, run: _Run) -> list[Alternative]:
+    """What other couplings come to in the scenario's own environment. Raises InputError for a picture of nothing."""
+    skipped = args.no_alternatives or run.trace.interrupted or args.vertex > 0
+    with render.progress("other couplings") as move:
+        made = [] if skipped else alternatives(scenario, args.case, move)
+    if args.side_by_side and not any(other.trace is not None for other in made):
+        raise InputError("--side-by-side is for runs without walls, friction, varying delays and --no-alternatives")
+    return made
+
+
+def _side_by_side(others: list[Alternative], path: Path) -> Path:
+    from sim.plots import Panel, plot_side_by_side
+
+    shown = [other for other in others if other.trace is not None and other.kind != "published"]
+    panels = []
+    for other in shown:
+        assert other.trace is not None
+        assert other.ideal is not None
+        panels.append(Panel(_panel_title(other), other.trace, other.ideal, other.until_s))
+    return plot_side_by_side(panels, path)
+
+
+def _panel_title(other: Alternative) -> str:
+    kind = ", spring-damper" if other.kind == "spring-damper" else ""
+    guarantee = f"guarantee: {other.promise}" if other.promise else "no guarantee"
+    felt = f"grows: {render.optional(other.growth, '{:+.2f} 1/s')}"
+    if other.error_percent is not None:
+        felt = f"force error {other.error_percent:.2g} %"
+    return f"{'no coupling' if other.kind == 'none' else other.name + kind}\n{felt}; {guarantee}"
+
+
 def _certified(chosen: Chosen, requirements: dict[str, Any], loop: Loop, whole: SetCheck | None) -> dict[str, Any]:
     certificates = report.certificates_part(requirements)
     return {
@@ -252,11 +294,14 @@ def _save(args: argparse.Namespace, out: Path, run: _Run, alike: ForceError, out
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
     files.append(write(out / "scene.xml", run.simulation.scene.xml))
     if not args.no_plot and result.t.size:
-        from sim.plots import plot_run
+        from sim.plots import Onset, plot_run
 
         apart, hertz = outcome["ideal_force"]["error_percent"], outcome["stability"]["exact_frequency_hz"]
         ideal = None if apart is None else (alike.ideal, apart)
-        files.append(plot_run(result, out / "figure.png", _title(args, outcome), hertz, ideal))
+        grows = outcome["stability"]["exact_verdict"] == "unstable" and run.exact is not None
+        growth = outcome["stability"]["exact_growth_rate_per_s"] if grows and _unstable(outcome) is None else None
+        onset = Onset(growth, outcome["run"]["steady_ticks"][0][1], outcome["credible"]["until_s"])
+        files.append(plot_run(result, out / "figure.png", _title(args, outcome), hertz, ideal, onset))
     return files
 
 
@@ -274,14 +319,38 @@ def _title(args: argparse.Namespace, outcome: dict[str, Any]) -> str:
 # The report as tables.
 
 
-def _tables(outcome: dict[str, Any]) -> list[Any]:
+def _tables(outcome: dict[str, Any], others: list[Alternative]) -> list[Any]:
     title = f"case {outcome['case']} · {outcome['scenario']} · coupling {outcome['coupling']['kind']}"
     shown = [render.facts(title, _rows(outcome), ("", ""))]
+    if others:
+        shown.append(_beside(others, outcome))
     if rows := outcome["reproducibility"]:
         columns = ("what", "paper", "here", "why")
         cells = [[row[column] for column in columns] for row in rows]
         shown.append(render.grid("beside the paper", ("", *columns[1:]), cells, range(4)))
     return shown
+
+
+def _beside(others: list[Alternative], outcome: dict[str, Any]) -> Any:
+    """The price of each guarantee; the run's own coupling is marked where it is one of them."""
+    own = outcome["coupling"]["kind"], outcome["certificate"]["condition"]
+    cells = []
+    for other in others:
+        mark = "*" if own == (other.kind, other.condition) or own[0] == other.kind != "spring-damper" else ""
+        if other.reason:
+            cells.append((other.name, "", "", f"not possible: {other.reason}", "", ""))
+            continue
+        needs = (_share(other.needs(condition), "never") for condition in render.ORDER)
+        grows = other.growth is None or other.growth > MARGINAL
+        error = "grows" if grows else render.optional(other.error_percent, "{:.3g} %")
+        cells.append((other.name + mark, *needs, other.promise or "none", _share(other.rendered, "-"), error))
+    heads = ("coupling", "this-env.", "any-env.", "guarantee", "stiffness", "error")
+    title = "the same devices with other couplings (*: this run): required damping in % of theirs,"
+    return render.grid(f"{title}\nguarantee, rendered stiffness and force error", heads, cells, left=(0, 3))
+
+
+def _share(value: float | None, absent: str) -> str:
+    return absent if value is None else f"{100 * value:.3g} %" if value < 10 else f"{100 * value:.0f} %"
 
 
 def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:

@@ -12,6 +12,7 @@ import numpy as np
 from cli import options, render
 from controller.environment import Member
 from design.certificate import ANY, assess, promise_of
+from design.designs import usual_condition
 from design.ranges import SetCheck, check_set, set_part
 from sim import report
 from sim.adversary import Worst, search
@@ -29,7 +30,8 @@ def main(argv: list[str]) -> int:
     """Meet random humans. 0: the claims hold, 1: not, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
-    chosen = choose(scenario, args.case, args.coupling, args.condition)
+    condition = args.condition or usual_condition(scenario.loop(args.case), args.coupling)
+    chosen = choose(scenario, args.case, args.coupling, None if args.case == "none" else condition)
     loop = scenario.loop(args.case)
     with render.progress("searching the ranges") as move:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)

@@ -24,6 +24,18 @@ from design.transparency import Transparency, transparency
 #: name -> the conditions that it can be made for, its own first
 KINDS = {"spring-damper": ("theorem4", "closed-loop"), "ccl": ("theorem4",), "optimal": ("closed-loop",)}
 
+
+def usual_condition(loop: Loop, kind: str | None) -> str | None:
+    """What the commands design a spring-damper for where nobody says it: this environment, which feels best.
+
+    Any environment where this-environment covers less than the loop: walls that make and break contact, ranges, delays
+    that vary. None, the kind's own, for others.
+    """
+    if kind not in (None, "spring-damper"):
+        return None
+    return "theorem4" if loop.environment.walls or loop.box or loop.jitter else "closed-loop"
+
+
 #: kind -> what else can be asked of it, in words of design.api.Options
 OPTIONS = {
     "spring-damper": ("switching", "limiter"),

@@ -14,6 +14,7 @@ import numpy as np
 
 from controller.delay import delay
 from controller.lti import Array, Lti
+from models.device import RigidDevice, credible_force
 from sim.engines import EXPONENTIAL
 from sim.run import Simulation, make_engine, run
 from sim.stability import close, dominant_mode, exact_growth, unstable, worst_mode
@@ -157,6 +158,54 @@ def _cycle(truth: Reference, engine: str, integrator: str | None, substeps: int 
 def _point(row: Row) -> Array:
     position = np.inf if row["position_relative_rms"] is None else row["position_relative_rms"]
     return np.array([row["wall_s_per_simulated_s"], position, abs(row["growth_rate_error"])])
+
+
+# ---- how long a run can be believed
+
+
+def credible_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
+    """Up to when a run stays within what its devices declare credible, and what it asks of them at most.
+
+    The model has a linear transmission of any strength, and motors of any speed. `until_s` is the first time at which a
+    transmission carries more than `credible_force`, or a motor moves faster than `credible_speed`; None where that
+    never happens. Figures per device; a rigid device has no transmission, and its force is None.
+    """
+    n, devices = simulation.scene.model.nq, simulation.scenario.device
+    forces: list[float | None] = []
+    speeds, outside = [], np.zeros(trace.t.size, bool)
+    for i, (device, handle) in enumerate(zip(devices, simulation.scene.handles, strict=True)):
+        motor, speed = trace.s[:, i], np.abs(trace.s[:, n + i])
+        outside |= speed > device.credible_speed
+        speeds.append(float(speed.max(initial=0.0)))
+        if isinstance(device, RigidDevice):
+            forces.append(None)
+            continue
+        stretched, stretching = motor - trace.s[:, handle], trace.s[:, n + i] - trace.s[:, n + handle]
+        force = np.abs(device.transmission_stiffness * stretched + device.transmission_damping * stretching)
+        outside |= force > credible_force(device)
+        forces.append(float(force.max(initial=0.0)))
+    part: dict[str, Any] = {
+        "until_s": float(trace.t[np.argmax(outside)]) if outside.any() else None,
+        "transmission_force_n": forces,
+        "motor_speed_m_per_s": speeds,
+        "credible_force_n": [None if isinstance(d, RigidDevice) else credible_force(d) for d in devices],
+        "credible_speed_m_per_s": [device.credible_speed for device in devices],
+    }
+    if part["until_s"] is not None:
+        part["reason"] = _not_credible(part)
+    return part
+
+
+def _not_credible(part: dict[str, Any]) -> str:
+    """One sentence, for report and caption."""
+    pairs = zip(part["transmission_force_n"], part["credible_force_n"], strict=True)
+    carried = max(((f, c) for f, c in pairs if f is not None), key=lambda pair: pair[0] / pair[1], default=None)
+    pairs = zip(part["motor_speed_m_per_s"], part["credible_speed_m_per_s"], strict=True)
+    speed, most = max(pairs, key=lambda pair: pair[0] / pair[1])
+    what = f"a motor moves at up to {speed:.2g} m/s (credible: {most:g})"
+    if carried:
+        what = f"a transmission carries up to {carried[0]:.3g} N (credible: {carried[1]:g}) and {what}"
+    return f"from t = {part['until_s']:.2f} s on the motion is the linear model's and no device's: {what}"
 
 
 # ---- beside the ideal environment

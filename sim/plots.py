@@ -6,6 +6,8 @@ returns its path.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -92,31 +94,137 @@ def _array(values: Any) -> Array:
 _SAME = 1e-6  # [%] what rounding leaves between two forces that are one
 
 
-def plot_run(
-    result: Trace, path: Path, title: str, frequency_hz: float, ideal: tuple[Array, float | None] | None = None
-) -> Path:
-    """Displacements and forces over the whole run, and about six periods of `frequency_hz` where forces turn sharply.
+@dataclass(frozen=True)
+class Onset:
+    """How an oscillation begins: what is predicted, and up to when the run says something about a device."""
 
-    `ideal`: forces (N, m) [N] of the ideal environment, drawn behind the others, and how far they are from it [%].
+    growth: float | None  # [1/s] predicted by the eigenvalues; None where nothing grows
+    steady: int  # ticks before the first clipped one
+    until: float | None = None  # [s] from here on the motion leaves what the devices declare credible
+
+
+def plot_run(
+    result: Trace,
+    path: Path,
+    title: str,
+    frequency_hz: float,
+    ideal: tuple[Array, float | None] | None = None,
+    onset: Onset | None = None,
+) -> Path:
+    """Displacements and forces over the whole run, and six periods of `frequency_hz` where forces turn most sharply.
+
+    Handles are thick, encoders thin where the two differ. `ideal`: forces (N, m) [N] of the ideal environment, drawn
+    behind the others, and how far they are from it [%]. `onset`: what is not credible is greyed, and of a loop that
+    grows the oscillation's amplitude is drawn over time beside its prediction, in place of the displacements' zoom.
     """
-    figure, axes = _panels(title, 2, 2, (11, 6), width_ratios=(2, 1), sharex="col")
-    parts = slice(None), _sharpest(result, frequency_hz)
-    for row, (values, label) in enumerate(((1e3 * result.x, "displacement [mm]"), (result.f, "force fed back [N]"))):
-        # a calm curve stays visible on an agitated one
-        calmest_last = np.argsort(-np.square(np.diff(values, axis=0)).sum(axis=0))
-        for axis, part, width in zip(axes[row], parts, (0.9, 1.4), strict=True):
-            for i in calmest_last:
-                style = _STYLES[i % len(_STYLES)]
-                axis.plot(result.t[part], values[part, i], label=f"device {i + 1}", linewidth=width, **style)
-        axes[row, 0].set_ylabel(label)
+    last, growth = result.t.size, onset.growth if onset else None
+    if onset and onset.until is not None:
+        last = int(np.searchsorted(result.t, onset.until))
+    if onset and growth is not None:
+        last = min(last, onset.steady)
+    near = _sharpest(result, frequency_hz, last if last > 1 else result.t.size)
+    zoomed = growth is not None or near != slice(0, result.t.size)
+    shape: dict[str, Any] = {"width_ratios": (2, 1)} if zoomed else {}
+    figure, axes = _panels(title, 2, 1 + zoomed, (11, 6.4), sharex=False if growth is not None else "col", **shape)
+    if growth is not None:
+        axes[0, 0].sharex(axes[1, 0])
+    parts = (slice(None), near)[: 1 + zoomed]
+    _draw_displacements(axes[0] if growth is None else axes[0, :1], result, parts)
+    # a calm curve stays visible on an agitated one
+    for axis, part, width in zip(axes[1], parts, (0.9, 1.4), strict=False):
+        for i in _calmest_last(result.f):
+            style = _STYLES[i % len(_STYLES)]
+            label = f"device {i + 1}, force" if _two_points(result) else f"device {i + 1}"
+            axis.plot(result.t[part], result.f[part, i], label=label, linewidth=width, **style)
+    axes[0, 0].set_ylabel("displacement [mm]")
+    axes[1, 0].set_ylabel("force fed back [N]")
     if ideal:
         _draw_ideal(axes[1], result, ideal, parts)
-    _legend(figure, dict(sorted(_entries(axes[1, 0]).items())), 6)
-    axes[0, 1].set_title("zoom: where the forces turn most sharply", fontsize=10)
+    if onset and onset.until is not None:
+        _grey_out(axes[:, 0], result, onset.until)
+    if onset and growth is not None:
+        _draw_onset(axes[0, 1], result, frequency_hz, onset)
+    entries = _entries(axes[0, 0]) | _entries(axes[1, 0])
+    _legend(figure, dict(sorted(entries.items())), 3 if len(entries) > 6 else 6, fontsize=9)
+    if zoomed:
+        zoom = axes[0, 1] if growth is None else axes[1, 1]
+        zoom.set_title("zoom: where the forces turn most sharply", fontsize=10)
     for axis in axes[1]:
         axis.set_xlabel("time [s]")
         axis.margins(x=0.01)
     return _save(figure, path)
+
+
+def _two_points(result: Trace) -> bool:
+    """Whether handles and encoders move apart by what can be seen in a picture."""
+    return bool(np.abs(result.x_handle - result.x).max(initial=0.0) > 0.02 * np.abs(result.x).max(initial=0.0))
+
+
+def _calmest_last(values: Array) -> list[int]:
+    return np.argsort(-np.square(np.diff(values, axis=0)).sum(axis=0)).tolist()
+
+
+def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...]) -> None:
+    """Handles over encoders, in millimetres; one curve where they are one point."""
+    two = _two_points(result)
+    for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
+        for i in _calmest_last(result.x):
+            style = _STYLES[i % len(_STYLES)]
+            label = f"device {i + 1}, encoder (thin)" if two else f"device {i + 1}"
+            thin = 0.5 * width if two else width
+            axis.plot(result.t[part], 1e3 * result.x[part, i], label=label, linewidth=thin, **style)
+        if two:
+            for i in _calmest_last(result.x_handle):
+                style = _STYLES[i % len(_STYLES)]
+                label, handle = f"device {i + 1}, handle (thick)", 1e3 * result.x_handle[part, i]
+                axis.plot(result.t[part], handle, label=label, linewidth=2.2 * width, **style)
+
+
+def _grey_out(axes: Array | list[Axes], result: Trace, until: float) -> None:
+    """What is the linear model's motion and no device's, under a veil."""
+    for axis in axes:
+        axis.axvspan(until, result.t[-1], color="0.85", alpha=0.75, zorder=5, linewidth=0)
+    text = "grey: beyond what the\ndevices declare credible"
+    where: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "ha": "right", "va": "top"}
+    axes[0].annotate(text, (1.0, 1.0), (-6, -5), fontsize=8, zorder=6, **where)
+
+
+def _draw_onset(axis: Axes, result: Trace, hertz: float, onset: Onset) -> None:
+    """The amplitude of the oscillation at the encoders over time, up to the first clipped tick, and its prediction."""
+    assert onset.growth is not None
+    t, sizes = _amplitudes(result, hertz, onset.steady)
+    axis.set_title(f"{hertz:.0f} Hz oscillation until a force clips", fontsize=10)
+    axis.set(yscale="log", xlabel="time [s]", ylabel="amplitude at the encoder [mm]")
+    if not t.size:
+        return
+    for i, column in enumerate(1e3 * sizes.T):
+        axis.plot(t, column, label=f"device {i + 1}", linewidth=1.6, **_STYLES[i % len(_STYLES)])
+    loudest = int(np.argmax(sizes[-1]))
+    # the last third: by then the slower modes have died away
+    late = slice(2 * t.size // 3, None)
+    level = np.exp(np.mean(np.log(sizes[late, loudest]) - onset.growth * t[late]))
+    predicted = 1e3 * level * np.exp(onset.growth * t)
+    label = f"slope predicted: {onset.growth:+.3g} 1/s"
+    axis.plot(t, 1.25 * predicted, color="black", linestyle=(0, (6, 3)), linewidth=1.2, label=label)
+    if onset.until is not None and onset.until < t[-1]:
+        axis.axvspan(onset.until, t[-1], color="0.85", alpha=0.75, linewidth=0)
+    axis.set_ylim(bottom=max(1e3 * sizes[sizes > 0].min(), 1e-5 * predicted[-1]))
+    axis.legend(fontsize=8, loc="lower right")
+
+
+def _amplitudes(result: Trace, hertz: float, ticks: int) -> tuple[Array, Array]:
+    """(t (k,), amplitude (k, m) [m]) of the encoders' oscillation at `hertz` in Hann windows of twelve periods."""
+    T = float(result.t[1] - result.t[0]) if result.t.size > 1 else 1.0
+    width = max(8, round(12 / (max(hertz, 1.0) * T)))
+    if ticks < 2 * width:
+        return np.empty(0), np.empty((0, result.x.shape[1]))
+    window, starts = np.hanning(width), np.arange(0, ticks - width, max(1, width // 4))
+    # the second difference takes a hand's slow motion away, and a sinusoid's only by a known factor
+    fast = np.diff(result.x[:ticks], n=2, axis=0, prepend=result.x[:1], append=result.x[ticks - 1 : ticks])
+    turning = window * np.exp(-2j * np.pi * hertz * T * np.arange(width))
+    sums = np.array([turning @ fast[k : k + width] for k in starts])
+    factor = 4 * np.sin(np.pi * hertz * T) ** 2
+    return result.t[starts] + 0.5 * width * T, 2 * np.abs(sums) / (window.sum() * factor)
 
 
 def _draw_ideal(axes: Array, result: Trace, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
@@ -134,12 +242,12 @@ def _draw_ideal(axes: Array, result: Trace, ideal: tuple[Array, float | None], p
         axis.set_ylim(max(low, -most), min(high, most))
 
 
-def _sharpest(result: Trace, frequency_hz: float) -> slice:
-    """Six periods where the forces turn most sharply; more where they turn less than six times in them."""
-    n = result.t.size
+def _sharpest(result: Trace, frequency_hz: float, ticks: int | None = None) -> slice:
+    """Six periods where the forces of the first `ticks` turn most sharply; more where they turn less than six times."""
+    n = result.t.size if ticks is None else ticks
     T = result.t[1] - result.t[0] if n > 1 else 1.0
     width = min(n, max(60, round(6 / (max(frequency_hz, 1.0) * T))))
-    bend = np.concatenate([[0.0], (np.diff(result.f, n=2, axis=0) ** 2).sum(axis=1), [0.0]])[:n]
+    bend = np.concatenate([[0.0], (np.diff(result.f[:n], n=2, axis=0) ** 2).sum(axis=1), [0.0]])[:n]
     total = np.concatenate([[0.0], np.cumsum(bend)])
     while True:
         first = int(np.argmax(total[width:] - total[:-width])) if n > width else 0
@@ -153,6 +261,50 @@ def _turns(f: Array) -> int:
     """How often the force that does so most turns round; (k, m)."""
     signs = (np.sign(column[column != 0]) for column in np.diff(f, axis=0).T)
     return max((int(np.count_nonzero(np.diff(sign))) for sign in signs), default=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One of several runs with the same hands."""
+
+    title: str
+    trace: Trace
+    ideal: Array  # (N, m) forces of the ideal environment [N]
+    until: float | None = None  # [s] as of an onset
+
+
+def plot_side_by_side(panels: Sequence[Panel], path: Path) -> Path:
+    """The forces of several couplings on the same axes, each over the force that should be felt (pale).
+
+    The axes are those of the forces that should be felt, as far as they are credible; what oscillates leaves them.
+    """
+    columns = 2 if len(panels) > 1 else 1
+    rows = -(-len(panels) // columns)
+    figure, axes = _panels(
+        "the same devices and hands", rows, columns, (11, 3.1 * rows + 0.6), sharex=True, sharey=True
+    )
+    calm = [panel.ideal for panel in panels if panel.until is None] or [panel.ideal for panel in panels]
+    most = 1.5 * max(float(np.abs(force).max(initial=1e-9)) for force in calm)
+    for axis, panel in zip(axes.flat, panels, strict=False):
+        axis.set_ylim(-most, most)
+        for i in _calmest_last(panel.trace.f):
+            style = _STYLES[i % len(_STYLES)]
+            ideal = panel.ideal[:, i]
+            axis.plot(panel.trace.t, ideal, color=style["color"], alpha=0.3, linewidth=5, zorder=1)
+            axis.plot(panel.trace.t, panel.trace.f[:, i], label=f"device {i + 1}", linewidth=1.1, **style)
+        if panel.until is not None:
+            _grey_out([axis], panel.trace, panel.until)
+        axis.set_title(panel.title, fontsize=10)
+        axis.margins(x=0.01)
+    for axis in axes.flat[len(panels) :]:
+        axis.set_visible(False)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("force [N]")
+    for axis in axes[-1]:
+        axis.set_xlabel("time [s]")
+    axes[0, 0].plot([], [], color="#BBBBBB", linewidth=5, label="pale: the force that should be felt")
+    _legend(figure, dict(sorted(_entries(axes[0, 0]).items())), 6)
+    return _save(figure, path)
 
 
 # ----------------------------------------------------------------------------------------------------

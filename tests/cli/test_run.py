@@ -43,8 +43,48 @@ def test_case_none_is_figure_5(tmp_path):
     assert np.abs(trace.f).max() == 12.0
 
 
-def test_case_i_is_designed_certified_and_proved(tmp_path):
-    code, report = run(tmp_path, "--case", "I")
+def test_the_default_is_the_design_for_this_environment_with_the_price_of_others_beside_it(tmp_path):
+    """Not the paper's condition: that renders half the stiffness, and the first run should show what is possible."""
+    code, report = run(tmp_path, "--case", "I", "--side-by-side", "--duration", "10")
+    assert code == 0
+    assert report["certificate"]["condition"] == "closed-loop"
+    assert report["certificate"]["proof"] == "rational"
+    assert report["promise"] == "this environment"
+    assert report["ideal_force"]["error_percent"] == pytest.approx(14.0, abs=0.1)
+    assert report["credible"]["until_s"] is None
+    rows = {(row["coupling"], row["condition"]): row for row in report["alternatives"]}
+    sd = "spring-damper"
+    assert list(rows)[:2] == [("none", None), ("published", None)]
+    none, free, here = rows["none", None], rows[sd, "any-environment"], rows[sd, "this-environment"]
+    best = rows["optimal", "this-environment"]
+    assert none["growth_rate_per_s"] == pytest.approx(1.481, abs=1e-3)
+    assert (none["promise"], none["force_error_percent"]) == (None, None)
+    assert none["required_damping"]["this-environment"] == pytest.approx([1.7229] * 2, rel=1e-4)
+    assert free["promise"] == "any passive environment"
+    assert [row["dc_ratio"] for row in (free, here, best)] == pytest.approx([0.476, 0.860, 0.996], abs=1e-3)
+    # the run's own coupling comes to the same there, by the other engine
+    assert here["force_error_percent"] == pytest.approx(report["ideal_force"]["error_percent"], rel=1e-6)
+    assert best["force_error_percent"] < 0.6 < here["force_error_percent"] < free["force_error_percent"]
+    assert best["rms_mismatch_db"] == pytest.approx(-29.5, abs=0.3)
+    assert (tmp_path / "out" / "couplings.png").stat().st_size > 50_000
+
+
+def test_where_one_environment_is_not_all_the_default_is_any_environment(tmp_path):
+    """Walls that make and break contact, and ranges, are covered by any-environment alone."""
+    for name in ("one-wall", "omega-pair-box"):
+        _, report = run(tmp_path, "--scenario", name, "--no-plot", "--duration", "0.5")
+        assert report["certificate"]["condition"] == "theorem4"
+        assert [row["coupling"] for row in report["alternatives"]] == ["none", "spring-damper"]
+    _, report = run(tmp_path, "--no-plot", "--duration", "0.5", "--no-alternatives")
+    assert report["alternatives"] == []
+    with pytest.raises(InputError, match="--side-by-side is for runs without walls"):
+        main(
+            ["--scenario", "one-wall", "--no-plot", "--duration", "0.5", "--side-by-side", "--out", str(tmp_path / "o")]
+        )
+
+
+def test_the_papers_case_i_is_designed_certified_and_proved(tmp_path):
+    code, report = run(tmp_path, "--case", "I", "--condition", "any-environment", "--no-alternatives")
     assert code == 0
     assert set(report) >= SECTIONS
     assert report["coupling"]["kind"] == "spring-damper"
@@ -165,7 +205,7 @@ def test_bad_input_is_one_line_on_stderr_and_exit_code_2(tmp_path):
 
 
 def test_what_cannot_be_designed_is_exit_code_1(tmp_path):
-    process = command("--psi", "1", cwd=tmp_path)
+    process = command("--psi", "1", "--condition", "any-environment", cwd=tmp_path)
     _, err = process.communicate()
     assert process.returncode == 1
     assert "Theorem 4 admits no coupling" in err

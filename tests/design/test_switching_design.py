@@ -72,7 +72,7 @@ def test_a_range_that_is_too_wide_says_so():
 @pytest.mark.parametrize(
     "options",
     [
-        ["--jitter", "1,2"],
+        ["--condition", "any-environment", "--jitter", "1,2"],  # without it the design is for this environment
         ["--condition", "closed-loop", "--jitter", "2,1"],
         ["--condition", "closed-loop", "--jitter", "1"],
     ],

@@ -72,6 +72,29 @@ def test_every_sample_of_a_run_is_on_the_picture(drawn):
     assert legend(figure) == ["device 1", "device 2", "device 3", "pale: ideal environment (asked force 12 % off)"]
 
 
+def test_an_onset_is_drawn_at_its_size_and_slope_and_what_is_not_credible_is_grey(drawn):
+    t = T * np.arange(6000)
+    swing = 1e-6 * np.exp(1.4 * t) * np.cos(2 * np.pi * 84 * t)
+    handle = 0.015 * np.sin(2 * np.pi * 0.6 * t)
+    x = np.stack([handle + swing, handle], axis=1)
+    result = Trace(t, x, 800 * x, np.stack([handle, handle], axis=1), x, np.zeros((6000, 1)), {})
+    middle, sizes = plots._amplitudes(result, 84.0, 5000)
+    np.testing.assert_allclose(sizes[:, 0], 1e-6 * np.exp(1.4 * middle), rtol=0.02)
+    assert middle[-1] < 5.0  # up to the first clipped tick
+    onset = plots.Onset(1.4, 5000, 4.0)
+    figure = drawn(plots.plot_run, result, title="t", frequency_hz=84.0, onset=onset)
+    curve = lines(figure.axes[1])["slope predicted: +1.4 1/s"]
+    assert np.diff(np.log(curve[:, 1]))[0] == pytest.approx(1.4 * np.diff(curve[:, 0])[0])
+    names = [f"device 1, {what}" for what in ("encoder (thin)", "force", "handle (thick)")]
+    assert legend(figure)[:3] == names
+    handles, encoders = (lines(figure.axes[0])[f"device 1, {what}"] for what in ("handle (thick)", "encoder (thin)"))
+    np.testing.assert_allclose(handles[:, 1], 1e3 * handle)
+    np.testing.assert_allclose(encoders[:, 1], 1e3 * x[:, 0])
+    (veil,) = figure.axes[0].patches
+    assert veil.get_x() == 4.0
+    assert figure.axes[3].lines[0].get_xdata().max() <= 4.0  # the zoom is of what is credible
+
+
 def test_a_figure_is_closed_where_it_cannot_be_written(tmp_path):
     with pytest.raises((OSError, ValueError)):
         plots.plot_run(trace(np.zeros((9, 1))), tmp_path / "absent" / "a.png", "t", 1.0)

@@ -1,0 +1,143 @@
+"""The same devices and hands with other couplings: what each promise costs, from no coupling to the best one.
+
+A run is of one coupling. Beside it stand the loop without any, the paper's printed gains where the loop is the paper's,
+the spring-damper for any passive environment, the one for this environment, and the optimal coupling where it is quick
+to find. Every one is judged as the run's own is, and drives the same hands with the exact engine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from controller.coupling import Coupling
+from controller.lti import Array
+from design.certificate import assess, finite, promise_of
+from design.conditions import Requirement
+from design.result import CONDITION_NAMES
+from design.transparency import decibels, transparency
+from sim.accuracy import credible_part, force_error
+from sim.couplings import choose
+from sim.run import assemble, run
+from sim.scenario import Scenario, load
+from sim.stability import exact_growth, unstable
+from sim.trace import Trace
+
+#: (kind, condition) in the order of a table; the optimal one is quick for so many channels
+_ROWS = (
+    ("none", None),
+    ("published", None),
+    ("spring-damper", "theorem4"),
+    ("spring-damper", "closed-loop"),
+    ("optimal", "closed-loop"),
+)
+_QUICK = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Alternative:
+    """One coupling in the loop, or the reason why there is none."""
+
+    kind: str
+    condition: str | None
+    coupling: Coupling | None = None
+    requirements: dict[str, Requirement] | None = None
+    promise: str | None = None
+    rendered: float | None = None  # share of the static stiffness that is felt
+    rms_mismatch_db: float | None = None
+    growth: float | None = None  # [1/s] of the exact loop
+    error_percent: float | None = None  # of the forces, as in a run's report; None where the loop grows or has walls
+    trace: Trace | None = None  # of the exact engine
+    ideal: Array | None = None  # (N, m) forces of the ideal environment at the trace's displacements [N]
+    until_s: float | None = None  # from here on the trace is not credible
+    reason: str | None = None  # why there is no such coupling
+
+    @property
+    def name(self) -> str:
+        """As tables and pictures call it: a spring-damper by its condition."""
+        if self.kind == "spring-damper":
+            return CONDITION_NAMES[self.condition or ""]
+        return {"optimal": "best (optimal)"}.get(self.kind, self.kind)
+
+    def part(self) -> dict[str, Any]:
+        """As plain data."""
+        damping = {
+            CONDITION_NAMES.get(name, name): [finite(float(x)) for x in requirement.required]
+            for name, requirement in (self.requirements or {}).items()
+        }
+        part: dict[str, Any] = {
+            "coupling": self.kind,
+            "condition": CONDITION_NAMES.get(self.condition or "", self.condition),
+            "required_damping": damping,
+            "promise": self.promise,
+            "dc_ratio": self.rendered,
+            "rms_mismatch_db": self.rms_mismatch_db,
+            "growth_rate_per_s": self.growth,
+            "force_error_percent": self.error_percent,
+        }
+        return part | ({"reason": self.reason} if self.reason else {})
+
+    def needs(self, condition: str) -> float | None:
+        """The largest share of its guaranteed damping that the condition asks of a device; None: none is enough."""
+        requirement = (self.requirements or {}).get(condition)
+        if requirement is None:
+            return None
+        pairs = zip(requirement.required, requirement.available, strict=True)
+        return finite(max(float(n) / float(a) if a else math.inf for n, a in pairs))
+
+
+def alternatives(
+    scenario: Scenario, case: str, progress: Callable[[int, int], None] = lambda done, of: None
+) -> list[Alternative]:
+    """Every coupling that can stand in the place of the run's own; none where the delays switch.
+
+    Walls and ranges are covered by any-environment alone: the couplings for one linear environment are left out there.
+    """
+    if scenario.switches:
+        return []
+    case = "I" if case == "none" else case
+    rows = [row for row in _ROWS if _possible(scenario, case, *row)]
+    made = []
+    for i, (kind, condition) in enumerate(rows):
+        progress(i, len(rows))
+        made.append(_alternative(scenario, case, kind, condition))
+    return made
+
+
+def _possible(scenario: Scenario, case: str, kind: str, condition: str | None) -> bool:
+    if kind == "published":
+        return scenario.loop(case) == load().loop(case)
+    one_environment = scenario.environment.walls or scenario.box
+    if condition == "closed-loop" and one_environment:
+        return False
+    return kind != "optimal" or scenario.channels <= _QUICK
+
+
+def _alternative(scenario: Scenario, case: str, kind: str, condition: str | None) -> Alternative:
+    try:
+        chosen = choose(scenario, case, kind, condition)
+    except ValueError as error:
+        return Alternative(kind, condition, reason=str(error))
+    loop, simulation = scenario.loop(case), assemble(scenario, chosen.coupling)
+    requirements = assess(loop, chosen.coupling, chosen.phi)
+    felt = transparency(simulation.felt, simulation.E, loop.lam)
+    growth = exact_growth(simulation)
+    made = Alternative(
+        kind,
+        condition,
+        chosen.coupling,
+        dict(requirements),
+        promise_of(requirements, loop, False),
+        finite(felt.dc_ratio),
+        finite(decibels(felt.rms_mismatch)),
+        finite(growth),
+    )
+    if scenario.environment.walls or simulation.friction:
+        return made
+    trace = run(simulation, "exact")
+    alike = force_error(simulation, trace, loop.lam)
+    error = None if unstable(growth) else alike.part()["error_percent"]
+    until = credible_part(simulation, trace)["until_s"]
+    return replace(made, error_percent=error, trace=trace, ideal=alike.ideal, until_s=until)
