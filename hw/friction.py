@@ -9,9 +9,9 @@ f0 + f1 t a constant force and its drift. A handle (m2) behind a transmission (k
 p = a b + l m, r = a m1: polynomials, since both sides were multiplied by a s^2 + l s + 1. A lag tau of the amplifier
 is l - tau and a + tau^2/2, so that it is not taken for negative damping. Derivatives are of h, never of the encoder; a
 force held for a tick is integrated exactly. All but a beside g is linear, so a fit takes milliseconds, and no state at
-the beginning is needed. Dry friction g(x') is c tanh(v/v0), and a part of it that is gone at speed (Stribeck), or a bristle
-that bends over some distance (Dahl). Which, is not known: all of _SLIPS and _BRISTLES are tried, and every one that
-fits hardly worse than the best has a say in the bound. So does a drag q >= 0: of b and q, the guaranteed damping is b.
+the beginning is needed. Dry friction g(x') is c tanh(v/v0), and a part of it that is gone at speed (Stribeck), or a
+bristle that bends over some distance (Dahl). Which, is not known: all of _SLIPS and _BRISTLES are tried, and every one
+that fits hardly worse than the best has a say in the bound. So does a drag q >= 0: of b and q, the guaranteed damping is b.
 Periodic are forces that repeat with position (a motor's poles) and errors of the encoder that do (its eccentricity);
 their periods are looked for in what is left.
 
@@ -42,8 +42,9 @@ _STILL = 0.02  # [s] within one count of which an encoder stands still
 _SLIPS = (5e-4, 1e-3, 2e-3, 5e-3, 1e-2, 2e-2)  # [m/s] speed at which dry friction is at 3/4
 _BRISTLES = (1e-5, 3e-5, 1e-4)  # [m] over which friction reverses, where it is position that turns it (Dahl 1968)
 _STRIBECK = 0.02  # [m/s] above which the rest of static friction is gone
+_SLOW, _WEAK = 0.2, 0.05  # part of a force that the window has to pass, unless it is so small a part of the strongest
 _BLOCKS = 10  # of the record, that are left out in turn
-_HIDDEN = 0.01  # of what is left unexplained, that may be damping in disguise
+_HIDDEN = 0.03  # of what is left unexplained, that may be damping in disguise
 _QUANTILE = 1.833  # of Student's t with 9 degrees of freedom, 95 % to one side
 _FEW = 200  # rows
 _ALMOST = 4.0  # by which a log likelihood ratio may be worse than the best law's
@@ -117,13 +118,20 @@ def _bristle(x: Array, reach: float) -> Array:
     return np.array(out)
 
 
+def _slow(force: Array, sigma: float, T: float) -> NDArray[np.bool_]:
+    """Where the force is not mostly faster than the window: there friction is turned by motion that is not seen."""
+    width = 3 * sigma
+    strong, left = (_filtered(f**2, 0, width, T) for f in (force, _filtered(force, 0, sigma, T)))
+    return (left > _SLOW**2 * strong) | (strong < _WEAK**2 * strong.max())
+
+
 class _Balance:
     """The rows of the balance where the axis moves."""
 
     def __init__(self, x: Array, force: Array, T: float, step: float) -> None:
         self.T, self.sigma, self.force = T, max(_WINDOW, 3 * T), force
         self.x = x - x[0]
-        self.rows = np.flatnonzero(_moving(x, step, T, self.sigma))
+        self.rows = np.flatnonzero(_moving(x, step, T, self.sigma) & _slow(force, self.sigma, T))
         if len(self.rows) < _FEW:
             raise ValueError(f"the axis moves in {len(self.rows)} samples only, at least {_FEW} are needed")
         short = (step**2 / 12 * T / (4 * np.sqrt(np.pi) * _SPEED_NOISE**2)) ** (1 / 3)
