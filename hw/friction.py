@@ -11,7 +11,7 @@ is l - tau and a + tau^2/2, so that it is not taken for negative damping. Deriva
 force held for a tick is integrated exactly. All but a beside g is linear, so a fit takes milliseconds, and no state at
 the beginning is needed. Dry friction g(x') is c tanh(v/v0), and a part of it that is gone at speed (Stribeck), or a
 bristle that bends over some distance (Dahl). Which, is not known: all of _SLIPS and _BRISTLES are tried, and every one
-that fits hardly worse than the best has a say in the bound. So does a drag q >= 0: of b and q, the guaranteed damping is b.
+that fits hardly worse than the best has a say in the bound. So does a drag q >= 0: of b and q, b is guaranteed.
 Periodic are forces that repeat with position (a motor's poles) and errors of the encoder that do (its eccentricity);
 their periods are looked for in what is left.
 
