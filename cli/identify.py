@@ -35,16 +35,17 @@ from hw.limits import Stage
 from hw.monitor import Ages
 from hw.recording import Recorder, outcome, result_of
 from hw.session import Session, session_for
+from models.device import RigidDevice
 from sim.files import write, write_json
 from sim.scenario import InputError, Scenario, require_constant_delay, require_linear
 
 LIMITS = (
-    "The bound is a statement about this record: 95 % confidence that the viscous friction of the model (motor, "
-    "transmission, handle) is at least this, where residuals are correlated over at most 60 ticks. It does not see "
-    "friction that changes with position, temperature or wear, gravity, or motions faster than the chirp. Nor can it "
-    "tell a hand from the device: whoever holds or touches the handle adds damping, and the bound is then too high. "
-    "Dry friction is taken to reverse within a few mm/s; where it takes 10 mm/s, bounds 2 % too high were seen. "
-    "Coulomb friction is left out of delta: it dissipates too, but ever less than a viscous damper as speed grows."
+    "The bound is a statement about this record: the least viscous friction of all laws that fit it, less its scatter "
+    "between parts of the record (95 %) and a part for what is left unexplained. It does not see friction that changes "
+    "with temperature or wear, nor that of a handle behind its transmission apart from the motor's. A hand that rests "
+    "on the handle springs it, and from 5 N/m on is refused; one that only damps cannot be told from the device. Dry "
+    "friction is left out of delta: it dissipates too, but ever less than a viscous damper as speed grows. Lag of the "
+    "amplifier is not in delta: it belongs to the delay."
 )
 
 
@@ -68,7 +69,7 @@ def main(argv: list[str]) -> int:
         link = measured_link(args, ages, scenario.T)
         return [chirp(scenario.channels, scenario.T, link, force, (low, high), seconds)]
 
-    played = 1.5 * seconds + 0.1  # from full gain on: the lead has the ramp
+    played = 2.5 * seconds + 0.1  # from full gain on: the lead has the ramp
     live = hold_session(args, session, plan, played, seed, out, nobody=True, coulomb=coulomb)
     report, estimates = _identified(session, recorder, scenario, live.dropped, float(args.pace))
     report["files"] = [str(p) for p in _save(out, session, recorder, scenario, estimates, report)]
@@ -130,29 +131,39 @@ def _save(
         result = result_of(recorder, session.units, scenario.T, report)
         files.append(result.save_npz(out / "trace.npz"))
     if report["bounded"]:
-        files.append(write(out / "devices.toml", "\n".join(map(_table, estimates))))
+        tables = [_table(e, scenario, i) for i, e in enumerate(estimates)]
+        files.append(write(out / "devices.toml", "\n".join(tables)))
     files.append(out / "report.json")
     write_json(files[-1], report | {"files": [str(p) for p in files]})
     return files
 
 
-def _table(e: Estimate) -> str:
-    """One [[device]] table for a scenario file."""
+def _table(e: Estimate, scenario: Scenario, i: int) -> str:
+    """One [[device]] table for a scenario file; a transmission that was not found is the scenario's."""
+    device, mass = scenario.device[i], e.friction.mass
     lines = ["[[device]]", f"damping = {e.viscous:.6g}", f"delta = {np.floor(1e6 * e.delta) / 1e6:.6f}"]
-    if e.stiffness is None:
-        return "\n".join([*lines, 'kind = "rigid"', f"mass = {e.mass:.6g}", ""])
-    masses = [f"motor_mass = {e.motor_mass:.6g}", f"handle_mass = {e.mass - e.motor_mass:.6g}"]
-    return "\n".join([*lines, 'kind = "compliant"', *masses, f"transmission_stiffness = {e.stiffness:.6g}", ""])
+    if isinstance(device, RigidDevice):
+        return "\n".join([*lines, 'kind = "rigid"', f"mass = {mass:.6g}", ""])
+    if (found := e.transmission) is not None:
+        motor, handle, stiffness = found.motor_mass, found.handle_mass, found.stiffness
+    else:
+        lines.insert(0, "# no transmission explained the record: its stiffness and how masses are shared are declared")
+        motor = mass * device.motor_mass / (device.motor_mass + device.handle_mass)
+        handle, stiffness = mass - motor, device.transmission_stiffness
+    masses = [f"motor_mass = {motor:.6g}", f"handle_mass = {handle:.6g}"]
+    return "\n".join([*lines, 'kind = "compliant"', *masses, f"transmission_stiffness = {stiffness:.6g}", ""])
 
 
 def _print(report: dict[str, Any], console: Console) -> None:
     table = Table(title=f"{report['scenario']}, identified")
-    for column in ("axis", "mass [kg]", "viscous [N s/m]", "Coulomb [N]", "mode [Hz]", "delta at least", "residual"):
+    for column in ("axis", "mass [kg]", "viscous [N s/m]", "dry [N]", "to ground [N/m]", "mode [Hz]", "delta at least"):
         table.add_column(column, justify="right")
     for i, axis in enumerate(report["axes"], start=1):
-        mode = "-" if axis["mode_hz"] is None else f"{axis['mode_hz']:.2f}"
-        figures = [f"{axis[name]:.5g} ± {2 * axis['errors'][name]:.2g}" for name in ("mass", "viscous", "coulomb")]
-        table.add_row(str(i), *figures, mode, f"{axis['delta']:.4f}", f"{axis['steps']:.2g} encoder steps")
+        found = axis["friction"]
+        mode = "-" if axis["transmission"] is None else f"{axis['transmission']['mode_hz']:.2f}"
+        names = ("mass", "viscous", "coulomb", "stiffness")
+        figures = [f"{found[name]:.5g} ± {2 * found['errors'][name]:.2g}" for name in names]
+        table.add_row(str(i), *figures, mode, f"{found['delta']:.4f}")
     console.print(table)
     if "reason" in report:
         console.print(f"nothing was identified: {report['reason']}")

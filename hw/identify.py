@@ -1,8 +1,9 @@
 """Mass, friction and transmission of one axis from a record of forces and displacements, and a bound on its friction.
 
-The excitation is a chirp of a small force, then silence: a force that does not depend on the motion closes no loop, so
-no certificate is needed. The estimate is output error: the parameters whose simulated displacement is nearest to the
-encoder's in the least-squares sense, where a standstill counts as few samples.
+The excitation is a chirp of a small force, slow motion at half of it, then silence: a force that does not depend on the
+motion closes no loop, so no certificate is needed. Mass and friction come from the balance of forces (hw/friction.py).
+The transmission is output error: the parameters whose simulated displacement is nearest to the encoder's in the
+least-squares sense, where a standstill counts as few samples.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from scipy.optimize import OptimizeResult, least_squares
 
 from controller.lti import Array, frozen
 from hw.control import Controller
+from hw.friction import Friction, friction
 from hw.recording import Recorder
 from hw.session import Session
 from models.device import RigidDevice
@@ -33,6 +35,7 @@ _SHIFT = 1e-5  # of log parameters, and of Coulomb friction in newtons, for deri
 _UNEXPLAINED = 0.7, 1.5e-3  # encoder steps rms (rounding alone leaves 0.29), or this part of the motion's rms
 _SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
 _COARSE, _FINE = 3, 8  # substeps of a tick for which it is held: in a search, and at its end
+_SLOWER, _SLOW_SPAN = 1.2, 5.0  # where the second sweep begins and ends, by the first one's lowest frequency
 _LEAD = 0.3  # [s] of zero force, in which the gain comes up
 _MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a mode is looked for first
 _PARTS = (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mass, that the motor may have
@@ -40,16 +43,12 @@ _STARTS = 2  # of the search in time
 _SPECTRUM = 250  # frequencies that are compared first
 _FLOOR = 1e-12  # of a ratio whose logarithm is taken
 _OUTLIER = 0.1  # of a logarithm, from which it counts less: friction spoils the low frequencies, a resonance is narrow
-_BANDWIDTH = 60  # [ticks] over which residuals may be correlated
-_RECORDS = 40  # that might have been
-_ROUNDING = 1 / 12  # variance of an error that is uniform within a step
-_WIDEST = 0.2  # standard deviations of the parameters' logarithms beyond which they are not drawn
-_EVALUATIONS = 60, 30  # of a search without Coulomb friction and with it, less those for derivatives
+_EVALUATIONS = 30  # of a search, less those for derivatives
 _POLISH = 15  # steps at the end, with friction integrated more finely
 _ENOUGH = 1e-6  # part of the sum of squares, from which on a step is the last one
-_ONE_SIDED_95 = 1.6449  # normal quantile
-_VAGUE = 0.1  # standard error of b, as a part of b, above which nothing is said of it
-_FRICTIONS = (1e-5, 0.01, 0.05)  # Coulomb friction that a search begins with, of the force's span
+_VAGUE = 10.0  # times what rounding leaves: then it is not this transmission
+_SPRUNG = 5.0  # [N/m] from which on it may be a hand: a cable has less
+_LEAST_FRICTION = 1e-5  # that a search begins with, of the force's span
 _SEARCH_REACH = 3.0  # of a search, in logarithms
 _SUSPICIOUS = 0.1  # part by which an estimate may exceed the declared damping
 
@@ -100,16 +99,21 @@ class _Player:
 def chirp(
     channels: int, T: float, link: int, amplitude: float, band: tuple[float, float], seconds: float
 ) -> Excitation:
-    """A cosine [N] whose frequency rises exponentially through `band` [Hz], then half as long without force.
+    """A cosine [N] whose frequency rises exponentially through `band` [Hz], slow motion at half the force, silence.
 
-    It begins with a cosine so that a free mass does not drift away.
+    The second one is as long, the silence half as long: friction that is not viscous is told by the two levels. They
+    begin with a cosine so that a free mass does not drift away.
     """
     t = np.arange(round(seconds / T)) * T
+
+    def sweep(low: float, high: float) -> Array:
+        rate = np.log(high / low) / seconds
+        return amplitude * np.cos(2 * np.pi * low * np.expm1(rate * t) / rate)
+
     low, high = band
-    rate = np.log(high / low) / seconds
-    wave = amplitude * np.cos(2 * np.pi * low * np.expm1(rate * t) / rate)
+    slow = sweep(low / _SLOWER, min(high, _SLOW_SPAN * low)) / 2
     lead, tail = np.zeros(round(_LEAD / T)), np.zeros(round(seconds / 2 / T))
-    return Excitation(np.tile(np.concatenate([lead, wave, tail])[:, None], channels), T, link)
+    return Excitation(np.tile(np.concatenate([lead, sweep(low, high), slow, tail])[:, None], channels), T, link)
 
 
 # How much a sample of an encoder is worth to a fit: all samples of one standstill together as much as a few.
@@ -288,139 +292,83 @@ def _spectral_starts(model: _Model, stiff: Array) -> list[Array]:
     return [point for _, point in sorted(refined, key=lambda entry: entry[0])]
 
 
-# How far the estimates scatter: by what the residuals show, and by records that might have been.
-#
-# Residuals show noise and what the model has not (the sandwich (J'J)^-1 J' R J (J'J)^-1 with Bartlett weights, Newey
-# and West 1987). They do not show where between two counts the encoder stood: in one record its error is one number
-# over a whole standstill, and no average over that record tells how it scatters. So records are made from the fitted
-# model, with parameters within their uncertainty, the encoder's origin anywhere within a step, the same rounding, and
-# white noise as strong as the residual's; each is estimated again by one Gauss-Newton step (parametric bootstrap;
-# Efron and Tibshirani 1993, section 6.5). Both variances are added: rounding is then counted twice, which errs on the
-# safe side.
-
-
-@dataclass(frozen=True, eq=False)
-class _Spread:
-    """Of the parameters p of _Model."""
-
-    covariance: Array  # (p, p)
-    bias: Array  # (p,) that the records that might have been have on average
-
-
-def _spread(model: _Model, p: Array, seed: int = 0) -> _Spread:
-    """Of the estimate p (p,) from `model`'s record."""
-    J = model.jacobian(p)
-    residual = model.error(p)
-    covariance = _sandwich(J, residual, model.weight)
-    share = model.weight / model.weight.sum()
-    noise = np.sqrt(max(0.0, float(share @ residual**2) / model.step**2 - _ROUNDING))  # [counts]
-    generator = np.random.default_rng(seed)
-    root = _root(covariance)
-    misses = np.array([_miss(model, p, root, J, noise, generator) for _ in range(_RECORDS)])
-    return _Spread(covariance + np.cov(misses.T), misses.mean(axis=0))
-
-
-def _miss(model: _Model, p: Array, root: Array, J: Array, noise: float, generator: np.random.Generator) -> Array:
-    """By how much a record that might have been is estimated wrong (p,)."""
-    other = p + np.clip(root @ generator.standard_normal(p.size), -_WIDEST, _WIDEST)
-    other[_COULOMB] = max(0.0, other[_COULOMB])
-    exact = model.simulate(other)[model.used] / model.step + generator.uniform()
-    counts = np.round(exact + noise * generator.standard_normal(exact.size))
-    weight = worth(counts)
-    error = model.step * (counts - exact)
-    root_weight = np.sqrt(weight)
-    centred = root_weight[:, None] * (J - np.average(J, axis=0, weights=weight))
-    return np.linalg.pinv(centred) @ (root_weight * (error - np.average(error, weights=weight)))
-
-
-def _root(covariance: Array) -> Array:
-    values, vectors = np.linalg.eigh(covariance)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
-
-
-def _sandwich(J: Array, residual: Array, weight: Array) -> Array:
-    centred = J - np.average(J, axis=0, weights=weight)
-    scores = centred * (weight * residual)[:, None]
-    middle = scores.T @ scores
-    for lag in range(1, min(_BANDWIDTH, len(scores) - 1)):
-        shared = scores[lag:].T @ scores[:-lag]
-        middle += (1 - lag / _BANDWIDTH) * (shared + shared.T)
-    bread = np.linalg.pinv(centred.T @ (weight[:, None] * centred))
-    return bread @ middle @ bread
-
-
 # the fit
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """One axis, with standard errors."""
+@dataclass(frozen=True)
+class Transmission:
+    """Motor and handle, and the spring between them."""
 
-    mass: float  # [kg] in all
     motor_mass: float  # [kg]
-    viscous: float  # b [N s/m]
-    coulomb: float  # c [N]
-    stiffness: float | None  # k [N/m] of the transmission, None for a rigid device
-    mode_hz: float | None  # the transmission mode, free at both ends
-    errors: dict[str, float]  # standard errors of mass, viscous, coulomb
-    delta: float  # [N s/m] 95 % lower confidence bound of b
-    rms: float  # [m] of the residual
-    steps: float  # the same in encoder steps
+    handle_mass: float  # [kg]
+    stiffness: float  # [N/m]
+    mode_hz: float  # free at both ends
 
 
-def identify(x: Array, force: Array, used: _Flags, T: float, step: float, rigid: bool, mass: float = 0.25) -> Estimate:
+@dataclass(frozen=True)
+class Estimate:
+    """One axis."""
+
+    friction: Friction
+    transmission: Transmission | None  # None for a rigid device, and where none explains the record
+
+    @property
+    def viscous(self) -> float:
+        return self.friction.viscous
+
+    @property
+    def delta(self) -> float:
+        return self.friction.delta
+
+
+def identify(x: Array, force: Array, used: _Flags, T: float, step: float, rigid: bool) -> Estimate:
     """Fit one axis: displacements x (N,) [m], what the motor did (N,) [N], which samples count (N,), encoder step [m].
 
-    `mass` is where the search begins. Raises ValueError where the device did not move or no model fits.
+    Raises ValueError where the device did not move, somebody holds it or nothing is left of its damping.
     """
     if np.ptp(x[used]) < 20 * step:
         raise ValueError(f"the axis moved by {np.ptp(x[used]) / step:.0f} encoder steps, at least 20 are needed")
-    whole = _Model(x, force, used, T, step, rigid=True)
-    stiff = _with_coulomb(whole, _without_coulomb(whole, np.array([np.log(mass), 0.0])).x)
-    if rigid:
-        fine = whole.finer()
-        return _settled(fine, _polished(fine, stiff.x))
-    model = _Model(x, force, used, T, step, rigid=False)
+    found = friction(x, force, T, step)
+    # one that is too uncertain to exclude a hand is refused as well
+    if (most := found.stiffness + 2 * found.errors["stiffness"]) > _SPRUNG:
+        raise ValueError(
+            f"the handle is sprung by {found.stiffness:.3g} N/m (up to {most:.3g}, at most {_SPRUNG:g} may be): a hand "
+            "or a finger rests on it? Its damping would be taken for the device's; let go, or loosen the spring"
+        )
+    if found.delta <= 0:
+        raise ValueError(
+            f"the record does not tell viscous from dry friction: {found.viscous:.3g} N s/m viscous, "
+            f"{found.coulomb:.3g} N dry, {1e3 * found.rms:.2g} mN unexplained; take one with more force or a longer one"
+        )
+    transmission = None if rigid else _transmission(_Model(x, force, used, T, step, rigid=False), found)
+    return Estimate(friction=found, transmission=transmission)
+
+
+def _transmission(model: _Model, found: Friction) -> Transmission | None:
+    """The transmission that explains a record, None where there is none."""
+    stiff = np.array([np.log(found.mass), np.log(found.viscous), found.coulomb])
     fine, ends = model.finer(), []
-    for start in _spectral_starts(model, stiff.x):
+    for start in _spectral_starts(model, stiff):
         p = _polished(fine, _search(model, start).x)
         ends.append((fine.rms(fine.residual(p)), p))
         if ends[-1][0] <= fine.allowed():
             break
-    return _settled(fine, min(ends, key=lambda end: end[0])[1])
-
-
-def _without_coulomb(model: _Model, start: Array) -> OptimizeResult:
-    """The nearest parameters within a factor of twenty of the start, which lacks c as the result does.
-
-    Coulomb friction bends the sum of squares so sharply that a search from afar with it does not arrive.
-    """
-
-    def residual(p: Array) -> Array:
-        return model.residual(np.insert(p, _COULOMB, 0.0))
-
-    bounds = (start - _SEARCH_REACH, start + _SEARCH_REACH)
-    return least_squares(residual, start, x_scale="jac", bounds=bounds, max_nfev=_EVALUATIONS[0])
-
-
-def _with_coulomb(model: _Model, near: Array) -> OptimizeResult:
-    """All parameters, from a start that lacks c: hardly any at first, then more as long as much is unexplained."""
-    fits = []
-    for part in _FRICTIONS:
-        fits.append(_search(model, np.insert(near, _COULOMB, part * np.ptp(model.force))))
-        if model.rms(fits[-1].fun) <= model.allowed():
-            break
-    return min(fits, key=lambda fit: fit.cost)
+    rms, p = min(ends, key=lambda end: end[0])
+    if rms > _VAGUE * fine.allowed():
+        return None
+    m1, m2, k = np.exp(p[[0, 3, 4]])
+    mode = np.sqrt(k * (m1 + m2) / (m1 * m2)) / (2 * np.pi)
+    return Transmission(float(m1), float(m2), float(k), float(mode))
 
 
 def _search(model: _Model, start: Array) -> OptimizeResult:
     strongest = np.ptp(model.force)
     start = start.copy()
-    start[_COULOMB] = np.clip(start[_COULOMB], _FRICTIONS[0] * strongest, strongest / 2)
+    start[_COULOMB] = np.clip(start[_COULOMB], _LEAST_FRICTION * strongest, strongest / 2)
     free = np.arange(start.size) != _COULOMB
     bounds = (np.where(free, start - _SEARCH_REACH, 0.0), np.where(free, start + _SEARCH_REACH, strongest))
     # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
-    options: dict[str, Any] = {"x_scale": "jac", "max_nfev": _EVALUATIONS[1], "ftol": 1e-4}
+    options: dict[str, Any] = {"x_scale": "jac", "max_nfev": _EVALUATIONS, "ftol": 1e-4}
     slopes: Any = lambda p: -model.slopes(p)  # noqa: E731 - SciPy's stub takes names only
     return least_squares(model.residual, start, slopes, bounds=bounds, **options)
 
@@ -446,43 +394,6 @@ def _polished(model: _Model, p: Array) -> Array:
         if gain < _ENOUGH:
             break
     return p
-
-
-def _settled(model: _Model, p: Array) -> Estimate:
-    step, rms, allowed = model.step, model.rms(model.residual(p)), model.allowed()
-    if rms > allowed:
-        raise ValueError(
-            f"the model leaves {rms / step:.2g} encoder steps rms unexplained, at most {allowed / step:.2g} may be "
-            "(friction of another kind, a hand at the handle, gravity, or a slipping drive?)"
-        )
-    estimate = _estimate(model, p, rms)
-    vague = estimate.errors["viscous"] / estimate.viscous
-    if vague > _VAGUE:
-        raise ValueError(
-            f"the record does not tell viscous from dry friction: {estimate.viscous:.3g} N s/m, standard error "
-            f"{100 * vague:.0f} %, at most {100 * _VAGUE:.0f} % may be; take one with more force or a longer one"
-        )
-    return estimate
-
-
-def _estimate(model: _Model, p: Array, rms: float) -> Estimate:
-    scatter = _spread(model, p)
-    covariance = scatter.covariance
-    m1, b = np.exp(p[0]), np.exp(p[1])
-    gradient = np.zeros(p.size)
-    gradient[0], mass, k, mode = m1, m1, None, None
-    if not model.rigid:
-        m2, k = np.exp(p[3]), float(np.exp(p[4]))
-        mass, gradient[3] = m1 + m2, m2
-        mode = float(np.sqrt(k * mass / (m1 * m2)) / (2 * np.pi))
-    errors = {
-        "mass": float(np.sqrt(gradient @ covariance @ gradient)),
-        "viscous": float(b * np.sqrt(covariance[1, 1])),
-        "coulomb": float(np.sqrt(covariance[2, 2])),
-    }
-    above = max(0.0, float(b * scatter.bias[1]))  # on average; a bias to the safe side is left where it is
-    delta = max(0.0, float(b) - above - _ONE_SIDED_95 * errors["viscous"])
-    return Estimate(float(mass), float(m1), float(b), float(p[2]), k, mode, errors, delta, rms, rms / model.step)
 
 
 # from a session's record
@@ -513,7 +424,10 @@ def _declared(scenario: Scenario, session: Session) -> list[float]:
 def capped(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[Estimate]:
     """No bound above the declared damping: what is more may be a hand."""
     said = _declared(scenario, session)
-    return [replace(e, delta=min(e.delta, limit)) for e, limit in zip(estimates, said, strict=False)]
+    return [
+        replace(e, friction=replace(e.friction, delta=min(e.delta, limit)))
+        for e, limit in zip(estimates, said, strict=False)
+    ]
 
 
 def estimate(

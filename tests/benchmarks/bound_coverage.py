@@ -103,7 +103,7 @@ def report(results: Iterable[tuple[Case, Estimate | str, float]]) -> None:
             print(f"{what} noise {c.noise}: none: {found}", flush=True)
             continue
         excess.append(100 * (found.delta / c.viscous - 1))
-        scaled.append((found.viscous - c.viscous) / found.errors["viscous"])
+        scaled.append((found.viscous - c.viscous) / found.friction.errors["viscous"])
         off = 100 * (found.viscous / c.viscous - 1)
         print(f"{what} noise {c.noise}: b {off:+.3f} %, bound {excess[-1]:+.3f} %, {seconds:.1f} s", flush=True)
     over = sum(e > 0 for e in excess)

@@ -40,8 +40,7 @@ def record_of(scenario, *faults):
 def test_known_parameters_come_back():
     """A compliant and a rigid device, neither of them the ones the search begins with.
 
-    Estimates to 0.2 %: the rounded encoder leaves standard errors of a few hundredths of a per cent, and the last part
-    of the release is cut off.
+    Masses and stiffness to 0.2 %; friction to 0.5 %, of which the record of 1.5 s a sweep leaves 0.3 %.
     """
     scenario = load()
     compliant = msgspec.structs.replace(
@@ -55,19 +54,20 @@ def test_known_parameters_come_back():
     scenario = scenario.replace(device=(compliant, RigidDevice(mass=0.16, damping=2.0, encoder_step=STEP)))
     recorder, session = record_of(scenario)
     first, second = estimate(recorder, session, scenario)
-    assert first.mass == pytest.approx(0.38, rel=2e-3)
-    assert first.motor_mass == pytest.approx(0.08, rel=2e-3)
-    assert first.viscous == pytest.approx(0.8, rel=2e-3)
-    assert first.stiffness == pytest.approx(9000.0, rel=2e-3)
+    found = first.transmission
+    assert first.friction.mass == pytest.approx(0.38, rel=2e-3)
+    assert found.motor_mass == pytest.approx(0.08, rel=2e-3)
+    assert first.viscous == pytest.approx(0.8, rel=5e-3)
+    assert found.stiffness == pytest.approx(9000.0, rel=2e-3)
     reduced = 0.08 * 0.3 / 0.38
-    assert first.mode_hz == pytest.approx(np.sqrt(9000.0 / reduced) / (2 * np.pi), rel=2e-3)
-    assert second.mass == pytest.approx(0.16, rel=2e-3)
-    assert second.viscous == pytest.approx(2.0, rel=2e-3)
-    assert (second.stiffness, second.mode_hz) == (None, None)
+    assert found.mode_hz == pytest.approx(np.sqrt(9000.0 / reduced) / (2 * np.pi), rel=2e-3)
+    assert second.friction.mass == pytest.approx(0.16, rel=2e-3)
+    assert second.viscous == pytest.approx(2.0, rel=5e-3)
+    assert second.transmission is None
     for found, true in ((first, 0.8), (second, 2.0)):
-        assert found.coulomb == pytest.approx(0.0, abs=1e-3)  # [N], of a chirp of 1 N
-        assert 0.99 * true < found.delta <= true
-        assert found.steps < 0.5  # rounding alone leaves 1/sqrt(12) = 0.29
+        assert found.friction.coulomb == pytest.approx(0.0, abs=1e-3)  # [N], of a chirp of 1 N
+        assert 0.95 * true < found.delta <= true
+        assert found.friction.stiffness == pytest.approx(0.0, abs=0.1)  # [N/m]
 
 
 def played(force, T, mass, b, c, substeps=64):
@@ -87,23 +87,53 @@ def test_dry_friction_is_told_from_viscous():
     force = chirp(1, T, 1, 1.0, (3.0, 60.0), 1.5).signal[:, 0]
     x = np.round(played(force, T, 0.25, 1.37, 0.1) / STEP) * STEP
     found = identify(x, force, np.ones(x.size, dtype=bool), T, STEP, rigid=True)
-    assert found.coulomb == pytest.approx(0.1, rel=0.1)
+    assert found.friction.coulomb == pytest.approx(0.1, rel=0.1)
     assert found.viscous == pytest.approx(1.37, rel=0.02)
     assert found.delta < found.viscous
 
 
-def test_a_record_that_the_model_does_not_explain_gives_no_bound():
-    """A spring to ground, which a hand at the handle is."""
-    T = 1.2e-3
-    force = chirp(1, T, 1, 1.0, (3.0, 60.0), 1.0).signal[:, 0]
-    x, s = np.zeros(force.size), np.zeros(2)
-    for k, f in enumerate(force):
-        x[k] = s[0]
+def rig(T, seconds, **odd):
+    """One mass with what rigs have, by Euler in small steps: x (N,) [m] and the force (N,) [N] that it was told."""
+    told = chirp(1, T, 1, 1.0, (3.0, 200.0), seconds).signal[:, 0]
+    x, v, felt, out, h = 0.0, 0.0, 0.0, [], T / 32
+    for f in told:
+        out.append(x + odd.get("eccentric", 0.0) * np.sin(2 * np.pi * x / 0.04))
         for _ in range(32):
-            s[1] += T / 32 * (f - 1.37 * s[1] - 300.0 * s[0]) / 0.25
-            s[0] += T / 32 * s[1]
-    with pytest.raises(ValueError, match=r"encoder steps rms unexplained"):
-        identify(x, force, np.ones(x.size, dtype=bool), T, STEP, rigid=True)
+            felt = felt + (f - felt) * -np.expm1(-h / odd["lag"]) if "lag" in odd else f
+            outside = odd.get("constant", 0.0) - odd.get("spring", 0.0) * x
+            outside += odd.get("cogging", 0.0) * np.sin(2 * np.pi * x / 0.004 + 1.0)
+            dry = odd.get("coulomb", 0.0) * np.tanh(v / odd.get("slip", 0.002))
+            v += h * (felt + outside - dry - (1.0 + odd.get("hand", 0.0)) * v) / 0.25
+            x += h * v
+    return np.round(np.array(out) / STEP) * STEP, told
+
+
+@pytest.mark.parametrize(
+    ("odd", "least"),
+    [
+        ({"constant": 1e-3}, 0.95),
+        ({"spring": 1.0}, 0.95),
+        ({"cogging": 2e-3}, 0.95),
+        ({"lag": 0.36e-3}, 0.95),
+        ({"eccentric": 2e-5}, 0.95),
+        ({"coulomb": 0.05, "slip": 0.02}, 0.90),
+        ({"coulomb": 0.03, "constant": 5e-3, "spring": 2.0}, 0.90),
+    ],
+)
+def test_rigs_that_are_not_ideal_have_bounds(odd, least):
+    """Viscous friction is 1 N s/m: the bound is never above, and at most a tenth below."""
+    x, told = rig(1.2e-3, 2.5, **odd)
+    found = identify(x, told, np.ones(x.size, dtype=bool), 1.2e-3, STEP, rigid=True)
+    assert least < found.delta <= 1.0
+    assert found.friction.stiffness == pytest.approx(odd.get("spring", 0.0), abs=0.3)
+
+
+def test_a_finger_on_the_handle_is_found_out():
+    """0.1 N s/m that are not the device's, and 20 N/m that say so: as 10 N/m of a light touch do."""
+    for spring in (10.0, 20.0):
+        x, told = rig(1.2e-3, 1.5, spring=spring, hand=0.1)
+        with pytest.raises(ValueError, match=r"handle is sprung by .* a hand or a finger rests on it"):
+            identify(x, told, np.ones(x.size, dtype=bool), 1.2e-3, STEP, rigid=True)
 
 
 def test_an_axis_that_does_not_move_gives_nothing():
@@ -139,7 +169,7 @@ def test_more_damping_than_declared_asks_who_holds_it(viscous, suspicious):
     """A hand that damps looks like the device: only the declared 1.37 N s/m can say so, with 10 % allowed."""
     scenario = load()
     session = Session(scenario, Limits((1.0, 1.0)), LinkSettings())
-    estimate = SimpleNamespace(viscous=viscous, delta=1.36)
+    estimate = SimpleNamespace(viscous=viscous)
     warnings = held([estimate], scenario, session)
     assert len(warnings) == suspicious
     if suspicious:
@@ -156,14 +186,14 @@ def coarse():
 
 def test_bounds_hold_wherever_the_encoder_stands(coarse):
     """Five origins within a step. All bounds must be below the truth: with the standstill as 1000 samples, half were
-    above. Nor may they be far below, or they would be of no use: three standard errors of 0.5 %, as measured.
+    above. Nor may they be far below, or they would be of no use: 5 %.
     """
     T, step, force, exact = coarse
     for origin in np.arange(0.1, 1.0, 0.2):
         x = step * np.round(exact / step + origin)
         found = identify(x, force, np.ones(x.size, dtype=bool), T, step, rigid=True)
-        assert 0.97 * 0.5 < found.delta <= 0.5
-        assert abs(found.viscous - 0.5) < 3 * found.errors["viscous"]
+        assert 0.95 * 0.5 < found.delta <= 0.5
+        assert found.viscous == pytest.approx(0.5, rel=0.02)
 
 
 def test_a_standstill_counts_as_few_samples():
@@ -187,11 +217,11 @@ def test_a_bound_never_exceeds_what_is_declared(coarse):
 
 
 def test_a_record_that_cannot_tell_the_frictions_apart_gives_no_bound():
-    """A short record of small motions, a few encoder steps long."""
+    """A short record of small motions, a few encoder steps long: most of it is a standstill."""
     T, step = 1.2e-3, 5e-5
     force = chirp(1, T, 1, 1.0, (8.0, 60.0), 0.5).signal[:, 0]
     x = step * np.round(played(force, T, 0.5, 0.3, 0.05) / step + 0.3)
-    with pytest.raises(ValueError, match="does not tell viscous from dry friction"):
+    with pytest.raises(ValueError, match=r"moves in \d+ samples only|does not tell viscous from dry friction"):
         identify(x, force, np.ones(x.size, dtype=bool), T, step, rigid=True)
 
 

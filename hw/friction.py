@@ -1,0 +1,280 @@
+"""Damping of an axis by a balance of forces, and a bound on it that holds on rigs that are not ideal.
+
+The balance, with h a Gaussian window that both sides are filtered by (modulating functions, Shinbrot 1957):
+
+    m x'' + b x' + p x''' + r x'''' + k x + f0 + f1 t + (1 + a D^2)(g + q x'|x'|) + periodic(x) = (1 + l D + a D^2) f
+
+with D = d/dt. m x'' and b x' are what is asked for. k x is a cable, a spring or gravity that changes with position,
+f0 + f1 t a constant force and its drift. A handle (m2) behind a transmission (k12, d12) is a = m2/k12, l = d12/k12,
+p = a b + l m, r = a m1: polynomials, since both sides were multiplied by a s^2 + l s + 1. A lag tau of the amplifier
+is l - tau and a + tau^2/2, so that it is not taken for negative damping. Derivatives are of h, never of the encoder; a
+force held for a tick is integrated exactly. All but a beside g is linear, so a fit takes milliseconds, and no state at
+the beginning is needed. Dry friction g(x') is c tanh(v/v0), and a part of it that is gone at speed (Stribeck), or a
+bristle that bends over some distance (Dahl). Which, is not known: all of _SLIPS and _BRISTLES are tried, and every one
+that fits hardly worse than the best has a say in the bound. So does a drag q >= 0: of b and q, b is guaranteed.
+Periodic are forces that repeat with position (a motor's poles) and errors of the encoder that do (its eccentricity);
+their periods are looked for in what is left.
+
+The bound is b less the scatter when tenths of the record are left out in turn, less a part of what noise as strong as
+the residual could make of b if all of it looked like damping; the least of all laws that fit.
+
+What friction dissipates per speed squared is least at high speed, where b alone is left: b is the guarantee.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
+from scipy.signal import fftconvolve
+from scipy.special import erf
+
+from controller.lti import Array
+
+_WINDOW = 0.012  # [s] standard deviation of h: half the amplitude at 16 Hz
+_SPEED_NOISE = 3e-4  # [m/s] of the speed that friction is told by: makes its window as short as the encoder allows
+_REACH = 6  # standard deviations that a window is cut at
+_STILL = 0.02  # [s] within one count of which an encoder stands still
+_SLIPS = (5e-4, 1e-3, 2e-3, 5e-3, 1e-2, 2e-2)  # [m/s] speed at which dry friction is at 3/4
+_BRISTLES = (1e-5, 3e-5, 1e-4)  # [m] over which friction reverses, where it is position that turns it (Dahl 1968)
+_STRIBECK = 0.02  # [m/s] above which the rest of static friction is gone
+_SLOW, _WEAK = 0.2, 0.05  # part of a force that the window has to pass, unless it is so small a part of the strongest
+_BLOCKS = 10  # of the record, that are left out in turn
+_HIDDEN = 0.03  # of what is left unexplained, that may be damping in disguise
+_QUANTILE = 1.833  # of Student's t with 9 degrees of freedom, 95 % to one side
+_FEW = 200  # rows
+_ALMOST = 4.0  # by which a log likelihood ratio may be worse than the best law's
+_ROUNDS = 3  # in which the transmission's part of friction is found
+_PERIODS = np.geomspace(5e-4, 0.08, 60)  # [m] where a periodic disturbance is looked for
+_PERIODIC = 4  # at most so many
+_GAIN = 0.05  # of the sum of squares, that a periodic one has to explain
+_MASS, _VISCOUS, _CONSTANT, _SLOPE, _SPRING, _TAU, _MODE, _LOSS, _STIFF, _DRAG, _DRY, _STATIC = range(12)
+_NOT_NEGATIVE = (_VISCOUS, _MODE, _DRAG, _DRY, _STATIC)
+
+
+@dataclass(frozen=True)
+class Friction:
+    """What the balance of one axis says, with standard errors."""
+
+    mass: float  # [kg]
+    viscous: float  # b [N s/m]
+    coulomb: float  # [N]
+    stiffness: float  # [N/m] to ground
+    constant: float  # [N]
+    slip: float  # [m/s] of dry friction's law that fits best
+    periods: tuple[float, ...]  # [m] of periodic disturbances that were found
+    errors: dict[str, float]  # standard errors of mass, viscous, coulomb, stiffness
+    delta: float  # [N s/m] lower bound of b
+    rms: float  # [N] that the balance leaves
+
+
+def _window(order: int, sigma: float, T: float) -> Array:
+    """Samples of the derivative of a Gaussian of standard deviation sigma [s], times T."""
+    t = np.arange(-round(_REACH * sigma / T), round(_REACH * sigma / T) + 1) * T / sigma
+    hermite = np.polynomial.hermite_e.hermeval(t, [0.0] * order + [1.0])
+    return T * (-1) ** order * hermite * np.exp(-(t**2) / 2) / (np.sqrt(2 * np.pi) * sigma ** (order + 1))
+
+
+def _filtered(signal: Array, order: int, sigma: float, T: float) -> Array:
+    return fftconvolve(signal, _window(order, sigma, T), mode="same")
+
+
+def _held(force: Array, sigma: float, T: float) -> tuple[Array, Array, Array]:
+    """A force held for each tick, filtered, and its two derivatives."""
+    n = round(_REACH * sigma / T)
+    t = np.arange(-n, n + 1) * T
+    step = (erf(t / (np.sqrt(2) * sigma)) - erf((t - T) / (np.sqrt(2) * sigma))) / 2
+    bells = [np.exp(-((s / sigma) ** 2) / 2) / (np.sqrt(2 * np.pi) * sigma) for s in (t, t - T)]
+    slope = (bells[1] * (t - T) - bells[0] * t) / sigma**2
+    first, second, third = (fftconvolve(force, kernel, mode="same") for kernel in (step, bells[0] - bells[1], slope))
+    return first, second, third
+
+
+def _moving(x: Array, step: float, T: float, sigma: float) -> NDArray[np.bool_]:
+    """Where the encoder does not stand still, nor within a window's width: what holds a body at rest is not in g."""
+    counts, n = np.round(x / step), max(2, round(_STILL / T))
+    still = np.zeros(len(x))
+    view = np.lib.stride_tricks.sliding_window_view(counts, n)
+    starts = np.flatnonzero(np.ptp(view, axis=1) <= 1)
+    for k in starts:
+        still[k : k + n] = 1.0
+    width = np.ones(2 * round(2 * sigma / T) + 1)
+    near = fftconvolve(still, width, mode="same") > 0.5
+    edge = round(_REACH * sigma / T)
+    near[:edge] = near[-edge:] = True
+    return ~near
+
+
+def _bristle(x: Array, reach: float) -> Array:
+    """Friction (N,) within +-1 that displacements x (N,) [m] wind up over `reach` [m] and keep where they slip."""
+    z, out = 0.0, []
+    for moved in np.diff(x, prepend=x[0]).tolist():
+        z = max(-reach, min(reach, z + moved))
+        out.append(z / reach)
+    return np.array(out)
+
+
+def _slow(force: Array, sigma: float, T: float) -> NDArray[np.bool_]:
+    """Where the force is not mostly faster than the window: there friction is turned by motion that is not seen."""
+    width = 3 * sigma
+    strong, left = (_filtered(f**2, 0, width, T) for f in (force, _filtered(force, 0, sigma, T)))
+    return (left > _SLOW**2 * strong) | (strong < _WEAK**2 * strong.max())
+
+
+class _Balance:
+    """The rows of the balance where the axis moves."""
+
+    def __init__(self, x: Array, force: Array, T: float, step: float) -> None:
+        self.T, self.sigma, self.force = T, max(_WINDOW, 3 * T), force
+        self.x = x - x[0]
+        self.rows = np.flatnonzero(_moving(x, step, T, self.sigma) & _slow(force, self.sigma, T))
+        if len(self.rows) < _FEW:
+            raise ValueError(f"the axis moves in {len(self.rows)} samples only, at least {_FEW} are needed")
+        short = (step**2 / 12 * T / (4 * np.sqrt(np.pi) * _SPEED_NOISE**2)) ** (1 / 3)
+        self.speed = _filtered(self.x, 1, float(np.clip(short, T, self.sigma / 2)), T)
+        applied, rate, bend = _held(force, self.sigma, T)
+        self.applied = applied[self.rows]
+        t = np.arange(len(x)) * T
+        zero = np.zeros(len(self.rows))
+        self.common = [
+            self._of(self.x, 2),
+            self._of(self.x, 1),
+            zero + 1.0,
+            t[self.rows] - t[self.rows].mean(),
+            self._of(self.x, 0),
+            rate[self.rows],
+            -bend[self.rows],
+            self._of(self.x, 3),
+            self._of(self.x, 4),
+        ]
+        self.drag = self.speed * np.abs(self.speed)
+
+    def _of(self, signal: Array, order: int) -> Array:
+        return _filtered(signal, order, self.sigma, self.T)[self.rows]
+
+    def laws(self, step: float) -> list[tuple[float, Array]]:
+        """Dry friction (N,) within +-1 by every law, and the speed [m/s] at which it is at 3/4 (0: by position)."""
+        bristles = [(0.0, _bristle(self.x, reach)) for reach in _BRISTLES if reach > step]
+        return [(slip, np.tanh(self.speed / slip)) for slip in _SLIPS] + bristles
+
+    def matrix(self, dry: Array, periodic: list[Array]) -> Callable[[float], Array]:
+        """Columns (rows, p) of the balance, by how much of friction's second derivative is in it."""
+        laws = [self.drag, dry, dry * np.exp(-((self.speed / _STRIBECK) ** 2))]
+        plain, bent = [self._of(law, 0) for law in laws], [self._of(law, 2) for law in laws]
+
+        def columns(mode: float) -> Array:
+            friction = [one + mode * two for one, two in zip(plain, bent, strict=True)]
+            return np.stack([*self.common, *friction, *periodic], axis=1)
+
+        return columns
+
+    def waves(self, period: float) -> tuple[list[Array], list[Array]]:
+        """A force that repeats with position, and an encoder's error that does."""
+        wave = np.exp(2j * np.pi * self.x / period)
+        return [self._of(wave.real, 0), self._of(wave.imag, 0)], [self._of(wave.real, 2), self._of(wave.imag, 2)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    p: Array
+    columns: Array
+    residual: Array
+
+    @property
+    def squares(self) -> float:
+        return float(self.residual @ self.residual)
+
+
+def _solve(columns: Array, force: Array) -> Array:
+    """Least squares where some parameters are not negative."""
+    scale = np.linalg.norm(columns, axis=0) + 1e-300
+    q, r = np.linalg.qr(columns / scale)
+    low = np.full(columns.shape[1], -np.inf)
+    low[list(_NOT_NEGATIVE)] = 0.0
+    return lsq_linear(r, q.T @ force, (low, np.inf), method="bvls").x / scale
+
+
+def _fitted(balance: _Balance, dry: Array, periodic: list[Array]) -> _Fit:
+    columns, mode, at = balance.matrix(dry, periodic), 0.0, np.zeros(0)
+    for _ in range(_ROUNDS):
+        at = columns(mode)
+        p = _solve(at, balance.applied)
+        mode = p[_MODE]
+    return _Fit(p, at, balance.applied - at @ p)
+
+
+def _disturbances(balance: _Balance, fit: _Fit) -> tuple[list[Array], tuple[float, ...]]:
+    """Periodic disturbances that explain what the fit leaves, strongest first, and their periods [m]."""
+    found: list[Array] = []
+    periods: list[float] = []
+    for _ in range(_PERIODIC):
+        q, _r = np.linalg.qr(np.stack([*fit.columns.T, *found], axis=1))
+        left = fit.residual - q @ (q.T @ fit.residual)
+        best = (0.0, 0.0, list[Array]())
+        for period in _PERIODS[np.ptp(balance.x) > _PERIODS]:
+            for pair in balance.waves(float(period)):
+                own = np.stack(pair, axis=1)
+                own = np.linalg.qr(own - q @ (q.T @ own))[0]
+                gain = float(np.sum((own.T @ left) ** 2) / (left @ left))
+                if gain > best[0]:
+                    best = (gain, float(period), pair)
+        if best[0] < _GAIN:
+            break
+        found += best[2]
+        periods.append(best[1])
+    return found, tuple(periods)
+
+
+def _scatter(fit: _Fit, force: Array) -> Array:
+    """Covariance (p, p) of the free parameters by leaving out each of _BLOCKS parts of the record in turn."""
+    edges = np.linspace(0, len(force), _BLOCKS + 1).astype(int)
+    others = []
+    for a, b in pairwise(edges):
+        keep = np.r_[0:a, b : len(force)]
+        others.append(_solve(fit.columns[keep], force[keep]))
+    apart = np.array(others) - np.mean(others, axis=0)
+    return (_BLOCKS - 1) / _BLOCKS * apart.T @ apart
+
+
+def _apart(columns: Array, i: int) -> Array:
+    """What of a column the others do not explain."""
+    others = np.linalg.qr(np.delete(columns, i, axis=1))[0]
+    return columns[:, i] - others @ (others.T @ columns[:, i])
+
+
+def friction(x: Array, force: Array, T: float, step: float) -> Friction:
+    """Of displacements x (N,) [m] under forces (N,) [N] held for T [s]; `step` [m] is the encoder's."""
+    balance = _Balance(x, force, T, step)
+    laws = balance.laws(step)
+    plain = min((_fitted(balance, dry, []) for _, dry in laws), key=lambda fit: fit.squares)
+    periodic, periods = _disturbances(balance, plain)
+    fits = [(slip, _fitted(balance, dry, periodic)) for slip, dry in laws]
+    slip, best = min(fits, key=lambda entry: entry[1].squares)
+    independent = len(balance.rows) * T / (2 * np.sqrt(np.pi) * balance.sigma)
+    delta, covariance = np.inf, np.zeros(0)
+    for _, fit in fits:
+        if independent * np.log(fit.squares / best.squares) > _ALMOST:
+            continue
+        spread = _scatter(fit, fit.residual + fit.columns @ fit.p)
+        hid = np.sqrt(fit.squares) / np.linalg.norm(_apart(fit.columns, _VISCOUS))
+        delta = min(delta, fit.p[_VISCOUS] - _QUANTILE * np.sqrt(spread[_VISCOUS, _VISCOUS]) - _HIDDEN * hid)
+        if fit is best:
+            covariance = spread
+    names = {"mass": _MASS, "viscous": _VISCOUS, "coulomb": _DRY, "stiffness": _SPRING}
+    p = best.p
+    return Friction(
+        mass=float(p[_MASS]),
+        viscous=float(p[_VISCOUS]),
+        coulomb=float(p[_DRY]),
+        stiffness=float(p[_SPRING]),
+        constant=float(p[_CONSTANT]),
+        slip=slip,
+        periods=periods,
+        errors={name: float(np.sqrt(covariance[i, i])) for name, i in names.items()},
+        delta=max(0.0, float(delta)),
+        rms=float(np.sqrt(best.squares / len(best.residual))),
+    )

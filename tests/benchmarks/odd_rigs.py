@@ -1,0 +1,192 @@
+"""Sixty simulated rigs that are not ideal, and what hw.identify makes of them.
+
+PYTHONPATH=. python tests/benchmarks/odd_rigs.py     (two minutes; --seed 1 draws other rigs)
+
+The plant is written here, by semi-implicit Euler in small steps, all rigs at once; nothing of the emulator is used.
+The true guarantee of each is its motor's viscous friction: all else is passive, or is not the device's (a hand).
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.lti import Array
+from hw.friction import Friction
+from hw.identify import chirp, identify
+
+T, SUBSTEPS, FORCE_STEP = 1.2e-3, 24, 4e-4
+BASE = ("viscous", "mass", "motor", "spring", "step")
+
+
+@dataclass(frozen=True)
+class Rig:
+    """What a rig has besides its masses; zero is the ideal."""
+
+    name: str
+    viscous: float = 1.0  # [N s/m] the truth
+    mass: float = 0.25  # [kg]
+    motor: float = 0.3  # part of it
+    spring: float = 14500.0  # [N/m] of the transmission
+    loss: float = 0.5  # [N s/m] of the transmission
+    step: float = 5e-6  # [m] encoder
+    coulomb: float = 0.0  # [N]
+    slip: float = 0.002  # [m/s]
+    static: float = 0.0  # [N] above Coulomb's, gone at 20 mm/s
+    drag: float = 0.0  # [N s2/m2]
+    bristle: float = 0.0  # [N/m] presliding (Dahl's law) in place of tanh
+    constant: float = 0.0  # [N]
+    drift: float = 0.0  # [N/s]
+    cable: float = 0.0  # [N/m]
+    cogging: float = 0.0  # [N]
+    period: float = 0.004  # [m] of cogging
+    eccentric: float = 0.0  # [m]
+    turn: float = 0.04  # [m] of eccentricity
+    gap: float = 0.0  # [m] backlash
+    lag: float = 0.0  # [T] first order
+    late: float = 0.0  # [T] pure delay
+    hand: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [kg], [N s/m], [N/m]
+    tremor: float = 0.0  # [N]
+
+
+def rigs(seed: int = 7) -> list[Rig]:
+    """Sixty: every imperfection by itself, with other devices, and together."""
+    one: list[dict[str, float]] = [
+        {},
+        {"constant": 1e-3},
+        {"cable": 1.0},
+        {"cogging": 2e-3},
+        {"gap": 1e-5},
+        {"lag": 0.3},
+        {"eccentric": 2e-5},
+        {"loss": 3.0},
+        {"coulomb": 0.05, "slip": 0.02},
+        {"coulomb": 0.05, "slip": 0.0005},
+        {"coulomb": 0.04, "static": 0.03},
+        {"coulomb": 0.03, "bristle": 2000.0},
+        {"drag": 0.5},
+        {"drift": 0.002},
+        {"late": 0.3},
+        {"constant": 0.02, "coulomb": 0.03},
+    ]
+    found = []
+    draw = np.random.default_rng(seed)
+    for variant in range(2):
+        for extra in one:
+            base = (
+                {}
+                if variant == 0
+                else {
+                    "viscous": float(np.exp(draw.uniform(np.log(0.4), np.log(2.0)))),
+                    "mass": draw.uniform(0.12, 0.45),
+                    "motor": draw.uniform(0.2, 0.5),
+                    "spring": draw.uniform(8e3, 3e4),
+                    "step": float(np.exp(draw.uniform(np.log(1e-6), np.log(2e-5)))),
+                }
+            )
+            name = ", ".join(f"{k} {v:g}" for k, v in extra.items()) or "ideal"
+            found.append(Rig(name, **(base | extra)))
+    for _ in range(22):
+        mixed: dict[str, float] = {
+            "viscous": float(np.exp(draw.uniform(np.log(0.4), np.log(2.0)))),
+            "mass": draw.uniform(0.12, 0.45),
+            "motor": draw.uniform(0.2, 0.5),
+            "spring": draw.uniform(8e3, 3e4),
+            "step": float(np.exp(draw.uniform(np.log(1e-6), np.log(2e-5)))),
+        }
+        for k in draw.choice(np.arange(1, len(one)), 3, replace=False):
+            mixed |= one[k]
+        found.append(Rig("mixed: " + ", ".join(k for k in mixed if k not in BASE), **mixed))
+    for hand in ((0.01, 0.1, 20.0), (0.02, 0.3, 60.0), (0.05, 0.2, 30.0), (0.1, 1.0, 200.0)):
+        found.append(Rig(f"hand {hand}", hand=hand))
+    for hand in ((0.01, 0.2, 8.0), (0.02, 0.5, 100.0)):
+        found.append(Rig(f"hand {hand} with tremor", hand=hand, tremor=0.005))
+    return found
+
+
+def records(many: list[Rig], signal: Array, seed: int = 3) -> Array:
+    """Encoder positions (ticks, rigs) [m] under the motors' forces `signal` (ticks,) [N]."""
+
+    def of(name: str) -> Array:
+        return np.array([getattr(r, name) for r in many], dtype=float)
+
+    b, m, k, d, step, c, slip = map(of, ("viscous", "mass", "spring", "loss", "step", "coulomb", "slip"))
+    m1, static, drag, bristle, gap = of("motor") * m, of("static"), of("drag"), of("bristle"), of("gap")
+    hand = np.array([r.hand for r in many])
+    m2, tremor = m - m1 + hand[:, 0], of("tremor")
+    lag, late, period, turn = T * of("lag"), of("late"), of("period"), of("turn")
+    cogging, eccentric = of("cogging"), of("eccentric")
+    constant, drift, cable = of("constant"), of("drift"), of("cable")
+    draw = np.random.default_rng(seed)
+    origin, phase = draw.uniform(size=len(many)), draw.uniform(0, 2 * np.pi, (2, len(many)))
+    x, v, y, w, z, felt = (np.zeros(len(many)) for _ in range(6))
+    h, out, before = T / SUBSTEPS, np.zeros((len(signal), len(many))), 0.0
+    dahl = bristle > 0
+    for n, force in enumerate(signal):
+        seen = x + eccentric * np.sin(2 * np.pi * x / turn + phase[0])
+        out[n] = step * np.round(seen / step + origin)
+        shake = tremor * np.sin(2 * np.pi * 9.3 * n * T) * (1 + np.sin(2 * np.pi * 0.7 * n * T))
+        outside = constant + drift * n * T
+        for i in range(SUBSTEPS):
+            now = np.where(i >= late * SUBSTEPS, force, before)
+            felt = np.where(lag > 0, felt + (now - felt) * -np.expm1(-h / np.maximum(lag, 1e-9)), now)
+            stretch = x - y
+            contact = np.sign(stretch) * np.maximum(np.abs(stretch) - gap / 2, 0.0)
+            link = k * contact + np.where((gap == 0) | (contact != 0), d * (v - w), 0.0)
+            z = np.clip(z + h * v, -c / np.maximum(bristle, 1e-9), c / np.maximum(bristle, 1e-9))
+            dry = np.where(dahl, bristle * z, np.tanh(v / slip) * (c + static * np.exp(-((v / 0.02) ** 2))))
+            total = felt + outside - link - b * v - drag * v * np.abs(v) - dry - cable * x
+            total = total + cogging * np.sin(2 * np.pi * x / period + phase[1])
+            v = v + h * total / m1
+            w = w + h * (link - hand[:, 1] * w - hand[:, 2] * y + shake) / m2
+            x, y = x + h * v, y + h * w
+        before = force
+    return out
+
+
+def excitation() -> Array:
+    """The command's own (ticks,) [N], in whole steps."""
+    signal = chirp(1, T, 1, 1.0, (3.0, 200.0), 2.5).signal[:, 0]
+    return FORCE_STEP * np.round(signal / FORCE_STEP)
+
+
+def judged(rig: Rig, x: Array, signal: Array) -> tuple[Friction | str, float]:
+    """What comes of a record, and how long it takes [s]."""
+    begin = time.perf_counter()
+    found: Friction | str
+    try:
+        found = identify(x, signal, np.ones(len(x), dtype=bool), T, rig.step, rigid=True).friction
+    except ValueError as error:
+        found = str(error)
+    return found, time.perf_counter() - begin
+
+
+def main() -> None:
+    """The table, and what the bounds are worth."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--workers", type=int, default=2)
+    args = parser.parse_args()
+    many, signal = rigs(args.seed), excitation()
+    x = records(many, signal, args.seed)
+    with ProcessPoolExecutor(args.workers) as pool:
+        results = list(pool.map(judged, many, x.T, [signal] * len(many)))
+    off, longest = [], max(seconds for _, seconds in results)
+    for i, (rig, (found, _)) in enumerate(zip(many, results, strict=True), start=1):
+        if isinstance(found, str):
+            print(f"{i:2d} {rig.name}: none: {found}")
+            continue
+        off.append(100 * (found.delta / rig.viscous - 1))
+        b = 100 * (found.viscous / rig.viscous - 1)
+        print(f"{i:2d} {rig.name}: {rig.viscous:.3f} N s/m, b {b:+.2f} %, bound {off[-1]:+.2f} %")
+    above, near = sum(part > 0 for part in off), sum(-10 <= part <= 0 for part in off)
+    print(f"{len(many)} rigs: {len(off)} bounds, {above} above the truth, {near} within 10 % below it")
+    print(f"median {np.median(off):.2f} %, least {min(off):.1f} %; {longest:.1f} s for the slowest")
+
+
+if __name__ == "__main__":
+    main()
