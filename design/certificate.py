@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 import scipy
 
-from controller.coupling import Coupling, Form, InternalModel, SpringDamper, Strict, require_channels
+from controller.coupling import Coupling, ForceFilter, Form, InternalModel, SpringDamper, Strict, require_channels
 from controller.delay import delay
 from controller.environment import Member, frozen_states
 from controller.loop import DelayRange, Loop
@@ -87,7 +87,7 @@ class Stored(Strict, frozen=True):
     loop: Loop
     coupling: Form
     certificate: Certificate | None = None
-    version: Literal[1] = 1
+    version: Literal[1, 2] = 2  # 2: force filters
 
     def __post_init__(self) -> None:
         require_channels(self.coupling, self.loop.channels)
@@ -404,13 +404,19 @@ class Verdict:
     reason: str | None = None
 
 
-def prove(loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[float] | None = None) -> Certificate:
+def prove(
+    loop: Loop,
+    coupling: Coupling,
+    condition: Condition,
+    phi: Sequence[float] | None = None,
+    swept: Requirement | None = None,
+) -> Certificate:
     """A certificate with an exact proof of the condition; `phi` [N s/m] is Theorem 4's multiplier where psi >= 1.
 
-    Raises NotProved with the reason.
+    `swept` is what `required_damping` gives, of a caller who has just asked. Raises NotProved with the reason.
     """
     multiplier = None if phi is None else [rational(float(p)) for p in phi]
-    requirement = required_damping(loop, coupling, condition, multiplier)
+    requirement = swept or required_damping(loop, coupling, condition, multiplier)
     if not requirement.certified:
         needed = ", ".join(f"{d:.6g}" for d in requirement.required)
         have = ", ".join(f"{d:.6g}" for d in requirement.available)
@@ -495,7 +501,7 @@ def required_damping(
 
 def no_compliance(coupling: Coupling) -> str:
     """Why Theorem 4 has nothing to say of a coupling that is no V of its own."""
-    if isinstance(coupling, InternalModel):
+    if isinstance(coupling, InternalModel | ForceFilter):
         return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
     return "without a coupling there is nothing that Theorem 4 could use"
 

@@ -32,7 +32,7 @@ from design.conditions import (
 )
 from design.designs import design_by_kind
 from design.frequency import Response, frequencies, on_circle
-from design.optimal import Wish
+from design.optimal import Options
 from design.result import PUBLISHED, Design, DesignFailed
 from design.transparency import decibels, transparency
 
@@ -245,11 +245,11 @@ class Setting:
 
     value: float
     loop: Loop
-    wish: Wish
+    wish: Options
 
 
 def settings(
-    axis: str, loop: Loop, wish: Wish, points: int, span: tuple[float, float] | None = None, kept: Kept = "samples"
+    axis: str, loop: Loop, wish: Options, points: int, span: tuple[float, float] | None = None, kept: Kept = "samples"
 ) -> list[Setting]:
     """The points of one axis, with what there is among them. Raises ValueError for a range that is none.
 
@@ -307,8 +307,7 @@ Designer = Callable[[Setting], Limit]
 def optimum(setting: Setting) -> Limit:
     """The optimal coupling of a setting."""
     wish = setting.wish
-    names = ("functions", "filter", "diagonal", "objective", "high_gain", "margin")
-    return measured(setting, "optimal", None, {name: getattr(wish, name) for name in names})
+    return measured(setting, "optimal", None, {field.name: getattr(wish, field.name) for field in fields(wish)})
 
 
 def spring_damper(condition: Condition) -> Designer:
@@ -359,7 +358,7 @@ def _damping(requirement: Requirement) -> tuple[float | None, ...]:
 
 def remembered(designer: Designer, whole: bool) -> Designer:
     """The same, but what was designed once is not designed again; `whole` if the wish matters to it."""
-    known: dict[tuple[str, Wish | None], Limit] = {}
+    known: dict[tuple[str, Options | None], Limit] = {}
 
     def recalled(setting: Setting) -> Limit:
         key = (digest(setting.loop), setting.wish if whole else None)
@@ -531,7 +530,7 @@ Curves_report = dict[str, dict[str, list[Limit]]]  # sweep -> design -> its poin
 EXACT_DB = -60.0  # below it the difference to the environment is the solver's
 
 
-def gains(plan: dict[str, list[Setting]], curves: Curves_report, loop: Loop, wish: Wish) -> list[str]:
+def gains(plan: dict[str, list[Setting]], curves: Curves_report, loop: Loop, wish: Options) -> list[str]:
     """What there is to gain, in a line per sweep."""
     lines = []
     for name, rows in curves.items():

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal, TypedDict, Unpack
 
 from controller.coupling import Coupling
-from controller.loop import Loop
+from controller.loop import DelayRange, Loop
 from design import certificate as promises
 from design.certificate import Stored, assess, switching_requirement
 from design.conditions import Condition, Requirement
@@ -26,8 +27,22 @@ KINDS = {"spring-damper": ("theorem4", "closed-loop"), "ccl": ("theorem4",), "op
 OPTIONS = {
     "spring-damper": ("switching",),
     "ccl": ("order", "method", "diagonal"),
-    "optimal": ("functions", "filter", "diagonal", "objective", "high_gain", "margin", "switching"),
+    "optimal": (
+        "objective",
+        "band_hz",
+        "high_gain",
+        "seconds",
+        "switching",
+        "functions",
+        "filter",
+        "diagonal",
+        "margin",
+    ),
 }
+
+#: options of the optimal coupling before 0.2: accepted and without effect
+RETIRED = ("functions", "filter", "diagonal", "margin")
+NO_LONGER = "the optimal coupling chooses its own basis and margin: {} has no effect, and will be refused in 0.3"
 
 
 def design_by_kind(
@@ -38,8 +53,7 @@ def design_by_kind(
     **options: Any,
 ) -> Design:
     """Design and verify a coupling; `options` are those of the design's own function: order, method, diagonal for ccl,
-    the fields of design.parameter.wish.Wish for optimal. `progress` hears what takes long: (what, steps done, of how
-    many).
+    those of design.optimal.Options for optimal. `progress` hears what takes long: (what, steps done, of how many).
 
     Raises ValueError for a kind or condition that does not exist, Infeasible or DesignFailed (design.failure) where
     there is nothing to return.
@@ -50,16 +64,40 @@ def design_by_kind(
     if condition not in KINDS[kind]:
         raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(KINDS[kind])}")
     from design import fixed_order as ccl  # cvxpy takes a second to import
-    from design import optimal, spring_damper
+    from design import spring_damper
     from design.lmi import Specification
-    from design.optimal import Wish
 
+    if kind == "optimal":
+        return _optimal(loop, progress, **options)
     spec = Specification.of(loop)
     if kind == "ccl":
         return ccl.design(spec, **options)
-    if kind == "optimal":
-        return optimal.design(spec, Wish(**options), progress)
     return spring_damper.design(spec, condition, **options)
+
+
+def _optimal(
+    loop: Loop,
+    progress: Callable[[str, int, int], None],
+    switching: tuple[Sequence[int], Sequence[int]] | None = None,
+    **options: Any,
+) -> Design:
+    """The optimal coupling; the rungs of its ladder are the steps."""
+    from design import optimal
+
+    for name in RETIRED:
+        if name in options:
+            options.pop(name)
+            warnings.warn(NO_LONGER.format(name), DeprecationWarning, stacklevel=4)
+    asked = optimal.Options(**options)
+    done = 0
+
+    def heard(rung: optimal.Rung) -> None:
+        nonlocal done
+        done += 1
+        progress(f"{rung.mismatch_db:.2f} dB after {rung.seconds:.1f} s", done, len(asked.ladder))
+
+    span = None if switching is None else DelayRange(*(tuple(map(int, end)) for end in switching))
+    return optimal.design(loop.switching(span), asked, progress=heard)
 
 
 def compare_methods(loop: Loop) -> tuple[Row, ...]:
@@ -75,20 +113,19 @@ LOOP = 'a Loop, as scenario.loop("I") gives it'
 
 
 class Options(TypedDict, total=False):
-    """What else can be asked of a kind, see design.designs.OPTIONS.
-
-    design.parameter.wish.Wish says more about the last five.
-    """
+    """What else can be asked of a kind, see design.designs.OPTIONS; functions, filter and margin have no effect."""
 
     order: int  # ccl: states per channel
     method: str  # ccl: complementarity, inner or fixed-poles
-    diagonal: bool  # ccl, optimal: no gain across channels
+    diagonal: bool  # ccl: no gain across channels
     switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of delays that vary
-    functions: int  # optimal: basis functions per entry of Q
-    filter: str  # optimal: where the poles of the basis are
     objective: Literal["rms", "sup"]  # optimal: of the mismatch relative to the environment
-    high_gain: float | None  # optimal: times the environment that the devices may feel at high frequency
-    margin: float  # optimal: share of the damping that stays unused
+    band_hz: tuple[float, float]  # optimal: where the mismatch counts
+    high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: kept low, not limited
+    seconds: float  # optimal: no further rung of the ladder is begun later than this
+    functions: int
+    filter: str
+    margin: float
 
 
 def design_coupling(

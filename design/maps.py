@@ -9,11 +9,11 @@ from functools import cached_property
 import msgspec
 import numpy as np
 
-from controller.coupling import Compliance, Coupling, InternalModel, NoCoupling, SpringDamper, basis
+from controller.coupling import Coupling
 from controller.delay import delay
 from controller.environment import Network, Spring, environment
 from controller.gains import Gains, force_maps
-from controller.lti import Array, Complex, Lti
+from controller.lti import Array, Complex, Lti, Sampled
 from design.conditions import half_widths
 from design.frequency import hermitian, on_circle, suprema
 
@@ -212,23 +212,8 @@ def closed_loop_in_each(
 
 
 def response(coupling: Coupling, T: float) -> Respond:
-    """How a coupling turns Psi E into G = (I + Psi E V)^-1 Psi E; the model of an InternalModel is that Psi E."""
-    match coupling:
-        case NoCoupling():
-            return lambda z, E: E
-        case InternalModel(poles=poles, Q=Q):
-            return lambda z, E: E - E @ (np.tensordot(basis(poles, z), Q, axes=1) @ E)
-        case SpringDamper():
-            V = coupling.compliance(T)
-        case Compliance(V=V):
-            pass
-        case _:
-            raise ValueError(f"{type(coupling).__name__} has no response that a map knows")
-    return lambda z, E: _closed_environment_map(E, V.at(z))
-
-
-def _closed_environment_map(E: Complex, V: Complex) -> Complex:
-    return np.linalg.solve(np.eye(E.shape[-1]) + E @ V, E).astype(np.complex128, copy=False)
+    """How a coupling turns Psi E into G; a model of the environment that it holds is that Psi E."""
+    return lambda z, E: coupling.around(Sampled(z, E, T)).G
 
 
 def nominal_over_step(z: Complex, lo: Sequence[int], hi: Sequence[int]) -> Complex:
