@@ -308,8 +308,12 @@ class Sampled:
         return self._with(np.linalg.inv(self.G))
 
     def split_at_one(self) -> tuple[Array, Sampled]:
-        """0 and G/(z - 1): off z = 1 its Hermitian part is that of the split, since He[G(1)/(z - 1)] = -G(1)/2."""
-        return np.zeros(self.G.shape[-2:]), self._with(self.G / (self.z - 1)[..., None, None])
+        """0 and G/(z - 1): off z = 1 its Hermitian part is that of the split, since He[G(1)/(z - 1)] = -G(1)/2.
+
+        1/(z - 1) = -1/2 - (j/2) cot(w/2), whose real part keeps its digits at low frequency.
+        """
+        over = -0.5 - 0.5j / np.tan(np.angle(self.z) / 2)
+        return np.zeros(self.G.shape[-2:]), self._with(self.G * over[..., None, None])
 
     def _with(self, G: Any) -> Sampled:
         return Sampled(self.z, G, self.T)

@@ -42,7 +42,7 @@ OPTIONS = {
 
 #: options of the optimal coupling before 0.2: accepted and without effect
 RETIRED = ("functions", "filter", "diagonal", "margin")
-NO_LONGER = "the optimal coupling chooses its own basis and margin: {} has no effect, and will be refused in 0.3"
+NO_LONGER = "the optimal coupling chooses its own basis and margin; without effect: {}"
 
 
 def design_by_kind(
@@ -84,10 +84,8 @@ def _optimal(
     """The optimal coupling; the rungs of its ladder are the steps."""
     from design import optimal
 
-    for name in RETIRED:
-        if name in options:
-            options.pop(name)
-            warnings.warn(NO_LONGER.format(name), DeprecationWarning, stacklevel=4)
+    if retired := [name for name in RETIRED if options.pop(name, None) is not None]:
+        warnings.warn(NO_LONGER.format(", ".join(retired)), DeprecationWarning, stacklevel=4)
     asked = optimal.Options(**options)
     done = 0
 

@@ -31,9 +31,10 @@ from design.conditions import least_multiple, switching_block, this_environment_
 from design.conditions import this_environment as requirement_of
 from design.exact import LARGEST as MOST_STATES
 from design.frequency import frequencies, hermitian, on_circle, peaks, supremum
-from design.result import Design, DesignFailed
+from design.result import Design, DesignFailed, number, one_of
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
+OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # share of the damping that stays unused: what an exact proof always finds room in
 LADDER = ((4, 3), (8, 6), (14, 10), (22, 16), (32, 24))  # taps and real poles of the rungs
 SETTLED_DB = 0.05  # a rung that gains less ends the climb
@@ -89,9 +90,9 @@ class Options:
     ladder: tuple[tuple[int, int], ...] = LADDER  # (taps, real poles)
 
     def __post_init__(self) -> None:
-        if self.objective not in ("rms", "sup"):
-            raise ValueError(f"objective is {self.objective!r}, allowed are 'rms' and 'sup'")
-        if self.high_gain is not None and not 1 <= self.high_gain < np.inf:
+        one_of("objective", self.objective, OBJECTIVES)
+        number("seconds", self.seconds)
+        if self.high_gain is not None and not 1 <= number("high_gain", self.high_gain) < np.inf:
             raise ValueError(f"high_gain is {self.high_gain}, expected a factor of at least 1")
         if not 0 < self.margin < 1:
             raise ValueError(f"margin is {self.margin}, allowed are shares of the damping above 0 and below 1")
@@ -357,6 +358,8 @@ class Problem:
         """A, b, c of |A x - b|^2 + c'x: squared relative mismatch, soft rows, and the share of static stiffness."""
         rows, right = [], []
         for case in self.cases:
+            if not case.weight:
+                continue
             loop = case.loop
             low, high = _band(loop, self.options.band_hz)
             if self.options.objective == "rms":
@@ -581,7 +584,7 @@ class _Climb:
         for member in loop.members():
             there = _at(loop, member.network)
             asked = [this_environment(there, options.margin), *(constraint(there) for constraint in further)]
-            if options.high_gain is not None and 2 * HIGH_HZ * loop.T < 1:
+            if options.high_gain is not None and 2 * HIGH_HZ * loop.T < 1 and there.E().D.any():
                 asked.append(most_gain(there, options.high_gain))
             if options.objective == "sup" and not cases:
                 asked.append(worst_mismatch(there, options.band_hz))

@@ -374,5 +374,5 @@ def test_a_basis_has_more_for_few_than_for_many():
 
 def test_options_of_old_have_no_effect_and_say_so():
     loop, same = loop_of("o02"), {"functions": 16, "filter": "mixed", "margin": 0.01}
-    with pytest.warns(DeprecationWarning, match="functions has no effect"):
+    with pytest.warns(DeprecationWarning, match="without effect: functions, filter, margin"):
         assert isinstance(design_coupling(loop, "optimal", **same).coupling, NoCoupling)
