@@ -37,10 +37,10 @@ figures: .venv/ready
 	$(PY) -m sim.run --case I --out out/figure-6
 	cp out/figure-5/figure.png docs/pictures/figure-5.png
 	cp out/figure-6/figure.png docs/pictures/figure-6.png
-	$(PY) -m design.plot --coupling published,spring-damper,spring-damper:closed-loop --out out/couplings
+	$(PY) -m design.compare --coupling published,spring-damper,spring-damper:this-environment --out out/couplings
 	for name in required-damping perceived singular-values; do cp out/couplings/$$name.png docs/pictures/; done
 	$(PY) -m sim.view --case I --video docs/pictures/view.gif --fps 5
-	$(PY) -m design.limits --out out/limits
+	$(PY) -m design.compare --over --out out/limits
 	cp out/limits/limits.png docs/pictures/limits.png
 	$(PY) -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0 --out out/zwidth || test $$? -eq 1 # 1: not certified
 	cp out/zwidth/zwidth.png docs/pictures/zwidth.png

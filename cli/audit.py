@@ -1,37 +1,24 @@
-"""python -m design.audit: are these gains safe, with what margin, and where does it bind?
-
-options -> Subject (coupling, loop, environment or rigid wall) -> both conditions -> report
-"""
+"""python -m design.audit: are these gains safe, with what margin, and where does it bind?"""
 
 from __future__ import annotations
 
 import argparse
+import math
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
-from cli.options import (
-    DOES_NOT_HOLD,
-    DONE,
-    Parser,
-    add_loop_options,
-    add_output_options,
-    add_rigid_option,
-    console,
-    numbers,
-    out_folder,
-    progress_bar,
-    ranges,
-    rigid_loop,
-    scenario_from,
-    seed_from,
-)
+from rich.table import Table
+
+from cli import options, render
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.loop import DelayRange
-from design.audit import LONGEST_DELAY, PRESETS, Subject, print_report, report
+from design.audit import LONGEST_DELAY, PRESETS, Subject, report
 from design.designs import KINDS
-from design.ranges import check_set
+from design.ranges import check_set, set_rows
+from design.result import CONDITION_NAMES, listed
 from sim.couplings import fitted, read_coupling, standing
-from sim.files import write_json
 from sim.scenario import InputError, Scenario
 
 EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
@@ -39,23 +26,19 @@ EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
   python -m design.audit --case I --K 879,552 --B 0.39,0.52 --jitter 1,2
   python -m design.audit --preset chai3d-omega3"""
 
-#: what a gain may be: within these, all arithmetic is far from overflow
-STIFFNESSES, DAMPINGS = (1e-3, 1e9, "N/m"), (0.0, 1e6, "N s/m")
-
 
 def main(argv: list[str]) -> int:
-    """Audit a coupling. 0: safe in this environment and at every vertex of its box, 1: not."""
+    """Audit a coupling. 0: safe in this environment and at every vertex of its ranges, 1: not."""
     args = _with_preset(_parser().parse_args(argv))
-    seed = seed_from(args)
-    scenario = scenario_from(args)
+    scenario = options.scenario_from(args)
     subject = _subject(args, scenario)
-    switching = _range(args, scenario, subject)
-    out = out_folder(args, "audit")
+    switching = _switching(args, scenario, subject)
+    out = options.out_folder(args, "audit")
 
     begin = time.perf_counter()
-    with (bar := progress_bar("searching the box"))[0]:
+    with render.progress("searching the ranges") as move:
         loop = None if args.rigid else scenario.loop(args.case)
-        whole = loop and check_set(loop, subject.coupling, seed, progress=bar[1])
+        whole = loop and check_set(loop, subject.coupling, args.seed, progress=move)
     outcome = {
         "case": args.case,
         "scenario": None if args.rigid else scenario.name,
@@ -64,26 +47,29 @@ def main(argv: list[str]) -> int:
         "notes": _notes(args, scenario, switching),
         "wall_s": time.perf_counter() - begin,
     }
-    write_json(out / "report.json", outcome)
-    print_report(outcome, console(args))
-    if args.json:
-        write_json(args.json, outcome)
+    outcome |= {name: outcome[key] for key, name in CONDITION_NAMES.items()}
+    render.publish(args, outcome, _tables(outcome), _remarks(outcome), out)
     proof = outcome["jitter-proof"]
-    return DONE if outcome["certified"] and (proof is None or proof["certified"]) else DOES_NOT_HOLD
+    holds = outcome["certified"] and (proof is None or proof["certified"])
+    return options.DONE if holds else options.DOES_NOT_HOLD
 
 
-def _parser() -> Parser:
-    parser = Parser("design.audit", "Say whether a coupling is safe for every passive human, and how far.", EXAMPLE)
-    what = parser.add_argument_group("the coupling")
-    what.add_argument("--K", metavar="K,K,..", help="stiffness per channel [N/m]; one is for all")
-    what.add_argument("--B", metavar="B,B,..", help="damping per channel [N s/m]; one is for all")
-    what.add_argument("--coupling", metavar="FILE.json", help="a stored coupling, in place of --K and --B")
-    what.add_argument("--preset", choices=tuple(PRESETS), help="limits that a framework ships; other options go first")
-    add_loop_options(parser)
-    add_rigid_option(parser)
+def _parser() -> options.Parser:
+    what = "Say whether a coupling is safe for every passive human, and how far."
+    parser = options.Parser("design.audit", what, EXAMPLE)
+    coupling = parser.add_argument_group("the coupling")
+    stiffness = options.several(float, 1e-3, 1e9, "N/m")  # far from overflow, and so is the damping
+    coupling.add_argument("--K", type=stiffness, metavar="K,K,..", help="stiffness per channel [N/m]; one is for all")
+    damping = options.several(float, 0, 1e6, "N s/m")
+    coupling.add_argument("--B", type=damping, metavar="B,B,..", help="damping per channel [N s/m]; one is for all")
+    coupling.add_argument("--coupling", metavar="FILE.json", help="a stored coupling, in place of --K and --B")
+    preset = "limits that a framework ships; other options go first"
+    coupling.add_argument("--preset", choices=tuple(PRESETS), help=preset)
+    options.add_loop_options(parser)
+    options.add_rigid_option(parser)
     switching = "also any switching of the forces' delays in this range [samples]; or LO-HI,LO-HI,.. per channel"
-    parser.add_argument("--jitter", metavar="LO,HI", help=switching)
-    add_output_options(parser)
+    parser.add_argument("--jitter", type=options.delay_ranges, metavar="LO,HI", help=switching)
+    options.add_output_options(parser)
     return parser
 
 
@@ -94,14 +80,15 @@ def _with_preset(args: argparse.Namespace) -> argparse.Namespace:
     if args.coupling:
         raise InputError("--preset with --coupling: give one of them")
     preset = PRESETS[args.preset]
-    fixed = {"K": str(preset.K), "B": str(preset.B), "T": str(preset.T), "theta": "0", "rigid": True}
-    given = {name: value for name, value in vars(args).items() if value not in (None, False)}
+    fixed = {"K": (preset.K,), "B": (preset.B,), "T": preset.T, "theta": (0,), "rigid": True}
+    given = {name: value for name, value in vars(args).items() if value is not None and value is not False}
     return argparse.Namespace(**(vars(args) | fixed | given))
 
 
 def _subject(args: argparse.Namespace, scenario: Scenario) -> Subject:
+    """The coupling in its loop. Raises InputError."""
     if args.rigid:
-        loop = {"network": None, "delta": scenario.delta[:1], **rigid_loop(args, scenario)}
+        loop: dict[str, Any] = {"network": None, "delta": scenario.delta[:1], **options.rigid_loop(args, scenario)}
     else:
         delays = {"theta": scenario.theta, "psi": scenario.psi}
         loop = {"network": scenario.environment, "delta": scenario.delta, **delays}
@@ -110,29 +97,6 @@ def _subject(args: argparse.Namespace, scenario: Scenario) -> Subject:
         return Subject(coupling, T=scenario.T, **loop)
     except ValueError as error:
         raise InputError(str(error)) from None
-
-
-def _notes(args: argparse.Namespace, scenario: Scenario, switching: DelayRange | None) -> list[str]:
-    """What the coupling's file is worth in the loop that is audited."""
-    if args.coupling is None:
-        return []
-    loop = scenario.loop(args.case)
-    return list(standing(read_coupling(args.coupling), loop.switching(switching)).notes)
-
-
-def _range(args: argparse.Namespace, scenario: Scenario, subject: Subject) -> DelayRange | None:
-    """The range of --jitter, or of the scenario, around the constant theta that the other conditions are about.
-
-    Raises InputError.
-    """
-    if args.jitter is None:
-        return None if args.rigid else scenario.loop(args.case).jitter
-    lo, hi = ranges("--jitter", args.jitter, subject.channels)
-    for i, (least, n, largest) in enumerate(zip(lo, subject.theta, hi, strict=True)):
-        if not 0 <= least <= n <= largest <= LONGEST_DELAY:
-            allowed = f"0 <= LO <= theta = {n} <= HI <= {LONGEST_DELAY} samples (--theta gives another)"
-            raise InputError(f"--jitter on channel {i + 1} is {least} to {largest}, expected {allowed}")
-    return DelayRange(lo, hi)
 
 
 def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Coupling:
@@ -146,9 +110,9 @@ def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Co
         if gains:
             raise InputError(f"{given[0]} with --coupling: give one of them")
         if args.coupling in KINDS and not Path(args.coupling).exists():
+            design = f"`python -m design --coupling {args.coupling} --out {args.coupling}.json`"
             raise InputError(
-                f"--coupling {args.coupling}: an audit takes the file of a coupling; make it with "
-                f"`python -m design --coupling {args.coupling} --out {args.coupling}.json`"
+                f"--coupling {args.coupling}: an audit takes the file of a coupling; make it with {design}"
             )
         return fitted(read_coupling(args.coupling), args.coupling, channels, scenario.T)
     if len(gains) == 1:
@@ -156,13 +120,115 @@ def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Co
         raise InputError(f"--{gains[0]} without --{missing}: a spring-damper has both (--B 0 is a spring alone)")
     if not gains:
         raise InputError("nothing to audit: give --K and --B, --coupling FILE.json, --preset NAME or --case none")
-    return SpringDamper(_gains("--K", args.K, channels, STIFFNESSES), _gains("--B", args.B, channels, DAMPINGS))
+    return SpringDamper(*(options.per_channel(f"--{name}", getattr(args, name), channels) for name in "KB"))
 
 
-def _gains(option: str, text: str, channels: int, allowed: tuple[float, float, str]) -> tuple[float, ...]:
-    low, high, unit = allowed
-    values = numbers(option, text, float, channels)
-    for value in values:
-        if not low <= value <= high:
-            raise InputError(f"{option} is {value:g}, allowed are {low:g} to {high:g} {unit}")
-    return values
+def _switching(args: argparse.Namespace, scenario: Scenario, subject: Subject) -> DelayRange | None:
+    """The range of --jitter, or of the scenario, around the constant theta that the other conditions are about.
+
+    Raises InputError.
+    """
+    if args.jitter is None:
+        return None if args.rigid else scenario.loop(args.case).jitter
+    lo, hi = options.ranges_per_channel("--jitter", args.jitter, subject.channels)
+    for i, (least, n, largest) in enumerate(zip(lo, subject.theta, hi, strict=True)):
+        if not 0 <= least <= n <= largest <= LONGEST_DELAY:
+            allowed = f"0 <= LO <= theta = {n} <= HI <= {LONGEST_DELAY} samples (--theta gives another)"
+            raise InputError(f"--jitter on channel {i + 1} is {least} to {largest}, expected {allowed}")
+    return DelayRange(lo, hi)
+
+
+def _notes(args: argparse.Namespace, scenario: Scenario, switching: DelayRange | None) -> list[str]:
+    """What the coupling's file is worth in the loop that is audited."""
+    if args.coupling is None:
+        return []
+    loop = scenario.loop(args.case)
+    return list(standing(read_coupling(args.coupling), loop.switching(switching)).notes)
+
+
+# ----------------------------------------------------------------------------------------------------
+# The report as a table, and what it does not cover.
+
+
+def _tables(outcome: dict[str, Any]) -> list[Table]:
+    parts = [outcome[condition] for condition in render.ORDER]
+    table = Table("", *(CONDITION_NAMES[name] for name in render.ORDER), title=_verdict(outcome), title_justify="left")
+    for name, cell in ROWS.items():
+        table.add_row(name, *(cell(part) for part in parts))
+    if not outcome["set"]:
+        return [table]
+    return [table, render.facts("the ranges around the environment", set_rows(outcome["set"]), left=True)]
+
+
+def _verdict(outcome: dict[str, Any]) -> str:
+    coupling = outcome["coupling"]
+    gains = f" K {listed(coupling['K'])} N/m, B {listed(coupling['B'])} N s/m" if coupling["K"] else ""
+    verdict = f"[green]certified[/] for {outcome['promise']}" if outcome["certified"] else "[red]not certified[/]"
+    if outcome["promise"] and not outcome["certified"]:
+        verdict += f" for the ranges, only for {outcome['promise']}"
+    return f"{coupling['kind']}{gains}: {verdict}"
+
+
+def _needs(part: dict[str, Any]) -> str:
+    word = "[green]certified[/]" if part["certified"] else "[red]not certified[/]"
+    return f"{render.needs(part)}: {word}"
+
+
+def _error(key: str, sign: str) -> Callable[[dict[str, Any]], str]:
+    """A relative error in percent, rounded down so that what is printed is tolerated."""
+
+    def cell(part: dict[str, Any]) -> str:
+        error = part["sensitivity"][key]
+        return "-" if error is None else f"{sign}{math.floor(1e4 * error) / 100:.2f} %"
+
+    return cell
+
+
+def _stiffest(K: Sequence[float | None]) -> str:
+    """To five digits, rounded down so that what is printed is certified."""
+    if None in K:
+        return "-"
+    units = ((k, 10.0 ** (math.floor(math.log10(k)) - 4)) for k in K if k is not None)
+    return ", ".join(f"{math.floor(k / unit) * unit:.5g}" for k, unit in units) + " N/m"
+
+
+#: name of a row -> what stands in it, given the part of a condition
+ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
+    "needs damping": _needs,
+    "margin": lambda part: render.optional(part["margin"], "{:.5g}"),
+    "binds at": lambda part: render.optional(part["binding_frequency_hz"], "{:.5g} Hz"),
+    "stiffest K here": lambda part: _stiffest(part["stiffest"]["K"]),
+    "delta error": _error("delta_error", "-"),
+    "T error": _error("T_error", "+"),
+    "spare samples": lambda part: render.optional(part["sensitivity"]["extra_samples"], "{:.5g}"),
+}
+
+
+def _remarks(outcome: dict[str, Any]) -> list[str]:
+    lines = [f"{note}." for note in outcome["notes"]]
+    for condition in render.ORDER:
+        part, name = outcome[condition], CONDITION_NAMES[condition]
+        sensitivity = part["sensitivity"].get("reason") if part["certified"] else None
+        reasons = {"": part.get("reason"), ", stiffest K": part["stiffest"].get("reason"), ", sensitivity": sensitivity}
+        lines += [f"{name}{of}: {reason}." for of, reason in reasons.items() if reason]
+    for helping in outcome["helps"]:
+        enough = "enough" if helping["certified"] else "not enough alone"
+        need = (
+            f"{CONDITION_NAMES[helping['condition']]} then needs {listed(helping['required_damping'])} N s/m, {enough}"
+        )
+        lines.append(f"What helps: {helping['change']} ({need}).")
+    if (part := outcome["jitter-proof"]) is not None:
+        lines += _switching_remarks(part)
+    return [*lines, outcome["not_covered"]]
+
+
+def _switching_remarks(part: dict[str, Any]) -> list[str]:
+    span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))
+    needs = f"needs {render.needs(part)}: {render.certified(part)}"
+    lines = [f"Any switching of the delays ({span} samples) {needs}."]
+    if "playout" not in part:
+        return [*lines, f"any switching: {part['reason']}."]
+    buffered = part["playout"]
+    enough = "certified" if buffered["certified"] else "not certified"
+    played = f"{listed(buffered['required_damping'])} N s/m: {enough}"
+    return [*lines, f"A playout buffer to the constant {listed(part['hi'])} needs {played}.", part["not_covered"]]

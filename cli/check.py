@@ -3,22 +3,54 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from rich.table import Table
 
-from cli.options import DOES_NOT_HOLD, DONE, Parser, check_json, console, progress_bar
+from cli import options, render
 from design.certificate import HERE, SET, Stored, SwitchingProof, Verdict, switching_promise, verify
 from design.ranges import Searched, search_box, search_part, search_words, violated_between
+from design.result import CONDITION_NAMES, listed
 from sim.couplings import read_coupling
-from sim.files import write_json
 from sim.scenario import InputError
+
+
+@dataclass(frozen=True)
+class _Switching:
+    """The claim for delays that vary; promise and proof are null where it fails."""
+
+    lo: Sequence[int]
+    hi: Sequence[int]
+    promise: str | None = render.figure("switching, guarantee")
+    proof: str | None = render.figure("switching, proof")
+    required_damping: Sequence[float] | None = render.figure("switching, required damping [N s/m]", listed)
+    margin: float | None = render.figure("switching, margin", "{:.6g}")
+
+
+@dataclass(frozen=True)
+class _Checked:
+    """The machine-readable result; figures are null where the file carries no certificate."""
+
+    proved: bool
+    reason: str | None = render.figure("reason")
+    condition: str | None = render.figure("condition", CONDITION_NAMES.__getitem__)
+    promise: str | None = render.figure("guarantee")
+    proof: str | None = render.figure("proof")
+    vertices: int | None = render.figure("vertices")
+    between: Mapping[str, Any] | None = render.figure("between", search_words)
+    required_damping: Sequence[float] | None = render.figure("required damping [N s/m]", listed)
+    available_damping: Sequence[float] = render.figure("available damping [N s/m]", listed)
+    margin: float | None = render.figure("margin", "{:.6g}")
+    wall_s: float = render.figure("seconds", "{:.6g}")
+    switching: _Switching | None = field(default=None)
 
 
 def main(argv: list[str]) -> int:
     """Prove a stored coupling again. 0: proved, 1: not."""
     args = _parser().parse_args(argv)
-    check_json(args)
+    options.check_json(args)
     begin = time.perf_counter()
     stored = read_coupling(args.coupling)
     try:
@@ -28,79 +60,61 @@ def main(argv: list[str]) -> int:
     searched = _searched(stored) if verdict.proved else None
     if searched and not searched.worst[0].ratio < 1:
         verdict = Verdict(False, violated_between(searched.worst[0].member, searched.worst[0].ratio))
-    result = _result(stored, verdict, searched, time.perf_counter() - begin)
-    console(args).print(_table(result))
-    if args.json:
-        write_json(args.json, result)
-    return DONE if verdict.proved else DOES_NOT_HOLD
+    checked = _checked(stored, verdict, searched, time.perf_counter() - begin)
+    render.publish(args, render.plain(checked), [_table(checked)])
+    return options.DONE if verdict.proved else options.DOES_NOT_HOLD
 
 
-def _searched(stored: Stored) -> Searched | None:
-    """The search between the vertices, again, where the file promises a set."""
-    if not (stored.certificate and stored.certificate.promise == SET):
-        return None
-    with (bar := progress_bar("searching the box between its vertices"))[0]:
-        return search_box(stored.loop, stored.coupling.build(stored.loop.T), bar[1])
-
-
-def _parser() -> Parser:
-    parser = Parser(
-        "design.check", "Prove a stored coupling again, in exact arithmetic.", "python -m design.check coupling.json"
-    )
+def _parser() -> options.Parser:
+    example = "python -m design.check coupling.json"
+    parser = options.Parser("design.check", "Prove a stored coupling again, in exact arithmetic.", example)
     parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling")
-    parser.add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
+    options.add_json_option(parser)
     return parser
 
 
-def _result(stored: Stored, verdict: Verdict, searched: Searched | None, seconds: float) -> dict[str, Any]:
-    """The machine-readable result; figures are null where the file carries no certificate."""
+def _searched(stored: Stored) -> Searched | None:
+    """The search between the vertices, again, where the file guarantees ranges of parameters."""
+    if not (stored.certificate and stored.certificate.promise == SET):
+        return None
+    with render.progress("searching the ranges between their vertices") as move:
+        return search_box(stored.loop, stored.coupling.build(stored.loop.T), move)
+
+
+def _checked(stored: Stored, verdict: Verdict, searched: Searched | None, seconds: float) -> _Checked:
     claim = stored.certificate
-    return {
-        "proved": verdict.proved,
-        "reason": verdict.reason,
-        "condition": claim and claim.condition,
-        "promise": claim.promise if claim and verdict.proved else None,
-        "proof": claim.proof if claim and verdict.proved else None,
-        "vertices": len(stored.loop.members()) - 1 if stored.loop.box else None,
-        "between": searched and search_part(searched),
-        "required_damping": claim and claim.required,
-        "available_damping": stored.loop.delta,
-        "margin": claim and claim.margin,
-        "switching": _switching(stored, verdict),
-        "wall_s": seconds,
-    }
+    return _Checked(
+        verdict.proved,
+        verdict.reason,
+        claim and claim.condition,
+        claim.promise if claim and verdict.proved else None,
+        claim.proof if claim and verdict.proved else None,
+        len(stored.loop.members()) - 1 if stored.loop.box else None,
+        searched and search_part(searched),
+        claim and claim.required,
+        stored.loop.delta,
+        claim and claim.margin,
+        seconds,
+        _switching(stored, verdict),
+    )
 
 
-def _switching(stored: Stored, verdict: Verdict) -> dict[str, Any] | None:
-    """The claim for delays that vary, None where the file makes none; promise and proof are null where it fails."""
+def _switching(stored: Stored, verdict: Verdict) -> _Switching | None:
     span, claim = stored.loop.jitter, stored.certificate and stored.certificate.switching
     if span is None or not isinstance(claim, SwitchingProof):
         return None
-    return {
-        "lo": span.lo,
-        "hi": span.hi,
-        "promise": f"{switching_promise(span)}, in {HERE}" if verdict.proved else None,
-        "proof": "rational" if verdict.proved else None,
-        "required_damping": claim.required,
-        "margin": claim.margin,
-    }
+    promise = f"{switching_promise(span)}, in {HERE}" if verdict.proved else None
+    proof = "rational" if verdict.proved else None
+    return _Switching(span.lo, span.hi, promise, proof, claim.required, claim.margin)
 
 
-def _table(result: dict[str, Any]) -> Table:
+def _table(checked: _Checked) -> Table:
     title = "not proved"
-    if result["proved"]:
-        title = "proved, in exact arithmetic"
-        if result["between"]:
-            title += ", at every vertex; between them searched, not proved"
-    table = Table(title=title, show_header=False, title_justify="left")
-    switching = result["switching"] or {}
-    rows = {key: value for key, value in result.items() if key not in ("proved", "switching")}
-    rows["between"] = result["between"] and search_words(result["between"])
-    rows |= {f"switching, {key}": value for key, value in switching.items() if key not in ("lo", "hi")}
-    claims = () if result["proved"] else ("required_damping", "margin")  # what a file says that was refused
-    rows = {f"{key}, claimed" if key in claims else key: value for key, value in rows.items()}
-    for key, value in rows.items():
-        if value is not None:
-            shown = ", ".join(f"{v:.6g}" for v in value) if isinstance(value, tuple) else value
-            table.add_row(key.replace("_", " "), f"{shown:.6g}" if isinstance(shown, float) else str(shown))
-    return table
+    if checked.proved:
+        between = ", at every vertex; between them searched, not proved" if checked.between else ""
+        title = f"proved, in exact arithmetic{between}"
+    rows = [*render.rows_of(checked), *(render.rows_of(checked.switching) if checked.switching else [])]
+    if not checked.proved:  # what a file says that was refused
+        claims = ("required", "margin", "switching, required", "switching, margin")
+        rows = [(f"{name}, claimed" if name.startswith(claims) else name, text) for name, text in rows]
+    return render.facts(title, rows, left=True)

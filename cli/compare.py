@@ -1,293 +1,129 @@
-"""python -m design.plot: couplings side by side over frequency.
+"""python -m design.compare: couplings over frequency, every design as a ladder, and the limits of any coupling.
 
-options -> couplings -> both conditions of each -> curves on one grid -> JSON, pictures, table
+Without --over and --ladder the couplings of --coupling are drawn: singular values, required damping, perceived
+stiffness and damping. --ladder designs what the project can design, for cases I and II. --over designs the optimal
+coupling along an axis of the loop, which shows how good any coupling could be with another device, delay or period.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from cli.options import (
-    DOES_NOT_HOLD,
-    DONE,
-    INTERRUPTED,
-    Parser,
-    add_loop_options,
-    add_output_options,
-    as_option,
-    console,
-    numbers,
-    out_folder,
-    progress_bar,
-    scenario_from,
-    seed_from,
-)
-from cli.run import coupling_part, transparency_part
+import numpy as np
+from rich.table import Table
+
+from cli import options, render
+from cli.design import RETIRED_WITH_VALUE, add_optimal_options, optimal_options
 from controller.environment import environment
 from controller.loop import Loop
 from controller.lti import Array
+from design import compare
 from design.certificate import CONDITIONS, certificate_part, finite
-from design.compare import (
-    AXES,
-    LADDERS,
-    Curves_report,
-    Designer,
-    Judged,
-    Limit,
-    Perceived,
-    Setting,
-    climb,
-    curves,
-    gains,
-    grid,
-    ideal,
-    judge,
-    optimum,
-    print_curves,
-    print_ladder,
-    remembered,
-    settings,
-    spring_damper,
-    tables,
-)
-from design.compare import Curves as Curves_curves
-from design.optimal import FILTERS, OBJECTIVES, Wish
-from design.result import DesignFailed
+from design.compare import AXES, FEEL_HZ, LADDERS, Judged, Limit, Perceived, Setting, optimum, settings
+from design.optimal import Options
+from design.result import CONDITION_NAMES, DesignFailed
 from design.transparency import transparency
+from sim import report
 from sim.couplings import NAMES, Chosen, choose
-from sim.files import write_json
 from sim.scenario import InputError, Scenario
-
-# ----------------------------------------------------------------------------------------------------
-# python -m design.limits: how good could a coupling be, with another device, delay, period or order?
-
-
-BESIDE = {"none": (), "theorem4": ("theorem4",), "closed-loop": ("closed-loop",), "both": ("theorem4", "closed-loop")}
-MOST_POINTS = 100
-OF_THE_CURVE = ("over", "points", "keep", "beside", "no_plot")
-OF_THE_CURVE += ("functions", "filter", "objective", "high_gain", "margin", "diagonal")
-
-
-def main(argv: list[str]) -> int:
-    """Draw the limit curve, or print the ladder. 0: done, 1: nothing could be designed, 130: interrupted."""
-    parser = _parser()
-    args = parser.parse_args(argv)
-    scenario = scenario_from(args)
-    if args.case == "none":
-        raise InputError("--case none has no coupling to design: give I or II")
-    seed, wish = seed_from(args), _wish(args)
-    head = {"scenario": scenario.name, "seed": seed}
-    if args.ladder:
-        _only_the_ladder(args, parser)
-        return _ladder(args, {case: scenario.loop(case) for case in ("I", "II")}, head)
-    loop = scenario.loop(args.case)
-    try:
-        if min(loop.delta) <= 0:
-            raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
-    except ValueError as error:
-        raise InputError(str(error)) from None
-    plan = _plan(args, loop, wish)
-    out = out_folder(args, "limits")
-    beside = BESIDE[args.beside]
-    designers = {"optimal": remembered(optimum, True)}
-    designers |= {name: remembered(spring_damper(name), False) for name in beside}
-    begin = time.perf_counter()
-    curves, interrupted = _curves(plan, designers)
-    head |= {"case": args.case, "objective": wish.objective, "delays_kept_in": args.keep, "wish": asdict(wish)}
-    outcome = head | {
-        "here": {"delta": list(loop.delta), "theta": list(loop.theta), "psi": list(loop.psi), "T_s": loop.T},
-        "sweeps": {name: _sweep(name, plan[name], rows) for name, rows in curves.items()},
-        "gains": gains(plan, curves, loop, wish),
-        "wall_s": time.perf_counter() - begin,
-        "interrupted": interrupted,
-    }
-    outcome["files"] = _save(args, out, outcome)
-    print_curves(outcome, BESIDE[args.beside], console(args))
-    if args.json:
-        write_json(args.json, outcome)
-    if interrupted:
-        return INTERRUPTED
-    found = any(row["rms_mismatch_db"] is not None for s in outcome["sweeps"].values() for row in s["optimal"])
-    return DONE if found else DOES_NOT_HOLD
-
-
-def _parser() -> Parser:
-    example = "python -m design.limits --over damping=0.7:10,delay --points 5"
-    what = "The best mismatch that any linear coupling reaches, against damping, delay, period and order."
-    parser = Parser("design.limits", what, example)
-    add_loop_options(parser)
-    curve = parser.add_argument_group("the curve")
-    names = ",".join(AXES)
-    curve.add_argument(
-        "--over", default=names, metavar="NAME[=LOW:HIGH],..", help=f"what is varied, of {names} (default all)"
-    )
-    curve.add_argument("--points", default="6", metavar="N", help="designs of each sweep (default 6)")
-    curve.add_argument("--keep", choices=("samples", "seconds"), default="samples", help="delays, as the period varies")
-    curve.add_argument("--beside", choices=tuple(BESIDE), default="both", help="spring-dampers drawn (default both)")
-    curve.add_argument("--no-plot", action="store_true", help="write no picture")
-    ladder = parser.add_argument_group("instead of the curve")
-    ladder.add_argument(
-        "--ladder",
-        nargs="?",
-        const="short",
-        choices=tuple(LADDERS),
-        help="every design side by side, cases I and II (full: minutes)",
-    )
-    wish = parser.add_argument_group("the optimal coupling")
-    wish.add_argument("--functions", metavar="N", default="10", help="basis functions of each entry of Q (default 10)")
-    wish.add_argument("--filter", choices=FILTERS, default="mixed", help="poles of the basis (default mixed)")
-    wish.add_argument("--objective", choices=OBJECTIVES, default="rms", help="the mismatch minimised and drawn")
-    wish.add_argument("--high-gain", metavar="G", default="1.5", help="of |F|/|E| above 100 Hz, or none (default 1.5)")
-    wish.add_argument("--margin", metavar="SHARE", default="0.005", help="of the damping that stays unused")
-    wish.add_argument("--diagonal", action="store_true", help="Q of separate channels (default: full)")
-    add_output_options(parser)
-    return parser
-
-
-def _wish(args: argparse.Namespace) -> Wish:
-    high_gain = None if args.high_gain == "none" else numbers("--high-gain", args.high_gain, float, 1)[0]
-    (functions,) = numbers("--functions", args.functions, int, 1)
-    (margin,) = numbers("--margin", args.margin, float, 1)
-    try:
-        return Wish(functions, args.filter, args.diagonal, args.objective, high_gain, margin)
-    except ValueError as error:
-        raise InputError(as_option(error, args)) from None
-
-
-def _only_the_ladder(args: argparse.Namespace, parser: Parser) -> None:
-    """Raises InputError where an option is given that the ladder would have to ignore."""
-    if args.case != parser.get_default("case"):
-        raise InputError(f"--ladder shows both cases: leave out --case {args.case}")
-    for name in OF_THE_CURVE:
-        if getattr(args, name) != parser.get_default(name):
-            raise InputError(f"--{name.replace('_', '-')} is for the curve, not for --ladder")
-
-
-def _plan(args: argparse.Namespace, loop: Loop, wish: Wish) -> dict[str, list[Setting]]:
-    """The settings of every sweep that is asked for. Raises InputError."""
-    (points,) = numbers("--points", args.points, int, 1)
-    if not 1 <= points <= MOST_POINTS:
-        raise InputError(f"--points is {points}, allowed are 1 to {MOST_POINTS}")
-    plan = {}
-    for part in args.over.split(","):
-        name, _, text = part.partition("=")
-        if name not in AXES:
-            raise InputError(f"--over has {name!r}, allowed are {', '.join(AXES)}")
-        try:
-            span = _span(name, text) if text else None
-            plan[name] = settings(name, loop, wish, points, span, args.keep)
-        except InputError:
-            raise
-        except ValueError as error:
-            raise InputError(f"--over {part}: {error}") from None
-    return plan
-
-
-def _span(name: str, text: str) -> tuple[float, float]:
-    low, colon, high = text.partition(":")
-    if not colon:
-        raise InputError(f"--over {name}={text}: expected LOW:HIGH in {AXES[name].unit}")
-    return numbers(f"--over {name}", low, float, 1)[0], numbers(f"--over {name}", high, float, 1)[0]
-
-
-def _curves(plan: dict[str, list[Setting]], designers: dict[str, Designer]) -> tuple[Curves_report, bool]:
-    """Every design at every setting; what is done when the keyboard interrupts is kept."""
-    curves: Curves_report = {}
-    total = len(designers) * sum(map(len, plan.values()))
-    bar, move = progress_bar("designing")
-    with bar:
-        done = 0
-        try:
-            for name, along in plan.items():
-                curves[name] = {kind: [] for kind in designers}
-                for setting in along:
-                    for kind, designer in designers.items():
-                        move(done, total)
-                        curves[name][kind].append(designer(setting))
-                        done += 1
-        except KeyboardInterrupt:
-            return curves, True
-    return curves, False
-
-
-def _sweep(name: str, along: Sequence[Setting], rows: dict[str, list[Limit]]) -> dict[str, Any]:
-    axis = AXES[name]
-    points = {kind: [asdict(limit) for limit in limits] for kind, limits in rows.items()}
-    return {"label": axis.label, "unit": axis.unit, "values": [s.value for s in along]} | points
-
-
-def _save(args: argparse.Namespace, out: Path, outcome: dict[str, Any]) -> list[str]:
-    files = [out / "report.json"]
-    if not args.no_plot and any(sweep["optimal"] for sweep in outcome["sweeps"].values()):
-        from sim.plots import plot_limits
-
-        files.append(plot_limits(outcome, out / "limits.png"))
-    write_json(files[0], outcome | {"files": [str(p) for p in files]})
-    return [str(p) for p in files]
-
-
-def _ladder(args: argparse.Namespace, loops: dict[str, Loop], head: dict[str, Any]) -> int:
-    """Print and write the table of designs."""
-    out, begin = out_folder(args, "ladder"), time.perf_counter()
-    bar, move = progress_bar("designing")
-    with bar:
-        rows, interrupted = climb(loops, LADDERS[args.ladder], move)
-    outcome = head | {"rows": [asdict(row) for row in rows], "wall_s": time.perf_counter() - begin}
-    outcome |= {"interrupted": interrupted, "files": [str(out / "report.json")]}
-    write_json(out / "report.json", outcome)
-    print_ladder(outcome, tuple(loops), console(args))
-    if args.json:
-        write_json(args.json, outcome)
-    return INTERRUPTED if interrupted else DONE
-
 
 MOST = 6  # curves that can be told apart in one panel
 
 
-def main_plot(argv: list[str]) -> int:
-    """Draw couplings over frequency. 0: all of them, 1: some could not be designed."""
-    args = _parser_plot().parse_args(argv)
-    seed = seed_from(args)
-    scenario = scenario_from(args)
-    names = _names(args)
-    out = out_folder(args, "plot")
-    chosen, failed = _chosen(scenario, args, names)
-
-    loop = scenario.loop(args.case)
-    outcome = {"case": args.case, "scenario": scenario.name, "seed": seed} | _data(loop, chosen)
-    outcome["notes"] = [*(f"{name}: {note}" for name, c in chosen.items() for note in c.notes), *failed]
-    outcome["notes"] += _reasons(outcome["couplings"])
-    outcome["files"] = [str(path) for path in _save_plot(args, out, outcome)]
-    screen = console(args)
-    for table in tables(outcome):
-        screen.print(table)
-    for note in outcome["notes"]:
-        screen.print(f"[dim]·[/] {note}")
-    for file in outcome["files"]:
-        screen.print(f"[dim]·[/] {file}", soft_wrap=True)
-    if args.json:
-        write_json(args.json, outcome)
-    return DOES_NOT_HOLD if failed else DONE
+def main(argv: list[str]) -> int:
+    """Compare. 0: done, 1: something could not be designed, 130: interrupted, with what was done until then."""
+    parser = _parser()
+    args = parser.parse_args(argv)
+    scenario = options.scenario_from(args)
+    _check_mode(args, parser)
+    if args.ladder:
+        return _ladder(args, scenario)
+    return _limits(args, scenario) if args.over else _couplings(args, scenario)
 
 
-def _parser_plot() -> Parser:
-    parser = Parser(
-        "design.plot",
-        "Draw couplings over frequency: singular values, required damping, perceived stiffness and damping.",
-        "python -m design.plot --coupling published,spring-damper:theorem4,spring-damper:closed-loop",
+def _parser() -> options.Parser:
+    example = """python -m design.compare --coupling published,spring-damper:any-environment,optimal
+  python -m design.compare --ladder
+  python -m design.compare --over damping=0.7:10,delay --points 5"""
+    what = "Compare couplings over frequency, all designs as a ladder, or the best coupling along an axis of the loop."
+    parser = options.Parser("design.compare", what, example)
+    options.add_loop_options(parser)
+    given = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION asks for a condition"
+    parser.add_argument("--coupling", metavar="NAME,FILE,..", help=f"{given} (default none,spring-damper)")
+    options.add_condition_option(parser, "of designs that name none")
+    short = "every design side by side, cases I and II (full: minutes)"
+    parser.add_argument("--ladder", nargs="?", const="short", choices=tuple(LADDERS), help=short)
+    axes, names = ",".join(AXES), "damping, delay, period, order"
+    over = f"the best coupling along these axes: {names} (default: all of them)"
+    parser.add_argument("--over", nargs="?", const=axes, metavar="NAME[=LOW:HIGH],..", help=over)
+    curve = parser.add_argument_group("with --over")
+    curve.add_argument(
+        "--points", type=options.whole(1, 100), default=6, metavar="N", help="designs of each (default 6)"
     )
-    add_loop_options(parser)
-    what = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION asks for a condition"
-    parser.add_argument("--coupling", metavar="NAME,FILE,..", help=f"{what} (default none,spring-damper)")
-    parser.add_argument("--condition", choices=CONDITIONS, help="the condition of designs that name none")
-    parser.add_argument("--no-plot", action="store_true", help="write no pictures")
-    add_output_options(parser)
+    curve.add_argument("--keep", choices=("samples", "seconds"), default="samples", help="delays, as the period varies")
+    beside = "spring-dampers drawn: none, any-environment, this-environment or both (default both)"
+    curve.add_argument("--beside", type=_beside, default=CONDITIONS, metavar="NAME", help=beside)
+    optimal = parser.add_argument_group("the optimal coupling of --over")
+    add_optimal_options(optimal)
+    optimal.add_argument("--diagonal", action="store_true", help=argparse.SUPPRESS)
+    options.add_output_options(parser, picture=True)
     return parser
+
+
+def _beside(text: str) -> tuple[str, ...]:
+    return {"none": (), "both": CONDITIONS}[text] if text in ("none", "both") else (options.condition(text),)
+
+
+#: options -> the modes that take them
+MODES = {
+    "coupling": ("",),
+    "condition": ("",),
+    "no_plot": ("", "--over"),
+    **dict.fromkeys(("points", "keep", "beside", "objective", "band_hz", "high_gain", "seconds"), ("--over",)),
+    **dict.fromkeys((*RETIRED_WITH_VALUE, "diagonal"), ("--over",)),
+}
+
+
+def _check_mode(args: argparse.Namespace, parser: options.Parser) -> None:
+    """Raises InputError where an option is given that this comparison would have to ignore."""
+    mode = "--ladder" if args.ladder else "--over" if args.over else ""
+    if args.ladder and args.over:
+        raise InputError("--over with --ladder: give one of them")
+    if args.ladder and args.case != parser.get_default("case"):
+        raise InputError(f"--ladder shows both cases: leave out --case {args.case}")
+    if mode and args.case == "none":
+        raise InputError("--case none has no coupling to design: give I or II")
+    for name, modes in MODES.items():
+        if mode not in modes and getattr(args, name) != parser.get_default(name):
+            takes = (
+                f"for --over, not for {mode}"
+                if "--over" in modes and mode
+                else f"not for {mode}"
+                if mode
+                else "for --over"
+            )
+            raise InputError(f"--{name.removesuffix('_hz').replace('_', '-')} is {takes}")
+
+
+# ----------------------------------------------------------------------------------------------------
+# Couplings over frequency.
+
+
+def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
+    names, out = _names(args), options.out_folder(args, "compare")
+    chosen, failed = _chosen(scenario, args, names)
+    loop = scenario.loop(args.case)
+    outcome = {"case": args.case, "scenario": scenario.name, "seed": args.seed} | _data(loop, chosen)
+    outcome["notes"] = [*(f"{name}: {note}" for name, c in chosen.items() for note in c.notes), *failed]
+    outcome["notes"] += _missing_curves(outcome["couplings"])
+    files = _pictures(args, out, outcome)
+    render.publish(args, outcome, [_guarantees(outcome), _feel(outcome)], outcome["notes"], out, files)
+    return options.DOES_NOT_HOLD if failed else options.DONE
 
 
 def _names(args: argparse.Namespace) -> list[str]:
@@ -309,12 +145,9 @@ def _chosen(scenario: Scenario, args: argparse.Namespace, names: list[str]) -> t
     chosen: dict[str, Chosen] = {}
     failures: dict[str, DesignFailed] = {}
     for name in names:
-        plain, _, condition = name.rpartition(":")
-        known = plain and condition in CONDITIONS
-        if plain in NAMES and not known:
-            raise InputError(f"--coupling {name}: the condition is {condition!r}, allowed are {', '.join(CONDITIONS)}")
+        kind, condition = _named(name)
         try:
-            chosen[name] = choose(scenario, args.case, plain if known else name, condition if known else args.condition)
+            chosen[name] = choose(scenario, args.case, kind, condition or args.condition)
         except DesignFailed as error:
             failures[name] = error
     if not chosen:
@@ -322,17 +155,28 @@ def _chosen(scenario: Scenario, args: argparse.Namespace, names: list[str]) -> t
     return chosen, [f"{name}: not possible: {' '.join(str(error).split())}" for name, error in failures.items()]
 
 
+def _named(name: str) -> tuple[str, str | None]:
+    """NAME:CONDITION as both, the condition None where none is named. Raises InputError."""
+    plain, _, words = name.rpartition(":")
+    try:
+        return (plain, options.condition(words)) if plain else (name, None)
+    except argparse.ArgumentTypeError as error:
+        if plain in NAMES:
+            raise InputError(f"--coupling {name}: the condition {error}") from None
+        return name, None  # a file may have a colon in its name
+
+
 def _data(loop: Loop, chosen: dict[str, Chosen]) -> dict[str, Any]:
     """Everything that the pictures show; SI units, null where a figure is infinite or does not exist."""
-    judged = {name: judge(loop, c.coupling, c.phi) for name, c in chosen.items()}
-    hz = grid(loop, list(judged.values()))
-    sigma_E, undelayed = ideal(loop, hz)
-    parts = []
+    judged = {name: compare.judge(loop, c.coupling, c.phi) for name, c in chosen.items()}
+    hz = compare.grid(loop, list(judged.values()))
+    sigma_E, undelayed = compare.ideal(loop, hz)
+    E, parts = environment(loop.environment, loop.T), []
     for name, c in chosen.items():
         at = judged[name]
-        figures = transparency(at.F, environment(loop.environment, loop.T), loop.lam)
-        shown = {"name": Path(name).name, **coupling_part(c.kind, c.coupling, loop.T), "states": at.F.order}
-        parts.append(shown | {"transparency": transparency_part(figures)} | _coupling_data(at, curves(loop, at, hz)))
+        shown = {"name": Path(name).name, **report.coupling_part(c.kind, c.coupling, loop.T), "states": at.F.order}
+        shown["transparency"] = report.transparency_part(transparency(at.F, E, loop.lam))
+        parts.append(shown | _curves(at, compare.curves(loop, at, hz)))
     return {
         "T_s": loop.T,
         "theta": list(loop.theta),
@@ -346,20 +190,20 @@ def _data(loop: Loop, chosen: dict[str, Chosen]) -> dict[str, Any]:
     }
 
 
-def _coupling_data(judged: Judged, lines: Curves_curves) -> dict[str, Any]:
+def _curves(judged: Judged, lines: compare.Curves) -> dict[str, Any]:
     data: dict[str, Any] = {"sigma_F": lines.sigma_F.tolist(), "sigma_M": lines.sigma_M.tolist()}
     data["perceived"] = _perceived(lines.perceived)
-    for name, requirement in judged.requirements.items():
-        demand = lines.demands[name]
-        data[name] = certificate_part(requirement) | {"ratio": finite(requirement.ratio), "demand": _row(demand)}
+    for key, requirement in judged.requirements.items():
+        demand, name = lines.demands[key], CONDITION_NAMES[key]
+        part = certificate_part(requirement) | {"ratio": finite(requirement.ratio), "demand": _row(demand)}
         if demand is None and not requirement.reason:
-            data[name]["reason"] = "this coupling is no V in feedback around the environment: no curve for theorem4"
+            part["reason"] = f"this coupling is no V in feedback around the environment: no curve for {name}"
+        data |= {key: part, name: part}
     return data
 
 
-def _reasons(couplings: list[dict[str, Any]]) -> list[str]:
-    """Why a curve is missing."""
-    parts = [(c["name"], condition, c[condition]) for c in couplings for condition in CONDITIONS]
+def _missing_curves(couplings: list[dict[str, Any]]) -> list[str]:
+    parts = [(c["name"], CONDITION_NAMES[condition], c[condition]) for c in couplings for condition in CONDITIONS]
     return [f"{name}, {condition}: {part['reason']}" for name, condition, part in parts if "reason" in part]
 
 
@@ -371,13 +215,210 @@ def _row(values: Array | None) -> list[float | None] | None:
     return None if values is None else [finite(v) for v in values]
 
 
-def _save_plot(args: argparse.Namespace, out: Path, outcome: dict[str, Any]) -> list[Path]:
-    files = [out / "curves.json"]
-    if not args.no_plot:
-        from sim.plots import plot_perceived, plot_required_damping, plot_singular_values
+def _pictures(args: argparse.Namespace, out: Path, outcome: dict[str, Any]) -> list[Path]:
+    if args.no_plot:
+        return []
+    from sim.plots import plot_perceived, plot_required_damping, plot_singular_values
 
-        files.append(plot_singular_values(outcome, out / "singular-values.png"))
-        files.append(plot_required_damping(outcome, out / "required-damping.png"))
-        files.append(plot_perceived(outcome, out / "perceived.png"))
-    write_json(files[0], outcome | {"files": [str(p) for p in files]})
-    return files
+    return [
+        plot_singular_values(outcome, out / "singular-values.png"),
+        plot_required_damping(outcome, out / "required-damping.png"),
+        plot_perceived(outcome, out / "perceived.png"),
+    ]
+
+
+def _guarantees(outcome: dict[str, Any]) -> Table:
+    """Required damping [N s/m] where all devices have the same, else as a multiple of what each has."""
+    available = outcome["available_damping"]
+    alike = len(set(available)) == 1
+    damping = "required damping" if alike else "required share of the damping"
+    title = f"{damping} of {_list(available)} N s/m · {outcome['scenario']}, case {outcome['case']}"
+    heads = ("coupling", "this-env.", "at Hz", "any-env.", "at Hz", "sup dB", "rms dB")  # render.ORDER
+    rows = []
+    for coupling in outcome["couplings"]:
+        parts = [coupling[condition] for condition in render.ORDER]
+        needs = [(_needs(p, available[0] if alike else 1.0), p["binding_frequency_hz"]) for p in parts]
+        asked = [cell for need, hz in needs for cell in (need, render.optional(hz, "{:.4g}"))]
+        errors = [coupling["transparency"][f"{which}_mismatch_db"] for which in ("relative", "rms")]
+        rows.append([coupling["name"], *asked, *(render.optional(e, "{:.2f}", "-inf") for e in errors)])
+    return render.grid(title, heads, rows)
+
+
+def _needs(part: dict[str, Any], scale: float) -> str:
+    """The worst device's figure, green where it is certified."""
+    if part["ratio"] is None:
+        return "[red]infinite[/]"
+    return f"[{'green' if part['certified'] else 'red'}]{scale * part['ratio']:.5g}[/]"
+
+
+def _feel(outcome: dict[str, Any]) -> Table:
+    columns = [(what, unit, hz) for what, unit in (("stiffness", "N/m"), ("damping", "N s/m")) for hz in FEEL_HZ]
+    heads = ["coupling", *(f"{what}\n{unit}, {hz:g} Hz" for what, unit, hz in columns)]
+    named = {"ideal (E)": outcome["ideal"], **{c["name"]: c["perceived"] for c in outcome["couplings"]}}
+    grid = outcome["frequency_hz"]
+    rows = [
+        [name, *(_list(_at(hz, grid, perceived[what])) for what, _, hz in columns)] for name, perceived in named.items()
+    ]
+    return render.grid("perceived by each device's user, the other devices held still", heads, rows)
+
+
+def _at(hz: float, grid: Sequence[float], values: Sequence[Sequence[float]]) -> list[float]:
+    """Each channel's curve at `hz`, which is in the grid; nan above Nyquist's frequency."""
+    return [float(np.interp(hz, grid, column, right=np.nan)) for column in np.transpose(values)]
+
+
+def _list(values: Iterable[float]) -> str:
+    """'1, 2', or '1' where all would read the same."""
+    shown = [format(v, ".0f" if abs(v) >= 1000 else ".3g") for v in values]
+    return shown[0] if len(set(shown)) == 1 else ", ".join(shown)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Every design as a ladder.
+
+
+def _ladder(args: argparse.Namespace, scenario: Scenario) -> int:
+    out, begin = options.out_folder(args, "compare"), time.perf_counter()
+    loops = {case: scenario.loop(case) for case in ("I", "II")}
+    with render.progress("designing") as move:
+        rows, interrupted = compare.compare_designs(loops, LADDERS[args.ladder], move)
+    outcome: dict[str, Any] = {"scenario": scenario.name, "seed": args.seed, "rows": [asdict(row) for row in rows]}
+    outcome |= {"wall_s": time.perf_counter() - begin, "interrupted": interrupted}
+    heads = ("design", "needs N s/m", "sup dB", "rms dB", "proof", "s")
+    shown = []
+    for case in loops:
+        cells = [_rung(row) for row in outcome["rows"] if row["case"] == case]
+        shown.append(render.grid(f"the ladder · {scenario.name}, case {case}", heads, cells, left=(0, 4)))
+    lines = [f"{row['design']}, case {row['case']}: {row['reason']}" for row in outcome["rows"] if row["reason"]]
+    render.publish(args, outcome, shown, [*lines, f"{outcome['wall_s']:.1f} s"], out)
+    return options.INTERRUPTED if interrupted else options.DONE
+
+
+def _rung(row: dict[str, Any]) -> tuple[str, ...]:
+    need = "inf" if row["required_damping"] is None else f"{max(row['required_damping']):.4f}"
+    need += "" if row["certified"] else " (no)"
+    errors = [render.optional(row[f"{which}_mismatch_db"], "{:.2f}", "exact") for which in ("relative", "rms")]
+    if row["required_damping"] is None:
+        need, errors = ("-", ["-", "-"]) if row["reason"] else ("-", ["-", errors[1]])
+    return row["design"], need, *errors, row["proof"] or "-", f"{row['wall_s']:.2f}"
+
+
+# ----------------------------------------------------------------------------------------------------
+# The limits of any coupling along an axis.
+
+
+def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
+    wish, loop = _wish(args), scenario.loop(args.case)
+    if min(loop.delta) <= 0:
+        raise InputError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
+    plan, out = _plan(args, loop, wish), options.out_folder(args, "compare")
+    designers = {"optimal": compare.remembered(optimum, True)}
+    designers |= {name: compare.remembered(compare.spring_damper(name), False) for name in args.beside}
+    begin = time.perf_counter()
+    curves, interrupted = _designed(plan, designers)
+    outcome: dict[str, Any] = {"scenario": scenario.name, "seed": args.seed, "case": args.case}
+    outcome |= {"objective": wish.objective, "delays_kept_in": args.keep, "wish": asdict(wish)}
+    outcome |= {
+        "here": {"delta": list(loop.delta), "theta": list(loop.theta), "psi": list(loop.psi), "T_s": loop.T},
+        "sweeps": {name: _sweep(name, plan[name], rows) for name, rows in curves.items()},
+        "gains": compare.gains(plan, curves, loop, wish),
+        "wall_s": time.perf_counter() - begin,
+        "interrupted": interrupted,
+    }
+    points = [(name, row) for name, sweep in outcome["sweeps"].items() for row in sweep["optimal"]]
+    files = []
+    if not args.no_plot and points:
+        from sim.plots import plot_limits
+
+        files.append(plot_limits(outcome, out / "limits.png"))
+    names = " and by ".join(CONDITION_NAMES[name] for name in args.beside)
+    lines = [f"beside the optimum: the designed spring-damper by {names}"] if names else []
+    lines += [f"{name} {row['value']:.4g}: {row['reason']}" for name, row in points if row["reason"]]
+    tables = [_limit_table(outcome, name, args.beside) for name in outcome["sweeps"]]
+    lines += [*outcome["gains"], *optimal_options(args)[1], f"{outcome['wall_s']:.1f} s"]
+    render.publish(args, outcome, tables, lines, out, files)
+    if interrupted:
+        return options.INTERRUPTED
+    found = any(row["rms_mismatch_db"] is not None for _, row in points)
+    return options.DONE if found else options.DOES_NOT_HOLD
+
+
+def _wish(args: argparse.Namespace) -> Options:
+    try:
+        return Options(**optimal_options(args)[0])
+    except ValueError as error:
+        raise InputError(options.as_option(error, args)) from None
+
+
+def _plan(args: argparse.Namespace, loop: Loop, wish: Options) -> dict[str, list[Setting]]:
+    """The settings of every sweep that is asked for. Raises InputError."""
+    plan = {}
+    for part in args.over.split(","):
+        name, _, text = part.partition("=")
+        if name not in AXES:
+            raise InputError(f"--over has {name!r}, allowed are {', '.join(AXES)}")
+        try:
+            plan[name] = settings(name, loop, wish, args.points, _span(name, text) if text else None, args.keep)
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(f"--over {part}: {error}") from None
+    return plan
+
+
+def _span(name: str, text: str) -> tuple[float, float]:
+    low, colon, high = text.partition(":")
+    if not colon:
+        raise InputError(f"--over {name}={text}: expected LOW:HIGH in {AXES[name].unit}")
+    return options.numbers(f"--over {name}", low, float, 1)[0], options.numbers(f"--over {name}", high, float, 1)[0]
+
+
+def _designed(
+    plan: dict[str, list[Setting]], designers: dict[str, compare.Designer]
+) -> tuple[dict[str, dict[str, list[Limit]]], bool]:
+    """Every design at every setting; what is done when the keyboard interrupts is kept."""
+    curves: dict[str, dict[str, list[Limit]]] = {name: {kind: [] for kind in designers} for name in plan}
+    jobs = [(name, setting, kind) for name, along in plan.items() for setting in along for kind in designers]
+    with render.progress("designing") as move:
+        try:
+            for done, (name, setting, kind) in enumerate(jobs):
+                move(done, len(jobs))
+                curves[name][kind].append(designers[kind](setting))
+        except KeyboardInterrupt:
+            return {name: rows for name, rows in curves.items() if any(rows.values())}, True
+    return curves, False
+
+
+def _sweep(name: str, along: Sequence[Setting], rows: dict[str, list[Limit]]) -> dict[str, Any]:
+    axis = AXES[name]
+    points = {kind: [asdict(limit) for limit in limits] for kind, limits in rows.items()}
+    return {"label": axis.label, "unit": axis.unit, "values": [s.value for s in along]} | points
+
+
+def _limit_table(outcome: dict[str, Any], name: str, beside: Sequence[str]) -> Table:
+    sweep, designs = outcome["sweeps"][name], ("optimal", *beside)
+    rows = []
+    for i, row in enumerate(sweep["optimal"]):
+        limits = {design: sweep[design][i] if i < len(sweep[design]) else None for design in designs}
+        errors = [_error(limit, outcome["objective"]) for limit in limits.values()]
+        theta = ",".join(map(str, row["theta"]))
+        rows.append((f"{row['value']:.4g}", theta, *errors, _proofs(limits), f"{row['wall_s']:.1f}"))
+    title = f"{outcome['objective']} transparency error over {name} · {outcome['scenario']}, case {outcome['case']}"
+    heads = (sweep["unit"], "theta", "optimal", *(CONDITION_NAMES[name] for name in beside), "proof", "seconds")
+    return render.grid(title, heads, rows, left=(1,))
+
+
+def _error(limit: dict[str, Any] | None, objective: str) -> str:
+    if limit is None:
+        return ""
+    value = limit["rms_mismatch_db" if objective == "rms" else "relative_mismatch_db"]
+    return "infeasible" if value is None else compare.printed_decibels(value)
+
+
+def _proofs(limits: dict[str, dict[str, Any] | None]) -> str:
+    """Rational where every design of a row is proved exactly, else which are only sampled."""
+    found = {name: limit["proof"] for name, limit in limits.items() if limit and limit["proof"]}
+    sampled = [CONDITION_NAMES.get(name, name) for name, proof in found.items() if proof != "rational"]
+    if not found:
+        return "-"
+    return f"sampled: {', '.join(sampled)}" if sampled else "rational"

@@ -7,36 +7,22 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from rich.table import Table
 
-from cli.options import (
-    DOES_NOT_HOLD,
-    DONE,
-    Parser,
-    add_loop_options,
-    add_output_options,
-    as_option,
-    check_json,
-    console,
-    numbers,
-    progress_bar,
-    ranges,
-    scenario_from,
-    seed_from,
-)
-from cli.run import coupling_part, transparency_part
-from controller.coupling import Coupling
+from cli import options, render
 from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY
+from design.bound import bound
 from design.certificate import (
     ANY,
-    CONDITIONS,
     HERE,
     Certificate,
     NotProved,
     Stored,
     assess,
-    certificate_part,
+    digest,
+    finite,
     promise_of,
     prove,
     save,
@@ -44,86 +30,15 @@ from design.certificate import (
     switching_promise,
     switching_requirement,
 )
-from design.designs import KINDS, compare_methods, design_by_kind
-from design.optimal import FILTERS, OBJECTIVES
+from design.designs import KINDS, NO_LONGER, compare_methods, design_by_kind
+from design.optimal import OBJECTIVES, Optimal, box_around, robustness
 from design.ranges import SAMPLES, SetCheck, check_set, cost_part, price, set_part, set_rows
-from design.result import METHODS, Design, DesignFailed, listed
+from design.result import CONDITION_NAMES, METHODS, Design, DesignFailed, listed
 from design.spring_damper import STIFFEST
-from design.transparency import transparency
-from sim.files import out_file, write_json
-from sim.scenario import InputError, Scenario
-
-# ----------------------------------------------------------------------------------------------------
-# What a design came to, as tables; python -m design prints them.
-
-
-def tables(outcome: dict[str, Any]) -> list[Table]:
-    """The design itself, the price of a set where it has one, the methods where they were compared."""
-    shown = [_table(outcome)]
-    if outcome["price"]:
-        shown.append(_costs(outcome["price"]))
-    if "comparison" in outcome:
-        shown.append(_comparison(outcome["comparison"]))
-    return shown
-
-
-def _table(outcome: dict[str, Any]) -> Table:
-    coupling, certificate, transparent = outcome["coupling"], outcome["certificate"], outcome["transparency"]
-    table = Table(title=f"{coupling['kind']}, case {outcome['case']}, {certificate['condition']}", show_header=False)
-    if coupling["K"]:
-        table.add_row("K [N/m]", listed(coupling["K"]))
-        if max(coupling["K"]) > 0.999 * STIFFEST:
-            table.add_row("", f"{STIFFEST:g} N/m is where the search ends, no optimum of its own")
-        table.add_row("B [N s/m]", listed(coupling["B"]))
-    for part in outcome["certificates"].values():
-        word = "certified" if part["certified"] else "not certified"
-        required = listed(part["required_damping"])
-        available = listed(part["available_damping"])
-        table.add_row(f"damping, {part['condition']}", f"needs {required} of {available} N s/m: {word}")
-    if part := outcome["jitter_proof"]:
-        word = "certified" if part["certified"] else "not certified"
-        span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))
-        needs = f"needs {listed(part['required_damping'])}: {word} (proof: {part['proof']})"
-        table.add_row("damping, any switching", f"{span} samples: {needs}")
-    for row in set_rows(outcome["set"]) if outcome["set"] else []:
-        table.add_row(*row)
-    stored = outcome["stored"]
-    table.add_row("promise", outcome["promise"] or "none")
-    if stored["switching"] and stored["switching"]["proof"]:
-        table.add_row("promise, delays", stored["switching"]["promise"])
-    table.add_row(outcome["objective_name"], f"{outcome['objective']:.5g}")
-    sup, rms = transparent["relative_mismatch_db"], transparent["rms_mismatch_db"]
-    table.add_row("mismatch", "none" if sup is None or rms is None else f"{sup:.2f} dB (rms {rms:.2f} dB)")
-    table.add_row("convex problems", f"{outcome['sdps']} in {outcome['wall_s']:.2f} s")
-    table.add_row("stored", f"{stored['file']} (proof: {stored['proof'] or stored['reason']})")
-    if stored["switching"] and not stored["switching"]["proof"]:
-        table.add_row("", f"for constant delays only: {stored['switching']['reason']}")
-    return table
-
-
-def _comparison(rows: list[dict[str, Any]]) -> Table:
-    table = Table("method", "||W1 L W2||", "SDPs", "seconds", title="one state per channel, diagonal")
-    for row in rows:
-        norm = "-" if row["norm"] is None else f"{row['norm']:.4g}"
-        table.add_row(row["method"], norm, str(row["sdps"]), f"{row['wall_s']:.1f}")
-    return table
-
-
-def _costs(rows: list[dict[str, Any]]) -> Table:
-    """Each figure in the nominal environment, and the worst of the set."""
-    title = "in the nominal environment / at the worst vertex"
-    table = Table(
-        "coupling", "needs of its damping", "vertices violated", "rms mismatch", "relative mismatch", title=title
-    )
-    for row in rows:
-        pairs = [row[name] for name in ("required_over_available", "rms_mismatch_db", "relative_mismatch_db")]
-        needs, rms, sup = (
-            ["-" if v is None else f"{v:.{4 - 2 * (n > 0)}f}" for v in p.values()] for n, p in enumerate(pairs)
-        )
-        table.add_row(
-            row["coupling"], " / ".join(needs), str(row["violated"]), f"{' / '.join(rms)} dB", f"{' / '.join(sup)} dB"
-        )
-    return table
+from design.transparency import BAND_HZ, transparency
+from sim import report
+from sim.files import out_file
+from sim.scenario import InputError
 
 
 def main(argv: list[str]) -> int:
@@ -131,77 +46,107 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
-    check_json(args)
+    options.check_json(args)
     out = out_file(args.out, f"out/design-{args.case}.json", "the file of the coupling")
-    loop = _loop(args, scenario_from(args))
-    options = _options(args) | _switching(args, loop)
-    if args.coupling == "optimal" and loop.environment.walls:
-        raise InputError("environment.walls: an optimal coupling holds a linear model, so it cannot face walls")
-    seed, samples = seed_from(args), _samples(args)
-    try:
-        with (bar := progress_bar("designing"))[0]:
-            design = design_by_kind(
-                loop, args.coupling, args.condition, lambda what, done, total: bar[1](done, total, what), **options
-            )
-    except DesignFailed:
-        raise
-    except ValueError as error:
-        raise InputError(as_option(error, args)) from None
-    F = loop.F(design.coupling)
-    requirements = assess(loop, design.coupling, design.phi)
-    with (bar := progress_bar("searching the box"))[0]:
-        whole = check_set(loop, design.coupling, seed, samples, bar[1])
+    loop = _loop(args)
+    design = _design(args, loop)
+    best = design if isinstance(design, Optimal) else None
+    held = best and best.certificate
+    requirements = assess(loop, design.coupling, design.phi, held)
+    with render.progress("searching the ranges") as move:
+        whole = check_set(loop, design.coupling, args.seed, args.samples, move, best and best.searched, held)
+    certificates = report.certificates_part(requirements)
     outcome = {
         "case": args.case,
-        "seed": seed,
-        "coupling": coupling_part(args.coupling, design.coupling, loop.T),
-        "certificate": certificate_part(requirements[design.condition]),
-        "certificates": {name: certificate_part(r) for name, r in requirements.items()},
+        "seed": args.seed,
+        "coupling": report.coupling_part(args.coupling, design.coupling, loop.T),
+        "certificate": certificates[design.condition],
+        "certificates": certificates,
         "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
         "set": whole and set_part(whole),
-        "price": _price(args, loop, design, options) if whole else None,
-        "transparency": transparency_part(transparency(F, loop.E(), loop.lam)),
+        "price": _robustness_loss(args, loop, design) if whole else None,
+        "transparency": report.transparency_part(transparency(loop.F(design.coupling), loop.E(), loop.lam)),
         "objective": design.objective,
         "objective_name": design.figure,
         "sdps": design.sdps,
         "wall_s": design.wall_s,
         "stored": _store(loop, design, whole, out),
-        "jitter_proof": _switching_figures(loop, design.coupling),
+        "jitter_proof": _switching_figures(loop, design),
     }
+    if best:
+        outcome |= _best_figures(args, loop, best)
     if args.compare:
         outcome["comparison"] = [asdict(row) for row in compare_methods(loop)]
-    for table in tables(outcome):
-        console(args).print(table)
-    if args.json:
-        write_json(args.json, outcome)
+    render.publish(args, outcome, _tables(outcome), outcome.get("notes", ()))
     holds = outcome["certificate"]["certified"] and (outcome["promise"] == ANY or not whole or whole.proved)
-    proof = outcome["jitter_proof"]
-    return DONE if holds and (proof is None or proof["certified"]) else DOES_NOT_HOLD
+    switching = outcome["jitter_proof"]
+    return options.DONE if holds and (switching is None or switching["certified"]) else options.DOES_NOT_HOLD
 
 
-def _parser() -> Parser:
+def _parser() -> options.Parser:
     example = "python -m design --case I --coupling spring-damper --out coupling.json"
-    parser = Parser("design", "Design a coupling, prove its certificate and store both.", example)
-    add_loop_options(parser)
+    parser = options.Parser("design", "Design a coupling, prove its certificate and store both.", example)
+    options.add_loop_options(parser)
     parser.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
-    parser.add_argument("--condition", choices=CONDITIONS, help="what to certify (default: the coupling's own)")
-    jitter = "safe under any switching of the forces' delays in this range too [samples]; for closed-loop designs"
-    parser.add_argument("--jitter", metavar="LO,HI", help=jitter)
+    best = "the coupling of the least transparency error: --coupling optimal"
+    parser.add_argument("--best", dest="coupling", action="store_const", const="optimal", help=best)
+    around = (
+        "certify for every stiffness and mass this much more or less, as [box] of a scenario does"
+    )
+    parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
+    options.add_condition_option(parser, "what to certify")
+    jitter = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"
+    parser.add_argument("--jitter", type=options.delay_ranges, metavar="LO,HI", help=jitter)
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
-    ccl.add_argument("--order", metavar="N", help="states per channel (default 1)")
+    ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
     ccl.add_argument("--method", choices=METHODS, help="complementarity is as printed (default inner)")
     ccl.add_argument("--compare", action="store_true", help="run every method, one state per channel (a minute)")
-    optimal = parser.add_argument_group("optimal: the best Q in the pair with a model of the environment")
-    optimal.add_argument("--functions", metavar="N", help="basis functions of each entry of Q (default 8)")
-    optimal.add_argument("--filter", choices=FILTERS, help="poles of the basis (default auto: by delays and functions)")
-    optimal.add_argument("--objective", choices=OBJECTIVES, help="which mismatch is minimised (default rms)")
-    optimal.add_argument("--high-gain", metavar="G", help="limit of |F|/|E| above 100 Hz, or none (default 1.5)")
-    optimal.add_argument("--margin", metavar="SHARE", help="of the damping that stays unused (default 0.005)")
-    parser.add_argument("--samples", metavar="N", help=f"random points in a box, beside the search (default {SAMPLES})")
-    both = parser.add_argument_group("ccl and optimal")
-    both.add_argument("--full", action="store_true", help="across channels (default: diagonal)")
-    add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case>.json)")
+    optimal = parser.add_argument_group("optimal: the best filter of the environment's forces")
+    add_optimal_options(optimal)
+    samples = f"random points in the ranges, beside the search (default {SAMPLES})"
+    parser.add_argument("--samples", type=options.whole(0, 10_000), default=SAMPLES, metavar="N", help=samples)
+    ccl.add_argument("--full", action="store_true", help="across channels (default: diagonal)")
+    options.add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case>.json)")
     return parser
+
+
+def add_optimal_options(group: argparse._ActionsContainer) -> None:
+    """What is asked of an optimal coupling; options that are not given are None."""
+    error = "which transparency error is minimised (default rms)"
+    group.add_argument("--objective", choices=OBJECTIVES, help=error)
+    band = "frequencies where it counts [Hz] (default 0.5,80)"
+    group.add_argument("--band", dest="band_hz", type=options.pair, metavar="LOW,HIGH", help=band)
+    gain = "limit of |F|/|E| above 100 Hz (default none: the force there is kept low, not limited)"
+    group.add_argument("--high-gain", type=_number_or_none, metavar="G", help=gain)
+    limit = "begin no larger basis after this time [s] (default 60)"
+    group.add_argument("--seconds", type=options.number(0), metavar="S", help=limit)
+    for name in RETIRED_WITH_VALUE:
+        group.add_argument(f"--{name}", help=argparse.SUPPRESS)
+
+
+RETIRED_WITH_VALUE = ("functions", "filter", "margin")
+
+
+def optimal_options(args: argparse.Namespace) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """What is asked of an optimal coupling, and a note where an option is given that it no longer has."""
+    given = {name: getattr(args, name) for name in ("objective", "band_hz", "high_gain", "seconds")}
+    given = {name: value for name, value in given.items() if value is not None}
+    if given.get("high_gain") == "none":
+        given.pop("high_gain")
+    retired = [f"--{name}" for name in (*RETIRED_WITH_VALUE, "full", "diagonal") if getattr(args, name, None)]
+    return given, (NO_LONGER.format(", ".join(retired)),) if retired else ()
+
+
+def _percent(text: str) -> float:
+    return options.number(0.1, 90.0, "%")(text.removesuffix("%"))
+
+
+def _number_or_none(text: str) -> float | str:
+    return text if text == "none" else options.number()(text)
+
+
+# ----------------------------------------------------------------------------------------------------
+# The request.
 
 
 #: options of a design -> the couplings that take them
@@ -210,54 +155,40 @@ OPTIONS = {
     "method": ("ccl",),
     "compare": ("ccl",),
     "full": ("ccl", "optimal"),
-    "functions": ("optimal",),
-    "filter": ("optimal",),
     "objective": ("optimal",),
+    "band_hz": ("optimal",),
     "high_gain": ("optimal",),
-    "margin": ("optimal",),
+    "seconds": ("optimal",),
+    **dict.fromkeys(RETIRED_WITH_VALUE, ("optimal",)),
 }
 
 
-def _options(args: argparse.Namespace) -> dict[str, Any]:
-    """The options of the design's own function. Raises InputError where they are for another coupling."""
-    given = {name: getattr(args, name) for name in OPTIONS if getattr(args, name) not in (None, False)}
-    for name in given:
-        if args.coupling not in OPTIONS[name]:
-            allowed = " or ".join(OPTIONS[name])
-            raise InputError(f"--{name.replace('_', '-')} is for --coupling {allowed}, not {args.coupling}")
-    given.pop("compare", None)
-    for name in ("order", "functions"):
-        if name in given:
-            (given[name],) = numbers(f"--{name}", given[name], int, 1)
-    if not 1 <= given.get("order", 1) <= 10:
-        raise InputError(f"--order is {given['order']}, allowed are 1 to 10")
-    if given.get("high_gain") == "none":
-        given["high_gain"] = None
-    elif "high_gain" in given:
-        (given["high_gain"],) = numbers("--high-gain", given["high_gain"], float, 1)
-    if "margin" in given:
-        (given["margin"],) = numbers("--margin", given["margin"], float, 1)
-    if given.pop("full", False):
-        given["diagonal"] = False
-    return given
-
-
-def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
+def _loop(args: argparse.Namespace) -> Loop:
     """The scenario's loop with the range of delays that --jitter gives. Raises InputError."""
-    loop = scenario.loop(args.case)
-    if args.jitter is None:
-        return loop
-    if not _for_switching(args):
-        raise InputError("--jitter is for --coupling optimal, or spring-damper with --condition closed-loop")
-    if loop.box:
-        raise InputError("--jitter and [box]: switching delays are judged in one environment; give one of them")
-    lo, hi = ranges("--jitter", args.jitter, len(loop.theta))
-    if any(not 0 <= a <= b <= LONGEST_DELAY for a, b in zip(lo, hi, strict=True)):
-        raise InputError(f"--jitter is {args.jitter!r}, expected 0 <= LO <= HI <= {LONGEST_DELAY} samples")
-    try:
-        return loop.switching(DelayRange(lo, hi))
-    except ValueError as error:
-        raise InputError(f"--jitter is {args.jitter!r}: {error}") from None
+    loop = options.scenario_from(args).loop(args.case)
+    if args.ranges is not None:
+        if loop.box or loop.environment.walls:
+            raise InputError(f"--ranges and {'[box]' if loop.box else 'environment.walls'}: give one of them")
+        try:
+            loop = msgspec.structs.replace(loop, box=box_around(loop.environment, args.ranges))
+        except ValueError as error:
+            raise InputError(f"--ranges {args.ranges:g}: {error}") from None
+    if args.jitter is not None:
+        if not _for_switching(args):
+            raise InputError("--jitter is for --coupling optimal, or spring-damper with --condition this-environment")
+        if loop.box:
+            raise InputError("--jitter and [box]: switching delays are judged in one environment; give one of them")
+        lo, hi = options.ranges_per_channel("--jitter", args.jitter, len(loop.theta))
+        asked = ",".join(f"{a}-{b}" for a, b in args.jitter)
+        if any(not 0 <= a <= b <= LONGEST_DELAY for a, b in zip(lo, hi, strict=True)):
+            raise InputError(f"--jitter is {asked}, expected 0 <= LO <= HI <= {LONGEST_DELAY} samples")
+        try:
+            loop = loop.switching(DelayRange(lo, hi))
+        except ValueError as error:
+            raise InputError(f"--jitter is {asked}: {error}") from None
+    if args.coupling == "optimal" and loop.environment.walls:
+        raise InputError("environment.walls: an optimal coupling holds a linear model, so it cannot face walls")
+    return loop
 
 
 def _for_switching(args: argparse.Namespace) -> bool:
@@ -266,32 +197,82 @@ def _for_switching(args: argparse.Namespace) -> bool:
     return args.coupling in ("spring-damper", "optimal") and condition == "closed-loop"
 
 
-def _switching(args: argparse.Namespace, loop: Loop) -> dict[str, Any]:
-    """The range of delays that a design must bear, as an option of the design's own function."""
-    return {"switching": (loop.jitter.lo, loop.jitter.hi)} if loop.jitter and _for_switching(args) else {}
+def _asked(args: argparse.Namespace) -> dict[str, Any]:
+    """The arguments of the design's own function. Raises InputError for options of another coupling."""
+    given = {name: getattr(args, name) for name in OPTIONS}
+    given = {name: value for name, value in given.items() if value is not None and value is not False}
+    for name in given:
+        if args.coupling not in OPTIONS[name]:
+            allowed = " or ".join(OPTIONS[name])
+            shown = name.removesuffix("_hz").replace("_", "-")
+            raise InputError(f"--{shown} is for --coupling {allowed}, not {args.coupling}")
+    if args.coupling == "optimal":
+        return optimal_options(args)[0]
+    given.pop("compare", None)
+    if given.pop("full", False):
+        given["diagonal"] = False
+    return given
 
 
-def _switching_figures(loop: Loop, coupling: Coupling) -> dict[str, Any] | None:
+def _design(args: argparse.Namespace, loop: Loop) -> Design:
+    """Raises InputError for a request that contradicts itself, DesignFailed where there is no such coupling."""
+    asked = _asked(args)
+    if loop.jitter and _for_switching(args):
+        asked["switching"] = (loop.jitter.lo, loop.jitter.hi)
+    try:
+        with render.progress("designing") as move:
+            return design_by_kind(loop, args.coupling, args.condition, lambda what, n, of: move(n, of, what), **asked)
+    except DesignFailed:
+        raise
+    except ValueError as error:
+        raise InputError(options.as_option(error, args)) from None
+
+
+# ----------------------------------------------------------------------------------------------------
+# What was designed: its figures, its file.
+
+
+MOST_FOR_A_BOUND = 2  # devices: for more the bound takes minutes
+
+
+def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[str, Any]:
+    """What an optimal coupling is reported with: how it was found, and how it stands to what is possible."""
+    there = robustness(loop, best.coupling)
+    limit: dict[str, Any] = {"rms_mismatch_db": None}
+    if loop.channels > MOST_FOR_A_BOUND:
+        limit["reason"] = f"worked out for up to {MOST_FOR_A_BOUND} devices"
+    elif best.objective == 0:
+        limit["reason"] = "the mismatch is zero: there is nothing to bound"
+    else:
+        limit["rms_mismatch_db"] = bound(loop, args.band_hz or BAND_HZ).rms_db
+    return {
+        "bound": limit,
+        "robustness": {
+            "percent": there.percent,
+            "required_over_available": finite(there.worst),
+            "where": there.where,
+            "certified": there.kept,
+        },
+        "rendered_stiffness": finite(best.g),
+        "ladder": [asdict(rung) for rung in best.ladder],
+        "notes": list(optimal_options(args)[1]),
+    }
+
+
+def _switching_figures(loop: Loop, design: Design) -> dict[str, Any] | None:
     """What any switching asks of the designed coupling, from the coupling alone."""
     if loop.jitter is None:
         return None
-    return switching_part(switching_requirement(loop, coupling), loop.sent(coupling), loop.jitter)
+    return switching_part(switching_requirement(loop, design.coupling), loop.sent(design.coupling), loop.jitter)
 
 
-def _samples(args: argparse.Namespace) -> int:
-    (samples,) = numbers("--samples", args.samples or str(SAMPLES), int, 1)
-    if not 0 <= samples <= 10_000:
-        raise InputError(f"--samples is {samples}, allowed are 0 to 10000")
-    return samples
-
-
-def _price(args: argparse.Namespace, loop: Loop, design: Design, options: dict[str, Any]) -> list[dict[str, Any]]:
-    """The coupling over the box; an optimal one beside the one for the nominal environment alone."""
+def _robustness_loss(args: argparse.Namespace, loop: Loop, design: Design) -> list[dict[str, Any]]:
+    """The coupling over the ranges; an optimal one beside the one for the nominal environment alone."""
     couplings = {args.coupling: design.coupling}
     if args.coupling == "optimal":
         couplings = {"whole set": design.coupling}
         try:
-            alone = design_by_kind(loop.at(loop.environment), "optimal", None, **options)
+            alone = design_by_kind(loop.at(loop.environment), "optimal", None, **_asked(args))
             couplings = {"nominal only": alone.coupling, **couplings}
         except DesignFailed:  # the set is given another basis by default
             pass
@@ -326,8 +307,87 @@ def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path) -> dic
 
 def _proved(loop: Loop, design: Design) -> tuple[Certificate | None, str | None]:
     """The certificate of all that the loop claims, or why there is none."""
+    held = design.certificate if isinstance(design, Optimal) else None
+    if held and held.scenario == digest(loop, design.coupling.form()):
+        return held, None
     try:
         phi = None if design.phi is None else design.phi.tolist()
         return prove(loop, design.coupling, design.condition, phi), None
     except NotProved as error:
         return None, str(error)
+
+
+# ----------------------------------------------------------------------------------------------------
+# The report as tables.
+
+
+def _tables(outcome: dict[str, Any]) -> list[Table]:
+    condition = CONDITION_NAMES[outcome["certificate"]["condition"]]
+    title = f"{outcome['coupling']['kind']}, case {outcome['case']}, {condition}"
+    shown = [render.facts(title, _rows(outcome))]
+    if outcome["price"]:
+        shown.append(_over_the_ranges(outcome["price"]))
+    if "comparison" in outcome:
+        rows = [
+            (row["method"], render.optional(row["norm"], "{:.4g}"), str(row["sdps"]), f"{row['wall_s']:.1f}")
+            for row in outcome["comparison"]
+        ]
+        heads = ("method", "||W1 L W2||", "SDPs", "seconds")
+        shown.append(render.grid("one state per channel, diagonal", heads, rows, left=range(4)))
+    return shown
+
+
+def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
+    coupling, stored, transparent = outcome["coupling"], outcome["stored"], outcome["transparency"]
+    switching, proof = stored["switching"] or {}, outcome["jitter_proof"]
+    end = f"{STIFFEST:g} N/m is where the search ends, no optimum of its own"
+    return [
+        ("K [N/m]", coupling["K"] and listed(coupling["K"])),
+        ("", end if max(coupling["K"] or [0]) > 0.999 * STIFFEST else None),
+        ("B [N s/m]", coupling["K"] and listed(coupling["B"])),
+        *render.certificate_rows(outcome["certificates"], proof=False),
+        ("damping, any switching", proof and _switching_words(proof)),
+        *(set_rows(outcome["set"]) if outcome["set"] else []),
+        ("guarantee", outcome["promise"] or "none"),
+        ("guarantee, delays", switching["promise"] if switching.get("proof") else None),
+        (outcome["objective_name"], f"{outcome['objective']:.5g}"),
+        ("transparency error", render.transparency_error(transparent)),
+        *_best_rows(outcome),
+        ("convex problems", f"{outcome['sdps']} in {outcome['wall_s']:.2f} s"),
+        ("stored", f"{stored['file']} (proof: {stored['proof'] or stored['reason']})"),
+        ("", f"for constant delays only: {switching['reason']}" if switching and not switching["proof"] else None),
+    ]
+
+
+def _best_rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
+    """What only an optimal coupling has."""
+    if "bound" not in outcome:
+        return []
+    limit, there = outcome["bound"], outcome["robustness"]
+    words = limit.get("reason") or f"no linear coupling can be better than {limit['rms_mismatch_db']:.2f} dB rms"
+    need = render.optional(there["required_over_available"], "{:.2f}", "infinite")
+    climbed = ", ".join(f"{rung['mismatch_db']:.2f}" for rung in outcome["ladder"])
+    return [
+        ("bound", words),
+        ("rendered stiffness", render.optional(outcome["rendered_stiffness"], "{:.3f} of the environment's")),
+        ("robustness", f"{need} of the damping is needed at {there['where']}, the worst within {there['percent']:g} %"),
+        ("ladder [dB]", climbed or None),
+    ]
+
+
+def _switching_words(proof: dict[str, Any]) -> str:
+    span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(proof["lo"], proof["hi"], strict=True))
+    word = "certified" if proof["certified"] else "not certified"
+    return f"{span} samples: needs {listed(proof['required_damping'])}: {word} (proof: {proof['proof']})"
+
+
+def _over_the_ranges(rows: list[dict[str, Any]]) -> Table:
+    """Each figure in the nominal environment, and the worst of the ranges."""
+    names = ("required_over_available", "rms_mismatch_db", "relative_mismatch_db")
+    cells = []
+    for row in rows:
+        forms = zip(names, ("{:.4f}", "{:.2f}", "{:.2f}"), strict=True)
+        needs, rms, sup = (" / ".join(render.optional(v, form) for v in row[name].values()) for name, form in forms)
+        cells.append((row["coupling"], needs, str(row["violated"]), f"{rms} dB", f"{sup} dB"))
+    heads = ("coupling", "needs of its damping", "vertices violated", "rms error", "largest error")
+    return render.grid("in the nominal environment / at the worst vertex", heads, cells, left=range(5))

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from rich.table import Table
 
-from cli.options import DOES_NOT_HOLD, DONE, Parser, add_output_options, check_json, console, seed_from
+from cli import options, render
 from controller.coupling import SpringDamperForm
 from design.certificate import HERE, SET, Stored, Verdict, switching_promise, verify
 from design.export import (
@@ -27,9 +26,9 @@ from design.export import (
     process_block,
     trial,
 )
-from design.result import listed
+from design.result import CONDITION_NAMES, listed
 from sim.couplings import read_coupling
-from sim.files import out_file, write, write_json
+from sim.files import out_file, write
 from sim.scenario import InputError
 
 SUFFIX = {"c": ".c", "json": ".json", "npz": ".npz", "control": ".py"}
@@ -38,15 +37,14 @@ SUFFIX = {"c": ".c", "json": ".json", "npz": ".npz", "control": ".py"}
 def main(argv: list[str]) -> int:
     """Export a stored coupling. 0: written, 1: written, but the certificate in its file does not hold."""
     args = _parser().parse_args(argv)
-    seed = seed_from(args)
-    check_json(args)
+    options.check_json(args)
     if args.without_theta and not args.process:
         raise InputError("--without-theta without --process: a coupling alone has no delay")
     stored = read_coupling(args.coupling)
     verdict = _verdict(stored)
     block = _block(args, stored, verdict)
     path = _destination(args, block)
-    test = trial(block, seed)
+    test = trial(block, args.seed)
     write(path, _content(args.format, block, test, path.name))
 
     outcome = {
@@ -57,16 +55,15 @@ def main(argv: list[str]) -> int:
         "states": block.system.order,
         "T_s": block.system.T,
         "certificate": {"proved": verdict.proved, "reason": verdict.reason},
-        "test": {"ticks": len(test.inputs), "seed": seed, "largest_output": float(np.abs(test.outputs).max())},
+        "test": {"ticks": len(test.inputs), "seed": args.seed, "largest_output": float(np.abs(test.outputs).max())},
     }
-    console(args).print(_table(outcome))
-    if args.json:
-        write_json(args.json, outcome)
-    return DOES_NOT_HOLD if stored.certificate and not verdict.proved else DONE
+    title = f"{outcome['what']} as {outcome['format']}"
+    render.publish(args, outcome, [render.facts(title, _rows(outcome), left=True)])
+    return options.DOES_NOT_HOLD if stored.certificate and not verdict.proved else options.DONE
 
 
-def _parser() -> Parser:
-    parser = Parser(
+def _parser() -> options.Parser:
+    parser = options.Parser(
         "design.export",
         "Write a stored coupling, or its whole discrete process, as C99, plain data or a python-control block.",
         "python -m design.export coupling.json --process --format c",
@@ -76,7 +73,7 @@ def _parser() -> Parser:
     parser.add_argument("--process", action="store_true", help="coupling, environment and delays as one block (6)")
     link = "leave out Theta, where the link to the devices is that delay"
     parser.add_argument("--without-theta", action="store_true", help=link)
-    add_output_options(parser, "FILE", "the file (default out/export/<coupling>-<what>.<suffix>)")
+    options.add_output_options(parser, "FILE", "the file (default out/export/<coupling>-<what>.<suffix>)")
     return parser
 
 
@@ -96,7 +93,7 @@ def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> Block:
     origin = (
         f"Written by python -m design.export from {Path(args.coupling).name}: {_gains(stored)}",
         *block.about,
-        _promise(stored, verdict),
+        _guarantee(stored, verdict),
     )
     return Block(block.name, block.system, block.input, block.output, origin)
 
@@ -108,13 +105,13 @@ def _gains(stored: Stored) -> str:
     return f"coupling of kind {coupling.__struct_config__.tag}"
 
 
-def _promise(stored: Stored, verdict: Verdict) -> str:
+def _guarantee(stored: Stored, verdict: Verdict) -> str:
     claim = stored.certificate
     if claim is None or not verdict.proved:
         return f"NOT CERTIFIED: {verdict.reason}"
     needs = f"needs {listed(claim.required)} of {listed(claim.available)} N s/m of device damping"
     delays = f"; {switching_promise(stored.loop.jitter)}, in {HERE}" if stored.loop.jitter else ""
-    how = f"{claim.condition}, proof: {claim.proof}"
+    how = f"{CONDITION_NAMES[claim.condition]}, proof: {claim.proof}"
     if claim.promise == SET:
         how += "; at the vertices, between them nothing is proved: design.check searches there"
     return f"Certified for {claim.promise}{delays} ({how}): {needs}; linear forces only."
@@ -145,11 +142,11 @@ def _content(kind: str, block: Block, test: Trial, file: str) -> Any:
     return archive
 
 
-def _table(outcome: dict[str, Any]) -> Table:
-    table = Table(title=f"{outcome['what']} as {outcome['format']}", show_header=False, title_justify="left")
-    table.add_row("file", outcome["file"])
-    table.add_row("block", f"{outcome['channels']} channels, {outcome['states']} states, T = {outcome['T_s']:g} s")
-    proved = outcome["certificate"]["proved"]
-    table.add_row("certificate", "[green]proved[/]" if proved else f"[red]none[/]: {outcome['certificate']['reason']}")
-    table.add_row("test vector", f"{outcome['test']['ticks']} ticks, in the file")
-    return table
+def _rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
+    certificate = outcome["certificate"]
+    return [
+        ("file", outcome["file"]),
+        ("block", f"{outcome['channels']} channels, {outcome['states']} states, T = {outcome['T_s']:g} s"),
+        ("certificate", "[green]proved[/]" if certificate["proved"] else f"[red]none[/]: {certificate['reason']}"),
+        ("test vector", f"{outcome['test']['ticks']} ticks, in the file"),
+    ]

@@ -1,87 +1,57 @@
 """python -m sim.hunt: does switching contact destabilise a loop whose every frozen contact state is certified?
 
-The loops, the hands and the criterion are those of sim/hunt/search.py.
+The loops, the hands and the criterion are those of sim/hunt.py.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
-from pathlib import Path
 from typing import Any
 
 import msgspec
-from rich.table import Table
 
-from cli.options import (
-    DOES_NOT_HOLD,
-    DONE,
-    INTERRUPTED,
-    Parser,
-    add_output_options,
-    check_json,
-    console,
-    numbers,
-    progress_bar,
-    seed_from,
-)
-from sim.files import folder, write_json
+from cli import options, render
 from sim.hunt import LENGTHS, Found, attack, draw
-from sim.scenario import InputError
 
 
 def main(argv: list[str]) -> int:
     """Search. 0: no counterexample among the draws, 1: at least one, 130: interrupted."""
     args = _parser().parse_args(argv)
-    draws, hands = (_whole(args, name) for name in ("draws", "hands"))
-    (seconds,) = numbers("--duration", args.duration, float, 1)
-    if not 0.5 <= seconds <= 1000:
-        raise InputError(f"--duration is {seconds:g}, allowed are 0.5 to 1000 s")
-    seed = seed_from(args)
-    check_json(args)
-    out = folder(Path(args.out or "out/hunt"))
+    out = options.out_folder(args, "hunt")
     results, drawn, interrupted, begin = [], 0, False, time.perf_counter()
-    bar, move = progress_bar("hunting")
-    with bar:
+    with render.progress("hunting") as move:
         try:
-            for index in range(draws):
-                move(index, draws)
-                case = draw(seed, index)
+            for index in range(args.draws):
+                move(index, args.draws)
+                case = draw(args.seed, index)
                 if case:
-                    results.append(attack(case, index, seed, hands, seconds))
+                    results.append(attack(case, index, args.seed, args.hands, args.duration))
                 drawn += 1
         except KeyboardInterrupt:
             interrupted = True
-    outcome = _outcome(results, drawn, hands, seconds, seed) | {"interrupted": interrupted}
+    outcome = _outcome(results, drawn, args.hands, args.duration, args.seed) | {"interrupted": interrupted}
     outcome["wall_s"] = time.perf_counter() - begin
-    outcome["files"] = [str(out / "report.json")]
-    write_json(out / "report.json", outcome)
-    _print(outcome, args)
-    if args.json:
-        write_json(args.json, outcome)
+    table = render.facts("contact that makes and breaks, every frozen state certified", _rows(outcome))
+    lines = [f"{outcome['wall_s']:.0f} s. None found is no proof; the any-environment condition is one."]
+    render.publish(args, outcome, [table], lines, out)
     if interrupted:
-        return INTERRUPTED
-    return DONE if not outcome["counterexamples"] else DOES_NOT_HOLD
+        return options.INTERRUPTED
+    return options.DONE if not outcome["counterexamples"] else options.DOES_NOT_HOLD
 
 
-def _parser() -> Parser:
-    parser = Parser(
+def _parser() -> options.Parser:
+    parser = options.Parser(
         "sim.hunt",
         "Search loops whose frozen contact states are all certified for one that contact keeps in motion.",
         "python -m sim.hunt --draws 200 --hands 100",
     )
-    parser.add_argument("--draws", default="20", metavar="N", help="random loops (default 20)")
-    parser.add_argument("--hands", default="50", metavar="N", help="lossless hands and starts for each (default 50)")
-    parser.add_argument("--duration", default="4", metavar="SECONDS", help="of the first run (default 4)")
-    add_output_options(parser, what="folder for report.json (default out/hunt)")
+    count, hands = options.whole(1, 1_000_000), "lossless hands and starts for each (default 50)"
+    parser.add_argument("--draws", type=count, default=20, metavar="N", help="random loops (default 20)")
+    parser.add_argument("--hands", type=count, default=50, metavar="N", help=hands)
+    seconds = options.number(0.5, 1000, "s")
+    parser.add_argument("--duration", type=seconds, default=4.0, metavar="SECONDS", help="of the first run (default 4)")
+    options.add_output_options(parser, what="folder for report.json (default out/hunt)")
     return parser
-
-
-def _whole(args: argparse.Namespace, name: str) -> int:
-    (value,) = numbers(f"--{name}", getattr(args, name), int, 1)
-    if not 1 <= value <= 1_000_000:
-        raise InputError(f"--{name} is {value}, allowed are 1 to 1000000")
-    return value
 
 
 def _outcome(results: list[Found], draws: int, hands: int, seconds: float, seed: int) -> dict[str, Any]:
@@ -115,18 +85,17 @@ def _part(found: Found) -> dict[str, Any]:
     }
 
 
-def _print(outcome: dict[str, Any], args: argparse.Namespace) -> None:
-    table = Table(title="contact that makes and breaks, every frozen state certified", show_header=False)
-    table.add_row("loops drawn", f"{outcome['draws']}, of which {outcome['searched']} are not certified by theorem4")
-    table.add_row("hands for each", f"{outcome['hands']}, lossless, seed {outcome['seed']}")
-    seconds = outcome["duration_s"]
-    lengths = ", ".join(f"{seconds * n:g}" for n in LENGTHS)
-    table.add_row(f"loops run for {lengths} s", ", ".join(map(str, outcome["runs"])))
+def _rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
+    lengths = ", ".join(f"{outcome['duration_s'] * n:g}" for n in LENGTHS)
     found = outcome["counterexamples"]
-    table.add_row("counterexamples", f"[red]{found}[/]" if found else "[green]none found[/]")
-    for part in outcome["strongest"][:3]:
-        ratios = ", ".join(f"{ratio:.4g}" for ratio in part["speed_ratio"])
-        table.add_row(f"loop {part['index']}, last over second speed", ratios)
-    screen = console(args)
-    screen.print(table)
-    screen.print(f"[dim]·[/] {outcome['wall_s']:.0f} s. None found is no proof; theorem4 is one.")
+    drawn = f"{outcome['draws']}, of which {outcome['searched']} are not certified for any environment"
+    return [
+        ("loops drawn", drawn),
+        ("hands for each", f"{outcome['hands']}, lossless, seed {outcome['seed']}"),
+        (f"loops run for {lengths} s", ", ".join(map(str, outcome["runs"]))),
+        ("counterexamples", f"[red]{found}[/]" if found else "[green]none found[/]"),
+        *(
+            (f"loop {part['index']}, last over second speed", ", ".join(f"{r:.4g}" for r in part["speed_ratio"]))
+            for part in outcome["strongest"][:3]
+        ),
+    ]

@@ -1,83 +1,34 @@
-"""The options that make delays vary, for the commands that simulate."""
+"""What the commands share: options with their types, exit codes, and one line for bad input.
+
+A type reads the words of one option and says what came and what is allowed; `Parser` puts the option's name in front.
+What depends on the scenario, such as one number per channel, is checked by `per_channel` once the scenario is known.
+"""
 
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn, Protocol, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import msgspec
-from rich.console import Console
-from rich.errors import MarkupError
-from rich.progress import Progress
-from rich.table import Table
-from rich.text import Text
 from threadpoolctl import threadpool_limits
 
 from controller.delay import LOST, Jitter
 from controller.lti import SingularLoop
-from design.result import DesignFailed
+from design.result import CONDITION_NAMES, DesignFailed
 from models.device import MOST_DAMPING
 from sim.files import check_file, folder, nobody_reads
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
 
-# ----------------------------------------------------------------------------------------------------
-# The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
-
-
-CUT = "…"  # what stands in a table for the end of a word that did not fit
-WIDEST = 400  # characters
-STEP = 2
-OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # what opens no tag of our reports: a unit, a name
-
-
-class Screen(Console):
-    """A console whose tables lose nothing: words may break, numbers do not; what is too wide runs over the edge."""
-
-    def print(self, *objects: Any, **how: Any) -> None:
-        """As rich's, at the least width from the terminal's at which no table loses a character."""
-        own = self._width
-        self._width = max([self.width, *(self._needed(one) for one in objects if isinstance(one, Table))])
-        try:
-            super().print(*objects, **how)
-        finally:
-            self._width = own
-
-    def render_str(self, text: str, **how: Any) -> Text:
-        """As rich's, but a file `[/b].npz` or a device that calls itself `:x:` is printed as it is."""
-        how |= {"emoji": False}
-        if how.get("markup") is not False:
-            try:
-                return super().render_str(OTHER_BRACKET.sub(r"\\[", text), **how)
-            except MarkupError:  # one of our own tags, closed too often
-                how |= {"markup": False}
-        return super().render_str(text, **how)
-
-    def on_broken_pipe(self) -> None:  # rich itself would leave with 1, our "it does not hold"
-        """A reader that has seen enough (`| head -1`) changes neither the work nor its exit code."""
-        self.quiet = True
-        nobody_reads()
-
-    def _needed(self, table: Table) -> int:
-        least = 4 * len(table.columns) + 1  # frames and padding, and one character for each column
-        for width in range(max(self.width, least), WIDEST, STEP):
-            lines = self.render_lines(table, self.options.update(width=width), pad=False)
-            if not any(CUT in part.text for line in lines for part in line):
-                return width
-        return WIDEST
-
-
-# ----------------------------------------------------------------------------------------------------
-# What every command shares: its options, its exit codes, one line for bad input.
-
-
 DONE, DOES_NOT_HOLD, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 Number = TypeVar("Number", int, float)
+OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # of the types below
 
 
 class Parser(argparse.ArgumentParser):
@@ -93,7 +44,121 @@ class Parser(argparse.ArgumentParser):
         )
 
     def error(self, message: str) -> NoReturn:
-        raise InputError(f"{message} (--help lists the options)")
+        own = OWN_WORDS.fullmatch(message)
+        raise InputError(f"{own[1]} {own[2]}" if own else f"{message} (--help lists the options)")
+
+
+# ----------------------------------------------------------------------------------------------------
+# Types of options.
+
+
+def number(least: float = -math.inf, most: float = math.inf, unit: str = "") -> Callable[[str], float]:
+    """A number within these limits."""
+    return _one(float, least, most, unit)
+
+
+def whole(least: float = -math.inf, most: float = math.inf) -> Callable[[str], int]:
+    """A whole number within these limits."""
+    return _one(int, least, most, "")
+
+
+def several(
+    kind: Callable[[str], Number], least: float = -math.inf, most: float = math.inf, unit: str = ""
+) -> Callable[[str], tuple[Number, ...]]:
+    """Numbers within these limits, separated by commas; `per_channel` makes them one for each channel."""
+
+    def read(text: str) -> tuple[Number, ...]:
+        try:
+            values = tuple(kind(part) for part in text.split(","))
+        except ValueError:
+            what = "whole numbers" if kind is int else "numbers"
+            raise argparse.ArgumentTypeError(f"is {text!r}, expected {what} separated by commas") from None
+        return tuple(_within(value, least, most, unit) for value in values)
+
+    return read
+
+
+def pair(text: str) -> tuple[float, float]:
+    """Two numbers separated by a comma."""
+    try:
+        first, second = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected two numbers separated by a comma") from None
+    return first, second
+
+
+def delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
+    """'1,2' as one range for all channels, '1-2,0-3' as one per channel [samples]."""
+    parts = [part.split("-") for part in text.split(",")]
+    if len(parts) == 2 and all(len(part) == 1 for part in parts):
+        parts = [[parts[0][0], parts[1][0]]]
+    try:
+        return tuple((int(lo), int(hi)) for lo, hi in parts)
+    except ValueError:
+        expected = "LO,HI or LO-HI,LO-HI,.. in whole samples"
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}") from None
+
+
+def condition(text: str) -> str:
+    """A condition by its name, or by the name that it had before, as reports and files call it."""
+    known = {name: key for key, name in CONDITION_NAMES.items()} | {key: key for key in CONDITION_NAMES}
+    if text not in known:
+        allowed = ", ".join(CONDITION_NAMES.values())
+        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {allowed}")
+    return known[text]
+
+
+def _one(kind: Callable[[str], Number], least: float, most: float, unit: str) -> Callable[[str], Number]:
+    def read(text: str) -> Number:
+        try:
+            value = kind(text)
+        except ValueError:
+            what = "a whole number" if kind is int else "a number"
+            raise argparse.ArgumentTypeError(f"is {text!r}, expected {what}") from None
+        return _within(value, least, most, unit)
+
+    return read
+
+
+def _within(value: Number, least: float, most: float, unit: str) -> Number:
+    if least <= value <= most:  # False for nan
+        return value
+    shown, low, high = (str(n) if isinstance(n, int) else f"{n:g}" for n in (value, least, most))
+    span = f"numbers from {low}" if most == math.inf else f"{low} to {high}"
+    raise argparse.ArgumentTypeError(f"is {shown}, allowed are {span}{unit and f' {unit}'}")
+
+
+def per_channel(option: str, values: tuple[Number, ...], channels: int) -> tuple[Number, ...]:
+    """One value for each channel; a single one serves all. Raises InputError."""
+    values = values * channels if len(values) == 1 else values
+    if len(values) != channels:
+        expected = "one" if channels == 1 else f"{channels} (one per channel) or 1"
+        raise InputError(f"{option} has {len(values)} entries, expected {expected}")
+    return values
+
+
+def ranges_per_channel(
+    option: str, pairs: tuple[tuple[int, int], ...], channels: int
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """(least, largest) delays of every channel [samples]; a single range serves all. Raises InputError."""
+    if len(pairs) not in (1, channels):
+        raise InputError(f"{option} has {len(pairs)} ranges, expected {channels} (one per channel) or 1")
+    lo, hi = zip(*(pairs * channels if len(pairs) == 1 else pairs), strict=True)
+    return lo, hi
+
+
+def numbers(option: str, text: str, kind: Callable[[str], Number], count: int) -> tuple[Number, ...]:
+    """Numbers that stand within a longer text, a single one for all. Raises InputError with `option` in front."""
+    try:
+        if count == 1 and "," not in text:
+            return (_one(kind, -math.inf, math.inf, "")(text),)
+        return per_channel(option, several(kind)(text), count)
+    except argparse.ArgumentTypeError as error:
+        raise InputError(f"{option} {error}") from None
+
+
+# ----------------------------------------------------------------------------------------------------
+# Groups of options that several commands have, and what they mean.
 
 
 def add_loop_options(parser: argparse.ArgumentParser) -> None:
@@ -103,114 +168,56 @@ def add_loop_options(parser: argparse.ArgumentParser) -> None:
     names = ", ".join(built_in())
     loop.add_argument("--scenario", default=DEFAULT, metavar="FILE.toml", help=f"or one of: {names}")
     for name, what in (("theta", "transmission"), ("psi", "environment"), ("lam", "reference")):
-        loop.add_argument(f"--{name}", metavar="N,N,..", help=f"{what} delay per channel [samples]; one is for all")
-    loop.add_argument("--delta", metavar="D,D,..", help="damping of each device [N s/m]; one is for all")
-    loop.add_argument("--T", metavar="SECONDS", help="sampling period [s]")
+        what = f"{what} delay per channel [samples]; one is for all"
+        loop.add_argument(f"--{name}", type=several(int), metavar="N,N,..", help=what)
+    damping, what = several(float, 0, MOST_DAMPING, "N s/m"), "damping of each device [N s/m]; one is for all"
+    loop.add_argument("--delta", type=damping, metavar="D,D,..", help=what)
+    loop.add_argument("--T", type=number(), metavar="SECONDS", help="sampling period [s]")
+
+
+def scenario_from(args: argparse.Namespace) -> Scenario:
+    """The scenario that the loop options describe. Raises InputError."""
+    scenario = load(args.scenario)
+    given = {name: getattr(args, name) for name in ("theta", "psi", "lam") if getattr(args, name) is not None}
+    changes: dict[str, Any] = {name: per_channel(f"--{name}", n, scenario.channels) for name, n in given.items()}
+    if args.T is not None:
+        changes["T"] = args.T
+    delta = None if args.delta is None else per_channel("--delta", args.delta, scenario.channels)
+    return scenario.replace(delta, **changes) if changes or delta else scenario
+
+
+def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: str = "spring-damper") -> None:
+    """Which coupling, and the condition that it is designed for or judged by."""
+    parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default {default})")
+    add_condition_option(parser)
+
+
+def add_condition_option(parser: argparse._ActionsContainer, what: str = "that the certificate is about") -> None:
+    """--condition."""
+    names = ",".join(CONDITION_NAMES.values())
+    help_ = f"{what}: {' or '.join(CONDITION_NAMES.values())} (default: the coupling's own)"
+    parser.add_argument("--condition", type=condition, metavar=f"{{{names}}}", help=help_)
 
 
 def add_output_options(
     parser: argparse.ArgumentParser,
     out: str = "DIR",
     what: str = "folder for files, made if it is not there (default out/<command>-<case>)",
+    picture: bool = False,
 ) -> None:
     """Where results go, and the seed."""
     output = parser.add_argument_group("output", "the folder of a FILE that you name must exist")
-    output.add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
+    if picture:
+        output.add_argument("--no-plot", action="store_true", help="write no picture")
+    add_json_option(output)
     output.add_argument("--out", metavar=out, help=what)
-    output.add_argument("--seed", metavar="N", default="0", help="for random draws; recorded (default 0)")
+    seed = "for random draws; recorded (default 0)"
+    output.add_argument("--seed", type=whole(0), metavar="N", default=0, help=seed)
 
 
-def add_rigid_option(parser: argparse.ArgumentParser) -> None:
-    """A rigid wall in place of the environment."""
-    wall = "a rigid wall in place of the environment; one channel, the scenario's first"
-    parser.add_argument("--rigid", action="store_true", help=wall)
-
-
-def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> dict[str, tuple[int, ...]]:
-    """theta and psi of the one channel that --rigid is about. Raises InputError where options name more of them."""
-    for name in ("theta", "psi", "delta"):
-        numbers(f"--rigid is one channel: --{name}", getattr(args, name) or "0", float, 1)
-    return {"theta": scenario.theta[:1], "psi": scenario.psi[:1] if args.psi else (0,)}
-
-
-def scenario_from(args: argparse.Namespace) -> Scenario:
-    """The scenario that the loop options describe. Raises InputError."""
-    scenario = load(args.scenario)
-    changes = {}
-    for name in ("theta", "psi", "lam"):
-        if getattr(args, name) is not None:
-            changes[name] = numbers(f"--{name}", getattr(args, name), int, scenario.channels)
-    if args.T is not None:
-        changes["T"] = numbers("--T", args.T, float, 1)[0]
-    delta = None if args.delta is None else numbers("--delta", args.delta, float, scenario.channels)
-    for value in delta or ():
-        if not 0 <= value <= MOST_DAMPING:
-            raise InputError(f"--delta is {value:g}, allowed are 0 to {MOST_DAMPING:g} N s/m")
-    return scenario.replace(delta, **changes) if changes or delta else scenario
-
-
-def require_linear(scenario: Scenario, what: str) -> None:
-    """Raises InputError where a loop has walls or Coulomb friction, for a command whose verdicts are of linear ones."""
-    for i, device in enumerate(scenario.device):
-        if device.friction:
-            instead = "sim.run and sim.zwidth simulate it"
-            raise InputError(f"device[{i}].friction is {device.friction:g} N: {what} decides linear loops; {instead}")
-    if scenario.environment.walls:
-        raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
-
-
-def require_constant_delay(scenario: Scenario, what: str) -> None:
-    """Raises InputError where a scenario's delays vary, for a command that would not make them vary."""
-    if scenario.jitter is not None:
-        instead = "sim.run simulates it"
-        raise InputError(f"jitter: {what} takes the delays that its link has; take the table out, {instead}")
-
-
-def numbers(option: str, text: str, kind: Callable[[str], Number], count: int) -> tuple[Number, ...]:
-    """'1,2' as `count` numbers; a single one serves all channels. Raises InputError."""
-    try:
-        values = tuple(kind(part) for part in text.split(","))
-    except ValueError:
-        what = "whole number" if kind is int else "number"
-        what = f"a {what}" if count == 1 else f"{what}s separated by commas"
-        raise InputError(f"{option} is {text!r}, expected {what}") from None
-    if len(values) == 1:
-        values *= count
-    if len(values) != count:
-        expected = "one" if count == 1 else f"{count} (one per channel) or 1"
-        raise InputError(f"{option} has {len(values)} entries, expected {expected}")
-    return values
-
-
-def ranges(option: str, text: str, count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """'1,2' as the range of all channels, '1-2,0-3' as one per channel: (lows, highs). Raises InputError."""
-    parts = [part.split("-") for part in text.split(",")]
-    if len(parts) == 2 and all(len(part) == 1 for part in parts):
-        parts = [[parts[0][0], parts[1][0]]]
-    try:
-        pairs = [(int(lo), int(hi)) for lo, hi in parts]
-    except ValueError:
-        raise InputError(f"{option} is {text!r}, expected LO,HI or LO-HI,LO-HI,.. in whole samples") from None
-    if len(pairs) not in (1, count):
-        raise InputError(f"{option} has {len(pairs)} ranges, expected {count} (one per channel) or 1")
-    lows, highs = zip(*(pairs * count if len(pairs) == 1 else pairs), strict=True)
-    return lows, highs
-
-
-def as_option(error: ValueError, args: argparse.Namespace) -> str:
-    """The error's text; where the field that it begins with was given as an option, by the option's name."""
-    text = str(error)
-    name = text.split(" ", 1)[0].split("[", 1)[0]
-    given = name in vars(args) and getattr(args, name) is not None
-    return f"--{name.replace('_', '-')}{text[len(name) :]}" if given else text
-
-
-def seed_from(args: argparse.Namespace) -> int:
-    """The seed, checked. Raises InputError."""
-    (seed,) = numbers("--seed", args.seed, int, 1)
-    if seed < 0:
-        raise InputError(f"--seed is {seed}, allowed are whole numbers from 0")
-    return seed
+def add_json_option(parser: argparse._ActionsContainer) -> None:
+    """--json."""
+    parser.add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
 
 
 def check_json(args: argparse.Namespace) -> None:
@@ -222,33 +229,113 @@ def check_json(args: argparse.Namespace) -> None:
 def out_folder(args: argparse.Namespace, command: str) -> Path:
     """The folder for the files of a command, made before any work is done. Raises InputError."""
     check_json(args)
-    return folder(Path(args.out or f"out/{command}-{args.case}"))
+    return folder(Path(args.out or f"out/{command}{f'-{args.case}' if 'case' in args else ''}"))
 
 
-def console(args: argparse.Namespace) -> Screen:
-    """Where tables go: standard error when standard output is taken by --json -."""
-    return Screen(stderr=args.json == "-", highlight=False)
+def seed_from(args: argparse.Namespace) -> int:
+    """The seed of a command that reads its words itself. Raises InputError."""
+    return numbers("--seed", str(args.seed), int, 1)[0]
 
 
-class Move(Protocol):
-    """Moves a progress bar to `done` of `total`, and may say what is being done."""
-
-    def __call__(self, done: int, total: int, what: str = ...) -> None: ...
-
-
-def progress_bar(description: str) -> tuple[Progress, Move]:
-    """A bar on standard error that shows only on a terminal, and the function that moves it."""
-    terminal = Console(stderr=True)
-    bar = Progress(transient=True, console=terminal, disable=not terminal.is_terminal)
-    task = bar.add_task(description, total=None)
-
-    def move(done: int, total: int, what: str = description) -> None:
-        bar.update(task, completed=done, total=total, description=what)
-
-    return bar, move
+def as_option(error: ValueError, args: argparse.Namespace) -> str:
+    """What a design says of its argument, with the option's name where the argument has one."""
+    text = str(error)
+    name, _, _ = text.partition(" ")
+    given = getattr(args, name, None)
+    return text if given is None or given is False else f"--{name.replace('_', '-')}{text[len(name) :]}"
 
 
-def execute(main: Callable[[list[str]], int]) -> NoReturn:
+def add_rigid_option(parser: argparse.ArgumentParser) -> None:
+    """A rigid wall in place of the environment."""
+    wall = "a rigid wall in place of the environment; one channel, the scenario's first"
+    parser.add_argument("--rigid", action="store_true", help=wall)
+
+
+def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> dict[str, tuple[int, ...]]:
+    """theta and psi of the one channel that --rigid is about. Raises InputError where options name more of them."""
+    for name in ("theta", "psi", "delta"):
+        per_channel(f"--rigid is one channel: --{name}", getattr(args, name) or (0,), 1)
+    return {"theta": scenario.theta[:1], "psi": scenario.psi[:1] if args.psi else (0,)}
+
+
+# ----------------------------------------------------------------------------------------------------
+# Delays that vary.
+
+
+DRAWN = ("constant", "random", "bursty", "adversarial")
+
+
+def add_varying_delay_options(parser: argparse.ArgumentParser) -> None:
+    """--jitter, --pattern, --loss and --playout."""
+    group = parser.add_argument_group("delays that vary")
+    span = "range of the forces' delays [samples]; or LO-HI,LO-HI,.. per channel"
+    group.add_argument("--jitter", type=delay_ranges, metavar="LO,HI", help=span)
+    pattern = f"{', '.join(DRAWN)} (default random), or a file of recorded delays, a row per tick"
+    group.add_argument("--pattern", metavar="NAME|FILE", help=pattern)
+    loss = "probability that a force is lost and the last one held"
+    group.add_argument("--loss", type=number(), metavar="P", help=loss)
+    group.add_argument("--playout", action="store_true", help="a buffer that makes every delay the largest one")
+
+
+def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenario:
+    """The scenario with the delays that the options describe, over those of its file. Raises InputError."""
+    changes: dict[str, Any] = {}
+    if args.pattern is not None:
+        changes |= _pattern(args.pattern, scenario.channels)
+    if args.jitter is not None:
+        changes["lo"], changes["hi"] = ranges_per_channel("--jitter", args.jitter, scenario.channels)
+    if args.loss is not None:
+        changes["loss"] = args.loss
+    if args.playout:
+        changes["playout"] = True
+    if not changes:
+        return scenario
+    if scenario.jitter is None and "lo" not in changes:
+        if "loss" not in changes or len(changes) > 1:
+            option = "--playout" if args.playout else "--pattern"
+            raise InputError(f"{option} without a range of delays: give --jitter LO,HI")
+        changes |= {"lo": scenario.theta, "hi": scenario.theta}
+    try:
+        old = scenario.jitter
+        jitter = msgspec.structs.replace(old, **changes) if old else Jitter(**changes)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    theta = jitter.hi if jitter.playout and args.theta is None else scenario.theta
+    return scenario.replace(theta=theta, jitter=jitter)
+
+
+def _pattern(name: str, channels: int) -> dict[str, Any]:
+    if name in DRAWN:
+        return {"pattern": name, "recorded": ()}
+    rows = _recorded(name, channels)
+    arrived = [[n for n in column if n != LOST] or [0] for column in zip(*rows, strict=True)]
+    lo, hi = (tuple(side(column) for column in arrived) for side in (min, max))
+    return {"pattern": "recorded", "recorded": rows, "lo": lo, "hi": hi}
+
+
+def _recorded(name: str, channels: int) -> tuple[tuple[int, ...], ...]:
+    """Rows of delays, separated by commas or blanks; one column serves all channels; # begins a comment."""
+    try:
+        text = Path(name).read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"--pattern {name}: {error.strerror}; give a file or one of: {', '.join(DRAWN)}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"--pattern {name}: not a text file in UTF-8") from None
+    rows = []
+    for line_number, line in enumerate(text.splitlines(), start=1):
+        words = line.split("#")[0].replace(",", " ").split()
+        if words:
+            rows.append(numbers(f"--pattern {name}, line {line_number}:", ",".join(words), int, channels))
+    if not rows:
+        raise InputError(f"--pattern {name}: holds no delays")
+    return tuple(rows)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Running a command.
+
+
+def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> NoReturn:
     """Run a command and leave with its exit code; bad input is one line on standard error.
 
     Whoever reads standard output may stop at any line (`| head -1`): the command's own exit code stays what it is,
@@ -259,7 +346,7 @@ def execute(main: Callable[[list[str]], int]) -> NoReturn:
     try:
         # the matrices here are small: more BLAS threads only wait for each other, and the last digits depend on them
         with threadpool_limits(1, user_api="blas"):
-            code = main(sys.argv[1:])
+            code = main(sys.argv[1:] if argv is None else argv)
     except (InputError, SingularLoop) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         code = BAD_INPUT
@@ -288,78 +375,3 @@ def _cannot(error: OSError) -> int:
     print(f"error: {place}: {error.strerror or error}", file=sys.stderr)
     nobody_reads()
     return BAD_INPUT
-
-
-DRAWN = ("constant", "random", "bursty", "adversarial")
-
-
-def add_jitter_options(parser: argparse.ArgumentParser) -> None:
-    """--jitter, --pattern, --loss and --playout."""
-    group = parser.add_argument_group("delays that vary")
-    group.add_argument(
-        "--jitter", metavar="LO,HI", help="range of the forces' delays [samples]; or LO-HI,LO-HI,.. per channel"
-    )
-    names = ", ".join(DRAWN)
-    group.add_argument(
-        "--pattern", metavar="NAME|FILE", help=f"{names} (default random), or a file of recorded delays, a row per tick"
-    )
-    group.add_argument("--loss", metavar="P", help="probability that a force is lost and the last one held")
-    group.add_argument("--playout", action="store_true", help="a buffer that makes every delay the largest one")
-
-
-def with_jitter(args: argparse.Namespace, scenario: Scenario) -> Scenario:
-    """The scenario with the delays that the options describe, over those of its file. Raises InputError."""
-    changes: dict[str, Any] = {}
-    if args.pattern is not None:
-        changes |= _pattern(args.pattern, scenario.channels)
-    if args.jitter is not None:
-        changes["lo"], changes["hi"] = ranges("--jitter", args.jitter, scenario.channels)
-    if args.loss is not None:
-        (changes["loss"],) = numbers("--loss", args.loss, float, 1)
-    if args.playout:
-        changes["playout"] = True
-    if not changes:
-        return scenario
-    if scenario.jitter is None and "lo" not in changes:
-        if "loss" not in changes or len(changes) > 1:
-            option = "--playout" if args.playout else "--pattern"
-            raise InputError(f"{option} without a range of delays: give --jitter LO,HI")
-        changes |= {"lo": scenario.theta, "hi": scenario.theta}
-    return _changed(args, scenario, changes)
-
-
-def _changed(args: argparse.Namespace, scenario: Scenario, changes: dict[str, Any]) -> Scenario:
-    try:
-        old = scenario.jitter
-        jitter = msgspec.structs.replace(old, **changes) if old else Jitter(**changes)
-    except ValueError as error:
-        raise InputError(str(error)) from None
-    theta = jitter.hi if jitter.playout and args.theta is None else scenario.theta
-    return scenario.replace(theta=theta, jitter=jitter)
-
-
-def _pattern(name: str, channels: int) -> dict[str, Any]:
-    if name in DRAWN:
-        return {"pattern": name, "recorded": ()}
-    rows = _recorded(name, channels)
-    arrived = [[n for n in column if n != LOST] or [0] for column in zip(*rows, strict=True)]
-    lo, hi = (tuple(side(column) for column in arrived) for side in (min, max))
-    return {"pattern": "recorded", "recorded": rows, "lo": lo, "hi": hi}
-
-
-def _recorded(name: str, channels: int) -> tuple[tuple[int, ...], ...]:
-    """Rows of delays, separated by commas or blanks; one column serves all channels; # begins a comment."""
-    try:
-        text = Path(name).read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"--pattern {name}: {error.strerror}; give a file or one of: {', '.join(DRAWN)}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"--pattern {name}: not a text file in UTF-8") from None
-    rows = []
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split("#")[0].replace(",", " ").split()
-        if words:
-            rows.append(numbers(f"--pattern {name}, line {number}:", ",".join(words), int, channels))
-    if not rows:
-        raise InputError(f"--pattern {name}: holds no delays")
-    return tuple(rows)

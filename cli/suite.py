@@ -1,195 +1,39 @@
 """python -m sim.suite (make validate): every check that a verdict rests on, in one report for a stranger.
 
-A check is a command with its options, run as a user would run it; the report shows that command beside its numbers.
-A further check is one more line in CHECKS.
+A check is another command with its options, run as a user would run it, or rows that are measured here; the report
+shows the command that repeats it beside its numbers. A further check is one more line in CHECKS.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib
 import json
 import os
 import platform
 import shlex
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass, field
+from importlib import import_module
 from importlib.metadata import version
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
-from cli.options import (
-    DOES_NOT_HOLD,
-    DONE,
-    INTERRUPTED,
-    Parser,
-    add_loop_options,
-    add_output_options,
-    check_json,
-    console,
-    numbers,
-    out_folder,
-    progress_bar,
-    scenario_from,
-    seed_from,
-)
-from controller.coupling import Coupling, NoCoupling
+from cli import options, render
+from controller.coupling import NoCoupling
 from controller.lti import SingularLoop
-from design.certificate import CONDITIONS, finite
-from design.conditions import this_environment
-from design.result import DesignFailed
+from design.certificate import finite
+from design.result import CONDITION_NAMES, DesignFailed
+from hw.faults import rehearse_faults
 from sim.adversary import Attempt, attempts
-from sim.couplings import NAMES, choose
+from sim.couplings import choose
 from sim.files import folder, write, write_json
-from sim.run import assemble
-from sim.scenario import InputError, Scenario
-
-# ----------------------------------------------------------------------------------------------------
-# python -m sim.tightness: how much damping too little is it before somebody makes the loop oscillate?
-#
-# The devices of each loop get a share less damping than the closed-loop condition requires, and the adversary
-# searches for a passive human who destabilises it. Where it succeeds close to the required damping, the condition is
-# tight; with the damping that is required it must never succeed.
-
-
-SHORT = "0,1,2,5,10,20"  # [%]
-Row = dict[str, Any]
-Loops = dict[str, tuple[Scenario, Coupling]]
-
-
-def run_tightness(argv: list[str]) -> int:
-    """Attack loops that lack damping. 0: nobody destabilises one that lacks none, 1: somebody, 130: interrupted."""
-    args = _tightness_parser().parse_args(argv)
-    scenario, seed, shortages = scenario_from(args), seed_from(args), _shortages(args)
-    (generations,) = numbers("--generations", args.generations, int, 1)
-    if not 1 <= generations <= 10_000:
-        raise InputError(f"--generations is {generations}, allowed are 1 to 10000")
-    out = out_folder(args, "tightness")
-    loops = _loops(args, scenario)
-    rows, interrupted = _attack(loops, shortages, seed, generations)
-    outcome: dict[str, Any] = {"scenario": scenario.name, "case": args.case, "seed": seed, "generations": generations}
-    outcome |= {"rows": rows, "rates": _rates(rows), "interrupted": interrupted}
-    outcome["holds"] = not any(row["found"] for row in rows if row["short"] <= 0)
-    outcome["files"] = _save(args, out, outcome)
-    _print(outcome, args)
-    if args.json:
-        write_json(args.json, outcome)
-    if interrupted:
-        return INTERRUPTED
-    return DONE if outcome["holds"] else DOES_NOT_HOLD
-
-
-def _tightness_parser() -> Parser:
-    parser = Parser(
-        "sim.tightness",
-        "Search destabilising humans for loops that lack a share of their required damping.",
-        "python -m sim.tightness --short 0,5,10 --generations 30",
-    )
-    add_loop_options(parser)
-    names = ", ".join(NAMES)
-    parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json, beside the loop without one")
-    parser.add_argument("--condition", choices=CONDITIONS, help="the condition of the design")
-    parser.add_argument("--short", default=SHORT, metavar="P,P,..", help=f"[%%] of damping missing (default {SHORT})")
-    parser.add_argument("--generations", default="40", metavar="N", help="of each search (default 40)")
-    parser.add_argument("--no-plot", action="store_true", help="write no picture")
-    add_output_options(parser)
-    return parser
-
-
-def _shortages(args: argparse.Namespace) -> list[float]:
-    """Shares of the required damping that are missing. Raises InputError."""
-    shares = numbers("--short", args.short, float, args.short.count(",") + 1)
-    for share in shares:
-        if not 0 <= share < 100:
-            raise InputError(f"--short is {share:g}, allowed are 0 to below 100 (per cent)")
-    return [share / 100 for share in shares]
-
-
-def _loops(args: argparse.Namespace, scenario: Scenario) -> Loops:
-    """The loop without coupling, and the one that was asked for. Raises InputError where no damping helps one."""
-    loops: Loops = {"no coupling": (scenario, NoCoupling())}
-    if args.case != "none":
-        chosen = choose(scenario, args.case, args.coupling, args.condition)
-        loops[f"{chosen.kind}, case {args.case}"] = (scenario, chosen.coupling)
-    for name, (_, coupling) in loops.items():
-        requirement = this_environment(assemble(scenario, coupling).F, scenario.delta)
-        if not np.isfinite(requirement.ratio):
-            raise InputError(f"{name}: no damping is enough ({requirement.reason}), so none can be short of it")
-    return loops
-
-
-def _attack(loops: Loops, shortages: list[float], seed: int, generations: int) -> tuple[list[Row], bool]:
-    rows: list[Row] = []
-    with (bar := progress_bar("attacking"))[0]:
-
-        def attempted(attempt: Attempt) -> None:
-            rows.append(_row(attempt))
-            bar[1](len(rows), len(loops) * len(shortages))
-
-        try:
-            attempts(loops, np.array(shortages), seed, generations, attempted)
-        except KeyboardInterrupt:
-            return rows, True
-    return rows, False
-
-
-def by_whom(row: Row) -> str:
-    """Who destabilises a loop."""
-    if not row["found"]:
-        return "nobody"
-    return "one person" if row["held_together"] else "one hand each"
-
-
-def _row(attempt: Attempt) -> Row:
-    worst = attempt.worst
-    return {
-        "loop": attempt.name,
-        "short": attempt.short,
-        "found": worst.destabilises,
-        "growth_rate_per_s": finite(worst.growth),
-        "frequency_hz": worst.frequency_hz,
-        "held_together": bool(worst.persons),
-        "evaluated": worst.evaluated,
-    }
-
-
-def _rates(rows: list[Row]) -> list[Row]:
-    """Share of the loops that somebody destabilises, by shortage."""
-    parts = {short: [row["found"] for row in rows if row["short"] == short] for short in {r["short"] for r in rows}}
-    return [{"short": s, "attempts": len(found), "rate": sum(found) / len(found)} for s, found in sorted(parts.items())]
-
-
-def _save(args: argparse.Namespace, out: Path, outcome: dict[str, Any]) -> list[str]:
-    files = [out / "report.json"]
-    if not args.no_plot and outcome["rows"]:
-        from sim.plots import plot_tightness
-
-        files.append(plot_tightness(outcome["rows"], out / "tightness.png"))
-    write_json(files[0], outcome | {"files": [str(path) for path in files]})
-    return [str(path) for path in files]
-
-
-def _print(outcome: dict[str, Any], args: argparse.Namespace) -> None:
-    table = Table(title=f"damping missing, and who notices · {outcome['scenario']}")
-    for name in ("loop", "short of required", "destabilised by", "growth [1/s]", "at [Hz]"):
-        table.add_column(name, justify="left" if name == "loop" else "right")
-    for row in outcome["rows"]:
-        found = f"{row['growth_rate_per_s']:+.3g}" if row["found"] else "-"
-        at = f"{row['frequency_hz']:.1f}" if row["found"] else "-"
-        table.add_row(row["loop"], f"{row['short']:.1%}", by_whom(row), found, at)
-    console(args).print(table)
-
-
-# ----------------------------------------------------------------------------------------------------
-# The suite's report: verdicts first, then the figures of each check under the command that reproduces them.
-
+from sim.hard import cases, measure
+from sim.scenario import InputError, load
 
 INTRODUCTION = """\
 Several force-feedback devices share one simulated object; the loop of hands, devices, delays and computer must not
@@ -202,6 +46,68 @@ tell the same of every hand. The *adversary* searches for the worst passive hand
 "Holds" means: both engines agree about everyone, nobody destabilises a certified loop, and its energy balance is
 never negative. An uncertified loop may be unstable; it holds as long as the engines agree.
 """
+
+
+# ----------------------------------------------------------------------------------------------------
+# Checks of our own: what they measure, row by row.
+
+
+Row = dict[str, Any]
+
+
+def hard_loops(seed: int) -> Iterator[Row]:
+    """Numerically hard loops, each with a setting that fails and the one that holds."""
+    for case in cases():
+        yield asdict(measure(case))
+
+
+def shortages(couplings: Sequence[str], short: Sequence[float], generations: int, **changes: Any) -> Callable[..., Any]:
+    """Loops whose devices lack these shares of the damping that the this-environment condition requires.
+
+    The adversary searches for a passive human who destabilises each. Where it succeeds close to the required damping,
+    the condition is tight; with the damping that is required it must never succeed.
+    """
+
+    def rows(seed: int) -> Iterator[Row]:
+        scenario = load().replace(**changes)
+        for name in couplings:
+            coupling = NoCoupling() if name == "none" else choose(scenario, "I", name).coupling
+            loop = {"no coupling" if name == "none" else f"{name}, case I": (scenario, coupling)}
+            for share in short:
+                (attempt,) = attempts(loop, np.array([share]), seed, generations)
+                yield _shortage(attempt)
+
+    return rows
+
+
+def _shortage(attempt: Attempt) -> Row:
+    worst = attempt.worst
+    return {
+        "loop": attempt.name,
+        "short": attempt.short,
+        "found": worst.destabilises,
+        "growth_rate_per_s": finite(worst.growth),
+        "frequency_hz": worst.frequency_hz,
+        "held_together": bool(worst.persons),
+        "evaluated": worst.evaluated,
+        "holds": attempt.short > 0 or not worst.destabilises,
+    }
+
+
+def rates(rows: Sequence[Row]) -> list[Row]:
+    """Share of the loops that the adversary destabilises, by shortage."""
+    parts = {short: [row["found"] for row in rows if row["short"] == short] for short in {r["short"] for r in rows}}
+    return [{"short": s, "attempts": len(found), "rate": sum(found) / len(found)} for s, found in sorted(parts.items())]
+
+
+def faults(seed: int) -> Iterator[Row]:
+    """Faults of a link, a device, a controller or a person, in virtual time."""
+    for outcome in rehearse_faults():
+        yield asdict(outcome) | {"holds": outcome.holds}
+
+
+# ----------------------------------------------------------------------------------------------------
+# How each report reads as figures.
 
 
 @dataclass(frozen=True)
@@ -230,7 +136,7 @@ def verdicts(report: dict[str, Any]) -> list[Part]:
     if worst:
         rows.append(("worst random hand", _growing(worst)))
     if adversary:
-        found = _growing(adversary) if adversary["found"] else "nobody makes the loop grow"
+        found = _growing(adversary) if adversary["found"] else "no human makes the loop grow"
         rows.append(("the adversary's worst", f"{found}, of {adversary['evaluated']} tried"))
     if traces:
         settled = f"{traces['stable_and_settling']} of {traces['stable']} stable loops"
@@ -248,15 +154,15 @@ def verdicts(report: dict[str, Any]) -> list[Part]:
 
 
 def tightness(report: dict[str, Any]) -> list[Part]:
-    """Of sim.tightness."""
-    rates = report["rates"]
-    rows = tuple((f"{r['short']:.1%}", str(r["attempts"]), f"{r['rate']:.0%}") for r in rates)
-    first = next((r["short"] for r in rates if r["rate"] == 1), None)
-    gist = "no shortage tried lets somebody destabilise every loop"
+    """Of loops that lack damping."""
+    found = rates(report["rows"])
+    rows = tuple((f"{r['short']:.1%}", str(r["attempts"]), f"{r['rate']:.0%}") for r in found)
+    first = next((r["short"] for r in found if r["rate"] == 1), None)
+    gist = "at no shortage that was tried does a human destabilise every loop"
     if first is not None:
-        gist = f"somebody destabilises every loop whose devices lack {first:.1%} of the damping required"
+        gist = f"a human destabilises every loop whose devices lack {first:.1%} of the damping required"
     single = tuple(
-        (r["loop"], f"{r['short']:.1%}", by_whom(r), f"{r['growth_rate_per_s']:+.3g}" if r["found"] else "-")
+        (r["loop"], f"{r['short']:.1%}", _by_whom(r), f"{r['growth_rate_per_s']:+.3g}" if r["found"] else "-")
         for r in report["rows"]
     )
     return [
@@ -288,28 +194,28 @@ def gain_map(report: dict[str, Any]) -> list[Part]:
     population, simulation = report["population"], report["simulation"]
     rows = [
         (
-            f"certified by {name}",
+            f"certified, {word}",
             f"{report[name]['certified_cells']} of {cells} cells, {report[name]['contradicted_cells']} contradicted",
         )
-        for name in ("theorem4", "closed-loop")
+        for name, word in CONDITION_NAMES.items()
     ]
     stable = f"{population['stable_cells']} of {population['decided_cells']} cells"
     rows.append((f"stable with all of {population['humans']} random hands", stable))
     odd = f"{simulation['oscillate']} oscillate, {simulation['differ_from_linear']} unlike the linear loop"
     rows.append((f"{len(simulation['points'])} points simulated in MuJoCo", odd))
-    edge = max(report["error"][name]["edge_relative_in_K"] for name in ("theorem4", "closed-loop"))
+    edge = max(report["error"][name]["edge_relative_in_K"] for name in CONDITION_NAMES)
     rows.append(("edge of the map, error in K", f"{edge:.0e}"))
-    contradicted = sum(report[name]["contradicted_cells"] for name in ("theorem4", "closed-loop"))
-    return [Part("", ("figure", "value"), tuple(rows), f"{contradicted} certified cells that any hand upsets")]
+    contradicted = sum(report[name]["contradicted_cells"] for name in CONDITION_NAMES)
+    return [Part("", ("figure", "value"), tuple(rows), f"{contradicted} certified cells that a hand destabilises")]
 
 
 def hard(report: dict[str, Any]) -> list[Part]:
-    """Of sim.hard."""
+    """Of hard loops."""
     rows = tuple(
         (
             row["name"],
             f"{row['exact']:+.4f}",
-            f"{' x '.join(map(str, row['fails']))}: {row['fault']}" if row["fails"] else "none tried",
+            _failing(row),
             f"RK4 x {row['substeps']}",
             f"{row['error']:+.1e}",
         )
@@ -318,6 +224,254 @@ def hard(report: dict[str, Any]) -> list[Part]:
     good = sum(row["holds"] for row in report["rows"])
     columns = ("loop", "exact growth [1/s]", "fails", "holds", "growth error [1/s]")
     return [Part("", columns, rows, f"{good} of {len(rows)} verdicts right under the substep rule")]
+
+
+def _failing(row: Row) -> str:
+    """The setting that fails, how and by how much."""
+    if not row["fails"]:
+        return "none tried"
+    off = "" if row["off"] is None else f" {row['off']:+.1e}"
+    return f"{' x '.join(map(str, row['fails']))}: {row['fault'] or '-'}{off}"
+
+
+def fault_table(report: dict[str, Any]) -> list[Part]:
+    """Of faults."""
+    rows = []
+    for row in report["rows"]:
+        zero, allowed = (render.optional(row[name], "{:.1f} ms") for name in ("zero_force_ms", "allowed_ms"))
+        rows.append((row["fault"], row["stage"], "; ".join(row["wrong"]) or row["cause"], zero, allowed))
+    good = sum(row["holds"] for row in report["rows"])
+    columns = ("fault", "ends in", "cause", "zero force after", "allowed")
+    return [Part("", columns, tuple(rows), f"{good} of {len(rows)} faults end as they must")]
+
+
+def _by_whom(row: Row) -> str:
+    if not row["found"]:
+        return "no human"
+    return "one person" if row["held_together"] else "one hand each"
+
+
+def _damping(certificates: dict[str, Any]) -> list[tuple[str, str]]:
+    rows = []
+    for name, word in CONDITION_NAMES.items():
+        part = certificates[name]
+        needed = [f"{value:.4g}" if value is not None else "infinite" for value in part["required_damping"]]
+        available = [f"{value:.4g}" for value in part["available_damping"]]
+        rows.append((f"damping needed, {word}", f"{', '.join(needed)} of {', '.join(available)} N s/m"))
+    return rows
+
+
+def _growing(part: dict[str, Any]) -> str:
+    growth = part["growth_rate_per_s"]
+    return "none" if growth is None else f"{growth:+.4g} 1/s at {part['frequency_hz']:.1f} Hz"
+
+
+# ----------------------------------------------------------------------------------------------------
+# The checks, and how one is run.
+
+
+@dataclass(frozen=True)
+class Check:
+    """A question, what answers it, and how its JSON report reads as figures."""
+
+    name: str  # of its folder, too
+    asks: str
+    answer: str | Callable[[int], Iterator[Row]]  # a command ({humans}, {seed} are filled in), or rows by the seed
+    figures: Callable[[dict[str, Any]], list[Part]]
+    picture: str | None = None  # of rows: the function of sim.plots that draws them
+
+    def command(self, humans: int, seed: int) -> str:
+        """What repeats this check."""
+        own = f"sim.suite --only {self.name} --seed {{seed}}"
+        return (self.answer if isinstance(self.answer, str) else own).format(humans=humans, seed=seed)
+
+
+_MEET = "--humans {humans} --links mixed --duration 1 --adversary --generations 60 --seed {seed}"
+_MAP = "sim.zwidth --rigid --T 1e-3 --theta 0 --grid 30 --points 8 --seed {seed}"
+_SHORT = shortages(("none", "spring-damper"), (0, 0.01, 0.02, 0.05, 0.1, 0.2), 25)
+_DELAYED = shortages(("none",), (0, 0.002, 0.005, 0.01, 0.02), 40, theta=(4, 9))
+
+
+def _meets(name: str, asks: str, loop: str) -> Check:
+    return Check(name, asks, f"sim.validate {loop} {_MEET}", verdicts)
+
+
+CHECKS = (
+    _meets("none", "Two devices without a coupling", "--case none"),
+    _meets("I", "A coupling for any passive environment", "--case I"),
+    _meets("II", "The same, designed against an undelayed reference", "--case II"),
+    _meets("stiff", "The stiffest coupling for this environment alone", "--case I --condition this-environment"),
+    _meets("optimal", "The best linear coupling for this environment", "--case I --coupling optimal"),
+    _meets("published", "The gains that the paper prints", "--case I --coupling published"),
+    _meets("three", "Three people, rigid devices, unequal delays", "--scenario three-rigid --case I"),
+    Check("tightness", "How tight is the condition?", _SHORT, tightness, "plot_tightness"),
+    Check("delayed", "How tight is it with long delays?", _DELAYED, tightness, "plot_tightness"),
+    Check("map", "Which springs and dampers may a device render against a wall?", _MAP, gain_map),
+    Check("accuracy", "Is MuJoCo right, and at what cost?", "sim.accuracy --duration 6", accuracy),
+    Check("hard", "Numerically hard loops", hard_loops, hard),
+    Check("faults", "Does every fault of a link end as it must?", faults, fault_table),
+)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a check found. Its files are in the folder of its name."""
+
+    check: Check
+    command: str
+    code: int | None  # the command's exit code; None where it broke off with `trouble`
+    wall_s: float
+    parts: tuple[Part, ...] = ()
+    pictures: tuple[str, ...] = ()  # paths from the report's folder
+    trouble: str | None = None
+    report: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def holds(self) -> bool:
+        return self.code == options.DONE
+
+
+def ask(check: Check, out: Path, humans: int, seed: int) -> Answer:
+    """Run one check with its files in `out`/name; bad input and impossible designs are its trouble."""
+    command, place = check.command(humans, seed), folder(out / check.name)
+    begin, trouble, code = time.perf_counter(), None, None
+    for old in (place / "report.json", *place.glob("*.png")):  # of an earlier run: never shown as this one's
+        old.unlink(missing_ok=True)
+    try:
+        code = _measured(check, place, seed) if callable(check.answer) else _called(command, place)
+    except (InputError, SingularLoop, DesignFailed) as error:
+        trouble = " ".join(str(error).split())
+    wall = time.perf_counter() - begin
+    written = place / "report.json"
+    report = json.loads(written.read_text()) if written.exists() else {}
+    parts = tuple(check.figures(report)) if report else ()
+    pictures = tuple(path.relative_to(out).as_posix() for path in sorted(place.glob("*.png")))
+    return Answer(check, f"python -m {command}", code, wall, parts, pictures, trouble, report)
+
+
+def _called(command: str, place: Path) -> int:
+    """Another command, as `python -m` runs it."""
+    module, *words = shlex.split(command)
+    with redirect_stdout(StringIO()):
+        return import_module(f"cli.{module.rpartition('.')[2]}").main([*words, "--out", str(place)])
+
+
+def _measured(check: Check, place: Path, seed: int) -> int:
+    """Rows of our own; what is done when the keyboard interrupts is kept."""
+    rows, interrupted = [], False
+    assert callable(check.answer)
+    try:
+        for row in check.answer(seed):
+            rows.append(row)
+    except KeyboardInterrupt:
+        interrupted = True
+    if check.picture and rows:
+        from sim import plots
+
+        getattr(plots, check.picture)(rows, place / f"{check.name}.png")
+    holds = all(row["holds"] for row in rows)
+    write_json(place / "report.json", {"rows": rows, "holds": holds, "seed": seed, "interrupted": interrupted})
+    if interrupted:
+        return options.INTERRUPTED
+    return options.DONE if holds else options.DOES_NOT_HOLD
+
+
+# ----------------------------------------------------------------------------------------------------
+# The command.
+
+
+def main(argv: list[str]) -> int:
+    """Run the checks. 0: all hold, 1: one does not, 130: interrupted; what was done is in the report."""
+    args = _parser().parse_args(argv)
+    options.check_json(args)
+    checks, out, screen = _chosen(args), folder(Path(args.out or "out/validate")), render.console(args)
+    answers: list[Answer] = []
+    begin, interrupted = time.perf_counter(), False
+    for number, check in enumerate(checks, start=1):
+        screen.print(f"[dim]{number}/{len(checks)}[/] {check.asks} ...", end="\n" if screen.is_terminal else " ")
+        try:
+            answers.append(ask(check, out, args.humans, args.seed))
+        except KeyboardInterrupt:
+            interrupted = True
+            break
+        screen.print(f"{_verdict(answers[-1])} ({answers[-1].wall_s:.1f} s)")
+        if interrupted := answers[-1].code == options.INTERRUPTED:
+            break
+    outcome = {
+        "holds": len(answers) == len(checks) and all(answer.holds for answer in answers),
+        "checks": [_part(answer) for answer in answers],
+        "left_out": [check.name for check in checks[len(answers) :]],
+        "humans": args.humans,
+        "seed": args.seed,
+        "interrupted": interrupted,
+        "wall_s": time.perf_counter() - begin,
+        "machine": machine(),
+    }
+    screen.print(headline(outcome))
+    if len(checks) == 1 and answers:
+        _show(answers[0], screen)
+    render.publish(args, outcome, (), (), out, [write(out / "report.md", markdown(outcome))])
+    if interrupted:
+        return options.INTERRUPTED
+    return options.DONE if outcome["holds"] else options.DOES_NOT_HOLD
+
+
+def _parser() -> options.Parser:
+    parser = options.Parser(
+        "sim.suite",
+        "Run every check that a verdict rests on and write one report.",
+        "python -m sim.suite --only I,hard --humans 200",
+    )
+    names = ",".join(check.name for check in CHECKS)
+    parser.add_argument("--only", type=_names, metavar="NAME,..", help=f"of {names} (default all)")
+    humans, count = "random humans per loop (default 300)", options.whole(1, 1_000_000)
+    parser.add_argument("--humans", type=count, default=300, metavar="N", help=humans)
+    options.add_output_options(parser, what="folder for the report (default out/validate)")
+    return parser
+
+
+def _names(text: str) -> list[str]:
+    known, names = [check.name for check in CHECKS], text.split(",")
+    for name in names:
+        if name not in known:
+            raise argparse.ArgumentTypeError(f"has {name!r}, allowed are {', '.join(known)}")
+    return names
+
+
+def _chosen(args: argparse.Namespace) -> list[Check]:
+    """The checks asked for, in the order of CHECKS."""
+    return [check for check in CHECKS if args.only is None or check.name in args.only]
+
+
+def _verdict(answer: Answer) -> str:
+    if answer.code == options.INTERRUPTED:
+        return "[yellow]interrupted[/]"
+    return "[green]holds[/]" if answer.holds else f"[red]{answer.trouble or 'does not hold'}[/]"
+
+
+def _show(answer: Answer, screen: render.Screen) -> None:
+    """The figures of a check that was asked for alone."""
+    for part in answer.parts:
+        screen.print(render.grid(part.title, part.columns, part.rows, left=range(len(part.columns))))
+
+
+def _part(answer: Answer) -> Row:
+    return {
+        "name": answer.check.name,
+        "asks": answer.check.asks,
+        "command": answer.command,
+        "exit_code": answer.code,
+        "holds": answer.holds,
+        "trouble": answer.trouble,
+        "wall_s": answer.wall_s,
+        "parts": [asdict(part) for part in answer.parts],
+        "pictures": list(answer.pictures),
+        "report": answer.report,
+    }
+
+
+# ----------------------------------------------------------------------------------------------------
+# The report for a stranger.
 
 
 def headline(outcome: dict[str, Any]) -> str:
@@ -391,232 +545,3 @@ def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
 def _anchor(title: str) -> str:
     """As GitHub makes it from a heading."""
     return "".join(c for c in title.lower() if c.isalnum() or c in " -").replace(" ", "-")
-
-
-def _damping(certificates: dict[str, Any]) -> list[tuple[str, str]]:
-    rows = []
-    for name, part in certificates.items():
-        needed = [f"{value:.4g}" if value is not None else "infinite" for value in part["required_damping"]]
-        available = [f"{value:.4g}" for value in part["available_damping"]]
-        rows.append((f"damping needed, {name}", f"{', '.join(needed)} of {', '.join(available)} N s/m"))
-    return rows
-
-
-def _growing(part: dict[str, Any]) -> str:
-    growth = part["growth_rate_per_s"]
-    return "none" if growth is None else f"{growth:+.4g} 1/s at {part['frequency_hz']:.1f} Hz"
-
-
-@dataclass(frozen=True)
-class Check:
-    """A question, the command that answers it, and how its JSON report reads as figures."""
-
-    name: str  # of its folder, too
-    asks: str
-    command: str  # module and options; {humans} and {seed} are filled in
-    figures: Callable[[dict[str, Any]], list[Part]]
-
-
-_MEET = "--humans {humans} --links mixed --duration 1 --adversary --generations 60 --seed {seed}"
-
-CHECKS = (
-    Check("none", "Two devices without a coupling", f"sim.validate --case none {_MEET}", verdicts),
-    Check("I", "A coupling for any passive environment", f"sim.validate --case I {_MEET}", verdicts),
-    Check(
-        "II",
-        "The same, designed against an undelayed reference",
-        f"sim.validate --case II {_MEET}",
-        verdicts,
-    ),
-    Check(
-        "stiff",
-        "The stiffest coupling for this environment alone",
-        f"sim.validate --case I --condition closed-loop {_MEET}",
-        verdicts,
-    ),
-    Check(
-        "optimal",
-        "The best linear coupling for this environment",
-        f"sim.validate --case I --coupling optimal {_MEET}",
-        verdicts,
-    ),
-    Check(
-        "published",
-        "The gains that the paper prints",
-        f"sim.validate --case I --coupling published {_MEET}",
-        verdicts,
-    ),
-    Check(
-        "three",
-        "Three people, rigid devices, unequal delays",
-        f"sim.validate --scenario three-rigid --case I {_MEET}",
-        verdicts,
-    ),
-    Check(
-        "tightness",
-        "How tight is the condition?",
-        "sim.tightness --case I --generations 25 --seed {seed}",
-        tightness,
-    ),
-    Check(
-        "delayed",
-        "How tight is it with long delays?",
-        "sim.tightness --case none --theta 4,9 --short 0,0.2,0.5,1,2 --seed {seed}",
-        tightness,
-    ),
-    Check(
-        "map",
-        "Which springs and dampers may a device render against a wall?",
-        "sim.zwidth --rigid --T 1e-3 --theta 0 --grid 30 --points 8 --seed {seed}",
-        gain_map,
-    ),
-    Check("accuracy", "Is MuJoCo right, and at what cost?", "sim.accuracy --duration 6", accuracy),
-    Check("hard", "Numerically hard loops", "sim.hard", hard),
-)
-
-
-@dataclass(frozen=True)
-class Answer:
-    """What a check found. Its files are in the folder of its name."""
-
-    check: Check
-    command: str
-    code: int | None  # the command's exit code; None where it broke off with `trouble`
-    wall_s: float
-    parts: tuple[Part, ...] = ()
-    pictures: tuple[str, ...] = ()  # paths from the report's folder
-    trouble: str | None = None
-    report: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def holds(self) -> bool:
-        return self.code == DONE
-
-
-def main(argv: list[str]) -> int:
-    """Run the checks. 0: all hold, 1: one does not, 130: interrupted; what was done is in the report."""
-    args = _parser().parse_args(argv)
-    checks, humans, seed = _chosen(args), _humans(args), seed_from(args)
-    check_json(args)
-    out, screen = folder(Path(args.out or "out/validate")), console(args)
-    answers: list[Answer] = []
-    begin, interrupted = time.perf_counter(), False
-    for number, check in enumerate(checks, start=1):
-        screen.print(f"[dim]{number}/{len(checks)}[/] {check.asks} ...", end="\n" if screen.is_terminal else " ")
-        try:
-            answers.append(ask(check, out, humans, seed))
-        except KeyboardInterrupt:
-            interrupted = True
-            break
-        _tell(answers[-1], screen)
-        if interrupted := answers[-1].code == INTERRUPTED:
-            break
-    outcome = _outcome(answers, checks, humans, seed, interrupted, time.perf_counter() - begin)
-    outcome["files"] = [str(write(out / "report.md", markdown(outcome)))]
-    outcome["files"].append(str(out / "report.json"))
-    write_json(out / "report.json", outcome)
-    screen.print(f"{headline(outcome)} Report: {out / 'report.md'}")
-    if args.json:
-        write_json(args.json, outcome)
-    if interrupted:
-        return INTERRUPTED
-    return DONE if outcome["holds"] else DOES_NOT_HOLD
-
-
-def ask(check: Check, out: Path, humans: int, seed: int) -> Answer:
-    """Run one check's command with its files in `out`/name; bad input and impossible designs are its trouble."""
-    command = check.command.format(humans=humans, seed=seed)
-    module, *options = shlex.split(command)
-    place = out / check.name
-    begin = time.perf_counter()
-    trouble, code = None, None
-    for old in (place / "report.json", *place.glob("*.png")):  # of an earlier run: never shown as this one's
-        old.unlink(missing_ok=True)
-    try:
-        with redirect_stdout(StringIO()):
-            code = entry(module)([*options, "--out", str(place)])
-    except (InputError, SingularLoop, DesignFailed) as error:
-        trouble = " ".join(str(error).split())
-    wall = time.perf_counter() - begin
-    written = place / "report.json"
-    report = json.loads(written.read_text()) if written.exists() else {}
-    parts = tuple(check.figures(report)) if report else ()
-    pictures = tuple(path.relative_to(out).as_posix() for path in sorted(place.glob("*.png")))
-    return Answer(check, f"python -m {command}", code, wall, parts, pictures, trouble, report)
-
-
-def entry(module: str) -> Callable[[list[str]], int]:
-    """What `python -m module` runs."""
-    if module == "sim.tightness":
-        return run_tightness
-    return importlib.import_module(f"cli.{module.rpartition('.')[2]}").main
-
-
-def _parser() -> Parser:
-    parser = Parser(
-        "sim.suite",
-        "Run every check that a verdict rests on and write one report.",
-        "python -m sim.suite --only I,hard --humans 200",
-    )
-    names = ",".join(check.name for check in CHECKS)
-    parser.add_argument("--only", metavar="NAME,..", help=f"of {names} (default all)")
-    parser.add_argument("--humans", default="300", metavar="N", help="random humans per loop (default 300)")
-    output = parser.add_argument_group("output")
-    output.add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
-    output.add_argument("--out", metavar="DIR", help="folder for the report (default out/validate)")
-    output.add_argument("--seed", metavar="N", default="0", help="for random draws; recorded (default 0)")
-    return parser
-
-
-def _chosen(args: argparse.Namespace) -> list[Check]:
-    """The checks asked for, in the order of CHECKS. Raises InputError."""
-    if args.only is None:
-        return list(CHECKS)
-    known, names = {check.name: check for check in CHECKS}, args.only.split(",")
-    for name in names:
-        if name not in known:
-            raise InputError(f"--only has {name!r}, allowed are {', '.join(known)}")
-    return [check for check in CHECKS if check.name in names]
-
-
-def _humans(args: argparse.Namespace) -> int:
-    (humans,) = numbers("--humans", args.humans, int, 1)
-    if not 1 <= humans <= 1_000_000:
-        raise InputError(f"--humans is {humans}, allowed are 1 to 1000000")
-    return humans
-
-
-def _outcome(
-    answers: Sequence[Answer], checks: Sequence[Check], humans: int, seed: int, interrupted: bool, wall: float
-) -> dict[str, Any]:
-    return {
-        "holds": len(answers) == len(checks) and all(answer.holds for answer in answers),
-        "checks": [
-            {
-                "name": answer.check.name,
-                "asks": answer.check.asks,
-                "command": answer.command,
-                "exit_code": answer.code,
-                "holds": answer.holds,
-                "trouble": answer.trouble,
-                "wall_s": answer.wall_s,
-                "parts": [asdict(part) for part in answer.parts],
-                "pictures": list(answer.pictures),
-                "report": answer.report,
-            }
-            for answer in answers
-        ],
-        "left_out": [check.name for check in checks[len(answers) :]],
-        "humans": humans,
-        "seed": seed,
-        "interrupted": interrupted,
-        "wall_s": wall,
-        "machine": machine(),
-    }
-
-
-def _tell(answer: Answer, screen: Console) -> None:
-    verdict = "[green]holds[/]" if answer.holds else f"[red]{answer.trouble or 'does not hold'}[/]"
-    if answer.code == INTERRUPTED:
-        verdict = "[yellow]interrupted[/]"
-    screen.print(f"{verdict} ({answer.wall_s:.1f} s)")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cli.options import DONE, Parser, check_json, console
-from sim.files import write_json
+from cli import options, render
 from sim.scenario import InputError
 from sim.trace import Result, growths, told
 
@@ -14,16 +13,8 @@ ZOOM_HZ = 10.0  # the picture shows six periods of it where nothing oscillates
 
 def main(argv: list[str]) -> int:
     """Look at a trace. 0: done, whatever it shows."""
-    parser = Parser(
-        "sim.trace",
-        "Growth of the oscillations in a stored trace, from its displacements alone, and its picture.",
-        "python -m sim.trace out/bridge-I/trace.npz --plot figure.png",
-    )
-    parser.add_argument("trace", metavar="TRACE.npz", help="written by sim.run or hw.bridge")
-    parser.add_argument("--plot", metavar="FILE.png", help="draw the trace")
-    parser.add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
-    args = parser.parse_args(argv)
-    check_json(args)
+    args = _parser().parse_args(argv)
+    options.check_json(args)
     result = Result.load_npz(Path(args.trace))
     found = growths(result)
     if not result.t.size:
@@ -39,12 +30,19 @@ def main(argv: list[str]) -> int:
 
         strongest = next((one.frequency_hz for one in found if one.frequency_hz), ZOOM_HZ)
         plot_run(result, Path(args.plot), args.trace, strongest)
-    out = console(args)
     T = float(result.t[-1]) / max(1, result.t.size - 1)
-    for part in outcome["growth"]:
-        out.print(f"growth, {told(part, T)}", soft_wrap=True)
-    if not found:
-        out.print("no loop was closed at full gain: there is no growth to tell of")
-    if args.json:
-        write_json(args.json, outcome)
-    return DONE
+    lines = [f"growth, {told(part, T)}" for part in outcome["growth"]]
+    render.publish(args, outcome, (), lines or ["no loop was closed at full gain: there is no growth to report"])
+    return options.DONE
+
+
+def _parser() -> options.Parser:
+    parser = options.Parser(
+        "sim.trace",
+        "Growth of the oscillations in a stored trace, from its displacements alone, and its picture.",
+        "python -m sim.trace out/bridge-I/trace.npz --plot figure.png",
+    )
+    parser.add_argument("trace", metavar="TRACE.npz", help="written by sim.run or hw.bridge")
+    parser.add_argument("--plot", metavar="FILE.png", help="draw the trace")
+    options.add_json_option(parser)
+    return parser

@@ -5,25 +5,12 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
-from cli.options import (
-    DONE,
-    INTERRUPTED,
-    Parser,
-    add_loop_options,
-    check_json,
-    console,
-    numbers,
-    progress_bar,
-    scenario_from,
-)
-from design.certificate import CONDITIONS
+from cli import options, render
+from design.result import CONDITION_NAMES
 from sim.files import write_json
 from sim.scenario import InputError
 from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, Script, first_loop, parse_script
@@ -41,10 +28,11 @@ DRAWN = ("auto", "gl", "flat")
 def main(argv: list[str]) -> int:
     """Show the loop until the window is closed or the film is full. 0: shown; 130: interrupted."""
     args = _parser().parse_args(argv)
-    scenario, wish = scenario_from(args), _wish(args)
-    check_json(args)
+    scenario = options.scenario_from(args)
+    options.check_json(args)
     if args.video:
         check_film(Path(args.video))
+        _check_speed(args)
     label, script = _beginning(args, scenario.channels)
     # --case none begins without a coupling; those that keys bring are for case I
     menu = Menu("I" if args.case == "none" else args.case, args.condition, args.coupling if label == GIVEN else None)
@@ -52,54 +40,40 @@ def main(argv: list[str]) -> int:
     executor = ThreadPoolExecutor(1)
     try:
         session = Session(prepared, executor, script, inf if args.video else LONGEST_LAG)
-        outcome = _film(args, session, wish) if args.video else _window(session, wish)
+        outcome = _film(args, session) if args.video else _window(session, args.duration)
     finally:
         executor.shutdown(cancel_futures=True)
     outcome = {"case": args.case, **session_report(session), **outcome}
-    _print_story(outcome, console(args))
+    _print_story(outcome, render.console(args))
     if args.json:
         write_json(args.json, outcome)
-    return INTERRUPTED if outcome["interrupted"] else DONE
+    return options.INTERRUPTED if outcome["interrupted"] else options.DONE
 
 
-def _parser() -> Parser:
+def _parser() -> options.Parser:
     keys = ", ".join(f"{name} {word}" for name, word in keys_help(given=True))
-    parser = Parser("sim.view", f"Feel the loop in a window, or film it.\n\nKeys: {keys}.", EXAMPLE)
-    add_loop_options(parser)
+    parser = options.Parser("sim.view", f"Feel the loop in a window, or film it.\n\nKeys: {keys}.", EXAMPLE)
+    options.add_loop_options(parser)
     what = f"to begin with: {', '.join(_names())} or FILE.json; designed is spring-damper"
     parser.add_argument("--coupling", metavar="NAME|FILE", help=what)
-    parser.add_argument("--condition", choices=CONDITIONS, help="of a design (default: each one's own)")
+    options.add_condition_option(parser, "of a design")
     parser.add_argument("--script", metavar="EVENTS", help=f"what happens when [s] (default of a video: '{SCRIPT}')")
-    parser.add_argument(
-        "--duration", metavar="SECONDS", help="default: a window until it is closed, a video until after its script"
-    )
-    parser.add_argument("--json", metavar="FILE|-", help="what happened, machine-readable; - is standard output")
+    seconds, until = options.number(1e-3, LONGEST, "s"), "a window until it is closed, a video until after its script"
+    parser.add_argument("--duration", type=seconds, metavar="SECONDS", help=f"default: {until}")
+    options.add_json_option(parser)
     film = parser.add_argument_group("without a display")
     film.add_argument("--video", metavar="FILE", help="a film: .gif, or .mp4 where ffmpeg is installed")
-    film.add_argument("--fps", metavar="N", default="10", help="pictures per second (default 10)")
-    film.add_argument(
-        "--draw", choices=DRAWN, default="auto", help="by OpenGL, or flat without it (default: by what works)"
-    )
+    rate = "pictures per second (default 10); for a .gif what divides 100"
+    film.add_argument("--fps", type=options.whole(1, 100), default=10, metavar="N", help=rate)
+    drawn = "by OpenGL, or flat without it (default: by what works)"
+    film.add_argument("--draw", choices=DRAWN, default="auto", help=drawn)
     return parser
 
 
-@dataclass(frozen=True)
-class Wish:
-    """How long, and how many pictures per second."""
-
-    duration: float | None  # [s]
-    fps: int
-
-
-def _wish(args: argparse.Namespace) -> Wish:
+def _check_speed(args: argparse.Namespace) -> None:
     """Raises InputError; GIF counts in hundredths of a second."""
-    duration = None if args.duration is None else numbers("--duration", args.duration, float, 1)[0]
-    if duration is not None and not 0 < duration <= LONGEST:
-        raise InputError(f"--duration is {duration:g}, allowed are more than 0 and up to {LONGEST} s")
-    (fps,) = numbers("--fps", args.fps, int, 1)
-    if not 1 <= fps <= 100 or (str(args.video).endswith(".gif") and 100 % fps):
-        raise InputError(f"--fps is {fps}, allowed are 1 to 100, and for a .gif only what divides 100")
-    return Wish(duration, fps)
+    if args.video.endswith(".gif") and 100 % args.fps:
+        raise InputError(f"--fps is {args.fps}, allowed for a .gif are the numbers that divide 100")
 
 
 def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:
@@ -134,41 +108,40 @@ def _names() -> list[str]:
     return list(dict.fromkeys([*LABELS, *COUPLINGS]))
 
 
-def _film(args: argparse.Namespace, session: Session, wish: Wish) -> dict[str, Any]:
+def _film(args: argparse.Namespace, session: Session) -> dict[str, Any]:
     """The session against a clock of its own: the same film every time. Interrupted, it is as long as it got."""
-    seconds = wish.duration or (session.script_ends + AFTER)
-    count, interrupted = round(seconds * wish.fps) + 1, False
+    seconds = args.duration or (session.script_ends + AFTER)
+    count, interrupted = round(seconds * args.fps) + 1, False
     assembly = session.prepared.assembly
     artist, drawn, remarks = painter(args.draw, assembly.scene, assembly.process.force_limit)
-    bar, progress = progress_bar("filming")
 
-    def pictures() -> Iterator[Picture]:
+    def pictures(move: render.Move) -> Iterator[Picture]:
         nonlocal interrupted
         for i in range(count):
             try:
-                picture = artist.picture(session.frame(i / wish.fps))
+                picture = artist.picture(session.frame(i / args.fps))
             except KeyboardInterrupt:
                 interrupted = True
                 return
             yield picture
-            progress(i + 1, count)
+            move(i + 1, count)
 
     try:
-        with bar:
-            made = save_film(Path(args.video), pictures(), wish.fps)
+        with render.progress("filming") as move:
+            made = save_film(Path(args.video), pictures(move), args.fps)
     finally:
         artist.close()
-    video = {"file": args.video, "pictures": made, "fps": wish.fps, "drawn": drawn}
+    video = {"file": args.video, "pictures": made, "fps": args.fps, "drawn": drawn}
     return {"video": video, "interrupted": interrupted, "remarks": remarks}
 
 
-def _window(session: Session, wish: Wish) -> dict[str, Any]:
+def _window(session: Session, duration: float | None) -> dict[str, Any]:
     from sim.view.window import NoWindow, show
 
     stage = Stage(session.prepared.assembly.scene, session.prepared.assembly.process.force_limit)
     interrupted = False
     try:
-        show(session, stage, wish.duration)
+        show(session, stage, duration)
     except NoWindow as error:
         raise InputError(f"{error}; --video FILE.gif needs no window") from None
     except KeyboardInterrupt:
@@ -177,23 +150,19 @@ def _window(session: Session, wish: Wish) -> dict[str, Any]:
     return {"clock": clock, "interrupted": interrupted, "remarks": []}
 
 
-def _print_story(outcome: dict[str, Any], out: Console) -> None:
+def _print_story(outcome: dict[str, Any], out: render.Screen) -> None:
     """One line per event, and where the film is."""
     for event in outcome["events"]:
-        held = [name for name, part in event["certificates"].items() if part["certified"]]
+        held = [word for name, word in CONDITION_NAMES.items() if event["certificates"][name]["certified"]]
         growth = event["exact_growth_rate_per_s"]
         grows = "no growth" if growth is None else f"{growth:+.3g} 1/s at {event['exact_frequency_hz']:.1f} Hz"
-        delays = f"theta {event['theta']}, psi {event['psi']}"
         proved = f"certified ({', '.join(held)})" if held else "NOT certified"
-        loop = f"{event['coupling']}, {delays}: {grows}, {proved}"
+        loop = f"{event['coupling']}, theta {event['theta']}, psi {event['psi']}: {grows}, {proved}"
         out.print(f"{event['t_s']:6.2f} s  {event['event']:<10} {loop}", soft_wrap=True)
     out.print(f"{outcome['simulated_s']:6.2f} s  end        {outcome['clipped_ticks']} ticks at a force limit")
-    if "clock" in outcome:
-        out.print(
-            f"The clock was missed {outcome['clock']['overruns']} times: {outcome['clock']['lost_s']:.2f} s lost."
-        )
-    if "video" in outcome:
-        video = outcome["video"]
+    if clock := outcome.get("clock"):
+        out.print(f"The clock was missed {clock['overruns']} times: {clock['lost_s']:.2f} s lost.")
+    if video := outcome.get("video"):
         out.print(f"{video['file']}: {video['pictures']} pictures, drawn by {video['drawn']}", soft_wrap=True)
     for remark in outcome["remarks"]:
         out.print(f"Note: {remark}.", soft_wrap=True)

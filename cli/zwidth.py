@@ -1,4 +1,4 @@
-"""python -m sim.zwidth: the K-B map that haptics people draw - certified, exact for random humans, simulated.
+"""python -m sim.zwidth: the Z-width map (K-B plane): certified, exact for random humans, simulated.
 
 options -> the loop (Ground: K and B are the coupling's; Surroundings: the environment's) -> Grid -> Map -> files
 """
@@ -8,39 +8,23 @@ from __future__ import annotations
 import argparse
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
-from cli.options import (
-    DOES_NOT_HOLD,
-    DONE,
-    INTERRUPTED,
-    Parser,
-    add_loop_options,
-    add_output_options,
-    add_rigid_option,
-    console,
-    numbers,
-    out_folder,
-    progress_bar,
-    require_constant_delay,
-    rigid_loop,
-    scenario_from,
-    seed_from,
-)
-from cli.run import coupling_part
+from cli import options, render
 from controller.lti import Array
 from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, promise_of
 from design.maps import contact_springs
 from design.ranges import check_set, set_part
+from design.result import CONDITION_NAMES
+from sim import report
 from sim.couplings import NAMES, Chosen, choose
-from sim.files import write, write_json
-from sim.scenario import InputError, Scenario
+from sim.files import write
+from sim.scenario import InputError, Scenario, require_constant_delay
 from sim.stability import MARGINAL, SUSTAINED, slowest_seen
 from sim.zwidth import (
     DECIDED,
@@ -65,37 +49,30 @@ from sim.zwidth import (
 )
 
 # ----------------------------------------------------------------------------------------------------
-# What a K-B map says, in a few lines on the terminal.
+# What a Z-width map says, in a few lines on the terminal.
 
 
-def print_map(outcome: dict[str, Any], console: Console) -> None:
-    """What the map says in a few lines."""
-    cells = len(outcome["grid"]["K"]) * len(outcome["grid"]["B"])
+def _table(outcome: dict[str, Any]) -> Table:
     K, B = outcome["grid"]["K"], outcome["grid"]["B"]
+    cells, crowd, simulation = len(K) * len(B), outcome["population"], outcome["simulation"]
     title = f"K {K[0]:.4g} to {K[-1]:.4g} N/m, B {B[0]:.4g} to {B[-1]:.4g} N s/m, {cells} couplings"
-    table = Table(title=title, title_justify="left", show_header=False)
-    errors = outcome.get("error", {})
-    if outcome["axes"] == "environment":
-        for row in _designed_rows(outcome):
-            table.add_row(*row)
+    rows = _designed_rows(outcome) if outcome["axes"] == "environment" else []
     for name in outcome["conditions"]:
-        error = errors.get(name)
-        near = f"; edge within {100 * error['edge_relative_in_K']:.2g} % of design.margin" if error else ""
-        table.add_row(f"certified, {name}", f"{_share(outcome[name]['certified_cells'], cells)}{near}")
-    crowd = outcome["population"]
-    who = f"stable with all of {crowd['humans']} random humans"
-    table.add_row(who, f"{_share(crowd['stable_cells'], cells)} ({crowd['decided_cells']} decided)")
-    simulation = outcome["simulation"]
+        error = outcome.get("error", {}).get(name)
+        near = f"; edge within {100 * error['edge_relative_in_K']:.2g} % of the condition's own sweep" if error else ""
+        rows.append((f"certified, {_word(name)}", f"{_share(outcome[name]['certified_cells'], cells)}{near}"))
+    stable = f"{_share(crowd['stable_cells'], cells)} ({crowd['decided_cells']} decided)"
+    rows.append((f"stable with all of {crowd['humans']} random humans", stable))
     if simulation["points"]:
         beside = f"{simulation['undecided']} {UNDECIDED}, {simulation['differ_from_linear']} unlike the linear loop"
         ends = f"{simulation['oscillate']} of {len(simulation['points'])} oscillate, {beside}"
-        table.add_row(f"simulated{_effects(simulation)}", ends)
-    table.add_row("seconds", ", ".join(f"{stage} {wall:.1f}" for stage, wall in outcome["wall_s"].items()) or "-")
-    console.print(table)
-    for mark in outcome.get("marks", ()):
-        console.print(_mark_line(mark, crowd["humans"]))
-    for line in _remarks(outcome):
-        console.print(f"[dim]·[/] {line}")
+        rows.append((f"simulated{_effects(simulation)}", ends))
+    seconds = ", ".join(f"{stage} {wall:.1f}" for stage, wall in outcome["wall_s"].items()) or "-"
+    return render.facts(title, [*rows, ("seconds", seconds)], left=True)
+
+
+def _word(name: str) -> str:
+    return CONDITION_NAMES.get(name, name)
 
 
 def _designed_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
@@ -103,32 +80,33 @@ def _designed_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
     designed = outcome["designed_for"]
     each = (f"{' - '.join(s['between'])} {s['K']:g} N/m, {s['B']:g} N s/m" for s in designed["contact_springs"])
     needs = "; ".join(
-        f"{name} needs {100 / part['margin']:.4g} % of the damping ({part['proof']})"
-        for name, part in designed["certificates"].items()
-        if part["margin"]
+        f"{word} needs {100 / designed['certificates'][name]['margin']:.4g} % of the damping "
+        f"({designed['certificates'][name]['proof']})"
+        for name, word in CONDITION_NAMES.items()
+        if designed["certificates"][name]["margin"]
     )
     return [
         ("coupling", f"{outcome['coupling']['kind']}, fixed"),
         ("designed for", ", ".join(each)),
-        ("there", f"promise: {designed['promise'] or 'none'}; {needs or 'no damping is enough'}"),
+        ("there", f"guarantee: {designed['promise'] or 'none'}; {needs or 'no damping is enough'}"),
     ]
 
 
 def _about(outcome: dict[str, Any]) -> str:
-    """What the axes are, and what a certified cell promises."""
+    """What the axes are, and what a certified cell guarantees."""
     line = "K and B are those of every spring at a contact; each is certified for its environment alone, by a sweep"
     if MODEL_KEPT not in outcome["conditions"]:
         return f"{line}."
     return (
-        f"{line}: closed-loop, the population and MuJoCo with the coupling's model set to the cell's environment, "
+        f"{line}: this-environment, the population and MuJoCo with the coupling's model set to the cell's environment, "
         f"{MODEL_KEPT} with the model left at what the coupling was designed for."
     )
 
 
 def _mark_line(mark: dict[str, Any], humans: int) -> str:
-    ends = ", ".join(f"{name} {_stiffest(K)}" for name, K in mark["stiffest_K_at_this_B"].items())
+    ends = ", ".join(f"{_word(name)} {_stiffest(K)}" for name, K in mark["stiffest_K_at_this_B"].items())
     needs = ", ".join(
-        f"{name} needs {max(mark[name]['required_damping'], key=lambda d: d or np.inf) or np.inf:.6g} of "
+        f"{_word(name)} needs {max(mark[name]['required_damping'], key=lambda d: d or np.inf) or np.inf:.6g} of "
         f"{min(mark[name]['available_damping']):.6g} N s/m "
         f"({'[green]certified[/]' if mark[name]['certified'] else '[red]not certified[/]'})"
         for name in mark["stiffest_K_at_this_B"]
@@ -161,7 +139,7 @@ def _remarks(outcome: dict[str, Any]) -> list[str]:
         lines += [*outcome["remarks"], _about(outcome)]
     for name in outcome["conditions"]:
         if outcome[name].get("reason"):
-            lines.append(f"{name}: {outcome[name]['reason']}.")
+            lines.append(f"{_word(name)}: {outcome[name]['reason']}.")
         if outcome[name].get("contradicted_cells"):
             lines.append(f"[red]CONTRADICTION[/]: {outcome[name]['contradicted_cells']} certified cells are unstable.")
     if not simulation["nonlinear"] and simulation["differ_from_linear"]:
@@ -170,8 +148,8 @@ def _remarks(outcome: dict[str, Any]) -> list[str]:
         lines.append("The velocity filter is in all maps: it is linear, and part of the coupling.")
     if outcome["one_sided"]:
         lines.append(
-            "One-sided contact: closed-loop and the population are about each frozen contact state, theorem4 (psi = 0) "
-            "and the simulated points about contact made and broken."
+            "One-sided contact: this-environment and the population are about each frozen contact state, "
+            "any-environment (psi = 0) and the simulated points about contact made and broken."
         )
     if simulation["points"]:
         lines.append(
@@ -181,7 +159,7 @@ def _remarks(outcome: dict[str, Any]) -> list[str]:
         )
     if outcome["interrupted"]:
         lines.append("Interrupted: the map has what was finished.")
-    return [*lines, *outcome["files"]]
+    return lines
 
 
 def _share(count: int, cells: int) -> str:
@@ -189,7 +167,7 @@ def _share(count: int, cells: int) -> str:
 
 
 # ----------------------------------------------------------------------------------------------------
-# A K-B map as JSON and CSV; sim.zwidth.text prints it.
+# A Z-width map as JSON and CSV.
 
 
 NOT_REACHED = "not reached before the interruption"
@@ -296,7 +274,7 @@ def add_truth(outcome: dict[str, Any], found: dict[str, Truth | None]) -> None:
 
 
 def add_marks(outcome: dict[str, Any], marks: Sequence[Mark]) -> None:
-    """What is asked about single couplings; the whole holds only if closed-loop certifies them all."""
+    """What is asked about single couplings; the whole holds only if this-environment certifies them all."""
     outcome["marks"] = [
         {
             "K": mark.K,
@@ -351,78 +329,75 @@ def main(argv: list[str]) -> int:
     """Draw a map. 0: nothing contradicts it and every mark is certified, 1: else, 130: interrupted."""
     args = _parser().parse_args(argv)
     of_coupling = args.coupling is None
-    args.grid, args.press = args.grid or ("60" if of_coupling else "24"), args.press or ("3" if of_coupling else "0")
-    scenario = scenario_from(args)
+    args.grid = args.grid or (60 if of_coupling else 24)
+    args.press = (3.0 if of_coupling else 0.0) if args.press is None else args.press
+    scenario = options.scenario_from(args)
     require_constant_delay(scenario, "sim.zwidth")
     _check_case(args)
-    seed, humans = seed_from(args), _whole(args, "humans", 1, 100_000)
-    marks = tuple(_pair("--mark", mark) for mark in args.mark or ())
     chosen = _chosen(args, scenario)
     ground: MapLoop = _surroundings(scenario, chosen) if chosen else _ground(args, scenario)
-    grid = _grid(args, ground, marks)
-    plan = _plan(args, ground)
-    out = out_folder(args, "zwidth")
+    marks = _marks(args)
+    grid, plan, out = _grid(args, ground, marks), _plan(args, ground), options.out_folder(args, "zwidth")
 
-    crowd = holders(ground.devices, ground.population, seed, humans, ground.population.links, ground.T)
-    bar, moved = progress_bar("certificates")
-    with bar:
-        drawn = draw_map(
-            ground,
-            grid,
-            crowd,
-            plan,
-            lambda stage, k, of: moved(k, of) or bar.update(bar.task_ids[0], description=stage),
-        )
-    outcome = summary(ground, drawn, plan, {"humans": humans, "seed": seed})
+    crowd = holders(ground.devices, ground.population, args.seed, args.humans, ground.population.links, ground.T)
+    with render.progress("certificates") as move:
+        drawn = draw_map(ground, grid, crowd, plan, lambda stage, k, of: move(k, of, stage))
+    outcome = summary(ground, drawn, plan, {"humans": args.humans, "seed": args.seed})
     outcome |= {"scenario": None if args.rigid else scenario.name, "scenario_digest": scenario.digest}
-    outcome |= _coupling(args, scenario, chosen, seed) if chosen else {"axes": "coupling", "coupling": None}
+    outcome |= _coupling(args, scenario, chosen) if chosen else {"axes": "coupling", "coupling": None}
     if not drawn.interrupted:
         add_truth(outcome, {name: truth(ground, drawn, name) for name in drawn.ratio})
         add_marks(outcome, [look(ground, crowd, *mark, grid.K) for mark in marks])
-    _save(args, ground, drawn, outcome, out)
-    print_map(outcome, console(args))
-    if args.json:
-        write_json(args.json, outcome)
+    files, lines = _save(args, drawn, outcome, out), [_mark_line(m, args.humans) for m in outcome.get("marks", ())]
+    render.publish(args, outcome, [_table(outcome)], [*lines, *_remarks(outcome)], out, files)
     if drawn.interrupted:
-        return INTERRUPTED
-    return DONE if outcome["holds"] else DOES_NOT_HOLD
+        return options.INTERRUPTED
+    return options.DONE if outcome["holds"] else options.DOES_NOT_HOLD
 
 
-def _parser() -> Parser:
-    parser = Parser("sim.zwidth", "Draw the K-B map: which spring-dampers are safe, for whom, by which test.", EXAMPLE)
-    add_loop_options(parser)
-    add_rigid_option(parser)
+def _parser() -> options.Parser:
+    what = "Draw the Z-width map: which spring-dampers are safe, for whom, by which test."
+    parser = options.Parser("sim.zwidth", what, EXAMPLE)
+    options.add_loop_options(parser)
+    options.add_rigid_option(parser)
     of_map = parser.add_argument_group("the map (K and B are the same on all channels)")
-    names = ", ".join(NAMES)
-    fixed = f"this coupling, fixed, and K and B of the environment's contact springs on the axes: {names} or FILE.json"
-    of_map.add_argument("--coupling", metavar="NAME|FILE", help=f"{fixed} (default: K and B of the coupling)")
-    of_map.add_argument("--condition", choices=CONDITIONS, help="that such a coupling is designed for")
-    of_map.add_argument("--grid", metavar="N", help="rows and columns (default 60; 24 with --coupling)")
-    of_map.add_argument("--K-range", metavar="LOW,HIGH", help="[N/m]; default from delta, theta and T")
-    of_map.add_argument("--B-range", metavar="LOW,HIGH", help="[N s/m]; default from delta")
+    fixed = "this coupling, fixed, and K and B of the environment's contact springs on the axes"
+    names = f"{', '.join(NAMES)} or FILE.json (default: K and B of the coupling)"
+    of_map.add_argument("--coupling", metavar="NAME|FILE", help=f"{fixed}: {names}")
+    options.add_condition_option(of_map, "that such a coupling is designed for")
+    rows = "rows and columns (default 60; 24 with --coupling)"
+    of_map.add_argument("--grid", type=options.whole(4, 400), metavar="N", help=rows)
+    K, B = "[N/m]; default from delta, theta and T", "[N s/m]; default from delta"
+    of_map.add_argument("--K-range", type=options.pair, metavar="LOW,HIGH", help=K)
+    of_map.add_argument("--B-range", type=options.pair, metavar="LOW,HIGH", help=B)
     of_map.add_argument("--scale", choices=("linear", "log"), help="default linear with --rigid, else log")
-    of_map.add_argument("--mark", action="append", metavar="K,B", help="where does this coupling lie? (repeatable)")
-    of_map.add_argument("--humans", default="200", metavar="N", help="random humans per device (default 200)")
-    of_map.add_argument("--no-plot", action="store_true", help="write no picture")
-    points = parser.add_argument_group("the points simulated in MuJoCo, and what they have beside the linear loop")
-    points.add_argument("--points", default="10", metavar="N", help="rows and columns of them (default 10, 0 for none)")
-    points.add_argument("--trials", default="1", metavar="N", help="humans at each, the most critical (default 1)")
-    points.add_argument("--duration", default="3", metavar="SECONDS", help="of each (default 3)")
-    points.add_argument(
-        "--start", default="1e-3", metavar="METRES", help="first swing of motor or handle (default 1e-3)"
-    )
-    pressing = "steady force of every hand (default 3; 0 with --coupling, whose soft environments give way to it)"
-    points.add_argument("--press", metavar="NEWTONS", help=pressing)
-    points.add_argument("--threshold", metavar="METRES", help="amplitude of an oscillation (default 2 steps or 1e-5)")
-    points.add_argument("--quantisation", metavar="METRES", help="encoder step of every device")
-    points.add_argument("--saturation", action="store_true", help="motors have their force limits")
-    points.add_argument("--friction", metavar="NEWTONS", help="Coulomb friction of every device")
-    points.add_argument("--wall", action="store_true", help="contacts push and never pull")
-    points.add_argument(
-        "--velocity-filter", metavar="HERTZ", help="first-order cut-off of the damped velocity; in all maps"
-    )
-    add_output_options(parser)
+    mark = "where does this coupling lie? (repeatable)"
+    of_map.add_argument("--mark", type=options.pair, action="append", metavar="K,B", help=mark)
+    humans = "random humans per device (default 200)"
+    of_map.add_argument("--humans", type=options.whole(1, 100_000), default=200, metavar="N", help=humans)
+    _add_points(parser.add_argument_group("the points simulated in MuJoCo, and what they have beside the linear loop"))
+    options.add_output_options(parser, picture=True)
     return parser
+
+
+def _add_points(points: argparse._ActionsContainer) -> None:
+    def add(name: str, kind: Callable[[str], float], metavar: str, what: str, default: float | None = None) -> None:
+        points.add_argument(f"--{name}", type=kind, metavar=metavar, default=default, help=what)
+
+    add("points", options.whole(0, 400), "N", "rows and columns of them (default 10, 0 for none)", 10)
+    add("trials", options.whole(1, 100), "N", "humans at each, the most critical (default 1)", 1)
+    add("duration", options.number(), "SECONDS", "of each (default 3)", 3.0)
+    add("start", options.number(1e-9, 1, "m"), "METRES", "first swing of motor or handle (default 1e-3)", 1e-3)
+    pressing = "steady force of every hand (default 3; 0 with --coupling, whose soft environments give way to it)"
+    add("press", options.number(0, 1e3, "N"), "NEWTONS", pressing)
+    swing = "amplitude of an oscillation (default 2 steps or 1e-5)"
+    add("threshold", options.number(1e-9, 1, "m"), "METRES", swing)
+    add("quantisation", options.number(0, 1e-2, "m"), "METRES", "encoder step of every device")
+    points.add_argument("--saturation", action="store_true", help="motors have their force limits")
+    add("friction", options.number(0, 1e3, "N"), "NEWTONS", "Coulomb friction of every device")
+    points.add_argument("--wall", action="store_true", help="contacts push and never pull")
+    cutoff = "first-order cut-off of the damped velocity; in all maps"
+    add("velocity-filter", options.number(1e-3, 1e6, "Hz"), "HERTZ", cutoff)
 
 
 def _check_case(args: argparse.Namespace) -> None:
@@ -431,7 +406,8 @@ def _check_case(args: argparse.Namespace) -> None:
         instead = "use --case I, or --coupling none for a map over environments"
         raise InputError(f"--case none is the loop without coupling, and the map is of couplings: {instead}")
     if args.coupling is None and args.condition:
-        raise InputError(f"--condition {args.condition}: without --coupling nothing is designed, and both are drawn")
+        why = "without --coupling nothing is designed, and both are drawn"
+        raise InputError(f"--condition {_word(args.condition)}: {why}")
     for name in ("rigid", "wall", "velocity_filter"):
         if args.coupling is not None and getattr(args, name):
             what = "is about a map of spring-dampers; with --coupling the axes are the environment's"
@@ -456,19 +432,19 @@ def _surroundings(scenario: Scenario, chosen: Chosen) -> Surroundings:
         raise InputError(str(error)) from None
 
 
-def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, seed: int) -> dict[str, Any]:
-    """The fixed coupling and what is promised of it where it was designed, in the scenario's own environment."""
+def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> dict[str, Any]:
+    """The fixed coupling and what is guaranteed of it where it was designed, in the scenario's own environment."""
     loop = scenario.loop(args.case)
-    with (bar := progress_bar("searching the box"))[0]:
-        whole = check_set(loop, chosen.coupling, seed, progress=bar[1])
+    with render.progress("searching the ranges") as move:
+        whole = check_set(loop, chosen.coupling, args.seed, progress=move)
     requirements = assess(loop, chosen.coupling, chosen.phi)
     springs = contact_springs(loop.environment)
     return {
         "axes": "environment",
-        "coupling": coupling_part(chosen.kind, chosen.coupling, scenario.T),
+        "coupling": report.coupling_part(chosen.kind, chosen.coupling, scenario.T),
         "designed_for": {
             "contact_springs": [{"between": s.between, "K": s.stiffness, "B": s.damping} for s in springs],
-            "certificates": {name: certificate_part(r) for name, r in requirements.items()},
+            "certificates": report.certificates_part(requirements),
             "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
             "set": whole and set_part(whole),
         },
@@ -478,74 +454,46 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, seed
 
 def _ground(args: argparse.Namespace, scenario: Scenario) -> Ground:
     """The loop without its coupling. Raises InputError."""
-    cutoff = None
-    if args.velocity_filter is not None:
-        cutoff = _number(args, "velocity_filter", 1e-3, 1e6, "Hz")
     loop: dict[str, Any] = {"network": scenario.environment, "theta": scenario.theta, "psi": scenario.psi}
     devices = scenario.device
     try:
         if args.rigid:
-            loop, devices = {"network": None, **rigid_loop(args, scenario)}, devices[:1]
+            loop, devices = {"network": None, **options.rigid_loop(args, scenario)}, devices[:1]
         elif args.wall:
             loop["network"] = one_sided(scenario.environment)
-        return Ground(
-            devices, scenario.population, T=scenario.T, cutoff=cutoff, one_sided=args.rigid and args.wall, **loop
-        )
+        loop |= {"T": scenario.T, "cutoff": args.velocity_filter, "one_sided": args.rigid and args.wall}
+        return Ground(devices, scenario.population, **loop)
     except ValueError as error:
         raise error if isinstance(error, InputError) else InputError(str(error)) from None
 
 
+def _marks(args: argparse.Namespace) -> tuple[Range, ...]:
+    """The couplings that are asked about. Raises InputError."""
+    for K, B in args.mark or ():
+        if not (1e-3 <= K <= 1e9 and 0 <= B <= 1e6):
+            raise InputError(f"--mark is {K:g},{B:g}, allowed are K 1e-3 to 1e9 N/m, B 0 to 1e6 N s/m")
+    return tuple(args.mark or ())
+
+
 def _grid(args: argparse.Namespace, ground: MapLoop, marks: tuple[Range, ...]) -> Grid:
-    K, B = (
-        None if getattr(args, f"{name}_range") is None else _pair(f"--{name}-range", getattr(args, f"{name}_range"))
-        for name in "KB"
-    )
-    for stiffness, damping in marks:
-        if not (1e-3 <= stiffness <= 1e9 and 0 <= damping <= 1e6):
-            raise InputError(f"--mark is {stiffness:g},{damping:g}, allowed are K 1e-3 to 1e9 N/m, B 0 to 1e6 N s/m")
-    return make_grid(ground, _whole(args, "grid", 4, 400), K, B, args.scale, marks)
+    return make_grid(ground, args.grid, args.K_range, args.B_range, args.scale, marks)
 
 
 def _plan(args: argparse.Namespace, ground: MapLoop) -> Plan:
-    step = None if args.quantisation is None else _number(args, "quantisation", 0, 1e-2, "m")
-    friction = None if args.friction is None else _number(args, "friction", 0, 1e3, "N")
-    effects = Effects(step, friction, args.saturation)
+    effects = Effects(args.quantisation, args.friction, args.saturation)
     coarsest = max(device.encoder_step for device in effects.on(ground.devices))
-    threshold = max(2 * coarsest, FINEST) if args.threshold is None else _number(args, "threshold", 1e-9, 1, "m")
-    duration = _number(args, "duration", max(1.5, 1024 * ground.T), 1e4, "s")
-    trials, points = _whole(args, "trials", 1, 100), _whole(args, "points", 0, 400)
-    start, press = _number(args, "start", 1e-9, 1, "m"), _number(args, "press", 0, 1e3, "N")
-    return Plan(effects, points, trials, start, press, duration, threshold)
+    threshold = max(2 * coarsest, FINEST) if args.threshold is None else args.threshold
+    shortest = max(1.5, 1024 * ground.T)
+    if not shortest <= args.duration <= 1e4:
+        raise InputError(f"--duration is {args.duration:g}, allowed are {shortest:g} to 10000 s")
+    return Plan(effects, args.points, args.trials, args.start, args.press, args.duration, threshold)
 
 
-def _save(args: argparse.Namespace, ground: MapLoop, drawn: Map, outcome: dict[str, Any], out: Path) -> None:
-    """The picture, the table and the report; `outcome` learns where they are."""
+def _save(args: argparse.Namespace, drawn: Map, outcome: dict[str, Any], out: Path) -> list[Path]:
+    """The table and the picture."""
     files = [save_csv(drawn, out / "map.csv")]
     if not args.no_plot:
         from sim.plots import plot_zwidth
 
         files.append(plot_zwidth(drawn, outcome, out / "zwidth.png"))
-    outcome["files"] = [str(path) for path in (*files, out / "report.json")]
-    write_json(out / "report.json", outcome)
-
-
-def _whole(args: argparse.Namespace, name: str, least: int, most: int) -> int:
-    (value,) = numbers(f"--{name}", getattr(args, name), int, 1)
-    if not least <= value <= most:
-        raise InputError(f"--{name} is {value}, allowed are {least} to {most}")
-    return value
-
-
-def _number(args: argparse.Namespace, name: str, least: float, most: float, unit: str) -> float:
-    option = f"--{name.replace('_', '-')}"
-    (value,) = numbers(option, getattr(args, name), float, 1)
-    if not least <= value <= most:
-        raise InputError(f"{option} is {value:g}, allowed are {least:g} to {most:g} {unit}")
-    return value
-
-
-def _pair(option: str, text: str) -> Range:
-    if text.count(",") != 1:
-        raise InputError(f"{option} is {text!r}, expected two numbers separated by a comma")
-    first, second = numbers(option, text, float, 2)
-    return first, second
+    return files

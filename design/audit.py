@@ -1,9 +1,9 @@
-"""What an audit says: one dictionary for machines, and the same as a table for people."""
+"""What an audit says of a coupling: both conditions, how far it is from their edges, and what would help."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
@@ -11,11 +11,9 @@ from typing import Any, Self, cast, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
-from rich.console import Console
-from rich.table import Table
 from scipy.optimize import brentq
 
-from controller.coupling import Compliance, Coupling, InternalModel, NoCoupling, SpringDamper
+from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, environment, held
 from controller.loop import DelayRange, Loop, force_map
 from controller.lti import Lti, SingularLoop
@@ -39,7 +37,7 @@ from design.conditions import (
     refusal,
     this_environment,
 )
-from design.ranges import SetCheck, set_part, set_rows
+from design.ranges import SetCheck, set_part
 from design.result import listed
 
 # ----------------------------------------------------------------------------------------------------
@@ -378,6 +376,7 @@ KINDS = {
     SpringDamper: "spring-damper",
     Compliance: "compliance",
     InternalModel: "internal-model",
+    ForceFilter: "force-filter",
 }
 
 
@@ -415,7 +414,7 @@ def report(
         "set": whole and set_part(whole),
         "certified": here and (whole is None or proved or promised == ANY),
         "promise": promised,
-        "helps": _helps(subject, requirements["theorem4" if this_environment else "closed-loop"]),
+        "helps": _helps(subject, requirements["theorem4" if here else "closed-loop"]),
         "not_covered": CAVEATS,
     }
 
@@ -466,115 +465,7 @@ def _helps(subject: Subject, requirement: Requirement) -> list[dict[str, Any]]:
     ]
 
 
-def print_report(report: dict[str, Any], console: Console) -> None:
-    """The report as a table, and what it does not cover."""
-    table = Table(title=_verdict(report), title_justify="left")
-    table.add_column("")
-    parts = [report[condition] for condition in ("closed-loop", "theorem4")]
-    for part in parts:
-        table.add_column(part["condition"])
-    for name, cell in ROWS.items():
-        table.add_row(name, *(cell(part) for part in parts))
-    console.print(table)
-    if report["set"]:
-        over = Table(title="the box around the environment", title_justify="left", show_header=False)
-        for row in set_rows(report["set"]):
-            over.add_row(*row)
-        console.print(over)
-    for line in _remarks(report):
-        console.print(f"[dim]·[/] {line}")
-
-
-def _verdict(report: dict[str, Any]) -> str:
-    coupling = report["coupling"]
-    gains = f" K {listed(coupling['K'])} N/m, B {listed(coupling['B'])} N s/m" if coupling["K"] else ""
-    outcome = f"[green]certified[/] for {report['promise']}" if report["certified"] else "[red]not certified[/]"
-    if report["promise"] and not report["certified"]:
-        outcome += f" for the set, only for {report['promise']}"
-    return f"{coupling['kind']}{gains}: {outcome}"
-
-
-def _needs(part: dict[str, Any]) -> str:
-    word = "[green]certified[/]" if part["certified"] else "[red]not certified[/]"
-    return f"{listed(part['required_damping'])} of {listed(part['available_damping'])} N s/m: {word}"
-
-
-def _error(key: str, sign: str) -> Callable[[dict[str, Any]], str]:
-    """A relative error in percent, rounded down so that what is printed is tolerated."""
-
-    def cell(part: dict[str, Any]) -> str:
-        error = part["sensitivity"][key]
-        return "-" if error is None else f"{sign}{math.floor(1e4 * error) / 100:.2f} %"
-
-    return cell
-
-
-def _optional(value: float | None, unit: str = "") -> str:
-    return "-" if value is None else f"{value:.5g}{unit}"
-
-
-#: name of a row -> what stands in it, given the part of a condition
-ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
-    "needs damping": _needs,
-    "margin": lambda part: _optional(part["margin"]),
-    "binds at": lambda part: _optional(part["binding_frequency_hz"], " Hz"),
-    "stiffest K here": lambda part: _gains(part["stiffest"]["K"]),
-    "delta error": _error("delta_error", "-"),
-    "T error": _error("T_error", "+"),
-    "spare samples": lambda part: _optional(part["sensitivity"]["extra_samples"]),
-}
-
-
-def _gains(K: Sequence[float | None]) -> str:
-    return "-" if None in K else ", ".join(_down(k) for k in K) + " N/m"
-
-
-def _down(K: float | None) -> str:
-    """A stiffness to five digits, rounded down so that what is printed is certified."""
-    if K is None:
-        return "-"
-    unit = 10.0 ** (math.floor(math.log10(K)) - 4)
-    return f"{math.floor(K / unit) * unit:.5g}"
-
-
-def _remarks(report: dict[str, Any]) -> list[str]:
-    lines = [f"{note}." for note in report["notes"]]
-    for condition in ("closed-loop", "theorem4"):
-        part = report[condition]
-        for name, reason in (
-            ("", part.get("reason")),
-            (", stiffest K", part["stiffest"].get("reason")),
-            (", sensitivity", part["sensitivity"].get("reason") if part["certified"] else None),
-        ):
-            if reason:
-                lines.append(f"{condition}{name}: {reason}.")
-    for helping in report["helps"]:
-        enough = "enough" if helping["certified"] else "not enough alone"
-        need = f"{helping['condition']} then needs {listed(helping['required_damping'])} N s/m, {enough}"
-        lines.append(f"What helps: {helping['change']} ({need}).")
-    if (part := report["jitter-proof"]) is not None:
-        lines += _switching_remarks(part)
-    return [*lines, report["not_covered"]]
-
-
-def _switching_remarks(part: dict[str, Any]) -> list[str]:
-    span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))
-    proof = ", proved exactly" if part["proof"] == "rational" else ""
-    lines = [f"Any switching of the delays ({span} samples) needs {_needs(part)}{proof}."]
-    if "playout" not in part:
-        return [*lines, f"jitter-proof: {part['reason']}."]
-    buffered = part["playout"]
-    enough = "certified" if buffered["certified"] else "not certified"
-    needs = f"{listed(buffered['required_damping'])} N s/m: {enough}"
-    return [
-        *lines,
-        f"A playout buffer to the constant {listed(part['hi'])} needs {needs}.",
-        part["not_covered"],
-    ]
-
-
 if __name__ == "__main__":
-    from cli.audit import main
-    from cli.options import execute
+    from cli.main import door
 
-    execute(main)
+    door("audit")

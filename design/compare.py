@@ -1,4 +1,4 @@
-"""The limit curve and the ladder as tables and sentences."""
+"""Couplings side by side: over frequency, as a ladder of designs, and as limits along an axis of the loop."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from controller.coupling import Coupling, NoCoupling
 from controller.delay import delay
 from controller.environment import environment
 from controller.loop import Loop
 from controller.lti import Array, Lti
+from design.bound import bound
 from design.certificate import NotProved, digest, finite, prove, theorem4_of
 from design.conditions import (
     Condition,
@@ -32,7 +31,7 @@ from design.conditions import (
 )
 from design.designs import design_by_kind
 from design.frequency import Response, frequencies, on_circle
-from design.optimal import Options
+from design.optimal import LADDER, Options
 from design.result import PUBLISHED, Design, DesignFailed
 from design.transparency import decibels, transparency
 
@@ -143,72 +142,6 @@ def _multiplier(loop: Loop, coupling: Coupling) -> Array | None:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The main numbers of couplings over frequency, as two tables with one row per coupling.
-
-
-def tables(outcome: dict[str, Any]) -> tuple[Table, Table]:
-    """What `python -m design.plot` prints, from its JSON."""
-    return _promises(outcome), _feel(outcome)
-
-
-def _promises(outcome: dict[str, Any]) -> Table:
-    """Required damping [N s/m] where all devices have the same, else as a multiple of what each has."""
-    available = outcome["available_damping"]
-    alike = len(set(available)) == 1
-    damping = "required damping" if alike else "required share of the damping"
-    where = f"{outcome['scenario']}, case {outcome['case']}"
-    table = Table(title=f"{damping} of {_list(available)} N s/m · {where}")
-    table.add_column("coupling", overflow="fold")
-    for name in ("closed-loop", "at Hz", "theorem4", "at Hz", "M sup dB", "M rms dB"):
-        table.add_column(name, justify="right")
-    for coupling in outcome["couplings"]:
-        parts = [coupling[condition] for condition in ("closed-loop", "theorem4")]
-        scale = available[0] if alike else 1.0
-        asked = [cell for part in parts for cell in (_needs(part, scale), _hertz(part["binding_frequency_hz"]))]
-        errors = [_decibels(coupling["transparency"][f"{which}_mismatch_db"]) for which in ("relative", "rms")]
-        table.add_row(coupling["name"], *asked, *errors)
-    return table
-
-
-def _feel(outcome: dict[str, Any]) -> Table:
-    table = Table(title="perceived by each device's user, the other devices held still")
-    table.add_column("coupling", overflow="fold")
-    columns = [(what, unit, hz) for what, unit in (("stiffness", "N/m"), ("damping", "N s/m")) for hz in FEEL_HZ]
-    for what, unit, hz in columns:
-        table.add_column(f"{what}\n{unit}, {hz:g} Hz", justify="right")
-    named = {"ideal (E)": outcome["ideal"], **{c["name"]: c["perceived"] for c in outcome["couplings"]}}
-    for name, perceived in named.items():
-        table.add_row(name, *(_list(_at(hz, outcome["frequency_hz"], perceived[what])) for what, _, hz in columns))
-    return table
-
-
-def _needs(part: dict[str, Any], scale: float) -> str:
-    """The worst device's figure, green where it is certified."""
-    if part["ratio"] is None:
-        return "[red]infinite[/]"
-    return f"[{'green' if part['certified'] else 'red'}]{scale * part['ratio']:.5g}[/]"
-
-
-def _hertz(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
-
-
-def _decibels(value: float | None) -> str:
-    return "-inf" if value is None else f"{value:.2f}"
-
-
-def _at(hz: float, grid: Sequence[float], values: Sequence[Sequence[float]]) -> list[float]:
-    """Each channel's curve at `hz`, which is in the grid; nan above Nyquist's frequency."""
-    return [float(np.interp(hz, grid, column, right=np.nan)) for column in np.transpose(values)]
-
-
-def _list(values: Sequence[float]) -> str:
-    """'1, 2', or '1' where all would read the same."""
-    shown = [format(v, ".0f" if abs(v) >= 1000 else ".3g") for v in values]
-    return shown[0] if len(set(shown)) == 1 else ", ".join(shown)
-
-
-# ----------------------------------------------------------------------------------------------------
 # How good a coupling could be if the laboratory were another: the optimum along one axis of the loop or of the
 # design.
 #
@@ -235,7 +168,7 @@ AXES = {
     "damping": Axis("damping of the devices (the least)", "N s/m", 0.5, 1.4, 1e-3, 1e3),
     "delay": Axis("transmission delay (the largest)", "samples", math.nan, math.nan, 0, 100),
     "period": Axis("sampling period", "s", 0.5, 2.5, 1e-5, 0.1),
-    "order": Axis("basis functions of each entry of Q", "functions", 0.2, 1.6, 1, 200),
+    "order": Axis("rungs of the optimal coupling's basis", "rungs", 0.2, 1.0, 1, len(LADDER)),
 }
 
 
@@ -277,8 +210,8 @@ def settings(
         return [Setting(float(n), _delayed(loop, n - longest), wish) for n in steps]
     if axis == "period":
         return [Setting(T, _sampled(loop, T, kept), wish) for T in _spread(loop.T, AXES[axis], points, span).tolist()]
-    counts = {max(1, round(n)) for n in _spread(wish.functions, AXES[axis], points, span).tolist()}
-    return [Setting(float(n), loop, replace(wish, functions=n)) for n in sorted(counts)]
+    rungs = {max(1, round(n)) for n in _spread(len(wish.ladder), AXES[axis], points, span).tolist()}
+    return [Setting(float(n), loop, replace(wish, ladder=LADDER[:n])) for n in sorted(rungs)]
 
 
 @dataclass(frozen=True)
@@ -289,7 +222,7 @@ class Limit:
     delta: tuple[float, ...]  # [N s/m]
     theta: tuple[int, ...]  # [samples]
     T_s: float
-    functions: int | None  # None for a spring-damper
+    states: int | None  # of the loop; None: no design
     rms_mismatch_db: float | None
     relative_mismatch_db: float | None
     required_damping: tuple[float | None, ...] | None  # closed-loop, [N s/m]
@@ -306,8 +239,7 @@ Designer = Callable[[Setting], Limit]
 
 def optimum(setting: Setting) -> Limit:
     """The optimal coupling of a setting."""
-    wish = setting.wish
-    return measured(setting, "optimal", None, {field.name: getattr(wish, field.name) for field in fields(wish)})
+    return measured(setting, "optimal", None, vars(setting.wish))
 
 
 def spring_damper(condition: Condition) -> Designer:
@@ -318,7 +250,8 @@ def spring_damper(condition: Condition) -> Designer:
 def measured(setting: Setting, kind: str, condition: Condition | None, options: dict[str, Any]) -> Limit:
     """One design and its figures, from the coupling alone; a request without a solution gives its reason."""
     loop, begin = setting.loop, time.perf_counter()
-    figures: dict[str, Any] = dict.fromkeys(("rms_mismatch_db", "relative_mismatch_db", "required_damping", "dc_ratio"))
+    names = ("states", "rms_mismatch_db", "relative_mismatch_db", "required_damping", "dc_ratio")
+    figures: dict[str, Any] = dict.fromkeys(names)
     bare: tuple[float | None, ...] = (None,) * len(loop.delta)
     try:
         bare = _damping(this_environment(loop.F(NoCoupling()), loop.delta))
@@ -329,14 +262,14 @@ def measured(setting: Setting, kind: str, condition: Condition | None, options: 
         F = loop.F(design.coupling)
         transparent = transparency(F, loop.E(), loop.lam)
         figures = {
+            "states": F.order,
             "rms_mismatch_db": finite(decibels(transparent.rms_mismatch)),
             "relative_mismatch_db": finite(decibels(transparent.relative_mismatch)),
             "required_damping": _damping(this_environment(F, loop.delta)),
             "dc_ratio": finite(transparent.dc_ratio),
         } | _proof(loop, design)
-    functions = setting.wish.functions if kind == "optimal" else None
     wall = time.perf_counter() - begin
-    place = (setting.value, loop.delta, loop.theta, loop.T, functions)
+    place = (setting.value, loop.delta, loop.theta, loop.T)
     return Limit(*place, **figures, bare_damping=bare, wall_s=wall)
 
 
@@ -425,7 +358,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class Rung:
+class LadderRow:
     """One line of the table."""
 
     design: str
@@ -441,58 +374,53 @@ class Rung:
     reason: str | None = None
 
 
-def _optimal(functions: int, **options: Any) -> Entry:
-    """The optimal coupling of so many functions per entry of Q; `HF` is what devices may feel above 100 Hz."""
-    kind = "full" if options.get("diagonal") is False else "diagonal"
-    words = [f"optimal, {kind} {functions}"]
-    words += [options["objective"]] if "objective" in options else []
-    words += ["no HF limit"] if "high_gain" in options else []
-    return Entry(", ".join(words), "optimal", "closed-loop", {"functions": functions, **options})
-
-
 SHORT = (
     Entry("none", "none"),
     Entry("published", "published"),
-    Entry("spring-damper, theorem4", "spring-damper", "theorem4"),
-    Entry("spring-damper, closed-loop", "spring-damper"),
-    _optimal(4, high_gain=None),
-    _optimal(8),
-    _optimal(8, high_gain=None),
+    Entry("spring-damper, any-environment", "spring-damper", "theorem4"),
+    Entry("spring-damper, this-environment", "spring-damper"),
+    Entry("optimal", "optimal"),
+    Entry("bound for any linear coupling", "bound"),
 )
 FULL = (
     *SHORT[:4],
-    Entry("ccl, one state per channel, theorem4", "ccl", "theorem4"),
+    Entry("ccl, one state per channel, any-environment", "ccl", "theorem4"),
+    Entry("optimal, one rung", "optimal", options={"ladder": LADDER[:1]}),
+    Entry("optimal, |F| <= 1.5 |E| above 100 Hz", "optimal", options={"high_gain": 1.5}),
+    Entry("optimal, sup", "optimal", options={"objective": "sup"}),
     *SHORT[4:],
-    _optimal(16, high_gain=None),
-    _optimal(16, diagonal=False, filter="mixed", high_gain=None),
-    _optimal(37, diagonal=False, high_gain=None),
-    _optimal(37, diagonal=False, high_gain=None, objective="sup"),
 )
 LADDERS = {"short": SHORT, "full": FULL}
 
 
-def climb(loops: Mapping[str, Loop], entries: Sequence[Entry], progress: Progress) -> tuple[list[Rung], bool]:
-    """The rungs of every case, and whether the keyboard ended it; what was done before is kept."""
-    rungs: list[Rung] = []
+def compare_designs(
+    loops: Mapping[str, Loop], entries: Sequence[Entry], progress: Progress
+) -> tuple[list[LadderRow], bool]:
+    """The rows of every case, and whether the keyboard ended it; what was done before is kept."""
+    rows: list[LadderRow] = []
     total = len(loops) * len(entries)
     try:
         for case, loop in loops.items():
             for entry in entries:
-                progress(len(rungs), total)
-                rungs.append(rung(case, loop, entry))
+                progress(len(rows), total)
+                rows.append(ladder_row(case, loop, entry))
     except KeyboardInterrupt:
-        return rungs, True
-    return rungs, False
+        return rows, True
+    return rows, False
 
 
-def rung(case: str, loop: Loop, entry: Entry) -> Rung:
+def ladder_row(case: str, loop: Loop, entry: Entry) -> LadderRow:
     """One design with its proof; a request without a solution gives its reason."""
     begin = time.perf_counter()
+    if entry.kind == "bound":
+        return _bound_row(case, loop, entry)
     try:
         coupling, design = _made(loop, case, entry)
     except DesignFailed as error:
         wall = time.perf_counter() - begin
-        return Rung(_name(entry, case), case, None, False, entry.condition, None, None, None, wall, 0.0, str(error))
+        return LadderRow(
+            _name(entry, case), case, None, False, entry.condition, None, None, None, wall, 0.0, str(error)
+        )
     wall = time.perf_counter() - begin
     F = loop.F(coupling)
     requirement = this_environment(F, loop.delta)
@@ -508,7 +436,17 @@ def rung(case: str, loop: Loop, entry: Entry) -> Rung:
     mismatch = finite(decibels(figures.relative_mismatch)), finite(decibels(figures.rms_mismatch))
     proof_s = time.perf_counter() - begin
     certified = requirement.certified
-    return Rung(_name(entry, case), case, required, certified, entry.condition, *mismatch, proof, wall, proof_s, reason)
+    return LadderRow(
+        _name(entry, case), case, required, certified, entry.condition, *mismatch, proof, wall, proof_s, reason
+    )
+
+
+def _bound_row(case: str, loop: Loop, entry: Entry) -> LadderRow:
+    """What no linear coupling can be better than: no design, and of the rms mismatch only."""
+    found = bound(loop)
+    return LadderRow(
+        entry.name, case, None, False, entry.condition, None, finite(found.rms_db), None, found.seconds, 0.0
+    )
 
 
 def _name(entry: Entry, case: str) -> str:
@@ -526,11 +464,11 @@ def _made(loop: Loop, case: str, entry: Entry) -> tuple[Coupling, Design | None]
     return design.coupling, design
 
 
-Curves_report = dict[str, dict[str, list[Limit]]]  # sweep -> design -> its points
+Sweeps = dict[str, dict[str, list[Limit]]]  # sweep -> design -> its points
 EXACT_DB = -60.0  # below it the difference to the environment is the solver's
 
 
-def gains(plan: dict[str, list[Setting]], curves: Curves_report, loop: Loop, wish: Options) -> list[str]:
+def gains(plan: dict[str, list[Setting]], curves: Sweeps, loop: Loop, wish: Options) -> list[str]:
     """What there is to gain, in a line per sweep."""
     lines = []
     for name, rows in curves.items():
@@ -540,7 +478,7 @@ def gains(plan: dict[str, list[Setting]], curves: Curves_report, loop: Loop, wis
             continue
         here = next((s.value for s in plan[name] if s.loop == loop and s.wish == wish), None)
         words = [
-            f"{_decibels_report(figure)} at {limit.value:.4g}" + (" (here)" if limit.value == here else "")
+            f"{printed_decibels(figure)} at {limit.value:.4g}" + (" (here)" if limit.value == here else "")
             for limit, figure in known
             if limit in (known[0][0], known[-1][0]) or limit.value == here
         ]
@@ -562,73 +500,12 @@ def _figure(limit: Limit, objective: str) -> float | None:
     return limit.rms_mismatch_db if objective == "rms" else limit.relative_mismatch_db
 
 
-def _decibels_report(value: float) -> str:
+def printed_decibels(value: float) -> str:
     """In case I a loop that needs no coupling reaches minus infinity, of which a solver finds some -60 to -120 dB."""
     return f"below {EXACT_DB:g} dB" if value < EXACT_DB else f"{value:.2f} dB"
 
 
-def print_curves(outcome: dict[str, Any], beside: Sequence[str], screen: Console) -> None:
-    """A table per sweep; reasons, gains and files below."""
-    reasons: list[str] = []
-    for name, sweep in outcome["sweeps"].items():
-        table = Table(
-            title=f"{outcome['objective']} mismatch over {name} · {outcome['scenario']}, case {outcome['case']}"
-        )
-        table.add_column(sweep["unit"], justify="right")
-        table.add_column("theta")
-        for column in ("optimal", *beside, "proof", "seconds"):
-            table.add_column(column, justify="right", no_wrap=True)
-        for i, row in enumerate(sweep["optimal"]):
-            others = [sweep[kind][i] if i < len(sweep[kind]) else None for kind in beside]
-            shown = [_shown(limit, outcome["objective"]) for limit in (row, *others)]
-            proof = _proofs(dict(zip(("optimal", *beside), (row, *others), strict=True)))
-            place = f"{row['value']:.4g}", ",".join(map(str, row["theta"]))
-            table.add_row(*place, *shown, proof, f"{row['wall_s']:.1f}")
-            reasons += [f"{name} {row['value']:.4g}: {row['reason']}"] if row["reason"] else []
-        screen.print(table)
-    if beside:
-        reasons = [f"beside the optimum: the designed spring-damper by {' and by '.join(beside)}", *reasons]
-    for line in (*reasons, *outcome["gains"]):
-        screen.print(f"[dim]·[/] {line}")
-    screen.print(f"{outcome['wall_s']:.1f} s; files: {', '.join(outcome['files'])}", soft_wrap=True)
+if __name__ == "__main__":
+    from cli.main import door
 
-
-def _proofs(limits: dict[str, dict[str, Any] | None]) -> str:
-    """Rational where every design of a row is proved exactly, else which are only sampled."""
-    found = {name: limit["proof"] for name, limit in limits.items() if limit and limit["proof"]}
-    sampled = [name for name, proof in found.items() if proof != "rational"]
-    if not found:
-        return "-"
-    return f"sampled: {', '.join(sampled)}" if sampled else "rational"
-
-
-def _shown(limit: dict[str, Any] | None, objective: str) -> str:
-    if limit is None:
-        return ""
-    value = limit["rms_mismatch_db" if objective == "rms" else "relative_mismatch_db"]
-    return "infeasible" if value is None else _decibels_report(value)
-
-
-def print_ladder(outcome: dict[str, Any], cases: Sequence[str], screen: Console) -> None:
-    """A table per case, reasons and files below."""
-    for case in cases:
-        screen.print(_rungs(case, [row for row in outcome["rows"] if row["case"] == case], outcome["scenario"]))
-    for row in outcome["rows"]:
-        if row["reason"]:
-            screen.print(f"[dim]·[/] {row['design']}, case {row['case']}: {row['reason']}")
-    screen.print("[dim]·[/] no HF limit: without |F| <= 1.5 |E| above 100 Hz, which the default design keeps.")
-    screen.print(f"{outcome['wall_s']:.1f} s; files: {', '.join(outcome['files'])}", soft_wrap=True)
-
-
-def _rungs(case: str, rows: Sequence[dict[str, Any]], scenario: str) -> Table:
-    table = Table(title=f"the ladder · {scenario}, case {case}")
-    for i, column in enumerate(("design", "needs N s/m", "sup dB", "rms dB", "proof", "s")):
-        table.add_column(column, justify="left" if i in (0, 4) else "right", no_wrap=i > 0)
-    for row in rows:
-        need = "inf" if row["required_damping"] is None else f"{max(row['required_damping']):.4f}"
-        need += "" if row["certified"] else " (no)"
-        figures = ["exact" if v is None else f"{v:.2f}" for v in (row["relative_mismatch_db"], row["rms_mismatch_db"])]
-        if row["reason"] and row["required_damping"] is None:
-            need, figures = "-", ["-", "-"]
-        table.add_row(row["design"], need, *figures, row["proof"] or "-", f"{row['wall_s']:.2f}")
-    return table
+    door("compare")

@@ -84,8 +84,6 @@ def _optimal(
     """The optimal coupling; the rungs of its ladder are the steps."""
     from design import optimal
 
-    if retired := [name for name in RETIRED if options.pop(name, None) is not None]:
-        warnings.warn(NO_LONGER.format(", ".join(retired)), DeprecationWarning, stacklevel=4)
     asked = optimal.Options(**options)
     done = 0
 
@@ -144,7 +142,10 @@ def design_coupling(
     of_kind("loop", loop, Loop, LOOP)
     one_of("kind", kind, KINDS)
     known(options, OPTIONS[kind], f"kind {kind!r}")
-    return design_by_kind(loop, kind, condition, **options)
+    asked: dict[str, Any] = dict(options)
+    if kind == "optimal" and (retired := [name for name in RETIRED if asked.pop(name, None) is not None]):
+        warnings.warn(NO_LONGER.format(", ".join(retired)), DeprecationWarning, stacklevel=2)
+    return design_by_kind(loop, kind, condition, **asked)
 
 
 def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[str]]:

@@ -389,7 +389,6 @@ def _row(values: Array) -> str:
 
 
 if __name__ == "__main__":
-    from cli.export import main
-    from cli.options import execute
+    from cli.main import door
 
-    execute(main)
+    door("export")

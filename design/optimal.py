@@ -129,6 +129,7 @@ class Optimal(Design):
     certificate: Certificate | None = field(kw_only=True)  # of the loop with its ranges and its switching delays
     ladder: tuple[Rung, ...] = field(kw_only=True, default=())
     reason: str | None = field(kw_only=True, default=None)  # why nothing is proved, where nothing is
+    searched: ranges.Searched | None = field(kw_only=True, default=None)  # between the vertices of ranges
 
     @property
     def proved(self) -> bool:
@@ -661,11 +662,13 @@ class _Climb:
         """
         coupling = found.coupling
         assert isinstance(coupling, ForceFilter)
-        ratio = ranges.search_box(self.loop, coupling).worst[0].ratio
-        if ratio > (limit := 1 - self.options.margin / 2):
+        searched = ranges.search_box(self.loop, coupling)
+        if (ratio := searched.worst[0].ratio) > (limit := 1 - self.options.margin / 2):
             coupling = _scaled(coupling, limit / ratio)
             found = self._assessed(coupling, coupling.g)
-        return self._proved(found)
+            lower = tuple(replace(one, ratio=one.ratio * limit / ratio) for one in searched.worst)  # each need scales
+            searched = replace(searched, worst=lower)
+        return replace(self._proved(found), searched=searched)
 
     def scaled(self) -> Optimal:
         """The environment itself, scaled down until it is safe."""

@@ -41,7 +41,11 @@ class Infeasible(DesignFailed):
 
 
 # ----------------------------------------------------------------------------------------------------
-# One figure per channel, as text.
+# Figures and conditions as text.
+
+
+#: the key of a condition in files and reports -> its name in words and options
+CONDITION_NAMES: dict[str, str] = {"closed-loop": "this-environment", "theorem4": "any-environment"}
 
 
 def listed(values: Iterable[float | None], digits: int = 6) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from cli.options import require_constant_delay, require_linear
 from controller.coupling import Coupling
 from design.certificate import assess, promise_of
 from design.conditions import Requirement
@@ -17,7 +16,7 @@ from hw.safety import Fault
 from hw.session import Session, Settings
 from hw.trace import Recorder, result_of
 from sim.couplings import Chosen
-from sim.scenario import InputError, Scenario
+from sim.scenario import InputError, Scenario, require_constant_delay, require_linear
 from sim.trace import Result
 
 MEASURE = 200  # answers that are timed: virtual time does not scatter

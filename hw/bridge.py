@@ -18,14 +18,12 @@ from cli.options import (
     Parser,
     add_loop_options,
     add_output_options,
-    console,
     execute,
     out_folder,
-    require_constant_delay,
-    require_linear,
     scenario_from,
     seed_from,
 )
+from cli.render import console
 from design.certificate import CONDITIONS
 from hw import session_report
 from hw.desk import add_link_options, check_link, hold_session, measured_link, number, session_for
@@ -34,7 +32,7 @@ from hw.safety import Stage
 from hw.trace import Recorder
 from sim.couplings import NAMES
 from sim.files import write_json
-from sim.scenario import InputError
+from sim.scenario import InputError, require_constant_delay, require_linear
 
 LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
 

@@ -15,7 +15,7 @@ from typing import Any
 from rich.live import Live
 from rich.table import Table
 
-from cli.options import Screen
+from cli.render import Screen
 from hw.session import Session
 
 WIDTH = 72  # columns

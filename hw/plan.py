@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from cli.run import coupling_part
 from controller.environment import environment
 from controller.loop import force_map
 from controller.lti import Lti
@@ -21,6 +20,7 @@ from hw.law import Controller, Law
 from hw.message import MAX_THETA
 from hw.safety import Fault
 from sim.couplings import Chosen, choose
+from sim.report import coupling_part
 from sim.scenario import InputError, Scenario
 
 FALLBACK = ("spring-damper", "theorem4")  # what softer couplings are where the one asked for cannot be had

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from cli.options import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute
+from cli.options import DOES_NOT_HOLD, DONE, Parser, check_json, execute
+from cli.render import console
 from controller.coupling import Form
 from controller.environment import environment
 from controller.loop import force_map

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from cli.run import error_part
 from controller.lti import Array
 from sim.engines import LEAPFROG
+from sim.report import error_part
 from sim.run import Assembly, Record, simulate
 from sim.stability import MARGINAL, close, dominant_mode, exact_growth, measured_hold
 
@@ -123,7 +123,6 @@ def _point(row: Row) -> Array:
 
 
 if __name__ == "__main__":
-    from cli.accuracy import main
-    from cli.options import execute
+    from cli.main import door
 
-    execute(main)
+    door("accuracy")

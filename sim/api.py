@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from cli import run as report
-from cli.options import require_linear
 from controller.coupling import Coupling, NoCoupling
 from design.result import COUPLING, Design, bare, number, of_kind, one_of, whole
 from sim.crowds import ENGINES, Findings, Question
 from sim.crowds import validate as examine_all
 from sim.engines import INTEGRATORS, LEAPFROG
+from sim.report import stability_part
 from sim.run import ENGINES as ALONE
 from sim.run import Progress, assemble
 from sim.run import simulate as close_loop
-from sim.scenario import InputError, Scenario
+from sim.scenario import InputError, Scenario, require_linear
 from sim.stability import LEAST, MOST, check_substeps, default_substeps
 from sim.switching import switching
 from sim.trace import Result
@@ -65,7 +64,7 @@ def simulate(
         "integrator": integrator if mujoco else None,
         "substeps": substeps if mujoco else None,
         "seed": seed,
-        "stability": None if scenario.switches else report.stability_part(assembly, record),
+        "stability": None if scenario.switches else stability_part(assembly, record),
         "remarks": warnings,
     }
     return Result.from_record(assembly, record, meta)

@@ -1,7 +1,134 @@
-"""python -m sim.hard: numerically hard loops."""
+"""Numerically hard loops, each with a setting of the engine that fails and the one that holds."""
 
-if __name__ == "__main__":
-    from cli.hard import main
-    from cli.options import execute
+from __future__ import annotations
 
-    execute(main)
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from controller.coupling import Coupling, SpringDamper
+from design.result import CASE_I
+from models.device import CompliantDevice
+from models.human import Human, Link
+from sim.report import error_part
+from sim.run import Assembly, assemble, simulate
+from sim.scenario import InputError, Scenario, load
+from sim.stability import check_substeps, default_substeps, exact_growth, simulated_growth
+
+CLOSE = 1e-2  # [1/s] what the growth rate of the rule's own choice may be off
+#: a setting holds if it is stable, has the exact verdict, and errs by less than both of these
+GROWTH, POSITION = 1e-3, 1e-3  # [1/s]; relative rms of the device positions over the run
+RK4, EULER = ("RK4", 1), ("Euler", 1)
+TRIED = tuple((name, 1) for name in ("RK4", "Euler", "Euler2", "implicitfast"))
+
+Setting = tuple[str, int]  # integrator, substeps
+
+
+@dataclass(frozen=True)
+class Hard:
+    """A loop that asks much of an integrator."""
+
+    name: str
+    scenario: Scenario
+    fails: Setting | None  # a setting that does not hold, None where all of TRIED do
+    how: str  # what is wrong with it: "refused", "verdict", "growth" or "position"
+    coupling: Coupling = CASE_I
+    substeps: int | None = None  # of RK4, which hold; default: what the rule picks
+
+
+@dataclass(frozen=True)
+class Row:
+    """What was measured of a hard loop."""
+
+    name: str
+    exact: float  # [1/s] growth of the exact loop
+    fails: Setting | None
+    fault: str | None  # what was wrong with it; None where it failed as little as the rest of TRIED
+    off: float | None  # by how much, None where it was refused
+    rule: int  # RK4 substeps that the rule picks
+    substeps: int  # RK4 substeps that hold
+    error: float  # [1/s] their growth rate against the exact one
+    holds: bool  # whether all of this is as it should be
+
+
+@cache
+def nominal() -> Scenario:
+    """The default scenario for a second: where every hard loop starts from."""
+    return load().replace(duration=1.0)
+
+
+def devices(**changes: float) -> Scenario:
+    """The nominal loop with other devices."""
+    return nominal().replace(device=(CompliantDevice(**changes),) * 2)
+
+
+def hands(mass: float, damping: float, stiffness: float) -> Scenario:
+    """The nominal loop in other hands."""
+    return nominal().replace(human=(Human((Link(mass, damping, stiffness),)),) * 2)
+
+
+def light(damping: float) -> Scenario:
+    """A handle of 1 g that nobody's mass is added to."""
+    return devices(handle_mass=1e-3).replace(human=(Human((Link(0.0, damping, 200.0),)),) * 2)
+
+
+def cases() -> tuple[Hard, ...]:
+    """All hard loops."""
+    return (
+        Hard("human stiffness 1e5 N/m", hands(0.3, 3.0, 1e5), RK4, "position"),
+        Hard("handle of 1 g, human damping 3 N s/m", light(3.0), RK4, "refused"),
+        Hard("handle of 1 g, no human damping", light(0.0), RK4, "refused", substeps=48),
+        Hard("motor 1 g", devices(motor_mass=1e-3), RK4, "refused"),
+        Hard("motor 100 kg", devices(motor_mass=100.0), EULER, "growth"),
+        Hard("human damping 1000 N s/m", hands(0.3, 1000.0, 200.0), EULER, "position"),
+        Hard("transmission 1e6 N/m", devices(transmission_stiffness=1e6), RK4, "refused"),
+        Hard("T = 4 ms", nominal().replace(T=4e-3), EULER, "refused"),
+        Hard("T = 10 us", nominal().replace(T=1e-5, duration=0.12), None, "none tried fails"),
+        Hard("50-sample delays", nominal().replace(theta=(50, 50)), EULER, "growth"),
+        Hard("zero damping", nominal().replace(delta=(0.0, 0.0)), EULER, "growth"),
+        Hard("coupling 1e5 N/m", nominal(), EULER, "verdict", SpringDamper(np.full(2, 1e5), np.zeros(2))),
+    )
+
+
+def faults(loop: Assembly, integrator: str, substeps: int) -> dict[str, float]:
+    """What is wrong with a setting, and by how much: nothing where it holds."""
+    try:
+        check_substeps(loop, integrator, substeps)
+    except InputError:
+        return {"refused": np.inf}
+    exact, own = exact_growth(loop), simulated_growth(loop, integrator, substeps)
+    error = error_part(simulate(loop, "mujoco", integrator, substeps), simulate(loop, "exact"), loop)
+    found = {"verdict": own - exact} if (own > 0) != (exact > 0) else {}
+    if abs(own - exact) > GROWTH:
+        found["growth"] = own - exact
+    if (error["position_relative_rms"] or 0.0) > POSITION:
+        found["position"] = error["position_relative_rms"]
+    return found
+
+
+def measure(hard: Hard) -> Row:
+    """The settings that fail and hold against the exact loop. Raises InputError where the rule finds none."""
+    loop = assemble(hard.scenario, hard.coupling)
+    rule, exact = default_substeps(loop), exact_growth(loop)
+    substeps = hard.substeps or rule
+    bad = faults(loop, *hard.fails) if hard.fails else {}
+    off = bad.get(hard.how)
+    chosen = simulated_growth(loop, "RK4", rule)
+    right = (
+        (off is not None if hard.fails else not any(faults(loop, *setting) for setting in TRIED)),
+        not faults(loop, "RK4", substeps),
+        (chosen > 0) == (exact > 0) and abs(chosen - exact) <= CLOSE,
+        (rule < substeps) == (hard.substeps is not None),
+    )
+    return Row(
+        hard.name,
+        exact,
+        hard.fails,
+        hard.how if off is not None else None,
+        off if off is not None and np.isfinite(off) else None,
+        rule,
+        substeps,
+        simulated_growth(loop, "RK4", substeps) - exact,
+        all(right),
+    )

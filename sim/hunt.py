@@ -194,7 +194,6 @@ def _let_go(case: Case, links: Array, start: Array, seconds: float) -> tuple[Arr
 
 
 if __name__ == "__main__":
-    from cli.hunt import main
-    from cli.options import execute
+    from cli.main import door
 
-    execute(main)
+    door("hunt")

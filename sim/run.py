@@ -192,7 +192,6 @@ def _each(devices: tuple[Device, ...], name: str) -> Array:
 
 
 if __name__ == "__main__":
-    from cli.options import execute
-    from cli.run import main
+    from cli.main import door
 
-    execute(main)
+    door("run")

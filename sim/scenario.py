@@ -360,3 +360,20 @@ def save_humans(path: Path, humans: tuple[Human, ...], remark: str, persons: tup
         cross = f"cross = {{ damping = {person.cross.damping!r}, stiffness = {person.cross.stiffness!r} }}"
         lines += ["", "[[person]]", f"holds = {list(person.holds)}", *body, cross]
     return write(path, "\n".join(lines) + "\n")
+
+
+def require_linear(scenario: Scenario, what: str) -> None:
+    """Raises InputError where a loop has walls or Coulomb friction, for a command whose verdicts are of linear ones."""
+    for i, device in enumerate(scenario.device):
+        if device.friction:
+            instead = "sim.run and sim.zwidth simulate it"
+            raise InputError(f"device[{i}].friction is {device.friction:g} N: {what} decides linear loops; {instead}")
+    if scenario.environment.walls:
+        raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
+
+
+def require_constant_delay(scenario: Scenario, what: str) -> None:
+    """Raises InputError where a scenario's delays vary, for a command that would not make them vary."""
+    if scenario.jitter is not None:
+        instead = "sim.run simulates it"
+        raise InputError(f"jitter: {what} takes the delays that its link has; take the table out, {instead}")

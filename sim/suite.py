@@ -1,7 +1,6 @@
 """python -m sim.suite: every check that a verdict rests on."""
 
 if __name__ == "__main__":
-    from cli.options import execute
-    from cli.suite import main
+    from cli.main import door
 
-    execute(main)
+    door("suite")

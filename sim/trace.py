@@ -286,7 +286,6 @@ def _rms(f: Array) -> float:
 
 
 if __name__ == "__main__":
-    from cli.options import execute
-    from cli.trace import main
+    from cli.main import door
 
-    execute(main)
+    door("trace")

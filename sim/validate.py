@@ -1,7 +1,6 @@
 """python -m sim.validate: thousands of random hands on the loop."""
 
 if __name__ == "__main__":
-    from cli.options import execute
-    from cli.validate import main
+    from cli.main import door
 
-    execute(main)
+    door("validate")

@@ -1057,7 +1057,6 @@ def _last(tried: Array, safe: NDArray[np.bool_], between: Callable[[float, float
 
 
 if __name__ == "__main__":
-    from cli.options import execute
-    from cli.zwidth import main
+    from cli.main import door
 
-    execute(main)
+    door("zwidth")

@@ -29,8 +29,6 @@ from cli.options import (
     add_loop_options,
     execute,
     numbers,
-    require_constant_delay,
-    require_linear,
     scenario_from,
     seed_from,
 )
@@ -38,7 +36,7 @@ from hw.emulator.child import pace_from
 from hw.emulator.core import Emulator
 from hw.emulator.plant import nobody
 from hw.emulator.upset import DEVICE, LINE, Line, Upset
-from sim.scenario import InputError
+from sim.scenario import InputError, require_constant_delay, require_linear
 
 LINGER_US = 50_000  # after the cable was pulled: the device comes to rest by itself
 

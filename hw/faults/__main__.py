@@ -1,4 +1,4 @@
-"""python -m hw.faults: every fault that we could think of, in virtual time, with what it ends in and how soon.
+"""Every fault that we could think of, in virtual time, with what it ends in and how soon.
 
 Each case is a whole session of bridge and emulated device. Time to zero force counts from the fault to the tick from
 which on no motor does anything.
@@ -6,16 +6,12 @@ which on no motor does anything.
 
 from __future__ import annotations
 
-import argparse
 import re
 from dataclasses import dataclass
-from typing import Any
 
 import msgspec
 import numpy as np
-from rich.table import Table
 
-from cli.options import DOES_NOT_HOLD, DONE, Parser, check_json, console, execute
 from hw.emulator.core import Emulator, info_of
 from hw.emulator.upset import Upset
 from hw.faults.cases import CASES, WHEN, Case
@@ -23,7 +19,6 @@ from hw.plan import Ages, Rung, ladder, link_delay
 from hw.rehearsal import Plan, Rehearsal
 from hw.safety import ENDED, Limits, Stage
 from hw.session import Session, Settings
-from sim.files import write_json
 from sim.scenario import Scenario, load
 
 MEASURED = 100  # answers whose age is measured: enough for a line that does not vary
@@ -109,47 +104,8 @@ def counted(session: Session, name: str) -> int:
     return session.decoder.rejected if name == "host_errors" else getattr(session.counters, name)
 
 
-def main(argv: list[str]) -> int:
-    """Rehearse every fault. 0: each ended as it must, 1: not."""
-    parser = Parser("hw.faults", "Rehearse every fault of a link in virtual time.", "python -m hw.faults")
-    parser.add_argument("--json", metavar="FILE|-", help="machine-readable result; - is standard output")
-    args = parser.parse_args(argv)
-    check_json(args)
+def outcomes() -> list[Outcome]:
+    """Every case, with a ladder that is made once."""
     scenario = lively(load())
     made = ladder(scenario, "I", None, None, 1, spare=1)
-    outcomes = [rehearse(case, scenario, made) for case in CASES]
-    report(outcomes, args)
-    return DONE if not any(outcome.wrong for outcome in outcomes) else DOES_NOT_HOLD
-
-
-def report(outcomes: list[Outcome], args: argparse.Namespace) -> None:
-    """The table of faults, and the same as JSON."""
-    table = Table(title="faults, in virtual time")
-    for column in ("fault", "ends in", "cause", "zero force after", "allowed"):
-        table.add_column(column, justify="right" if column in ("zero force after", "allowed") else "left")
-    for outcome in outcomes:
-        part = _part(outcome)
-        zero = "-" if part["zero_force_ms"] is None else f"{part['zero_force_ms']:.1f} ms"
-        allowed = "-" if part["allowed_ms"] is None else f"{part['allowed_ms']:.1f} ms"
-        ends = part["stage"] if part["holds"] else f"[red]{part['stage']}[/]"
-        table.add_row(part["fault"], ends, "; ".join(part["wrong"]) or part["cause"], zero, allowed)
-    console(args).print(table)
-    if args.json:
-        write_json(args.json, {"cases": [_part(o) for o in outcomes], "holds": not any(o.wrong for o in outcomes)})
-
-
-def _part(outcome: Outcome) -> dict[str, Any]:
-    session, case = outcome.rehearsal.session, outcome.case
-    return {
-        "fault": case.name,
-        "stage": str(session.stage),
-        "cause": session.cause,
-        "zero_force_ms": None if outcome.to_zero is None else 1e3 * outcome.to_zero,
-        "allowed_ms": case.within,
-        "holds": not outcome.wrong,
-        "wrong": list(outcome.wrong),
-    }
-
-
-if __name__ == "__main__":
-    execute(main)
+    return [rehearse(case, scenario, made) for case in CASES]

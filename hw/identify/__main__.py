@@ -23,16 +23,13 @@ from cli.options import (
     Parser,
     add_loop_options,
     add_output_options,
-    console,
     execute,
     numbers,
     out_folder,
-    progress_bar,
-    require_constant_delay,
-    require_linear,
     scenario_from,
     seed_from,
 )
+from cli.render import console, progress
 from hw import session_report
 from hw.desk import add_link_options, check_link, hold_session, measured_link, number, session_for
 from hw.identify.excitation import Excitation, chirp
@@ -43,7 +40,7 @@ from hw.session import Session
 from hw.trace import Recorder, result_of
 from models.device import RigidDevice
 from sim.files import write, write_json
-from sim.scenario import InputError, Scenario
+from sim.scenario import InputError, Scenario, require_constant_delay, require_linear
 
 SUSPICIOUS = 0.1  # part by which an estimate may exceed the declared damping
 LIMITS = (
@@ -160,8 +157,7 @@ def estimate(recorder: Recorder, session: Session, scenario: Scenario) -> list[E
         raise ValueError(f"{missing} of {len(recorder)} ticks came without a STATE: take another record")
     applied = link["applied"]
     estimates = []
-    bar, move = progress_bar("estimating")
-    with bar:
+    with progress("estimating") as move:
         for i, device in enumerate(scenario.device):
             move(i, scenario.channels, f"estimating axis {i + 1}")
             rigid = isinstance(device, RigidDevice)

@@ -1,7 +1,6 @@
 """python -m sim.view: the live window."""
 
 if __name__ == "__main__":
-    from cli.options import execute
-    from cli.view import main
+    from cli.main import door
 
-    execute(main)
+    door("view")

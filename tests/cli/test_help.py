@@ -10,10 +10,12 @@ from pathlib import Path
 
 import pytest
 
+from cli.main import COMMANDS
 from cli.options import Parser
 
 ROOT = Path(__file__).parents[2]
-LAUNCH = re.compile(r"    execute\((\w+)\)")  # how a file says that it is a command
+DOOR = re.compile(r"    door\(\"(\w+)\"\)")  # how a file says that it is a command
+LAUNCH = re.compile(r"    execute\((\w+)\)")  # the same, of a file that holds its command
 
 
 class Parsed(Exception):
@@ -23,17 +25,20 @@ class Parsed(Exception):
 def modules():
     """Every command as python -m names it."""
     files = [path for folder in ("design", "sim", "hw") for path in sorted((ROOT / folder).rglob("*.py"))]
-    found = [path.relative_to(ROOT).with_suffix("").parts for path in files if LAUNCH.search(path.read_text())]
+    texts = {path: path.read_text() for path in files}
+    doors = [path for path in files if DOOR.search(texts[path]) or LAUNCH.search(texts[path])]
+    found = [path.relative_to(ROOT).with_suffix("").parts for path in doors]
     return [".".join(parts).removesuffix(".__main__") for parts in found]
 
 
 def main_of(module):
     path = ROOT / module.replace(".", "/")
     text = (path / "__main__.py" if path.is_dir() else path.with_suffix(".py")).read_text()
-    name = LAUNCH.search(text).group(1)
-    door = re.search(rf"from (cli\.\w+) import {name}\b", text)
+    if found := DOOR.search(text):
+        assert COMMANDS[found.group(1)][0] == module
+        return importlib.import_module(f"cli.{found.group(1)}").main
     package = f"{module}.__main__" if path.is_dir() else module
-    return getattr(importlib.import_module(door.group(1) if door else package), name)
+    return getattr(importlib.import_module(package), LAUNCH.search(text).group(1))
 
 
 def help_of(module, capsys):
@@ -85,7 +90,7 @@ def test_help_says_what_every_option_is(module, capsys, monkeypatch):
 def test_commands_compute_with_one_blas_thread():
     """The last digits of a result depend on how a sum is shared; an environment that asks for two changes nothing."""
     script = (
-        "import sys, scipy.linalg; from threadpoolctl import threadpool_info; from sim.command import execute\n"
+        "import sys, scipy.linalg; from threadpoolctl import threadpool_info; from cli.options import execute\n"
         "count = lambda: {lib['num_threads'] for lib in threadpool_info() if lib['user_api'] == 'blas'}\n"
         "print(count()); execute(lambda words: print(count()) or 0)"
     )
@@ -94,3 +99,17 @@ def test_commands_compute_with_one_blas_thread():
     if "{2}" not in done.stdout:
         pytest.skip("no BLAS with threads of its own here")
     assert done.stdout.split() == ["{2}", "{1}"]
+
+
+def script(*words):
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    return subprocess.run([sys.executable, "-m", "cli", *words], env=environment, capture_output=True, text=True)
+
+
+def test_the_console_script_lists_every_command_and_runs_it():
+    listed = script().stdout
+    assert all(f"({module})" in listed for module in modules())
+    assert script("check", "--help").stdout.startswith("usage: python -m design.check")
+    unknown = script("chekc")
+    assert (unknown.returncode, unknown.stdout) == (2, "")
+    assert unknown.stderr.startswith("error: unknown command 'chekc', allowed are run, validate")

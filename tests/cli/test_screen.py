@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from rich.table import Table
 
-from cli.options import Screen
+from cli.render import Screen
 
 ROOT = Path(__file__).parents[2]
 NUMBERS = ["7.8429", "18.895", "-11.19", "0.71449", "1.3699"]
@@ -47,7 +47,7 @@ def test_every_report_is_printed_on_a_screen():
         calls = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
         if any(isinstance(call.func, ast.Name) and call.func.id == "Console" for call in calls):
             bare.add(path.name)
-    assert bare == {"options.py"}
+    assert bare == {"render.py"}
 
 
 @pytest.mark.parametrize("name", ["[/]", "[/red]", "[b]out[/b]", "a[0", "[red", ":x:", "[K]", "[m/s]"])

@@ -215,7 +215,7 @@ def test_a_run_reports_the_contact_and_who_covers_it(tmp_path):
 
     soft, bare = run(), run("--case", "none")
     assert soft["promise"] == "any passive environment"
-    assert any("theorem4 covers it" in line for line in soft["remarks"])
+    assert any("any-environment covers it" in line for line in soft["remarks"])
     assert soft["stability"]["contact"]["made"] == 2
     assert [state["touching"] for state in soft["stability"]["contact"]["frozen"]] == [[], [1]]
     assert soft["stability"]["growth_rate_per_s"] is None

@@ -344,7 +344,7 @@ def test_a_violated_vertex_leaves_the_commands_with_1(scenario_file, tmp_path, c
     [
         (["--vertex", "4"], "--vertex is 4, allowed are 0 to 3"),
         (["--vertex", "x"], "--vertex is 'x', expected a whole number"),
-        (["--vertex", "1", "--scenario", "omega-pair"], "the scenario has no box"),
+        (["--vertex", "1", "--scenario", "omega-pair"], "the scenario has no ranges"),
     ],
 )
 def test_a_vertex_that_does_not_exist(scenario_file, tmp_path, options, message):
@@ -353,5 +353,5 @@ def test_a_vertex_that_does_not_exist(scenario_file, tmp_path, options, message)
 
 
 def test_a_box_that_is_not_there_cannot_be_drawn_from(tmp_path):
-    with pytest.raises(InputError, match="--environments box: the scenario has no box"):
+    with pytest.raises(InputError, match="--environments box: the scenario has no ranges"):
         validate_main(["--environments", "box", "--out", str(tmp_path)])

@@ -1,11 +1,11 @@
-"""design.plot: curves against formulas evaluated by hand, their maxima against the conditions' figures."""
+"""design.compare: curves against formulas evaluated by hand, their maxima against the conditions' figures."""
 
 import json
 
 import numpy as np
 import pytest
 
-from cli.compare import main_plot
+from cli.compare import main
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring
 from controller.loop import Loop
@@ -127,7 +127,7 @@ def test_required_damping_is_what_is_perceived_with_the_hold():
 
 def test_the_command_writes_pictures_and_curves(tmp_path, capsys):
     out = tmp_path / "o"
-    assert main_plot(["--coupling", "none,published", "--out", str(out), "--json", "-"]) == 0
+    assert main(["--coupling", "none,published", "--out", str(out), "--json", "-"]) == 0
     stdout, stderr = capsys.readouterr()
     outcome = json.loads(stdout)
     assert "published" in stderr
@@ -138,7 +138,7 @@ def test_the_command_writes_pictures_and_curves(tmp_path, capsys):
     assert len(published["sigma_M"]) == len(outcome["frequency_hz"]) == len(published["perceived"]["damping"])
     assert outcome["couplings"][0]["theorem4"]["demand"] is None
     assert outcome["couplings"][0]["theorem4"]["reason"]
-    assert json.loads((out / "curves.json").read_text())["couplings"] == outcome["couplings"]
+    assert json.loads((out / "report.json").read_text())["couplings"] == outcome["couplings"]
     for name in ("singular-values", "required-damping", "perceived"):
         assert (out / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
 
@@ -146,7 +146,7 @@ def test_the_command_writes_pictures_and_curves(tmp_path, capsys):
 def test_other_devices_other_delays_and_no_pictures(tmp_path):
     """Three unequal devices, one of them delayed by option."""
     args = ["--scenario", "three-rigid", "--theta", "0,1,2", "--coupling", "none", "--no-plot", "--out", str(tmp_path)]
-    assert main_plot([*args, "--json", str(tmp_path / "r.json")]) == 0
+    assert main([*args, "--json", str(tmp_path / "r.json")]) == 0
     assert not list(tmp_path.glob("*.png"))
     outcome = json.loads((tmp_path / "r.json").read_text())
     assert outcome["available_damping"] == [2.0, 0.8, 1.37]
@@ -155,10 +155,10 @@ def test_other_devices_other_delays_and_no_pictures(tmp_path):
 
 def test_a_design_that_does_not_exist_leaves_the_others(tmp_path, capsys):
     base = ["--psi", "1,1", "--no-plot", "--out", str(tmp_path)]
-    assert main_plot(["--coupling", "none,spring-damper", *base]) == 1
+    assert main(["--coupling", "none,spring-damper", *base]) == 1
     assert "spring-damper: not possible" in capsys.readouterr().out
     with pytest.raises(DesignFailed):
-        main_plot(["--coupling", "spring-damper", *base])
+        main(["--coupling", "spring-damper", *base])
 
 
 @pytest.mark.parametrize(
@@ -177,4 +177,4 @@ def test_a_design_that_does_not_exist_leaves_the_others(tmp_path, capsys):
 )
 def test_bad_input_is_one_line(argv, message, tmp_path):
     with pytest.raises(InputError, match=message):
-        main_plot([*argv, "--out", str(tmp_path)])
+        main([*argv, "--out", str(tmp_path)])

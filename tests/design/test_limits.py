@@ -5,21 +5,20 @@ import json
 import numpy as np
 import pytest
 
-from cli import compare as limits
+from cli import compare as command
 from cli.compare import main
 from controller.environment import environment
 from controller.loop import force_map
 from design import compare as limit_curve
-from design import compare as limits_report
-from design.compare import AXES, LADDERS, SHORT, Setting, measured, optimum, remembered, rung, settings
+from design.compare import AXES, LADDERS, SHORT, Setting, ladder_row, measured, optimum, remembered, settings
 from design.conditions import this_environment
-from design.optimal import Wish
+from design.optimal import LADDER, Options
 from design.result import CASE_I
 from sim.plots import plot_limits
 from sim.scenario import InputError, load
 
 LOOP = load().loop("I")
-SMALL = Wish(functions=4, diagonal=True, high_gain=None)
+SMALL = Options(ladder=LADDER[:1])
 
 
 def run(tmp_path, *options):
@@ -150,7 +149,7 @@ def test_interrupting_keeps_the_points_that_are_done(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return measured(setting, "spring-damper", "theorem4", {})  # what is designed does not matter here
 
-    monkeypatch.setattr(limits, "optimum", interrupted)
+    monkeypatch.setattr(command, "optimum", interrupted)
     wish = ("--functions", "4", "--diagonal", "--filter", "fir", "--beside", "none")
     code, report = run(tmp_path, "--over", "damping=1.3:1.5", "--points", "4", *wish)
     assert code == 130
@@ -168,17 +167,17 @@ def test_interrupting_keeps_the_points_that_are_done(tmp_path, monkeypatch):
         (["--over", "damping=a:2"], "--over damping is 'a', expected a number"),
         (["--over", "delay=0:3"], "--over delay=0:3: delay starts at 0, but the channels differ by 1 samples"),
         (["--over", "delay=1.5:3"], "expected whole numbers of samples"),
-        (["--points", "0"], "--points is 0, allowed are 1 to 100"),
-        (["--functions", "0"], "--functions is 0, allowed are 1 to 200"),
-        (["--margin", "2"], "--margin is 2.0, allowed are shares"),
-        (["--case", "none"], "--case none has no coupling to design"),
-        (["--ladder", "--over", "order"], "--over is for the curve, not for --ladder"),
-        (["--ladder", "--diagonal"], "--diagonal is for the curve, not for --ladder"),
+        (["--over", "--points", "0"], "--points is 0, allowed are 1 to 100"),
+        (["--over", "--functions", "0"], "--functions is 0, allowed are 1 to 200"),
+        (["--over", "--margin", "2"], "--margin is 2.0, allowed are shares"),
+        (["--over", "--case", "none"], "--case none has no coupling to design"),
+        (["--ladder", "--over", "order"], "--over with --ladder: give one of them"),
+        (["--ladder", "--diagonal"], "--diagonal is for --over, not for --ladder"),
         (["--ladder", "--case", "II"], "--ladder shows both cases"),
         (["--ladder", "long"], "argument --ladder: invalid choice: 'long'"),
         (["--over", "order=1:500"], "--over order=1:500: the range 1:500 is none between 1 and 200 functions"),
         (["--over", "period=1e-9:1"], "--over period=1e-9:1: the range"),
-        (["--delta", "0"], "expected positive dampings"),
+        (["--over", "--delta", "0"], "expected positive dampings"),
     ],
 )
 def test_bad_options(options, message, tmp_path, monkeypatch):
@@ -205,7 +204,7 @@ def test_a_picture_of_every_number_of_panels(tmp_path):
 def test_rungs_are_the_designs_that_they_name():
     """Against figures of their own: required damping and mismatch of the other commands."""
     by_name = {entry.name: entry for entry in SHORT}
-    published = rung("I", LOOP, by_name["published"])
+    published = ladder_row("I", LOOP, by_name["published"])
     E = environment(LOOP.environment, LOOP.T)
     expected = this_environment(force_map(E, CASE_I, LOOP.theta, LOOP.psi), LOOP.delta)
     assert published.design == "published (27)"
@@ -213,11 +212,11 @@ def test_rungs_are_the_designs_that_they_name():
     assert not published.certified
     assert published.proof is None
     assert published.relative_mismatch_db == pytest.approx(7.70, abs=0.005)
-    theorem4 = rung("I", LOOP, by_name["spring-damper, theorem4"])
+    theorem4 = ladder_row("I", LOOP, by_name["spring-damper, any-environment"])
     assert theorem4.required_damping == pytest.approx([0.7145] * 2, abs=1e-4)
     assert theorem4.condition == "theorem4"
     assert theorem4.proof == "rational"
-    optimal = rung("I", LOOP, by_name["optimal, diagonal 4, no HF limit"])
+    optimal = ladder_row("I", LOOP, by_name["optimal, diagonal 4, no HF limit"])
     assert optimal.relative_mismatch_db <= -16.9
     assert optimal.proof == "rational"
     assert optimal.certified
@@ -225,7 +224,7 @@ def test_rungs_are_the_designs_that_they_name():
 
 def test_a_rung_that_does_not_exist_says_so():
     loop = load("three-rigid").loop("I")
-    missing = rung("I", loop, next(entry for entry in SHORT if entry.kind == "published"))
+    missing = ladder_row("I", loop, next(entry for entry in SHORT if entry.kind == "published"))
     assert missing.required_damping is None
     assert missing.reason == "the paper prints gains for 2 channels, not 3"
 
@@ -237,7 +236,7 @@ def test_the_ladder_is_a_command(tmp_path, monkeypatch):
     assert [(row["case"], row["design"]) for row in report["rows"]] == [
         (case, name)
         for case, printed in (("I", "(27)"), ("II", "(28)"))
-        for name in ("none", f"published {printed}", "spring-damper, theorem4")
+        for name in ("none", f"published {printed}", "spring-damper, any-environment")
     ]
     assert report["rows"][0]["rms_mismatch_db"] is None
     assert report["rows"][3]["relative_mismatch_db"] == pytest.approx(0.34, abs=0.005)
@@ -260,5 +259,5 @@ def test_a_point_says_what_is_proved_of_it(monkeypatch):
     limit = measured(setting, "spring-damper", "theorem4", {})
     assert (limit.proof, limit.proof_reason) == ("sampled", "too many states")
     row = {"optimal": {"proof": "rational"}, "theorem4": {"proof": limit.proof}, "closed-loop": None}
-    assert limits_report._proofs(row) == "sampled: theorem4"
-    assert limits_report._proofs({"optimal": {"proof": None}}) == "-"
+    assert command._proofs(row) == "sampled: any-environment"
+    assert command._proofs({"optimal": {"proof": None}}) == "-"

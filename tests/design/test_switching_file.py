@@ -318,7 +318,7 @@ def test_without_an_exact_proof_the_file_keeps_the_constants(tmp_path, capsys, m
 def test_a_design_for_a_range_without_its_theta_is_refused(tmp_path):
     options = ["--condition", "closed-loop", "--jitter", "2,3", "--out", str(tmp_path / "c.json")]
     with pytest.raises(
-        ValueError, match=r"--jitter is '2,3': theta is \[1, 2\], outside of its jitter, \[2, 3\] samples"
+        ValueError, match=r"--jitter is 2-3: theta is \[1, 2\], outside of its jitter, \[2, 3\] samples"
     ):
         design_main(options)
 

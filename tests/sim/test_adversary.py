@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from cli import run as run_command
-from cli.suite import run_tightness as tightness
+from cli.suite import Check, rates, shortages, tightness
+from cli.suite import main as suite
 from cli.validate import main
 from controller.coupling import NoCoupling, SpringDamper
 from design.conditions import this_environment as real
@@ -19,7 +20,7 @@ from sim import adversary
 from sim.adversary import DESTABILISED, attempts, search
 from sim.engines import hold
 from sim.run import assemble
-from sim.scenario import InputError, load
+from sim.scenario import load
 from sim.stability import close, dominant_mode
 
 SCENARIO = load()
@@ -128,29 +129,18 @@ def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypa
     assert not report["holds"]
 
 
-def test_the_tightness_command_reports_the_rate_by_shortage(tmp_path):
-    options = ["--short", "0,20", "--generations", "10", "--seed", "1", "--json", str(tmp_path / "r.json")]
-    assert tightness([*options, "--out", str(tmp_path)]) == 0
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert report["rates"] == [{"short": 0.0, "attempts": 2, "rate": 0.0}, {"short": 0.2, "attempts": 2, "rate": 1.0}]
-    assert {row["loop"] for row in report["rows"]} == {"no coupling", "spring-damper, case I"}
-    assert (tmp_path / "tightness.png").stat().st_size > 10_000
+def test_the_rate_by_shortage():
+    rows = list(shortages(("none", "spring-damper"), (0, 0.2), 10)(1))
+    assert rates(rows) == [{"short": 0, "attempts": 2, "rate": 0.0}, {"short": 0.2, "attempts": 2, "rate": 1.0}]
+    assert {row["loop"] for row in rows} == {"no coupling", "spring-damper, case I"}
+    assert all(row["holds"] for row in rows)
 
 
-def test_somebody_who_destabilises_a_loop_with_enough_damping_fails_the_command(tmp_path, monkeypatch):
-    """Were the condition wrong, the command would say so: here it is told that a third of the damping is enough."""
-    monkeypatch.setattr("sim.adversary.closed_loop", lambda F, delta: replace(real(F, delta), required=(0.5, 0.5)))
-    assert tightness(["--case", "none", "--short", "0", "--generations", "5", "--out", str(tmp_path)]) == 1
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--short", "-1"], "--short is -1, allowed are 0 to below 100"),
-        (["--short", "5,many"], "--short is '5,many', expected numbers"),
-        (["--generations", "0"], "--generations is 0, allowed are 1 to 10000"),
-    ],
-)
-def test_bad_calls_of_tightness(options, message, tmp_path):
-    with pytest.raises(InputError, match=message):
-        tightness([*options, "--out", str(tmp_path)])
+def test_a_human_who_destabilises_a_loop_with_enough_damping_fails_the_check(tmp_path, monkeypatch):
+    """Were the condition wrong, the suite would say so: here it is told that a third of the damping is enough."""
+    monkeypatch.setattr("sim.adversary.this_environment", lambda F, delta: replace(real(F, delta), required=(0.5, 0.5)))
+    check = Check("tightness", "How tight?", shortages(("none",), (0,), 5), tightness, "plot_tightness")
+    monkeypatch.setattr("cli.suite.CHECKS", (check,))
+    assert suite(["--out", str(tmp_path)]) == 1
+    assert (tmp_path / "tightness" / "tightness.png").stat().st_size > 10_000
+    assert "| no coupling | 0.0% |" in (tmp_path / "report.md").read_text()

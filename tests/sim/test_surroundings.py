@@ -139,7 +139,7 @@ def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
     for name in report["conditions"]:
         missing = any(value is None for row in report[name]["required_over_available"] for value in row)
         assert missing == ("reason" in report[name])
-    for words in ("promise: this environment", "for its environment alone", "model set to the cell's environment"):
+    for words in ("guarantee: this environment", "for its environment alone", "model set to the cell's environment"):
         assert words in " ".join(text.split())
     assert (tmp_path / "zwidth.png").read_bytes().startswith(b"\x89PNG")
 
@@ -166,7 +166,7 @@ def test_null_cells_say_why_and_what_pushes_outwards_runs_away(tmp_path):
         (["--coupling", "optimal", "--rigid"], "--rigid with --coupling optimal: it is about a map of spring-dampers"),
         (["--coupling", "none", "--velocity-filter", "50"], "--velocity-filter with --coupling none"),
         (["--coupling", "optimal", "--condition", "theorem4"], "for optimal allowed are closed-loop"),
-        (["--condition", "theorem4"], "--condition theorem4: without --coupling nothing is designed"),
+        (["--condition", "theorem4"], "--condition any-environment: without --coupling nothing is designed"),
         (["--coupling", "optimal", "--scenario", "one-wall"], "an optimal coupling holds a linear model"),
         (["--coupling", "published", "--scenario", "one-wall"], "the paper prints gains for 2 channels"),
     ],

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from cli import run as run_command
-from cli import validate as verdict_report
 from cli.validate import main
 from controller.coupling import NoCoupling, SpringDamper
 from design.result import CASE_I
@@ -21,6 +20,7 @@ from models.human import Person
 from models.scene import Crowd, build, plant, variants
 from sim import crowds as examine_module
 from sim import crowds as shards
+from sim import report as verdict_report
 from sim.couplings import choose
 from sim.crowds import BATCH, MIXED, Findings, Question, crowds, crowds_of, draw, validate
 from sim.engines import ExactBatchEngine, ExactEngine, hold
@@ -278,7 +278,7 @@ def test_hands_that_had_no_time_to_rest_are_no_verdict(duration):
     """Against the slowest eigenvalue of the same humans, by the exact engine."""
     question = Question(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", duration)
     found = validate(question)
-    traces = verdict_report.outcome(question, found, True, 1.0)["traces"]
+    traces = verdict_report.validation_part(question, found, True, 1.0)["traces"]
     assert traces["slowest_decay_s"] == pytest.approx(-1 / found.exact.max())
     assert traces["settling_decides"] == (duration > 30)
     assert ("reason" in traces) == (duration < 30)

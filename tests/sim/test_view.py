@@ -558,9 +558,9 @@ BAD = [
     (("--video", "a.png"), "--video a.png: the name must end in .gif or .mp4"),
     (("--video", "nowhere/a.gif"), "the folder nowhere does not exist"),
     (("--video", "/proc/a.gif"), "--video /proc/a.gif: cannot write to /proc"),
-    (("--video", "a.gif", "--fps", "12"), "--fps is 12, allowed are 1 to 100, and for a .gif only what divides 100"),
-    (("--video", "a.gif", "--duration", "0"), "--duration is 0, allowed are more than 0 and up to 3600 s"),
-    (("--video", "a.gif", "--duration", "-1"), "--duration is -1, allowed are more than 0 and up to 3600 s"),
+    (("--video", "a.gif", "--fps", "12"), "--fps is 12, allowed for a .gif are the numbers that divide 100"),
+    (("--video", "a.gif", "--duration", "0"), "--duration is 0, allowed are 0.001 to 3600 s"),
+    (("--video", "a.gif", "--duration", "-1"), "--duration is -1, allowed are 0.001 to 3600 s"),
     (
         ("--coupling", "soft"),
         "'soft', allowed are none, published, spring-damper, optimal, ccl, designed or a FILE.json",

@@ -464,7 +464,7 @@ def test_slices_cover_everything_once():
         (["--grid", "1"], "--grid is 1, allowed are 4 to 400"),
         (["--humans", "0"], "--humans is 0, allowed are 1 to 100000"),
         (["--K-range", "5"], "--K-range is '5', expected two numbers separated by a comma"),
-        (["--mark", "5000,x"], "--mark is '5000,x', expected numbers"),
+        (["--mark", "5000,x"], "--mark is '5000,x', expected two numbers"),
         (["--mark", "0,1"], "--mark is 0,1, allowed are K"),
         (["--case", "none"], "--case none is the loop without coupling"),
         (["--rigid", "--theta", "1,2"], "--rigid is one channel: --theta has 2 entries"),

@@ -1,0 +1,238 @@
+"""Reports as tables on the terminal and as JSON: the one place where either is made.
+
+A report is a dictionary or a dataclass of plain figures, in SI units. Its table is made from rows, pairs of a name and
+a text; a row whose text is None is left out. The rows of a dataclass come from its fields, by the name and the format
+that `figure` gives them: a new figure is one field.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import MISSING, asdict, field, fields
+from pathlib import Path
+from typing import Any, Protocol
+
+from rich.console import Console
+from rich.errors import MarkupError
+from rich.progress import Progress
+from rich.table import Table
+from rich.text import Text
+
+from design.result import CONDITION_NAMES, listed
+from sim.files import nobody_reads, write_json
+
+# ----------------------------------------------------------------------------------------------------
+# The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
+
+
+CUT = "…"  # what stands in a table for the end of a word that did not fit
+WIDEST = 400  # characters
+STEP = 2
+OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # what opens no tag of our reports: a unit, a name
+
+
+class Screen(Console):
+    """A console whose tables lose nothing: words may break, numbers do not; what is too wide runs over the edge."""
+
+    def print(self, *objects: Any, **how: Any) -> None:
+        """As rich's, at the least width from the terminal's at which no table loses a character."""
+        own = self._width
+        self._width = max([self.width, *(self._needed(one) for one in objects if isinstance(one, Table))])
+        try:
+            super().print(*objects, **how)
+        finally:
+            self._width = own
+
+    def render_str(self, text: str, **how: Any) -> Text:
+        """As rich's, but a file `[/b].npz` or a device that calls itself `:x:` is printed as it is."""
+        how |= {"emoji": False}
+        if how.get("markup") is not False:
+            try:
+                return super().render_str(OTHER_BRACKET.sub(r"\\[", text), **how)
+            except MarkupError:  # one of our own tags, closed too often
+                how |= {"markup": False}
+        return super().render_str(text, **how)
+
+    def on_broken_pipe(self) -> None:  # rich itself would leave with 1, our "it does not hold"
+        """A reader that has seen enough (`| head -1`) changes neither the work nor its exit code."""
+        self.quiet = True
+        nobody_reads()
+
+    def _needed(self, table: Table) -> int:
+        least = 4 * len(table.columns) + 1  # frames and padding, and one character for each column
+        for width in range(max(self.width, least), WIDEST, STEP):
+            lines = self.render_lines(table, self.options.update(width=width), pad=False)
+            if not any(CUT in part.text for line in lines for part in line):
+                return width
+        return WIDEST
+
+
+def console(args: argparse.Namespace) -> Screen:
+    """Where tables go: standard error when standard output is taken by --json -."""
+    return Screen(stderr=args.json == "-", highlight=False)
+
+
+class Move(Protocol):
+    """Moves a progress bar to `done` of `total`, and may say what is being done."""
+
+    def __call__(self, done: int, total: int, what: str = ...) -> None: ...
+
+
+@contextmanager
+def progress(description: str) -> Iterator[Move]:
+    """A bar on standard error that shows only on a terminal; yields the function that moves it."""
+    terminal = Console(stderr=True)
+    with Progress(transient=True, console=terminal, disable=not terminal.is_terminal) as bar:
+        task = bar.add_task(description, total=None)
+
+        def move(done: int, total: int, what: str = description) -> None:
+            bar.update(task, completed=done, total=total, description=what)
+
+        yield move
+
+
+# ----------------------------------------------------------------------------------------------------
+# A whole report: files, tables, lines below them, JSON.
+
+
+def publish(
+    args: argparse.Namespace,
+    outcome: dict[str, Any],
+    shown: Iterable[Table],
+    lines: Iterable[str] = (),
+    folder: Path | None = None,
+    files: Iterable[Path] = (),
+) -> None:
+    """Keep the outcome as report.json in the folder, print tables and lines, and write what --json asks for.
+
+    `files` are those written before; the outcome names them and its own.
+    """
+    if folder:
+        kept = folder / "report.json"
+        outcome["files"] = [*map(str, files), str(kept)]
+        write_json(kept, outcome)
+    screen = console(args)
+    for table in shown:
+        screen.print(table)
+    for line in lines:
+        screen.print(f"[dim]·[/] {line}")
+    if folder:
+        screen.print("files: " + ", ".join(outcome["files"]), soft_wrap=True)
+    if args.json:
+        write_json(args.json, outcome)
+
+
+def plain(report: Any) -> dict[str, Any]:
+    """A dataclass as JSON takes it."""
+    return asdict(report)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Tables.
+
+
+Rows = Iterable[tuple[str, str | None]]
+Form = str | Callable[[Any], str]
+
+
+def facts(title: str, rows: Rows, heads: Sequence[str] = (), left: bool = False) -> Table:
+    """A table of names and texts; a text of None is left out."""
+    table = Table(*heads, title=title, title_justify="left" if left else "center", show_header=bool(heads))
+    for name, text in rows:
+        if text is not None:
+            table.add_row(name, text)
+    return table
+
+
+def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = (0,)) -> Table:
+    """A table of figures, to the right but for the columns `left`."""
+    table = Table(title=title)
+    for i, head in enumerate(heads):
+        table.add_column(head, justify="left" if i in left else "right", overflow="fold" if i == 0 else "ellipsis")
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def figure(name: str, form: Form = "{}", default: Any = MISSING) -> Any:
+    """A field of a report that its table shows under this name, in this format."""
+    return field(default=default, metadata={"name": name, "form": form})
+
+
+def rows_of(report: Any) -> Rows:
+    """The figures of a dataclass as rows; those that are None are left out."""
+    for one in _figures(report):
+        value = getattr(report, one.name)
+        yield one.metadata["name"], None if value is None else _formed(value, one.metadata["form"])
+
+
+def _figures(report: Any) -> list[Any]:
+    return [one for one in fields(report) if "form" in one.metadata]
+
+
+def _formed(value: Any, form: Form) -> str:
+    return form(value) if callable(form) else form.format(value)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Phrases that several reports share.
+
+
+ORDER = ("closed-loop", "theorem4")  # of conditions in a table
+
+
+def certified(part: Mapping[str, Any]) -> str:
+    """Whether it is, and whether that is proved in exact arithmetic."""
+    if not part["certified"]:
+        return "[red]not certified[/]"
+    return "[green]certified[/]" + (", proved exactly" if part["proof"] == "rational" else "")
+
+
+def needs(part: Mapping[str, Any], digits: int = 6) -> str:
+    """Required of available damping."""
+    required, available = (listed(part[f"{which}_damping"], digits) for which in ("required", "available"))
+    return f"{required} of {available} N s/m"
+
+
+def certificate_rows(certificates: Mapping[str, dict[str, Any]], digits: int = 6, proof: bool = True) -> Rows:
+    """What each condition needs, and whether that is proved exactly, where no other row says it."""
+    for name, part in certificates.items():
+        if name in CONDITION_NAMES:
+            word = certified(part) if proof else certified(part | {"proof": None})
+            yield f"damping, {CONDITION_NAMES[name]}", f"needs {needs(part, digits)}: {word}"
+
+
+def optional(value: float | None, form: str, absent: str = "-") -> str:
+    """A figure that may not exist."""
+    return absent if value is None else form.format(value)
+
+
+def transparency_error(part: Mapping[str, Any]) -> str:
+    """The mismatch M relative to the reference, in decibels."""
+    sup, rms = (optional(part[f"{which}_mismatch_db"], "{:.2f} dB", "zero") for which in ("relative", "rms"))
+    return f"{sup} at most, {rms} rms (0 dB: as wrong as no force)"
+
+
+def verdict(word: str | None) -> str:
+    """Stable or not."""
+    return {"stable": "[green]stable[/]", "unstable": "[red]unstable[/]"}.get(word or "", "not decided")
+
+
+def delay_rows(part: Mapping[str, Any]) -> Rows:
+    """Delays that vary, of a run or of a validation."""
+    spans = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))
+    played = ", played out at the largest" if part["playout"] else ""
+    lost = f", {100 * part['loss']:g} % lost" if part["loss"] else ""
+    yield "varying delay", f"{spans} samples, {part['pattern']}{played}{lost}"
+    if age := part.get("age"):
+        met = zip(age["least"], age["largest"], age["mean"], strict=True)
+        yield "age of the forces", "; ".join(f"{a} to {b}, mean {c:.2f}" for a, b, c in met) + " samples"
+    if period := part.get("period"):
+        growth = f"{period['growth_rate_per_s']:+.4f} 1/s with a period of {period['ticks']} ticks"
+        yield "worst switching found", f"{growth}: {verdict(period['verdict'])}"
+    if proof := part.get("jitter_proof"):
+        yield "damping, any switching", f"needs {needs(proof, 5)}: {certified(proof)}"
+    yield "these delays covered", "[green]yes[/]" if part["covered"] else "[yellow]no[/]"

@@ -1,0 +1,515 @@
+"""What a run and a validation came to, as plain data: SI units, null with a "reason" where a figure does not exist."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, SpringDamper
+from controller.delay import LOST, Jitter, Ticks, ages
+from controller.lti import Array
+from design.certificate import ANY, CAVEATS, assess, certificate_part, finite
+from design.conditions import Requirement
+from design.result import CONDITION_NAMES, PRINTED_TAU_DB, PUBLISHED, listed
+from design.transparency import Transparency, decibels
+from models.human import Human, Person
+from sim.adversary import Worst
+from sim.couplings import Chosen
+from sim.crowds import MIXED, Findings, Question, crowd_of
+from sim.engines import ExactBatchEngine, HeldPlant
+from sim.run import Assembly, Record
+from sim.scenario import Scenario, load
+from sim.stability import (
+    Mode,
+    clipped_ticks,
+    close,
+    dominant_mode,
+    frozen_modes,
+    measured_growth,
+    unstable,
+    verdict,
+    worst_mode,
+)
+from sim.switching import Period, certified_part, knocked, unlimited
+
+# ----------------------------------------------------------------------------------------------------
+# Certificates, couplings and transparency.
+
+
+def certificates_part(requirements: Mapping[str, Requirement]) -> dict[str, Any]:
+    """Both conditions, each under its name and under the name that it had before: the same objects."""
+    parts = {name: certificate_part(requirement) for name, requirement in requirements.items()}
+    return parts | {CONDITION_NAMES[name]: part for name, part in parts.items()}
+
+
+def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
+    """Kind, gains (None where it has none) and order of V, Q or R."""
+    part: dict[str, Any] = {"kind": kind, "K": None, "B": None, "order": 0}
+    match coupling:
+        case SpringDamper(K=K, B=B):
+            part |= {"K": K.tolist(), "B": B.tolist(), "order": coupling.compliance(T).order}
+        case Compliance(V=V):
+            part["order"] = V.order
+        case InternalModel():
+            part["order"] = coupling.parameter(T).order
+        case ForceFilter():
+            part["order"] = coupling.filter(T).order
+    return part
+
+
+def transparency_part(figures: Transparency) -> dict[str, Any]:
+    """The figures of the mismatch, in decibels, with a reason where one is infinite."""
+    part: dict[str, Any] = {
+        "tau_db": finite(decibels(figures.tau)),
+        "relative_mismatch_db": finite(decibels(figures.relative_mismatch)),
+        "rms_mismatch_db": finite(decibels(figures.rms_mismatch)),
+        "dc_ratio": finite(figures.dc_ratio),
+        "high_frequency_gain": finite(figures.high_frequency_gain),
+        "band_hz": list(figures.band_hz),
+    }
+    if figures.relative_mismatch == 0:
+        part["reason"] = "the devices see the reference exactly: the mismatch is zero, minus infinity in dB"
+    elif math.isinf(figures.tau):
+        part["reason"] = "tau (25) divides by inf sigma_min(E), which is 0: some motion costs no static force"
+    return part
+
+
+# ----------------------------------------------------------------------------------------------------
+# What a run was worth: one dictionary for machines, and the same as tables for people.
+
+
+def stability_part(assembly: Assembly, record: Record) -> dict[str, Any]:
+    """Measured on the trace, and from the eigenvalues of the exact loop; of walls, in the worst contact state."""
+    mode = worst_mode(assembly)
+    limit = assembly.process.force_limit
+    contact = _contact(assembly, record) if assembly.process.contact else {}
+    if contact.get("ticks"):
+        growth, reason = None, f"contact was made {contact['made']} times, and a growth rate is of one linear loop"
+    elif assembly.friction:
+        growth, reason = None, "with Coulomb friction there is no growth rate; the eigenvalues are those without it"
+    else:
+        loop = close(assembly.plant, assembly.F)
+        growth, reason = measured_growth(loop, dominant_mode(loop), record, limit)
+    if record.diverged:
+        reason = "the simulation left the range of finite numbers: reported as unstable"
+    part: dict[str, Any] = {
+        "verdict": "unstable" if record.diverged else None if growth is None else verdict(growth),
+        "clipped_ticks": int(clipped_ticks(record, limit).sum()),
+        "growth_rate_per_s": growth,
+        "frequency_hz": _strongest_line(record, assembly.scenario.T),
+        **_eigenvalues(mode),
+    }
+    part |= {"contact": contact} if contact else {}
+    return part | ({"reason": reason} if reason else {})
+
+
+def _eigenvalues(mode: Mode) -> dict[str, Any]:
+    """What the eigenvalues of the exact loop say."""
+    return {
+        "exact_verdict": mode.verdict,
+        "exact_growth_rate_per_s": finite(mode.growth),
+        "exact_frequency_hz": mode.frequency_hz,
+        "spectral_radius": mode.spectral_radius,
+    }
+
+
+def _contact(assembly: Assembly, record: Record) -> dict[str, Any]:
+    """How often the walls were touched in a run, and the linear loops that they switch between."""
+    walls = assembly.process.contact
+    assert walls is not None
+    touching = walls.depths(record.z[:, :, 0]) > 0
+    states = [
+        {
+            "touching": [i + 1 for i, on in enumerate(state) if on],
+            "exact_growth_rate_per_s": finite(mode.growth),
+            "exact_frequency_hz": mode.frequency_hz,
+            "exact_verdict": mode.verdict,
+        }
+        for state, mode in frozen_modes(assembly).items()
+    ]
+    return {
+        "made": int((touching[1:] & ~touching[:-1]).sum() + touching[:1].sum()),
+        "ticks": int(touching.any(axis=1).sum()),
+        "frozen": states,
+    }
+
+
+def error_part(
+    record: Record, exact: Record | None, assembly: Assembly, unstable: bool | None = None
+) -> dict[str, Any]:
+    """Device positions against the exact engine's closed loop, where there is one.
+
+    `unstable` where its eigenvalues do not say it.
+    """
+    if exact is None:
+        reason = "the exact engine is linear and has no Coulomb friction to compare with"
+        return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
+    limit, m = assembly.process.force_limit, assembly.process.channels
+    n = min(record.s.shape[0], exact.s.shape[0])
+    clipped = clipped_ticks(exact, limit)[:n] | clipped_ticks(record, limit)[:n]
+    if unstable is None:
+        unstable = worst_mode(assembly).verdict == "unstable"
+    linear = int(np.argmax(clipped)) if unstable and clipped.any() else n
+    relative, largest = _distance(record.s[:linear, :m], exact.s[:linear, :m])
+    if linear == n:
+        return {"position_relative_rms": relative, "position_max_m": largest}
+    until = f"the unstable run first clips at t = {linear * assembly.scenario.T:.3f} s"
+    reason = f"{until}; up to there the relative rms is {relative:.1e}, and its growth multiplies any difference"
+    return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
+
+
+def remarks(outcome: dict[str, Any]) -> list[str]:
+    """What a reader must know to read the figures rightly."""
+    lines = []
+    certificates = {name: outcome["certificates"][name] for name in ("theorem4", "closed-loop")}
+    for name, part in certificates.items():
+        if part["certified"] or "reason" in part:
+            continue
+        worst = max(n / a for n, a in zip(part["required_damping"], part["available_damping"], strict=True))
+        condition = f"the {CONDITION_NAMES[name]} condition" + (
+            " (the paper's Theorem 4)" if name == "theorem4" else ""
+        )
+        lines.append(
+            f"These gains fail {condition}: they need {worst:.3g} times the damping that the devices guarantee."
+        )
+    if "contact" in outcome["stability"]:
+        covered = "any-environment covers" if outcome["promise"] == ANY else "no certificate covers"
+        frozen = "this-environment is about frozen contact states"
+        lines.append(f"Contact that makes and breaks: {covered} it in this loop; {frozen}.")
+    for name in ("stability", "error", "transparency"):
+        if "reason" in outcome[name]:
+            lines.append(f"{name}: {outcome[name]['reason']}.")
+    for name, part in certificates.items():
+        if "reason" in part:
+            lines.append(f"{CONDITION_NAMES[name]}: {part['reason']}.")
+    if outcome.get("jitter"):
+        lines.append(f"Delays that vary: {outcome['jitter']['covers']}.")
+    return [*lines, CAVEATS]
+
+
+def _distance(a: Array, b: Array) -> tuple[float | None, float | None]:
+    size = float(np.sqrt(np.mean(b**2))) if b.size else 0.0
+    if size == 0:
+        return None, None
+    return float(np.sqrt(np.mean((a - b) ** 2))) / size, float(np.abs(a - b).max())
+
+
+def _strongest_line(record: Record, T: float) -> float | None:
+    """The strongest line above 10 Hz in the last quarter of the forces: what one hears and feels."""
+    tail = record.f[-(record.f.shape[0] // 4) :, :, 0]
+    if tail.shape[0] < 64:
+        return None
+    window = np.hanning(tail.shape[0])[:, None]
+    spectrum = np.abs(np.fft.rfft((tail - tail.mean(axis=0)) * window, axis=0)).sum(axis=1)
+    frequency = np.fft.rfftfreq(tail.shape[0], T)
+    spectrum[frequency < 10.0] = 0.0
+    return float(frequency[np.argmax(spectrum)]) if spectrum.any() else None
+
+
+# ----------------------------------------------------------------------------------------------------
+# What the paper prints beside what comes out here, for its own scenario.
+
+
+def beside_the_paper(scenario: Scenario, case: str, outcome: dict[str, Any]) -> list[dict[str, str]]:
+    """Rows of {what, paper, here, why}; empty where the loop is not the paper's."""
+    if scenario.jitter or scenario.loop(case) != load().loop(case):
+        return []
+    figure = _figure(case, outcome["stability"])
+    return [figure] if case == "none" else [*_printed_gains(scenario, case, outcome), _tau(case), figure]
+
+
+def _printed_gains(scenario: Scenario, case: str, outcome: dict[str, Any]) -> list[dict[str, str]]:
+    printed, got = PUBLISHED[case], outcome["coupling"]
+    need = assess(scenario.loop(case), printed)
+    theorem4, closed_loop = (need[name].required for name in ("theorem4", "closed-loop"))
+    here = "none" if got["K"] is None else f"K = {listed(got['K'], 5)}, B = {listed(got['B'], 5)}"
+    return [
+        {
+            "what": "gains [N/m], [N s/m]",
+            "paper": f"K = {listed(printed.K, 5)}, B = {listed(printed.B, 5)}",
+            "here": here,
+            "why": "the printed gains are no solution of the paper's own problem (next row)",
+        },
+        {
+            "what": "damping that the printed gains need [N s/m]",
+            "paper": f"at most {listed(scenario.delta, 5)}",
+            "here": f"{listed(theorem4, 5)} by Theorem 4; {listed(closed_loop, 5)} in this environment",
+            "why": "Theorem 4 as printed is strictly infeasible (E-hat has a pole at z = 1); mended, it refuses them",
+        },
+    ]
+
+
+def _tau(case: str) -> dict[str, str]:
+    return {
+        "what": "transparency index tau (25)",
+        "paper": f"{PRINTED_TAU_DB[case]} dB",
+        "here": "infinite",
+        "why": "inf sigma_min(E) = 0: moving both contacts together costs no static force",
+    }
+
+
+def _figure(case: str, stability: dict[str, Any]) -> dict[str, str]:
+    growth = f"{stability['exact_growth_rate_per_s']:+.2f} 1/s at {stability['exact_frequency_hz']:.1f} Hz"
+    return {
+        "what": "Figure 5: no coupling" if case == "none" else "Figure 6: with a coupling",
+        "paper": "self-sustained oscillation" if case == "none" else "no oscillation",
+        "here": f"{stability['exact_verdict']}: {growth}",
+        "why": "agrees; masses and stiffness of the devices are assumed",
+    }
+
+
+# ----------------------------------------------------------------------------------------------------
+# What a run with varying delays says: the delays it met, whether it grew, and what certificates cover.
+
+
+JUDGED = 4.0  # [s] at most of the linear loop from which a growth is read: later numbers may overflow
+
+
+def delays_part(
+    assembly: Assembly, chosen: Chosen, period: Period | None, ticks: int, certified: bool
+) -> dict[str, Any] | None:
+    """All that a report says of delays that vary; None where the scenario has no jitter."""
+    scenario = assembly.scenario
+    if scenario.jitter is None:
+        return None
+    met = _delays_met(assembly, period, ticks) if scenario.switches else {}
+    return delay_range_part(scenario.jitter) | met | certified_part(scenario, chosen, certified)
+
+
+def delay_range_part(jitter: Jitter) -> dict[str, Any]:
+    """The range of delays and how they vary within it."""
+    return {
+        "lo": list(jitter.lo),
+        "hi": list(jitter.hi),
+        "pattern": jitter.pattern,
+        "loss": jitter.loss,
+        "playout": jitter.playout,
+        "constant": jitter.steady,
+    }
+
+
+def _delays_met(switched: Assembly, period: Period | None, ticks: int) -> dict[str, Any]:
+    """The delays that a run met, and the growth of its linear loop under them."""
+    delays = switched.process.delays
+    assert delays is not None
+    met = ages(delays[:ticks])[..., 0]
+    used = met[(met >= 0).all(axis=1)]
+    growth, window = _growth_under_delays(switched, ticks)
+    return {
+        "age": _age(used),
+        "lost_packets": (delays[:ticks] == LOST).sum(axis=(0, 2)).tolist(),
+        "held_ticks": (np.diff(used, axis=0) == 1).sum(axis=0).tolist(),
+        "growth_rate_per_s": finite(growth),
+        "verdict": "unstable" if growth > 0 else "stable",
+        "judged_s": window,
+        "period": None
+        if period is None
+        else {
+            "ticks": len(period.ages),
+            "growth_rate_per_s": finite(period.growth),
+            "spectral_radius": period.spectral_radius,
+            "verdict": "unstable" if period.growth > 0 else "stable",
+        },
+    }
+
+
+def _age(used: Ticks) -> dict[str, Any] | None:
+    """Of the forces in use [samples], per channel, from the first arrival on; None where none arrives."""
+    if not used.size:
+        return None
+    figures = {"least": used.min(axis=0), "largest": used.max(axis=0), "mean": used.mean(axis=0)}
+    return {name: values.tolist() for name, values in figures.items()}
+
+
+def _growth_under_delays(switched: Assembly, ticks: int) -> tuple[float, float]:
+    """(rate [1/s], window [s]) of the exact linear loop after a knock, under the run's first delays."""
+    T, plant = switched.scenario.T, switched.plant
+    judged = max(4, min(ticks, round(JUDGED / T)))
+    one = HeldPlant(plant.A[None], plant.B[None], plant.C, T)
+    process = unlimited(switched.process)
+    engine = ExactBatchEngine(one, process.force_limit)
+    return float(knocked(process, engine, switched.scene, plant.A.shape[0], judged, 1).rate[0]), judged * T
+
+
+def switched_stability_part(assembly: Assembly, record: Record, jitter: dict[str, Any]) -> dict[str, Any]:
+    """As report.stability_part, for a loop that switches: it has no eigenvalue of its own but over a period."""
+    worst = jitter["period"] or jitter
+    constant = _eigenvalues(dominant_mode(close(assembly.plant, assembly.F)))
+    verdict = "unstable" if record.diverged or "unstable" in (worst["verdict"], jitter["verdict"]) else "stable"
+    return {
+        "verdict": verdict,
+        "clipped_ticks": int(clipped_ticks(record, assembly.process.force_limit).sum()),
+        "growth_rate_per_s": worst["growth_rate_per_s"],
+        "frequency_hz": _strongest_line(record, assembly.scenario.T),
+        **constant,
+        "reason": _how(jitter)
+        + f"; the eigenvalues are those of the constant delay theta = {listed(assembly.scenario.theta)}",
+    }
+
+
+def _how(jitter: dict[str, Any]) -> str:
+    if jitter["period"]:
+        return f"growth by the eigenvalues of the product over the {jitter['period']['ticks']} ticks of a period"
+    return f"growth of the linear loop after a knock, over {jitter['judged_s']:.3g} s under the run's delays"
+
+
+# ----------------------------------------------------------------------------------------------------
+# What a validation found: one dictionary for machines, and the same as a table for people.
+
+
+SETTLING = 4  # decay times of the slowest mode in a trace whose hands must be slower in its last quarter than before
+ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
+
+
+def validation_part(question: Question, findings: Findings, certified: bool, wall: float) -> dict[str, Any]:
+    """The contract of `sim.validate --json`."""
+    bad, mujoco = unstable(findings.exact), question.engine != "exact"
+    disagreements = int(findings.disagreements.sum())
+    wrong = int((bad | (mujoco & unstable(findings.mujoco) & (findings.mujoco > 1e-3))).sum())
+    part: dict[str, Any] = {
+        "humans": int(findings.index.size),
+        "links": "mixed" if question.links == MIXED else question.links,
+        "seed": question.seed,
+        "engine": question.engine,
+        "unstable": {
+            "exact": int(bad.sum()),
+            "mujoco": int(unstable(findings.mujoco).sum()) if mujoco else None,
+        },
+        "disagreements": disagreements,
+        "disagreeing": [_identified(question, int(i)) for i in findings.index[findings.disagreements]],
+        "worst": _worst(question, findings),
+        "largest_difference_per_s": _largest(np.abs(findings.mujoco - findings.exact)),
+        "traces": _traces(question, findings),
+        "environments": _environments(question, findings, bad),
+        "certified": certified,
+        "holds": disagreements == 0 and not (certified and wrong),
+        "interrupted": findings.interrupted,
+        "wall_s": wall,
+        "simulated_s_per_s": findings.simulated / wall,
+    }
+    if certified and question.ticks:
+        part["energy_audit"] = _energy(findings)
+        part["holds"] = part["holds"] and part["energy_audit"]["holds"]
+    if not findings.index.size:
+        part |= {"holds": None, "reason": "interrupted before the first batch of humans was done"}
+    return part
+
+
+def varying_delays_part(findings: Findings, covered: dict[str, Any]) -> dict[str, Any]:
+    """How many humans grow under delays that vary; it holds unless certificates cover these delays and one grows."""
+    exact, mujoco = findings.switching, findings.switching_mujoco
+    seen = ~np.isnan(exact)
+    unstable, also = int((exact > 0).sum()), mujoco[~np.isnan(mujoco)]
+    worst = int(np.nanargmax(exact)) if seen.any() else None
+    return covered | {
+        "unstable": {"exact": unstable, "mujoco": int((also > 0).sum()) if also.size else None},
+        "humans": int(seen.sum()),
+        "mujoco_unclipped": int(also.size),
+        "largest_growth_per_s": None if worst is None else finite(float(exact[worst])),
+        "worst_index": None if worst is None else int(findings.index[worst]),
+        "holds": not (covered["covered"] and unstable),
+    }
+
+
+def adversary_part(worst: Worst, ratio: float, certified: bool) -> dict[str, Any]:
+    """What the search found, and how far the loop is from its required damping."""
+    return {
+        "found": worst.destabilises,
+        "spectral_radius": worst.spectral_radius,
+        "growth_rate_per_s": finite(worst.growth),
+        "frequency_hz": worst.frequency_hz,
+        "evaluated": worst.evaluated,
+        "required_over_available_damping": finite(ratio),
+        "human": _humans(worst.humans),
+        "person": _persons(worst.persons),
+        "holds": not (certified and worst.destabilises),
+    }
+
+
+def _humans(humans: tuple[Human, ...]) -> list[dict[str, Any]]:
+    """Links of each channel's human."""
+    names = ("mass", "damping", "stiffness")
+    return [{"links": [{name: getattr(link, name) for name in names} for link in human.links]} for human in humans]
+
+
+def _persons(persons: tuple[Person, ...]) -> list[dict[str, Any]]:
+    """Those who hold several devices."""
+    return [msgspec.to_builtins(person) for person in persons]
+
+
+def _identified(question: Question, index: int) -> dict[str, Any]:
+    crowd = crowd_of(question.scenario, question.seed, index, question.links)
+    who = {"human": _humans(crowd.humans(0)), "person": _persons(crowd.persons(0))}
+    member = question.environment(index)
+    where = {"environment": member.name, "network": msgspec.to_builtins(member.network)} if member else {}
+    return {"seed": question.seed, "index": index} | who | where
+
+
+def _environments(question: Question, findings: Findings, bad: NDArray[np.bool_]) -> dict[str, Any]:
+    """Which environments the loops had, and in which of them a loop was unstable."""
+    if not question.environments:
+        return {"of": "the nominal environment", "count": 1}
+    unstable_in = sorted({int(i) % len(question.environments) for i in findings.index[bad]})
+    return {
+        "of": "the box",
+        "count": len(question.environments),
+        "names": [member.name for member in question.environments],
+        "unstable_in": [question.environments[i].name for i in unstable_in],
+    }
+
+
+def _worst(question: Question, findings: Findings) -> dict[str, Any] | None:
+    if not findings.index.size:
+        return None
+    k = int(np.argmax(findings.radius))
+    figures = {
+        "spectral_radius": float(findings.radius[k]),
+        "growth_rate_per_s": finite(float(findings.exact[k])),
+        "frequency_hz": float(findings.frequency[k]),
+    }
+    return figures | _identified(question, int(findings.index[k]))
+
+
+def _traces(question: Question, findings: Findings) -> dict[str, Any] | None:
+    if not question.ticks or not findings.index.size:
+        return None
+    measured, stable = np.isfinite(findings.trace), ~unstable(findings.exact)
+    duration = question.ticks * question.scenario.T
+    decay = _largest(-1 / findings.exact[findings.exact < 0])
+    decides = decay is None or duration >= SETTLING * decay
+    part = {
+        "duration_s": duration,
+        "clipped_runs": int((findings.clipped > 0).sum()),
+        "measured": int(measured.sum()),
+        "largest_difference_per_s": _largest(np.abs(findings.trace - findings.exact)),
+        "stable_and_settling": int((stable & (findings.settling < 1)).sum()),
+        "stable": int(stable.sum()),
+        "slowest_settling": _largest(findings.settling[stable]),
+        "slowest_decay_s": decay,
+        "settling_decides": decides,
+    }
+    if not decides:
+        part["reason"] = f"the slowest mode decays in {decay:.3g} s: in {duration:g} s its hands need not be slower"
+    return part
+
+
+def _energy(findings: Findings) -> dict[str, Any]:
+    unclipped = findings.clipped == 0
+    violated = unclipped & ~(findings.energy >= -ROUNDING * findings.audited)
+    return {
+        "audited": int(unclipped.sum()),
+        "clipped": int((~unclipped).sum()),
+        "violated": int(violated.sum()),
+        "least_J": float(findings.energy[unclipped].min()) if unclipped.any() else None,
+        "holds": not violated.any(),
+    }
+
+
+def _largest(values: Array) -> float | None:
+    values = values[np.isfinite(values)]
+    return float(values.max()) if values.size else None

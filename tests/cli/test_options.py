@@ -1,0 +1,98 @@
+"""Types of options: one line that names the option, what came and what is allowed; names of conditions, old and new."""
+
+import argparse
+import json
+from dataclasses import dataclass
+
+import pytest
+
+from cli import options, render
+from cli.audit import main as audit
+from cli.run import main as run
+from sim.scenario import InputError
+
+
+def parser():
+    made = options.Parser("x", "what", "python -m x")
+    made.add_argument("--count", type=options.whole(1, 9))
+    made.add_argument("--seed", type=options.whole(0))
+    made.add_argument("--length", type=options.number(1e-3, 2, "m"))
+    made.add_argument("--K", type=options.several(float, 0, 1e3, "N/m"))
+    made.add_argument("--theta", type=options.several(int))
+    made.add_argument("--mark", type=options.pair, action="append")
+    made.add_argument("--jitter", type=options.delay_ranges)
+    options.add_condition_option(made)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--count 0", "--count is 0, allowed are 1 to 9"),
+        ("--count 1.5", "--count is '1.5', expected a whole number"),
+        ("--seed=-1", "--seed is -1, allowed are numbers from 0"),
+        ("--length nan", "--length is nan, allowed are 0.001 to 2 m"),
+        ("--length long", "--length is 'long', expected a number"),
+        ("--K 1,2000", "--K is 2000, allowed are 0 to 1000 N/m"),
+        ("--theta 1,x", "--theta is '1,x', expected whole numbers separated by commas"),
+        ("--mark 1,2,3", "--mark is '1,2,3', expected two numbers separated by a comma"),
+        ("--jitter 1", "--jitter is '1', expected LO,HI or LO-HI,LO-HI,.. in whole samples"),
+        ("--condition any", "--condition is 'any', allowed are this-environment, any-environment"),
+        ("--nonsense", "unrecognized arguments: --nonsense (--help lists the options)"),
+    ],
+)
+def test_one_line_for_bad_words(words, message):
+    with pytest.raises(InputError) as caught:
+        parser().parse_args(words.split())
+    assert str(caught.value) == message
+
+
+def test_good_words():
+    words = "--count 3 --length 1e-3 --K 1,2 --theta 0 --mark 5000,0 --mark 1,2 --jitter 1-2,0-3"
+    args = parser().parse_args(words.split())
+    assert (args.count, args.length, args.K, args.theta) == (3, 1e-3, (1.0, 2.0), (0,))
+    assert args.mark == [(5000.0, 0.0), (1.0, 2.0)]
+    assert options.per_channel("--theta", args.theta, 3) == (0, 0, 0)
+    assert options.ranges_per_channel("--jitter", args.jitter, 2) == ((1, 0), (2, 3))
+    assert options.ranges_per_channel("--jitter", options.delay_ranges("1,2"), 2) == ((1, 1), (2, 2))
+    with pytest.raises(InputError, match="--K has 2 entries, expected 3"):
+        options.per_channel("--K", args.K, 3)
+
+
+@pytest.mark.parametrize("words", [("any-environment", "theorem4"), ("this-environment", "closed-loop")])
+def test_a_condition_has_a_name_and_the_one_that_it_had(words):
+    new, old = (parser().parse_args(["--condition", word]).condition for word in words)
+    assert new == old == words[1]
+
+
+def test_a_report_has_both_keys_of_a_condition(tmp_path, capsys):
+    words = ["--K", "879,552", "--B", ".39,.52", "--out", str(tmp_path)]
+    assert audit([*words, "--json", str(tmp_path / "audit.json")]) == 0
+    found = json.loads((tmp_path / "audit.json").read_text())
+    assert found["any-environment"] == found["theorem4"]
+    assert found["this-environment"] == found["closed-loop"]
+    assert "any-environment" in capsys.readouterr().out
+    quick = ["--case", "none", "--duration", "0.1", "--no-plot", "--out", str(tmp_path)]
+    assert run([*quick, "--json", str(tmp_path / "run.json")]) == 0
+    certificates = json.loads((tmp_path / "run.json").read_text())["certificates"]
+    assert certificates["any-environment"] == certificates["theorem4"]
+    assert set(certificates) == {"any-environment", "this-environment", "theorem4", "closed-loop"}
+
+
+@dataclass(frozen=True)
+class Report:
+    name: str = render.figure("loop")
+    growth: float | None = render.figure("growth [1/s]", "{:+.2f}")
+    holds: bool = True
+
+
+def test_a_figure_is_a_field(capsys):
+    """Its name and format stand beside it; table and JSON follow."""
+    reports = [Report("a", 1.0), Report("b", None, False)]
+    assert list(render.rows_of(reports[0])) == [("loop", "a"), ("growth [1/s]", "+1.00")]
+    assert list(render.rows_of(reports[1])) == [("loop", "b"), ("growth [1/s]", None)]
+    assert render.plain(reports[1]) == {"name": "b", "growth": None, "holds": False}
+    screen = render.console(argparse.Namespace(json=None))
+    screen.print(render.facts("a loop", render.rows_of(reports[0])))
+    lines = capsys.readouterr().out.splitlines()
+    assert [part.strip() for part in lines[3].strip("│").split("│")] == ["growth [1/s]", "+1.00"]
