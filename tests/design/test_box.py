@@ -157,22 +157,27 @@ def test_a_vertex_that_cannot_be_simulated_is_refused():
         Loop(T, (0,), (0,), (0,), (1.0,), Network(("tip",), springs), box)
 
 
-# one Q for all
+# one R for all
 
 
 def by_hand(network: Network, coupling, w):
-    """F = Theta (E - E Q E) from the network's own matrices and the definition of the basis, shape (k, 2, 2)."""
+    """F = Theta R E from the network's own matrices and the definition of the basis, shape (k, 2, 2)."""
     M, D, K = network.matrices()
     z = np.exp(1j * w)
     s = ((z - 1) / (T * z))[:, None, None]
     Z = M * s**2 + D * s + K
     E = Z[:, :2, :2] - Z[:, :2, 2:] @ Z[:, 2:, :2] / Z[:, 2:, 2:]
-    Q, through = coupling.Q[0].astype(complex), np.ones_like(z)
-    for a, coefficient in zip(coupling.poles, coupling.Q[1:], strict=True):
-        Q = Q + coefficient * (through * (1 - a) / (z - a))[:, None, None]
+    R, through = coupling.R[0].astype(complex), np.ones_like(z)
+    for a, coefficient in zip(coupling.poles, coupling.R[1:], strict=False):
+        R = R + coefficient * (through * (1 - a) / (z - a))[:, None, None]
         through = through * (1 - a * z) / (z - a)
+    rest = coupling.R[1 + coupling.poles.size :]
+    for (b1, b2), first, second in zip(coupling.pairs, rest[::2], rest[1::2], strict=True):
+        section = (through * (1 + b1 + b2) / (z * z + b1 * z + b2))[:, None, None]
+        R = R + (first * z[:, None, None] + second) * section
+        through = through * (b2 * z * z + b1 * z + 1) / (z * z + b1 * z + b2)
     late = np.stack([z ** -THETA[0], z ** -THETA[1]], axis=1)[:, :, None]
-    return late * (E - E @ Q @ E)
+    return late * (R @ E)
 
 
 def least_room(network: Network, coupling, points: int = 2000) -> float:
@@ -191,12 +196,12 @@ def test_the_force_map_of_each_vertex_is_that_of_its_raw_matrices(robust):
         np.testing.assert_allclose(F, expected, rtol=0, atol=1e-7 * np.abs(expected).max())
 
 
-def test_one_q_holds_at_every_vertex_where_that_of_the_environment_alone_does_not(robust, nominal_only):
+def test_one_filter_holds_at_every_vertex_where_that_of_the_environment_alone_does_not(robust, nominal_only):
     rooms = [least_room(m.network, robust.coupling) for m in LOOP.members()]
     alone = [least_room(m.network, nominal_only.coupling) for m in LOOP.members()]
-    # half a percent of the damping is the design's own margin
-    assert min(rooms) > 0.004
-    assert alone[0] > 0.004
+    # two thousandths of the damping are the design's own margin
+    assert min(rooms) > 0.0015
+    assert alone[0] > 0.0015
     assert min(alone) < -0.01
 
 
@@ -255,7 +260,7 @@ def test_a_wider_box_is_another_claim(stored):
 
 
 def test_a_coupling_for_one_environment_is_not_proved_for_the_set(nominal_only):
-    with pytest.raises(NotProved, match=r"^vertex 2 .*needs 1\.39"):
+    with pytest.raises(NotProved, match=r"^vertex 2 .*needs 1\.409"):
         prove(LOOP, nominal_only.coupling, "closed-loop")
     part = set_part(check_set(LOOP, nominal_only.coupling, samples=8))
     assert not part["certified"]
@@ -317,7 +322,7 @@ def test_design_check_run_audit_and_validate_speak_of_the_set(scenario_file, tmp
     )
     assert (code, run["promise"]) == (0, "a set")
     assert run["run"]["environment"].startswith("vertex 3 (mass-contact 1 absent")
-    assert np.abs(np.load(tmp_path / "out" / "trace.npz")["f"][:, 0]).max() == 0  # the lost contact renders nothing
+    assert np.abs(np.load(tmp_path / "out" / "trace.npz")["f"][:, 0]).max() < 1e-3  # of the other's force, filtered
 
     code, audit = told(audit_main, "--coupling", str(file), *out)
     assert (code, audit["promise"], audit["certified"]) == (0, "a set", True)

@@ -208,7 +208,6 @@ LOOP = SHORT.loop("I")
             "funtions is no option of kind 'optimal' (did you mean",
         ),
         (lambda: design_coupling(LOOP, order=3), "order is no option of kind 'spring-damper', allowed are switching"),
-        (lambda: design_coupling(LOOP, "optimal", objective=1), "objective is 1, allowed are rms, sup"),
         (lambda: design_coupling(LOOP, "optimal", high_gain="x"), "high_gain is 'x' (str), expected a number"),
         (lambda: design_coupling(LOOP, "ccl", order=1.5), "order is 1.5 (float), allowed are whole numbers, 1 or more"),
         (lambda: certify(SHORT, GAINS), "loop is a Scenario, expected a Loop"),
