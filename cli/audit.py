@@ -18,7 +18,7 @@ from design.audit import LONGEST_DELAY, PRESETS, Subject, report
 from design.designs import KINDS
 from design.ranges import check_set, set_rows
 from design.result import CONDITION_NAMES, listed
-from sim.couplings import fitted, read_coupling, standing
+from sim.couplings import check_stored, fitted, read_coupling
 from sim.scenario import InputError, Scenario
 
 EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
@@ -120,7 +120,8 @@ def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Co
         raise InputError(f"--{gains[0]} without --{missing}: a spring-damper has both (--B 0 is a spring alone)")
     if not gains:
         raise InputError("nothing to audit: give --K and --B, --coupling FILE.json, --preset NAME or --case none")
-    return SpringDamper(*(options.per_channel(f"--{name}", getattr(args, name), channels) for name in "KB"))
+    K, B = (options.per_channel(f"--{name}", getattr(args, name), channels) for name in "KB")
+    return SpringDamper(K, B)
 
 
 def _switching(args: argparse.Namespace, scenario: Scenario, subject: Subject) -> DelayRange | None:
@@ -143,7 +144,7 @@ def _notes(args: argparse.Namespace, scenario: Scenario, switching: DelayRange |
     if args.coupling is None:
         return []
     loop = scenario.loop(args.case)
-    return list(standing(read_coupling(args.coupling), loop.switching(switching)).notes)
+    return list(check_stored(read_coupling(args.coupling), loop.switching(switching)).notes)
 
 
 # ----------------------------------------------------------------------------------------------------

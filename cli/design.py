@@ -90,9 +90,7 @@ def _parser() -> options.Parser:
     parser.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
     best = "the coupling of the least transparency error: --coupling optimal"
     parser.add_argument("--best", dest="coupling", action="store_const", const="optimal", help=best)
-    around = (
-        "certify for every stiffness and mass this much more or less, as [box] of a scenario does"
-    )
+    around = "certify for every stiffness and mass this much more or less, as [box] of a scenario does"
     parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
     options.add_condition_option(parser, "what to certify")
     jitter = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +15,16 @@ from design.ranges import SetCheck, check_set, set_part, set_rows
 from design.result import listed
 from design.transparency import transparency
 from sim import report
+from sim.accuracy import ForceError, force_error, position_error
 from sim.couplings import NAMES, Chosen, choose
-from sim.engines import INTEGRATORS, LEAPFROG
+from sim.engines import INTEGRATORS, default_integrator
 from sim.files import write
-from sim.run import ENGINES, Assembly, Record, assemble, simulate
+from sim.run import ENGINES, Simulation, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, load_humans
-from sim.stability import LEAST, MOST, before_clipping, check_substeps, default_substeps
+from sim.stability import stability_part
+from sim.stepping import MOST, check_substeps, default_substeps
 from sim.switching import Period, switching
-from sim.trace import Likeness, Result, likeness
+from sim.trace import Trace
 
 
 def main(argv: list[str]) -> int:
@@ -35,25 +37,25 @@ def main(argv: list[str]) -> int:
     with render.progress("searching the ranges") as move:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)
 
-    run = _run(args, simulated, chosen)
-    requirements = assess(run.loop(args.case), chosen.coupling, chosen.phi)
+    done = _run(args, simulated, chosen)
+    requirements = assess(done.loop(args.case), chosen.coupling, chosen.phi)
     outcome = {
         "case": args.case,
         "scenario": scenario.name,
         "coupling": report.coupling_part(chosen.kind, chosen.coupling, scenario.T),
-        **_certified(chosen, requirements, run.loop(args.case), whole),
-        "transparency": report.transparency_part(transparency(run.assembly.felt, run.assembly.E, loop.lam)),
-        **_stability(chosen, run, any(requirement.certified for requirement in requirements.values())),
-        "run": _settings(args, run, loop.lam) | {"environment": environment},
+        **_certified(chosen, requirements, done.loop(args.case), whole),
+        "transparency": report.transparency_part(transparency(done.simulation.felt, done.simulation.E, loop.lam)),
+        **_stability(chosen, done, any(requirement.certified for requirement in requirements.values())),
+        "run": _settings(args, done, loop.lam) | {"environment": environment},
     }
-    outcome["error"] = report.error_part(run.record, run.exact, run.assembly, _unstable(outcome))
-    outcome["reproducibility"] = report.beside_the_paper(run.assembly.scenario, args.case, outcome)
-    alike = likeness(run.assembly, run.record, loop.lam)
+    outcome["error"] = position_error(done.trace, done.exact, done.simulation, _unstable(outcome))
+    outcome["reproducibility"] = report.beside_the_paper(done.simulation.scenario, args.case, outcome)
+    alike = force_error(done.simulation, done.trace, loop.lam)
     outcome["ideal_force"] = alike.part()
-    outcome["remarks"] = [*run.warnings, *chosen.notes, *report.remarks(outcome)]
-    files = _save(args, out, run, alike, outcome)
+    outcome["remarks"] = [*done.warnings, *chosen.notes, *report.remarks(outcome)]
+    files = _save(args, out, done, alike, outcome)
     render.publish(args, outcome, _tables(outcome), outcome["remarks"], out, files)
-    return options.INTERRUPTED if run.record.interrupted else options.DONE
+    return options.INTERRUPTED if done.trace.interrupted else options.DONE
 
 
 def _parser() -> options.Parser:
@@ -64,8 +66,9 @@ def _parser() -> options.Parser:
     options.add_varying_delay_options(parser)
     options.add_coupling_options(parser, ", ".join(NAMES))
     parser.add_argument("--engine", choices=ENGINES, default="mujoco", help="MuJoCo, or the exact solution")
-    parser.add_argument("--integrator", choices=(*INTEGRATORS, LEAPFROG), default="RK4", help="of MuJoCo (default RK4)")
-    steps = "MuJoCo steps per period (default 4, more where needed)"
+    steppers = "of MuJoCo (default exponential, RK4 where devices rub)"
+    parser.add_argument("--integrator", choices=tuple(INTEGRATORS), help=steppers)
+    steps = "MuJoCo steps per period (default: what the plant asks)"
     parser.add_argument("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
     parser.add_argument("--duration", type=options.number(), metavar="SECONDS", help="default: the scenario's")
     who = "other humans: [[human]] per channel in a .toml, or `humans` in a .py"
@@ -102,51 +105,54 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """One simulation of a scenario, and the exact engine's beside it."""
+    """One run of a scenario, and the exact engine's beside it."""
 
-    assembly: Assembly
+    simulation: Simulation
     period: Period | None  # of the worst switching found, where the delays switch
-    substeps: int | None  # None for the exact engine
+    integrator: str | None  # None for the exact engine, and so are the substeps
+    substeps: int | None
     warnings: list[str]
-    record: Record
-    exact: Record | None  # None where friction makes the loop another one than the linear
+    trace: Trace
+    exact: Trace | None  # None where friction makes the loop another one than the linear
     wall_s: float
 
     def loop(self, case: str) -> Loop:
         """What was simulated, as a design knows it."""
-        return self.assembly.scenario.loop(case)
+        return self.simulation.scenario.loop(case)
 
 
 def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> _Run:
     """Close the loop. Raises InputError for settings that cannot be."""
-    assembly, period = assemble(scenario, chosen.coupling), None
-    if args.engine == "exact" and assembly.friction:
+    simulation, period = assemble(scenario, chosen.coupling), None
+    if args.engine == "exact" and simulation.friction:
         raise InputError("--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco")
     if scenario.switches:
-        assembly, period = switching(assembly, chosen.coupling, args.seed, scenario.samples)
-    substeps, warnings = _substeps(args, assembly)
+        simulation, period = switching(simulation, chosen.coupling, args.seed, scenario.samples)
+    integrator, substeps, warnings = _steps(args, simulation)
+    engine = make_engine(simulation, args.engine, integrator, substeps)
     with render.progress("simulating") as move:
         begin = time.perf_counter()
-        record = simulate(assembly, args.engine, args.integrator, substeps or LEAST, progress=move)
+        trace = run(simulation, engine, progress=move)
         wall = time.perf_counter() - begin
-    exact = record
+    exact = trace
     if args.engine != "exact":
-        exact = None if assembly.friction else simulate(assembly, "exact", samples=record.s.shape[0])
-    return _Run(assembly, period, substeps, warnings, record, exact, wall)
+        exact = None if simulation.friction else run(simulation, "exact", ticks=trace.t.size)
+    return _Run(simulation, period, integrator, substeps, warnings, trace, exact, wall)
 
 
-def _substeps(args: argparse.Namespace, assembly: Assembly) -> tuple[int | None, list[str]]:
-    """Of this run, with remarks on a number that was asked for."""
+def _steps(args: argparse.Namespace, simulation: Simulation) -> tuple[str | None, int | None, list[str]]:
+    """Integrator and substeps of this run, with remarks on a number that was asked for."""
     if args.engine == "exact":
-        return None, []
+        return None, None, []
+    integrator = args.integrator or default_integrator(simulation.scene)
     try:
         if args.substeps is None:
-            return default_substeps(assembly, args.integrator), []
-        return args.substeps, check_substeps(assembly, args.integrator, args.substeps)
+            return integrator, default_substeps(simulation, integrator), []
+        return integrator, args.substeps, check_substeps(simulation, integrator, args.substeps)
     except InputError:
         raise
     except ValueError as error:
-        raise InputError(f"--integrator {args.integrator}: {error}") from None
+        raise InputError(f"--integrator {integrator}: {error}") from None
 
 
 def _certified(chosen: Chosen, requirements: dict[str, Any], loop: Loop, whole: SetCheck | None) -> dict[str, Any]:
@@ -160,10 +166,10 @@ def _certified(chosen: Chosen, requirements: dict[str, Any], loop: Loop, whole: 
 
 
 def _stability(chosen: Chosen, run: _Run, certified: bool) -> dict[str, Any]:
-    jitter = report.delays_part(run.assembly, chosen, run.period, run.record.s.shape[0], certified)
-    if jitter and run.assembly.scenario.switches:
-        return {"stability": report.switched_stability_part(run.assembly, run.record, jitter), "jitter": jitter}
-    return {"stability": report.stability_part(run.assembly, run.record), "jitter": jitter}
+    jitter = report.delays_part(run.simulation, chosen, run.period, run.trace.t.size, certified)
+    if jitter and run.simulation.scenario.switches:
+        return {"stability": report.switched_stability_part(run.simulation, run.trace, jitter), "jitter": jitter}
+    return {"stability": stability_part(run.simulation, run.trace), "jitter": jitter}
 
 
 def _unstable(outcome: dict[str, Any]) -> bool | None:
@@ -173,10 +179,10 @@ def _unstable(outcome: dict[str, Any]) -> bool | None:
 
 
 def _settings(args: argparse.Namespace, run: _Run, lam: tuple[int, ...]) -> dict[str, Any]:
-    scenario, process, samples = run.assembly.scenario, run.assembly.process, run.record.s.shape[0]
+    scenario, process, samples = run.simulation.scenario, run.simulation.process, run.trace.t.size
     return {
         "engine": args.engine,
-        "integrator": args.integrator if args.engine == "mujoco" else None,
+        "integrator": run.integrator,
         "substeps": run.substeps,
         "duration_s": samples * scenario.T,
         "samples": samples,
@@ -187,17 +193,17 @@ def _settings(args: argparse.Namespace, run: _Run, lam: tuple[int, ...]) -> dict
         "lam": list(lam),
         "T_s": scenario.T,
         "seed": args.seed,
-        "interrupted": run.record.interrupted,
+        "interrupted": run.trace.interrupted,
         "scenario_digest": scenario.digest,
         "encoder_step_m": process.encoder_step.tolist(),
-        "steady_ticks": [[0, before_clipping(run.record, process.force_limit)]],
+        "steady_ticks": [[0, run.trace.ticks_before_clipping(process.force_limit)]],
     }
 
 
-def _save(args: argparse.Namespace, out: Path, run: _Run, alike: Likeness, outcome: dict[str, Any]) -> list[Path]:
-    result = Result.from_record(run.assembly, run.record, outcome)
+def _save(args: argparse.Namespace, out: Path, run: _Run, alike: ForceError, outcome: dict[str, Any]) -> list[Path]:
+    result = replace(run.trace, meta=outcome)
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
-    files.append(write(out / "scene.xml", run.assembly.scene.xml))
+    files.append(write(out / "scene.xml", run.simulation.scene.xml))
     if not args.no_plot and result.t.size:
         from sim.plots import plot_run
 

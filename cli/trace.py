@@ -6,7 +6,7 @@ from pathlib import Path
 
 from cli import options, render
 from sim.scenario import InputError
-from sim.trace import Result, growths, told
+from sim.trace import Trace, format_growth, growths
 
 ZOOM_HZ = 10.0  # the picture shows six periods of it where nothing oscillates
 
@@ -15,7 +15,7 @@ def main(argv: list[str]) -> int:
     """Look at a trace. 0: done, whatever it shows."""
     args = _parser().parse_args(argv)
     options.check_json(args)
-    result = Result.load_npz(Path(args.trace))
+    result = Trace.load_npz(Path(args.trace))
     found = growths(result)
     if not result.t.size:
         raise InputError(f"{args.trace}: it has no ticks")
@@ -31,7 +31,7 @@ def main(argv: list[str]) -> int:
         strongest = next((one.frequency_hz for one in found if one.frequency_hz), ZOOM_HZ)
         plot_run(result, Path(args.plot), args.trace, strongest)
     T = float(result.t[-1]) / max(1, result.t.size - 1)
-    lines = [f"growth, {told(part, T)}" for part in outcome["growth"]]
+    lines = [f"growth, {format_growth(part, T)}" for part in outcome["growth"]]
     render.publish(args, outcome, (), lines or ["no loop was closed at full gain: there is no growth to report"])
     return options.DONE
 

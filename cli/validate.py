@@ -16,7 +16,7 @@ from design.ranges import SetCheck, check_set, set_part
 from sim import report
 from sim.adversary import Worst, search
 from sim.couplings import NAMES, Chosen, choose
-from sim.crowds import ENGINES, MIXED, Findings, Question, crowd_of, validate, validate_on_cluster
+from sim.crowds import ENGINES, MIXED, Findings, Validation, validate, validate_on_cluster
 from sim.run import assemble
 from sim.scenario import InputError, Scenario, require_linear, save_humans
 from sim.switching import certified_part
@@ -126,13 +126,13 @@ def _environments(args: argparse.Namespace, whole: SetCheck | None) -> tuple[Mem
 
 def _question(
     args: argparse.Namespace, scenario: Scenario, chosen: Chosen, environments: tuple[Member, ...]
-) -> Question:
+) -> Validation:
     links = LINKS[args.links] if args.links else scenario.population.links
     work = args.humans, links, args.engine, args.duration
-    return Question(scenario, chosen.coupling, args.seed, *work, environments=environments)
+    return Validation(scenario, chosen.coupling, args.seed, *work, environments=environments)
 
 
-def _findings(args: argparse.Namespace, question: Question) -> tuple[Findings, float]:
+def _findings(args: argparse.Namespace, question: Validation) -> tuple[Findings, float]:
     """What the humans did, and the seconds that it took."""
     begin = time.perf_counter()
     with render.progress("validating") as move:
@@ -162,7 +162,7 @@ def _attack(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, outcom
 def _save(
     args: argparse.Namespace,
     out: Path,
-    question: Question,
+    question: Validation,
     findings: Findings,
     adversary: Worst | None,
     outcome: dict[str, Any],
@@ -173,7 +173,7 @@ def _save(
     if findings.index.size:
         named |= {"worst-human.toml": int(findings.index[np.argmax(findings.radius)])}
     for name, i in named.items():
-        crowd = crowd_of(scenario, question.seed, i, question.links)
+        crowd = question.crowd(i)
         remark = f"seed {question.seed}, index {i}"
         files.append(save_humans(out / name, crowd.humans(0), remark, crowd.persons(0)))
     if adversary:

@@ -25,7 +25,8 @@ from sim import report
 from sim.couplings import NAMES, Chosen, choose
 from sim.files import write
 from sim.scenario import InputError, Scenario, require_constant_delay
-from sim.stability import MARGINAL, SUSTAINED, slowest_seen
+from sim.stability import MARGINAL
+from sim.trace import SUSTAINED, slowest_seen
 from sim.zwidth import (
     DECIDED,
     MODEL_KEPT,

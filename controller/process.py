@@ -231,7 +231,7 @@ class Process:
         return np.block([[self.F.C, self.F.D], [self.F.A, self.F.B]]).dot
 
 
-class Tape:
+class StepBuffer:
     """The record of a stretch of ticks, laid out so that the loop writes it without copying.
 
     A row holds [z, s, w, f] of one tick for all simulations: process state, plant state (whose first

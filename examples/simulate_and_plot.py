@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from design import design_coupling
-from sim import Result, load, plot_run, simulate
+from sim import Trace, load, plot_run, simulate
 
 SECONDS = 8.0
 
 
-def show(name: str, result: Result, out: Path) -> None:
+def show(name: str, result: Trace, out: Path) -> None:
     """One line of figures, and a picture."""
     stability = result.meta["stability"]
     growth, hertz = stability["exact_growth_rate_per_s"], stability["exact_frequency_hz"]

@@ -11,7 +11,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hw.api import Rehearsed, rehearse
+    from hw.rehearsal import Rehearsed, rehearse
 
 __all__ = ["Rehearsed", "rehearse"]
 
@@ -19,7 +19,7 @@ __all__ = ["Rehearsed", "rehearse"]
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'hw' has no attribute {name!r}")
-    return getattr(import_module("hw.api"), name)
+    return getattr(import_module("hw.rehearsal"), name)
 
 
 def __dir__() -> list[str]:

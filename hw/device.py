@@ -1,13 +1,33 @@
 """The device's side of the link: safety states, and forces latched at tick k + theta; no clock and no port of its own.
 
-The same machine as hw/firmware/haptic_link.h, integer for integer and byte for byte (tests/test_firmware.py). Its rules
-are in docs/protocol.md. Forces are in steps, per axis, as tuples.
+The same machine as hw/firmware/haptic_link.h, integer for integer and byte for byte (tests/hw/test_firmware.py). Its
+rules are in docs/protocol.md. Forces are in steps, per axis, as tuples.
 """
 
-from hw.frame import Ack, Config, Decoder, Force, Hello, Info, Message, State, Stop, config_crc, distance, encode
-from hw.message import MAX_RELEASE_NS, MAX_THETA, NO_MARGIN, Cause, Command, Phase, Reason, Refused
+from hw.protocol import (
+    MAX_RELEASE_NS,
+    MAX_THETA,
+    NO_MARGIN,
+    Ack,
+    Cause,
+    Command,
+    Config,
+    Decoder,
+    Force,
+    Hello,
+    Info,
+    Message,
+    Phase,
+    Reason,
+    Refused,
+    State,
+    Stop,
+    config_crc,
+    distance,
+    encode,
+)
 
-SLOTS = 16  # forces that wait for their tick: a power of two above MAX_THETA
+_SLOTS = 16  # forces that wait for their tick: a power of two above MAX_THETA
 RUNNING = (Phase.ARMED, Phase.HOLDING, Phase.RAMP)  # the motors may carry a force
 
 
@@ -30,19 +50,19 @@ class Device:
 
     def clear(self) -> None:
         """Forget every force."""
-        self.slots: list[Force | None] = [None] * SLOTS
+        self.slots: list[Force | None] = [None] * _SLOTS
         self.applied = self.ramp_from = self.zero
         self.held = self.ramp_left = self.run = 0
         self.echo, self.margin = 0, NO_MARGIN
 
     @property
-    def status(self) -> int:
+    def _status(self) -> int:
         return self.phase | self.cause << 4
 
     def tick(self, now_us: int, counts: tuple[int, ...]) -> tuple[tuple[int, ...], bytes]:
         """A period begins: the forces that act from now on, and the bytes to send. `counts` was sampled just before."""
         self.k, self.now = (self.k + 1) & 0xFFFF, now_us & 0xFFFFFFFF
-        frame, self.slots[self.k % SLOTS] = self.slots[self.k % SLOTS], None
+        frame, self.slots[self.k % _SLOTS] = self.slots[self.k % _SLOTS], None
         if self.phase in (Phase.DISARMED, Phase.ARMED, Phase.HOLDING):
             self.misses += frame is None
             if self.phase != Phase.DISARMED:
@@ -50,8 +70,8 @@ class Device:
             elif frame is not None and frame.command == Command.ARM:
                 self.phase = Phase.ARMED
         if self.phase == Phase.RAMP:
-            self.ramp_down()
-        return self.applied, self.speak(counts)
+            self._ramp_down()
+        return self.applied, self._speak(counts)
 
     def latch(self, frame: Force | None) -> None:
         """The force for this tick, or without one the last one held, for `hold` ticks."""
@@ -69,10 +89,10 @@ class Device:
             caps = [cap_after(self.config, cap, self.run) for cap in self.config.cap]
             self.applied = tuple(map(limited, frame.force, self.applied, caps, self.config.slew))
 
-    def ramp_down(self) -> None:
+    def _ramp_down(self) -> None:
         assert self.config is not None
         self.ramp_left -= 1
-        self.applied = tuple(scaled(f, self.ramp_left, self.config.ramp) for f in self.ramp_from)
+        self.applied = tuple(_scaled(f, self.ramp_left, self.config.ramp) for f in self.ramp_from)
         if self.ramp_left == 0:
             self.phase = Phase.STOPPED
 
@@ -95,7 +115,7 @@ class Device:
             self.clear()
             self.phase, self.cause = Phase.ESTOP, cause
 
-    def speak(self, counts: tuple[int, ...]) -> bytes:
+    def _speak(self, counts: tuple[int, ...]) -> bytes:
         """INFO where asked for and the motors rest, then ACK, then STATE once configured."""
         out, self.ack = self.ack, b""
         if self.asked and self.phase not in RUNNING:
@@ -103,16 +123,16 @@ class Device:
         if self.config is None:
             return out
         errors, misses = (self.decoder.rejected + self.unexpected) & 0xFF, self.misses & 0xFF
-        state = State(self.status, self.k, self.echo, self.margin, errors, misses, self.now, counts, self.applied)
+        state = State(self._status, self.k, self.echo, self.margin, errors, misses, self.now, counts, self.applied)
         self.margin = NO_MARGIN
         return out + encode(state)
 
     def receive(self, data: bytes, now_us: int) -> None:
         """Bytes that came at `now_us`, in any pieces."""
         for message in self.decoder.feed(data):
-            self.understand(message, now_us)
+            self._understand(message, now_us)
 
-    def understand(self, message: Message, now_us: int) -> None:
+    def _understand(self, message: Message, now_us: int) -> None:
         if isinstance(message, Force):
             self.accept(message, now_us)
         elif isinstance(message, Config):
@@ -134,23 +154,23 @@ class Device:
             return
         if self.config is None or distance(frame.apply_at, frame.source) != self.config.theta:
             return
-        ahead, slot = distance(frame.apply_at, self.k), frame.apply_at % SLOTS
+        ahead, slot = distance(frame.apply_at, self.k), frame.apply_at % _SLOTS
         if ahead > self.config.theta or (ahead > 0 and self.slots[slot] is not None):
             return
         since = (now_us - self.now) & 0xFFFFFFFF
-        margin = scaled(ahead, self.info.period_ns, 1000) - since
+        margin = _scaled(ahead, self.info.period_ns, 1000) - since
         self.echo, self.margin = frame.source, max(-0x7FFF, min(0x7FFF, margin))
         if ahead > 0:
             self.slots[slot] = frame
 
     def configure(self, config: Config) -> None:
-        refused = self.refuse(config)
+        refused = self._refuse(config)
         self.ack = encode(Ack(config_crc(config), refused))
         if not refused:
             self.clear()
             self.config, self.phase, self.cause = config, Phase.DISARMED, Cause.NONE
 
-    def refuse(self, config: Config) -> Refused:
+    def _refuse(self, config: Config) -> Refused:
         """Why this CONFIG cannot be taken, ACCEPTED where it can."""
         release = (config.hold + config.ramp) * self.info.period_ns
         reasons = (
@@ -176,7 +196,7 @@ def limited(force: int, last: int, cap: int, slew: int) -> int:
     return last + max(-slew, min(slew, force - last))
 
 
-def scaled(value: int, by: int, over: int) -> int:
+def _scaled(value: int, by: int, over: int) -> int:
     """value * by / over, rounded towards zero as C does."""
     size = abs(value) * by // over
     return size if value >= 0 else -size

@@ -13,18 +13,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from controller.coupling import Coupling
 from controller.lti import Array
-from hw.emulator.core import Emulator
-from hw.emulator.upset import Line, Upset
-from hw.message import Phase
-from hw.plan import Ages, Program
-from hw.safety import ENDED, Fault, Stage
-from hw.session import Session
-from hw.steering import Steering
+from design.certificate import promise_of
+from design.conditions import Requirement
+from design.result import COUPLING, Design, bare, number, of_kind, whole
+from hw.control import CertifiedCoupling, Program, certified_coupling, certified_couplings, link_delay
+from hw.emulator import Emulator, FaultInjection, Line
+from hw.limits import ENDED, Fault, Stage
+from hw.monitor import Ages, LinkSettings
+from hw.protocol import Phase
+from hw.recording import Recorder, result_of
+from hw.session import Operator, Session, session_for
+from sim.scenario import InputError, Scenario, require_constant_delay, require_linear
+from sim.trace import Trace
 
-POLL_US = 1000
-GRACE_US = 20_000  # after the end
-LATENCY_US = 60  # one way, and as long for the host to answer: the measured median age of 130 us
+_MEASURE = 200  # answers that are timed: virtual time does not scatter
+_QUANTILE, _GUARD_US = 0.99, 100.0  # of the ages that the delay covers, and what is added [us]; as hw.bridge has it
+_POLL_US = 1000
+_GRACE_US = 20_000  # after the end
+_LATENCY_US = 60  # one way, and as long for the host to answer: the measured median age of 130 us
 
 Plan = Callable[[Ages], Sequence[Program]]
 
@@ -44,19 +52,21 @@ class Rehearsal:
     session: Session
     emulator: Emulator
     plan: Plan
-    upsets: tuple[Upset, ...] = ()
+    faults: tuple[FaultInjection, ...] = ()
     seed: int = 0
     actions: Sequence[tuple[float, Callable[[Session, int], bytes]]] = ()
     host_stalls: Sequence[tuple[float, float]] = ()  # (seconds after arming, seconds) in which the host is frozen
     arm: bool = True  # once; a softer coupling waits for a person
-    steering: Steering | None = None  # in place of `arm`: the rule of a live session
-    latency_us: float = LATENCY_US
+    operator: Operator | None = None  # in place of `arm`: the rule of a live session
+    latency_us: float = _LATENCY_US
     clock: float = 1.0  # how long a tick of the device lasts, in T
+    keep: bool = True  # every tick of the device in `moments`
+    glance: Callable[[Session], None] = lambda session: None  # called every millisecond
     moments: list[Moment] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self._up = Line("up", self.upsets, self.seed, self.latency_us)
-        self._down = Line("down", self.upsets, self.seed, self.latency_us)
+        self._up = Line("up", self.faults, self.seed, self.latency_us)
+        self._down = Line("down", self.faults, self.seed, self.latency_us)
         self._queue: list[tuple[float, int, str, Any]] = []
         self._number = count()
         self._done: set[int] = set()
@@ -65,7 +75,7 @@ class Rehearsal:
         self._period = 1e6 * self.session.scenario.T * self.clock
         self._at(0, "tick", 0)
         self._at(500, "start", None)
-        self._at(POLL_US, "poll", None)
+        self._at(_POLL_US, "poll", None)
 
     def run(self, seconds: float) -> Session:
         """Until `seconds` of virtual time are over. Returns the session."""
@@ -76,10 +86,18 @@ class Rehearsal:
     def run_until_armed(self, seconds: float) -> Session:
         """Until `seconds` after arming, or a little longer than a session that is never armed."""
         while self.armed_us is None and not (
-            self.session.stage in ENDED and self._queue[0][0] > self._ended + GRACE_US
+            self.session.stage in ENDED and self._queue[0][0] > self._ended + _GRACE_US
         ):
             self._next()
         return self.run(1e-6 * self.armed_us + seconds) if self.armed_us is not None else self.session
+
+    def run_to_the_end(self, most: float) -> Session:
+        """Until the session has ended and its device has come to rest, or for `most` seconds of virtual time."""
+        while not (self.session.stage in ENDED and self._queue[0][0] > self._ended + _GRACE_US):
+            if self._queue[0][0] > 1e6 * most:
+                break
+            self._next()
+        return self.session
 
     def _next(self) -> None:
         now, _, what, data = heapq.heappop(self._queue)
@@ -96,7 +114,8 @@ class Rehearsal:
             return self._at(emulator.stalled_until, "tick", None)
         data = emulator.tick(clock)
         emulator.advance()
-        self.moments.append(Moment(clock, emulator.device.phase, emulator.applied))
+        if self.keep:
+            self.moments.append(Moment(clock, emulator.device.phase, emulator.applied))
         self._at(now + self._period * emulator.stretch, "tick", None)
         if emulator.unplugged and not self._gone:
             self._gone = True
@@ -112,13 +131,13 @@ class Rehearsal:
         self._send(session.receive(data, round(now)), now)
         if session.stage == Stage.MEASURED:
             try:
-                rungs = self.plan(session.measurement.result)
+                programs = self.plan(session.measurement.result)
             except Fault as fault:
                 return self._send(session.refuse(str(fault), round(now)), now)
-            return self._send(session.load(rungs, round(now)), now)
-        if self.steering:
-            return self._send(self.steering.look(session, round(now)), now)
-        if session.stage == Stage.DISARMED and self.arm and session.rung is session.rungs[0]:
+            return self._send(session.load(programs, round(now)), now)
+        if self.operator:
+            return self._send(self.operator.look(session, round(now)), now)
+        if session.stage == Stage.DISARMED and self.arm and session.program is session.programs[0]:
             self._send(session.arm(round(now)), now)  # once: a softer coupling waits for a person
         return None
 
@@ -128,12 +147,13 @@ class Rehearsal:
     def _on_poll(self, now: float, _: None) -> None:
         if (frozen := self._frozen(now)) > now:  # what came in the meantime is read first
             return self._at(frozen + 1, "poll", None)
-        self._at(now + POLL_US, "poll", None)
+        self._at(now + _POLL_US, "poll", None)
         since = self.emulator.since_armed(round(now))
         for i, (when, call) in enumerate(self.actions):
             if since is not None and since >= when and i not in self._done:
                 self._done.add(i)
                 self._send(call(self.session, round(now)), now)
+        self.glance(self.session)
         return self._send(self.session.poll(round(now)), now)
 
     def _on_gone(self, now: float, _: None) -> None:
@@ -144,7 +164,7 @@ class Rehearsal:
 
     def _send(self, data: bytes, now: float) -> None:
         since = self.emulator.since_armed(round(now))
-        for frame in data.split(b"\0")[:-1]:
+        for frame in filter(None, data.split(b"\0")):
             for when, part in self._down.send(frame + b"\0", now + self.latency_us / 6, since):
                 self._at(when, "device", part)
 
@@ -172,3 +192,96 @@ class Rehearsal:
             return 0.0
         quiet = next((m.t_us for m in self.moments if m.t_us > last), None)
         return None if quiet is None else 1e-6 * (quiet - begin)
+
+
+@dataclass(frozen=True, eq=False)
+class Rehearsed:
+    """What a session came to."""
+
+    stage: str  # "finished" where all went well; else "refused", "stopped", "lost", "e-stop"
+    cause: str  # of the end
+    delay: float | None  # median from a sample to its force [s]; None where it was not measured
+    theta: tuple[int, ...] | None  # delays that the coupling is certified for [samples]; None where there is none
+    coupling: Coupling | None  # that the device was armed with, or would have been
+    requirements: dict[str, Requirement]  # of that coupling by both conditions, as `certify` gives them
+    promise: str | None  # for which environments they hold
+    result: Trace | None  # t, x and f of every tick, as `simulate` gives them; handles are not measured
+    zero_after: float | None  # from the wish to stop until no motor does anything [s]; None where it never ran
+
+
+def rehearse(
+    scenario: Scenario,
+    coupling: Coupling | Design | None = None,
+    case: str = "I",
+    seconds: float = 2.0,
+    seed: int = 0,
+) -> Rehearsed:
+    """A session with the scenario's devices behind the real protocol, without a device, a port or waiting.
+
+    Handshake, delay measured, coupling designed for it (or `coupling`, judged for it), certified, armed, run for
+    `seconds`, ramped out. The scenario's theta is the least delay; a slower link makes it longer. A session that is
+    refused, because nothing is certified for its delay, is a result too: see `stage` and `cause`.
+
+    Raises InputError for a scenario that cannot stand behind a serial link, TypeError for an argument of another type.
+    """
+    of_kind("scenario", scenario, Scenario, 'a Scenario, as load("omega-pair") gives it')
+    alone = None if coupling is None else bare(coupling, f"{COUPLING}, or None to have one designed")
+    if case not in ("I", "II"):
+        raise InputError(f"case is {case!r}, allowed are I, II")
+    seconds, seed = number("seconds", seconds, "a number of seconds"), whole("seed", seed, 0)
+    if not 0.1 <= seconds <= 3600:
+        raise InputError(f"seconds is {seconds:g}, allowed are 0.1 to 3600")
+    require_linear(scenario, "rehearse")
+    require_constant_delay(scenario, "rehearse")
+    if min(scenario.delta) <= 0:
+        raise InputError(f"delta is {list(scenario.delta)}: a device without damping can promise no human anything")
+    session = session_for(scenario, LinkSettings(measure=_MEASURE))
+    session.record = recorder = Recorder(scenario.channels)
+    programs: list[CertifiedCoupling] = []
+    delays: list[float] = []  # [s]
+
+    def plan(ages: Ages) -> list[CertifiedCoupling]:
+        delays.append(1e-6 * ages.median)
+        link = link_delay(ages, 1e6 * scenario.T, _QUANTILE, _GUARD_US)
+        if alone is None:
+            programs.extend(certified_couplings(scenario, case, None, None, link))
+        else:
+            programs.append(certified_coupling(scenario, case, None, None, link, alone))
+        return programs
+
+    stopped: list[float] = []  # [s] after arming
+
+    def stop(session: Session, now: int) -> bytes:
+        stopped.append(seconds)
+        return session.stop("asked to", now)
+
+    try:
+        emulator = Emulator(scenario)
+    except ValueError as error:
+        raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
+    rehearsal = Rehearsal(session, emulator, plan, seed=seed, actions=[(seconds, stop)])
+    rehearsal.run_until_armed(seconds + 0.5)
+    return _outcome(rehearsal, recorder, programs, delays, stopped)
+
+
+def _outcome(
+    rehearsal: Rehearsal,
+    recorder: Recorder,
+    programs: list[CertifiedCoupling],
+    delays: list[float],
+    stopped: list[float],
+) -> Rehearsed:
+    session, first = rehearsal.session, programs[0] if programs else None
+    scenario, ran = session.scenario, rehearsal.armed_us is not None
+    meta = {"scenario": scenario.name, "scenario_digest": scenario.digest, "stage": str(session.stage)}
+    return Rehearsed(
+        stage=str(session.stage),
+        cause=session.cause,
+        delay=delays[0] if delays else None,
+        theta=first and first.scenario.theta,
+        coupling=first and first.chosen.coupling,
+        requirements=first.requirements if first else {},
+        promise=promise_of(first.requirements, first.scenario.loop(first.case)) if first else None,
+        result=result_of(recorder, session.units, scenario.T, meta) if ran and len(recorder) else None,
+        zero_after=rehearsal.zero_after(stopped[0]) if stopped and ran else None,
+    )

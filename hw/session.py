@@ -10,21 +10,50 @@ answers nothing but repeats its STOP to a device that still drives; it never arm
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
-from hw.conduct import check_state
-from hw.dialogue import Dialogue, Unanswered
-from hw.drive import Drive, Row
-from hw.ending import STOPPING_US, Ending, drives
-from hw.frame import Ack, Config, Decoder, Info, Message, State, Stop, encode
-from hw.handshake import Units, probe_delay
-from hw.message import Command, Phase, Reason
-from hw.plan import Program
-from hw.safety import DRIVING, ENDED, Fault, Limits, Stage
-from hw.stream import USUAL, Settings, Stream, answer
-from sim.scenario import Scenario
+from hw.control import Drive, Program, TraceRow
+from hw.limits import (
+    DRIVING,
+    ENDED,
+    Fault,
+    Limits,
+    Stage,
+    Units,
+    configuration,
+    objections,
+    probe_delay,
+    watchdog_for,
+)
+from hw.monitor import Counters, LinkMonitor, LinkSettings, Measurement, check_state
+from hw.protocol import (
+    Ack,
+    Command,
+    Config,
+    Decoder,
+    Force,
+    Hello,
+    Info,
+    Message,
+    Phase,
+    Reason,
+    Refused,
+    State,
+    Stop,
+    config_crc,
+    encode,
+)
+from sim.scenario import InputError, Scenario
 
-ARMING_US = 500_000  # in which a device must follow ARM
+_RESEND_US, _PATIENCE_US = 100_000, 2_000_000  # of a question: asked again, and given up
+_ARMING_US = 500_000  # in which a device must follow ARM
+_QUIET_US = 1_000_000  # longest silence of a device that has no force to take away
+_STOPPING_US = 50_000  # in which a device that was stopped must say so
+_OBEYING_US = 30_000  # in which one that was told to stop must rest: the longest hold and ramp, and half as long again
+_DEADMAN_US = 1_000_000  # after which nobody is there
+_STRONGEST = 12.0  # [N] whatever a scenario allows
+_KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
 
 
 class Event(NamedTuple):
@@ -38,23 +67,29 @@ class Event(NamedTuple):
 class Session:
     """The host's side of the link."""
 
-    def __init__(self, scenario: Scenario, limits: Limits, settings: Settings = USUAL) -> None:
+    def __init__(self, scenario: Scenario, limits: Limits, settings: LinkSettings | None = None) -> None:
         if len(limits.cap) != scenario.channels:
             raise ValueError(f"cap has {len(limits.cap)} entries for {scenario.channels} channels")
-        self.scenario, self.limits, self.settings = scenario, limits, settings
+        self.scenario, self.limits, self.settings = scenario, limits, settings or LinkSettings()
         self.probe = probe_delay(scenario.T)
-        self.decoder = Decoder()
-        self.dialogue = Dialogue(scenario, limits, settings.baud)
-        self.stream = Stream(limits, settings, self.probe, scenario.T)
-        self.counters, self.watch, self.measurement = self.stream.counters, self.stream.watch, self.stream.measurement
+        self.decoder, self.counters = Decoder(), Counters()
+        self.link = LinkMonitor(self.settings, self.counters)
+        self.measurement = Measurement(self.settings.measure, self.probe, scenario.T, self.settings.missed)
         self.stage, self.cause = Stage.CONNECTING, ""
         self.log: list[Event] = []
-        self.rungs: tuple[Program, ...] = ()
-        self.rung: Program | None = None
+        self.info: Info | None = None  # what the device is; None before it said so
+        self.config: Config | None = None  # how the device was asked to run, last
+        self.programs: tuple[Program, ...] = ()
+        self.program: Program | None = None
+        self.drive: Drive | None = None  # the coupling at work, from one arming to the next end
         self.armings: list[tuple[Program, Config]] = []  # what forces came from, arming by arming
-        self.record: Callable[[Row], None] = lambda row: None
-        self.now = self.entered = 0
-        self._ending: Ending | None = None
+        self.record: Callable[[TraceRow], None] = lambda row: None
+        self.listen: Callable[[Event], None] = lambda event: None
+        self.missed_while_driving = 0  # ticks
+        self.now = self.entered = self.heard = 0  # [us]
+        self._units: Units | None = None
+        self._question = _Question(Hello(), 0)
+        self._shutdown: _Shutdown | None = None
         self._after: Stage | None = Stage.FINISHED  # what a ramp-out ends in; None: with a softer coupling, disarmed
 
     @property
@@ -63,25 +98,10 @@ class Session:
         return self.drive.gain.value if self.drive else 0.0
 
     @property
-    def drive(self) -> Drive | None:
-        """The coupling at work; None unless forces act."""
-        return self.stream.drive
-
-    @property
-    def info(self) -> Info | None:
-        """What the device is; None before it said so."""
-        return self.dialogue.info
-
-    @property
-    def config(self) -> Config | None:
-        """How the device was asked to run, last."""
-        return self.dialogue.config
-
-    @property
     def units(self) -> Units:
         """The device's units, once it is known."""
-        assert self.dialogue.units
-        return self.dialogue.units
+        assert self._units
+        return self._units
 
     # what a person or the driver does
 
@@ -89,16 +109,16 @@ class Session:
         """Ask the device who it is."""
         self.now = now
         self._enter(Stage.CONNECTING, "HELLO")
-        return self.dialogue.hello(now)
+        return self._ask(Hello())
 
-    def load(self, rungs: Sequence[Program], now: int) -> bytes:
+    def load(self, programs: Sequence[Program], now: int) -> bytes:
         """Take the couplings for the measured delay, the fastest first; the device is told its theta."""
         self.now = now
         if self.stage != Stage.MEASURED:
             return b""
-        if not rungs or not all(rung.certified for rung in rungs):
+        if not programs or not all(program.certified for program in programs):
             return self.refuse("the coupling is not certified", now)
-        self.rungs = tuple(rungs)
+        self.programs = tuple(programs)
         return self._take(0, "certified")
 
     def refuse(self, cause: str, now: int) -> bytes:
@@ -110,10 +130,19 @@ class Session:
         """A person's wish to feel forces; does nothing unless the session is disarmed."""
         self.now = now
         if self.stage == Stage.DISARMED:
-            assert self.rung
+            assert self.program
             assert self.config
-            self.stream.arm(self.rung.controller(), self.units, self.config, self.record, len(self.armings))
-            self.armings.append((self.rung, self.config))
+            self.drive = Drive(
+                self.program.controller(),
+                self.units,
+                self.config,
+                self.limits,
+                self.settings,
+                self.counters,
+                self.record,
+                len(self.armings),
+            )
+            self.armings.append((self.program, self.config))
             self._enter(Stage.ARMING, "asked to")
         return b""
 
@@ -166,16 +195,15 @@ class Session:
         """Look at the time."""
         self.now = now
         if self.stage in ENDED:
-            return self._ending.again(now) if self._ending else b""
+            return self._shutdown.again(now) if self._shutdown else b""
         if self.stage in (Stage.CONNECTING, Stage.CONFIGURING):
-            try:
-                return self.dialogue.again(now)
-            except Unanswered as given_up:
-                return self._end(Stage.LOST, str(given_up))
-        if self.stage == Stage.ARMING and self.gain == 0 and now - self.entered > ARMING_US:
-            return self._end(Stage.STOPPED, f"the device did not arm within {ARMING_US // 1000} ms")
-        silence = self.stream.silence(now, self.stage in DRIVING)
-        return self._end(Stage.LOST, silence) if silence and self.stage != Stage.MEASURED else b""
+            return self._ask_again()
+        if self.stage == Stage.ARMING and self.gain == 0 and now - self.entered > _ARMING_US:
+            return self._end(Stage.STOPPED, f"the device did not arm within {_ARMING_US // 1000} ms")
+        silence = now - self.heard
+        if silence > (self.limits.watchdog_us if self.stage in DRIVING else _QUIET_US) and self.stage != Stage.MEASURED:
+            return self._end(Stage.LOST, f"no new STATE for {silence / 1000:.1f} ms")
+        return b""
 
     def _understand(self, message: Message) -> bytes:
         match message:
@@ -190,55 +218,77 @@ class Session:
         self.counters.unexpected += 1
         return b""
 
+    # questions: who are you (HELLO), and run like this (CONFIG)
+
+    def _ask(self, question: Hello | Config) -> bytes:
+        self._question = _Question(question, self.now)
+        return b"\0" + encode(question)  # the zero ends whatever was left in the line
+
+    def _ask_again(self) -> bytes:
+        """The question once more, where it is time for it; given up where there was time enough."""
+        question = self._question
+        waited = self.now - question.begun
+        if waited > _PATIENCE_US:
+            name = type(question.message).__name__.upper()
+            n = self.decoder.rejected
+            noise = f"; {n} unreadable frame{'s' if n > 1 else ''}: wrong baud rate?" if n else ""
+            return self._end(Stage.LOST, f"no answer to {name} within {waited / 1e6:.1f} s{noise}")
+        if self.now - question.asked < _RESEND_US:
+            return b""
+        question.asked = self.now
+        return b"\0" + encode(question.message)
+
     def _on_info(self, info: Info) -> bytes:
-        try:
-            self.dialogue.meet(info)
-        except Fault as fault:
-            return self._end(Stage.REFUSED, str(fault))
+        if reasons := objections(info, self.scenario, self.limits, self.settings.baud):
+            return self._end(Stage.REFUSED, "; ".join(reasons))
+        self.info, self._units = info, Units.of(info)
         name = "".join(c if c.isprintable() else "?" for c in info.firmware) or "device"
         return self._configure(self.probe, f"{name} {info.serial}, to be measured")
 
     def _configure(self, theta: int, cause: str) -> bytes:
+        assert self.info
         self._enter(Stage.CONFIGURING, cause)
-        return self.dialogue.configure(theta, self.now)
+        self.config = configuration(self.info, self.limits, theta)
+        return self._ask(self.config)
 
     def _on_ack(self, ack: Ack) -> bytes:
-        if not self.dialogue.concerns(ack):
+        if self.config is None or ack.crc != config_crc(self.config):
             self.counters.unexpected += 1
             return b""
-        try:
-            if not self.dialogue.agreed(ack):
-                return b""
-        except Fault as fault:
-            return self._end(Stage.REFUSED, str(fault))
-        assert self.config
-        self.stream.restart(self.now)
-        self._enter(Stage.DISARMED if self.rung else Stage.MEASURING, f"theta = {self.config.theta}")
+        if ack.refused == Refused.RUNNING:
+            return b""  # it is still on its way to zero force: it will be asked again
+        if ack.refused != Refused.ACCEPTED:
+            known = [r.name.lower() for r in Refused if r == ack.refused]
+            return self._end(Stage.REFUSED, f"the device refuses the configuration: {(known or [ack.refused])[0]}")
+        self.link.restart()
+        self.heard = self.now
+        self._enter(Stage.DISARMED if self.program else Stage.MEASURING, f"theta = {self.config.theta}")
         return b""
 
     def _take(self, index: int, cause: str) -> bytes:
-        self.rung = self.rungs[index]
-        return self._configure(self.rung.link, f"{self.rung.name}: {cause}")
+        self.program = self.programs[index]
+        return self._configure(self.program.link, f"{self.program.name}: {cause}")
 
-    # the stream
+    # the stream of STATEs
 
     def _on_state(self, state: State) -> bytes:
         if self.stage == Stage.CONNECTING:  # another session's device: to zero force first
-            return encode(Stop(Reason.FAULT)) if drives(state) else b""
+            return encode(Stop(Reason.FAULT)) if _drives(state) else b""
         if self.info is None or state.axes != self.info.axes:
             self.counters.unexpected += 1
             return b""
         if self.stage in ENDED:
             return self._on_state_after_the_end(state)
         if self.stage == Stage.CONFIGURING:
-            if not drives(state):
+            if not _drives(state):
                 return b""
-            if self.now - self.entered > STOPPING_US:
+            if self.now - self.entered > _STOPPING_US:
                 raise Fault("the device drives, and nobody asked it to")
             return encode(Stop(Reason.DONE))
-        ticks = self.stream.news(state, self.now)
+        ticks = self.link.take(state)
         if not ticks:
             return b""
+        self.heard = self.now
         if state.phase == Phase.ESTOP:
             return self.estop(f"pressed, {state.cause.name.lower()}", self.now)
         assert self.config is not None
@@ -247,45 +297,57 @@ class Session:
             return self._on_driving(state, ticks)
         if self.stage == Stage.MEASURING:
             return self._measure(state)
-        return answer(self.config, state, Command.IDLE)
+        return self._answer(state, Command.IDLE)
 
     def _on_state_after_the_end(self, state: State) -> bytes:
-        assert self._ending
-        if cause := self._ending.disobeyed(state, self.now):
+        assert self._shutdown
+        if cause := self._shutdown.disobeyed(state, self.now):
             if self.stage == Stage.FINISHED:
                 self._enter(Stage.STOPPED, cause)  # whatever it was to end in, it has not finished
             else:
                 self._log(cause)
-        return self._ending.heard(state)
+        return self._shutdown.heard(state)
 
     def _on_driving(self, state: State, ticks: int) -> bytes:
-        assert self.config
+        assert self.drive
         ready = state.phase != Phase.DISARMED
         direction = (-1 if self.stage == Stage.DISARMING else 1) if ready else 0
-        steps = self.stream.step(state, ticks, direction, self.now)
-        if self.stage != Stage.DISARMING and (late := self.stream.too_late()):
+        self.missed_while_driving += self.link.missed
+        first = self.drive.reference is None
+        steps = self.drive.step(state, ticks, direction, self.now)
+        if first and any(self.drive.reference or ()):
+            places = ", ".join(f"{1e3 * x:+.4g}" for x in self.units.positions(self.drive.reference or ()))
+            self._log(f"positions count from where the handles are: {places} mm")
+        if self.stage != Stage.DISARMING and (late := self.link.too_late()):
             self._soften(late)
         if self.stage == Stage.ARMING and self.gain == 1.0:
             self._enter(Stage.ARMED, "full gain")
         if self.stage == Stage.DISARMING and self.gain == 0.0:
             return self._ramped_out()
-        return answer(self.config, state, Command.RUN if ready else Command.ARM, steps)
+        return self._answer(state, Command.RUN if ready else Command.ARM, steps)
+
+    def _answer(self, state: State, command: Command, steps: tuple[int, ...] | None = None) -> bytes:
+        """The FORCE for a STATE: zero where no `steps` are given."""
+        assert self.config
+        apply_at = (state.tick + self.config.theta) & 0xFFFF
+        return encode(Force(command, apply_at, state.tick, steps or (0,) * state.axes))
 
     def _measure(self, state: State) -> bytes:
-        assert self.config
         try:
-            if not self.stream.measured(state):
-                return answer(self.config, state, Command.IDLE)
+            if not self.measurement.note(state, self.link.margin, self.link.missed):
+                return self._answer(state, Command.IDLE)
         except Fault as fault:
             return self._end(Stage.REFUSED, str(fault))
         ages = self.measurement.result
         self._enter(Stage.MEASURED, f"{len(ages.values)} answers, median age {ages.median} us")
         return b""
 
+    # to zero force, and what comes then
+
     def _soften(self, late: str) -> None:
         """To zero force by a ramp, and to the next coupling where there is one."""
-        assert self.rung is not None
-        softer = self.rungs.index(self.rung) + 1 < len(self.rungs)
+        assert self.program is not None
+        softer = self.programs.index(self.program) + 1 < len(self.programs)
         self._ramp_out(None if softer else Stage.STOPPED, late + ("" if softer else ", and nothing softer is left"))
 
     def _ramp_out(self, after: Stage | None, cause: str) -> None:
@@ -295,10 +357,9 @@ class Session:
     def _ramped_out(self) -> bytes:
         if self._after:
             return self._end(self._after, self.cause, Reason.DONE)
-        assert self.rung is not None
-        return encode(Stop(Reason.DONE)) + self._take(self.rungs.index(self.rung) + 1, f"softer, since {self.cause}")
-
-    # stages
+        assert self.program is not None
+        softer = self.programs.index(self.program) + 1
+        return encode(Stop(Reason.DONE)) + self._take(softer, f"softer, since {self.cause}")
 
     def _enter(self, stage: Stage, cause: str) -> None:
         self.stage, self.cause, self.entered = stage, cause, self.now
@@ -306,9 +367,125 @@ class Session:
 
     def _log(self, cause: str) -> None:
         self.log.append(Event(self.now, self.stage, cause))
+        self.listen(self.log[-1])
 
     def _end(self, stage: Stage, cause: str, reason: Reason = Reason.FAULT) -> bytes:
-        self.stream.drive = None
-        self._ending = Ending(reason, bool(self.armings), self.now, self.scenario.T)
+        self.drive = None
+        self._shutdown = _Shutdown(reason, bool(self.armings), self.now, self.scenario.T)
         self._enter(stage, cause)
         return encode(Stop(reason))
+
+
+def limits_for(scenario: Scenario, cap: float = _STRONGEST, **more: Any) -> Limits:
+    """Limits for the scenario's devices, of at most `cap` [N]. Raises ValueError where T is none for a serial link."""
+    watchdog = watchdog_for(scenario.T)
+    return Limits(tuple(min(cap, d.force_limit) for d in scenario.device), watchdog_us=watchdog, **more)
+
+
+def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:
+    """A session that never asks for more than `cap` [N], with `more` Limits. Raises InputError for what cannot be."""
+    try:
+        return Session(scenario, limits_for(scenario, cap, **more), settings)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+@dataclass
+class _Question:
+    """What the device was asked last, and since when."""
+
+    message: Hello | Config
+    begun: int  # [us]
+    asked: int = -1  # [us] for the last time
+
+    def __post_init__(self) -> None:
+        self.asked = self.begun
+
+
+def _drives(state: State) -> bool:
+    """Whether it moves its motors as nobody may who was told to stop; a ramp is on its way to zero."""
+    return state.phase in (Phase.ARMED, Phase.HOLDING) or (state.phase != Phase.RAMP and any(state.applied))
+
+
+class _Shutdown:
+    """STOP, told until the device says that it rests; an emergency stop, until it says that it has latched it."""
+
+    def __init__(self, reason: Reason, acted: bool, now: int, T: float) -> None:
+        """`acted`: forces have acted, so that a device which says nothing is told again, every T seconds."""
+        self._stop, self._latch = encode(Stop(reason)), reason == Reason.ESTOP
+        self._repeat, self._every = acted or self._latch, 1e6 * T
+        self._began = self._told = now
+        self._rests, self._obeys = False, True
+
+    def heard(self, state: State) -> bytes:
+        """The answer to a STATE that came after the end."""
+        self._rests = not _drives(state) and (not self._latch or state.phase == Phase.ESTOP)
+        return b"" if self._rests else self._stop
+
+    def again(self, now: int) -> bytes:
+        """STOP, where no STATE has said for a tick that it was heard: the one before may be lost, and STATEs too."""
+        due = now - self._told >= self._every and now - self._began < _STOPPING_US
+        if self._rests or not due or not self._repeat:
+            return b""
+        self._told = now
+        return self._stop
+
+    def disobeyed(self, state: State, now: int) -> str | None:
+        """Said once, of a device that goes on driving."""
+        if not self._obeys or now - self._began <= _OBEYING_US or not _drives(state):
+            return None
+        self._obeys = False
+        return f"told to stop, the device still drives after {_OBEYING_US // 1000} ms: cut its power"
+
+
+@dataclass
+class Operator:
+    """A person's part in a session: arming, the planned end, keys. It arms by itself at most once, ever.
+
+    With a `deadman`, forces act only as long as it is told every second that somebody is there: by any key, or by
+    whatever answers `deadman`.
+    """
+
+    auto_arm: bool
+    seconds: float  # of forces at full gain, from each arming on
+    deadman: Callable[[], bool] | None = None  # whether somebody showed up since the last call
+    _asked: bool = False  # auto_arm has been used up
+    _armed_at: int | None = None  # [us]
+    _seen_at: int | None = None  # [us] when somebody showed up last
+
+    def look(self, session: Session, now: int) -> bytes:
+        """What is to be said at `now` [us] because of where the session stands."""
+        if session.stage == Stage.DISARMED:
+            self._armed_at = None
+            if self.auto_arm:
+                return self._arm_once(session, now)
+        if session.stage == Stage.ARMED and self._armed_at is None:
+            self._armed_at = now
+        if self.deadman:
+            if self.deadman() or session.stage not in DRIVING or self._seen_at is None:
+                self._seen_at = now
+            if now - self._seen_at > _DEADMAN_US and session.stage != Stage.DISARMING:
+                return session.stop(f"the deadman was let go for {_DEADMAN_US / 1e6:g} s", now)
+        if self._armed_at is not None and now - self._armed_at > 1e6 * self.seconds:
+            return session.stop("the time is over", now)
+        return b""
+
+    def press(self, key: str, session: Session, now: int) -> bytes:
+        """A key of a person, who is there then. `a` means something to a disarmed session only."""
+        self._seen_at = now
+        match _KEYS.get(key):
+            case "arm" if session.stage == Stage.DISARMED:
+                self._asked = True
+                return session.arm(now)
+            case "stop":
+                return session.stop(f"key {key}", now)
+            case "estop":
+                return session.estop("space bar", now)
+        return b""
+
+    def _arm_once(self, session: Session, now: int) -> bytes:
+        if self._asked:  # a softer coupling is ready, and nobody is there to arm it
+            softer = session.program.name if session.program else "none"
+            return session.refuse(f"nobody to arm the softer coupling, {softer}", now)
+        self._asked = True
+        return session.arm(now)

@@ -1,12 +1,12 @@
-"""Where the two worlds meet: scenarios, engines, the loop, and what a run is worth.
+"""The closed loop: scenarios, engines, runs, and what a run is worth.
 
     from sim import Scenario, load, parse, simulate, validate, plot_run
 
 load("omega-pair"), parse(text)     a Scenario, from a TOML file, by name, or from text; Scenario.replace changes it
 Scenario.loop("I")                  all that a design may know of it, for the package `design`
-simulate(scenario, coupling)        a Result: what happens with the people of the scenario, tick by tick
+simulate(scenario, coupling)        a Trace: what happens with the people of the scenario, tick by tick
 validate(scenario, coupling)        Findings: what happens with so many random ones
-plot_run(result, path, ...)         a picture of a Result
+plot_run(trace, path, ...)          a picture of a Trace
 InputError                          a ValueError: something to put right, in one line
 
 help(sim.simulate) and the like say more. Names are loaded when they are first used: a command must not wait for what
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from sim.crowds import Findings
     from sim.plots import plot_run
     from sim.scenario import InputError, Scenario, load, parse
-    from sim.trace import Result
+    from sim.trace import Result, Trace
 
 set_aside()
 
-__all__ = ["Findings", "InputError", "Result", "Scenario", "load", "parse", "plot_run", "simulate", "validate"]
+__all__ = ["Findings", "InputError", "Result", "Scenario", "Trace", "load", "parse", "plot_run", "simulate", "validate"]
 
 _HOMES = {
     "simulate": "sim.api",
@@ -37,6 +37,7 @@ _HOMES = {
     "Findings": "sim.crowds",
     "plot_run": "sim.plots",
     "Result": "sim.trace",
+    "Trace": "sim.trace",
 }
 
 

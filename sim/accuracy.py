@@ -1,85 +1,103 @@
-"""What one setting of an engine costs, and how wrong it is: measured in the same run, against the exact engine."""
+"""How wrong a run is: its engine beside the exact one, and its forces beside those of an ideal environment.
+
+`measure` gives what one setting of an engine costs and how wrong it is, from the same run.
+"""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from controller.lti import Array
-from sim.engines import LEAPFROG
-from sim.report import error_part
-from sim.run import Assembly, Record, simulate
-from sim.stability import MARGINAL, close, dominant_mode, exact_growth, measured_hold
+from controller.delay import delay
+from controller.lti import Array, Lti
+from sim.engines import EXPONENTIAL
+from sim.run import Simulation, make_engine, run
+from sim.stability import close, dominant_mode, exact_growth, unstable, worst_mode
+from sim.stepping import measured_hold
+from sim.trace import Trace
+
+# ---- beside the exact engine
+
+
+def position_error(
+    trace: Trace, exact: Trace | None, simulation: Simulation, grows: bool | None = None
+) -> dict[str, Any]:
+    """Device positions against the exact engine's closed loop, where there is one; None with a reason elsewhere.
+
+    `grows` says whether the loop is unstable where its eigenvalues do not: then the trace is compared up to the first
+    clipped tick, because growth multiplies any difference.
+    """
+    if exact is None:
+        reason = "the exact engine is linear and has no Coulomb friction to compare with"
+        return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
+    limit, m = simulation.process.force_limit, simulation.process.channels
+    n = min(trace.t.size, exact.t.size)
+    clipped = exact.clipped(limit)[:n] | trace.clipped(limit)[:n]
+    if grows is None:
+        grows = worst_mode(simulation).verdict == "unstable"
+    linear = int(np.argmax(clipped)) if grows and clipped.any() else n
+    own, true = trace.s[:linear, :m], exact.s[:linear, :m]
+    size, relative, largest = _rms(true), None, None
+    if size > 0:
+        relative, largest = _rms(own - true) / size, float(np.abs(own - true).max())
+    if linear == n:
+        return {"position_relative_rms": relative, "position_max_m": largest}
+    until = f"the unstable run first clips at t = {linear * simulation.scenario.T:.3f} s"
+    reason = f"{until}; up to there the relative rms is {relative:.1e}, and its growth multiplies any difference"
+    return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
+
 
 #: (engine, integrator, substeps) that are compared; the first is the reference
 SETTINGS = (
     ("exact", None, None),
+    ("mujoco", EXPONENTIAL, 1),
     *(("mujoco", "RK4", n) for n in (1, 2, 3, 4, 8)),
-    *(("mujoco", LEAPFROG, n) for n in (1, 2, 4, 8)),
     *(("mujoco", "Euler", n) for n in (1, 4, 12)),
     *(("mujoco", "implicitfast", n) for n in (1, 4, 12)),
     *(("mujoco", "discrete", n) for n in (4, 12)),
 )
-REPEATS = 3  # the least of their times is the cost
-TAIL = 4000  # ticks in which a limit cycle is measured
 Row = dict[str, Any]
+
+_REPEATS = 3  # the least of their times is the cost
+_TAIL = 4000  # ticks in which a limit cycle is measured
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
     """The exact engine's answers: with the coupling that was asked for, and without any."""
 
-    coupled: Assembly
-    uncoupled: Assembly
-    trace: Record
+    coupled: Simulation
+    uncoupled: Simulation
+    trace: Trace
     cycle: tuple[int, float, float] | None  # channel, amplitude [N], frequency [Hz]; None where none is sustained
 
 
-def reference(coupled: Assembly, uncoupled: Assembly) -> Reference:
+def reference(coupled: Simulation, uncoupled: Simulation) -> Reference:
     """Run the exact engine on both loops."""
     cycle = None
-    if exact_growth(uncoupled) > MARGINAL:
-        free = simulate(uncoupled, "exact")
-        if free.s.shape[0] > TAIL and not free.diverged:
-            channel = int(np.argmax(free.f[-TAIL:, :, 0].std(axis=0)))
-            cycle = (channel, *limit_cycle(free, channel, uncoupled.scenario.T))
-    return Reference(coupled, uncoupled, simulate(coupled, "exact"), cycle)
+    if unstable(exact_growth(uncoupled)):
+        free = run(uncoupled, "exact")
+        if free.t.size > _TAIL and not free.diverged:
+            channel = int(np.argmax(free.f[-_TAIL:].std(axis=0)))
+            cycle = (channel, *limit_cycle(free, channel))
+    return Reference(coupled, uncoupled, run(coupled, "exact"), cycle)
 
 
 def measure(truth: Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
     """One row: errors of position [-], growth [1/s] and limit cycle [-], [Hz], and the cost of that very run."""
     row: Row = {"engine": engine, "integrator": integrator, "substeps": substeps}
-    settings = (engine, integrator or "RK4", substeps or 1)
-    record, wall = _timed(truth.coupled, *settings)
-    for _ in range(REPEATS - 1):
+    settings = (engine, integrator, substeps)
+    trace, wall = _timed(truth.coupled, *settings)
+    for _ in range(_REPEATS - 1):
         wall = min(wall, _timed(truth.coupled, *settings)[1])
-    error = error_part(record, truth.trace, truth.coupled)
-    row["position_relative_rms"] = error["position_relative_rms"]
+    row["position_relative_rms"] = position_error(trace, truth.trace, truth.coupled)["position_relative_rms"]
     row |= _growth(truth, *settings) | _cycle(truth, *settings)
-    row["wall_s_per_simulated_s"] = wall / (record.s.shape[0] * truth.coupled.scenario.T)
+    row["wall_s_per_simulated_s"] = wall / (trace.t.size * truth.coupled.scenario.T)
     return row
-
-
-def _timed(assembly: Assembly, engine: str, integrator: str, substeps: int) -> tuple[Record, float]:
-    begin = time.perf_counter()
-    record = simulate(assembly, engine, integrator, substeps)
-    if record.interrupted:  # a part of a run is no measurement
-        raise KeyboardInterrupt
-    return record, time.perf_counter() - begin
-
-
-def limit_cycle(record: Record, channel: int, T: float) -> tuple[float, float]:
-    """Standard deviation [N] and frequency [Hz] of a force's tail; the spectral peak is refined by a parabola."""
-    force = record.f[-TAIL:, channel, 0]
-    level = np.log(np.abs(np.fft.rfft((force - force.mean()) * np.hanning(force.size))) + 1e-300)
-    peak = int(np.clip(np.argmax(level[1:-1]) + 1, 1, level.size - 2))
-    low, mid, high = level[peak - 1 : peak + 2]
-    curvature = low - 2 * mid + high
-    shift = 0.5 * (low - high) / curvature if curvature else 0.0
-    return float(force.std()), float((peak + shift) / (force.size * T))
 
 
 def mark_front(rows: list[Row]) -> None:
@@ -94,32 +112,103 @@ def mark_front(rows: list[Row]) -> None:
         row["pareto"] = bool(np.isfinite(points[i]).all() and row["verdict_correct"] and not beaten)
 
 
-def _growth(truth: Reference, engine: str, integrator: str, substeps: int) -> Row:
+def limit_cycle(trace: Trace, channel: int) -> tuple[float, float]:
+    """Standard deviation [N] and frequency [Hz] of a force's tail; the spectral peak is refined by a parabola."""
+    force = trace.f[-_TAIL:, channel]
+    level = np.log(np.abs(np.fft.rfft((force - force.mean()) * np.hanning(force.size))) + 1e-300)
+    peak = int(np.clip(np.argmax(level[1:-1]) + 1, 1, level.size - 2))
+    low, mid, high = level[peak - 1 : peak + 2]
+    curvature = low - 2 * mid + high
+    shift = 0.5 * (low - high) / curvature if curvature else 0.0
+    return float(force.std()), float((peak + shift) / (force.size * trace.t[1]))
+
+
+def _timed(simulation: Simulation, engine: str, integrator: str | None, substeps: int | None) -> tuple[Trace, float]:
+    begin = time.perf_counter()
+    trace = run(simulation, make_engine(simulation, engine, integrator, substeps))
+    if trace.interrupted:  # a part of a run is no measurement
+        raise KeyboardInterrupt
+    return trace, time.perf_counter() - begin
+
+
+def _growth(truth: Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
     """The larger growth-rate error of the two loops, and whether both verdicts are right."""
     errors, right = [], True
-    for assembly in (truth.coupled, truth.uncoupled):
-        own = dominant_mode(close(measured_hold(assembly, engine, integrator, substeps), assembly.F)).growth
-        exact = exact_growth(assembly)
-        errors.append(own - exact)
-        right &= (own > MARGINAL) == (exact > MARGINAL)
-    return {"growth_rate_error": float(max(errors, key=abs)), "verdict_correct": bool(right)}
+    for simulation in (truth.coupled, truth.uncoupled):
+        held = measured_hold(simulation, engine, integrator, substeps)
+        own, exact = dominant_mode(close(held, simulation.F)).growth, exact_growth(simulation)
+        errors.append(float(own - exact))
+        right &= bool(unstable(own) == unstable(exact))
+    return {"growth_rate_error": max(errors, key=abs), "verdict_correct": right}
 
 
-def _cycle(truth: Reference, engine: str, integrator: str, substeps: int) -> Row:
+def _cycle(truth: Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
     names = ("cycle_amplitude_n", "cycle_frequency_hz", "cycle_amplitude_error", "cycle_frequency_error_hz")
     if truth.cycle is None:
         return dict.fromkeys(names)
     channel, amplitude, frequency = truth.cycle
-    record = simulate(truth.uncoupled, engine, integrator, substeps)
-    if record.diverged:
+    trace = run(truth.uncoupled, make_engine(truth.uncoupled, engine, integrator, substeps))
+    if trace.diverged:
         return dict.fromkeys(names)
-    own, turns = limit_cycle(record, channel, truth.uncoupled.scenario.T)
+    own, turns = limit_cycle(trace, channel)
     return dict(zip(names, (own, turns, own / amplitude - 1, turns - frequency), strict=True))
 
 
 def _point(row: Row) -> Array:
     position = np.inf if row["position_relative_rms"] is None else row["position_relative_rms"]
     return np.array([row["wall_s_per_simulated_s"], position, abs(row["growth_rate_error"])])
+
+
+# ---- beside the ideal environment
+
+
+@dataclass(frozen=True, eq=False)
+class ForceError:
+    """Two answers to the same displacements, from rest at t = 0 and over the whole run, before any force limit."""
+
+    asked: Array  # (N, m) what the coupled loop asks of the motors, F x [N]
+    ideal: Array  # (N, m) what the delay-matched environment itself would ask, Lambda E x [N]
+    reason: str | None = None  # why the two cannot be compared
+
+    def part(self) -> dict[str, Any]:
+        """rms(asked - ideal)/rms(ideal) in percent, over all ticks and channels; None with a reason where undefined."""
+        asked, ideal, apart = _rms(self.asked), _rms(self.ideal), _rms(self.asked - self.ideal)
+        part: dict[str, Any] = {"error_percent": None, "asked_rms_n": asked, "ideal_rms_n": ideal}
+        if self.reason:
+            return part | {"ideal_rms_n": None, "reason": self.reason}
+        if not np.isfinite([asked, ideal, apart]).all():
+            return part | {"asked_rms_n": None, "ideal_rms_n": None, "reason": "the run left the range of numbers"}
+        if ideal == 0:
+            return part | {"reason": "the ideal environment would have rendered no force"}
+        return part | {"error_percent": 100 * apart / ideal}
+
+
+def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> ForceError:
+    """The run's forces before their limits, and those of Lambda E, for the displacements that the encoders gave.
+
+    Where delays switch, the forces are those that arrived, within their limits. Of walls there is no linear ideal.
+    """
+    process = simulation.process
+    if process.contact:
+        return ForceError(trace.f, trace.f, "walls have no linear ideal to compare with")
+    F = process.F
+    asked = trace.f if process.delays is not None else trace.z @ F.C.T + trace.x @ F.D.T
+    return ForceError(asked, response(delay(lam, F.T) @ simulation.E, trace.x))
+
+
+def response(G: Lti, x: Array) -> Array:
+    """y = G x from rest; x (N, inputs), y (N, outputs)."""
+    states = np.zeros((x.shape[0] + 1, G.order))
+    driven = x @ G.B.T
+    with np.errstate(over="ignore", invalid="ignore"):  # an unstable run may leave the range of numbers
+        for k in range(x.shape[0]):
+            states[k + 1] = G.A @ states[k] + driven[k]
+        return states[:-1] @ G.C.T + x @ G.D.T
+
+
+def _rms(values: Array) -> float:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
 
 
 if __name__ == "__main__":

@@ -29,22 +29,22 @@ from models.human import Human, Person
 from models.scene import Crowd, variants
 from sim.run import Progress
 from sim.scenario import Scenario
-from sim.stability import dominant_modes, exact_loops
+from sim.stability import dominant_mode, exact_loops
 
-MASS, STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
+_MASS, _STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
 DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9
 
 
-class Pass(NamedTuple):
+class _Pass(NamedTuple):
     """One search. Slow modes of a lossless hand barely decay and would hide the one that grows."""
 
     links: int  # of each arm; one mass and spring already present every reactance at one frequency
-    audible: float  # [Hz] least frequency of the modes looked at
+    min_frequency_hz: float  # of the modes looked at
     held: bool = False  # by one person, whose body and cross spring present every reactance matrix
 
 
-PASSES = (Pass(1, 2.0), Pass(2, 2.0), Pass(1, 0.0), Pass(1, 2.0, held=True))
-CANDIDATES = 120  # sets of humans in a generation
+_PASSES = (_Pass(1, 2.0), _Pass(2, 2.0), _Pass(1, 0.0), _Pass(1, 2.0, held=True))
+_CANDIDATES = 120  # sets of humans in a generation
 
 
 @dataclass(frozen=True)
@@ -73,10 +73,10 @@ def search(
 ) -> Worst:
     """The lossless humans with the largest growth that were found; with `first`, the first that destabilise.
 
-    `progress` hears of every generation.
+    `progress` is called after every generation.
     """
     m, done = scenario.channels, 0
-    passes = [p for p in PASSES if m > 1 or not p.held]
+    passes = [p for p in _PASSES if m > 1 or not p.held]
 
     def stop(intermediate_result: OptimizeResult) -> bool:
         nonlocal done
@@ -86,12 +86,12 @@ def search(
 
     best, evaluated = None, 0
     for trial, kind in enumerate(passes):
-        ranges = [MASS, STIFFNESS] * (m * kind.links) + [MASS, STIFFNESS, STIFFNESS] * kind.held
+        ranges = [_MASS, _STIFFNESS] * (m * kind.links) + [_MASS, _STIFFNESS, _STIFFNESS] * kind.held
         found = differential_evolution(
             partial(_losses, scenario=scenario, F=F, kind=kind),
             np.log(ranges),
             rng=np.random.default_rng(np.random.SeedSequence((seed, trial))),
-            popsize=CANDIDATES // len(ranges),
+            popsize=_CANDIDATES // len(ranges),
             maxiter=generations,
             tol=0,
             polish=False,
@@ -100,7 +100,7 @@ def search(
             callback=stop,
         )
         done = (trial + 1) * generations
-        evaluated += (found.nit + 1) * (CANDIDATES // len(ranges)) * len(ranges)
+        evaluated += (found.nit + 1) * (_CANDIDATES // len(ranges)) * len(ranges)
         worst = _worst(scenario, F, _ladders(found.x[:, None], m, kind), evaluated)
         best = worst if best is None or worst.growth > best.growth else best
         if first and best.destabilises:
@@ -127,7 +127,8 @@ def attempts(
 ) -> list[Attempt]:
     """Attack every loop at every shortage: devices get (1 - short) times the damping that `this_environment` requires.
 
-    A negative shortage gives the devices more than required: there the search must fail. `attempted` hears of each.
+    A negative shortage gives the devices more than required: there the search must fail. `attempted` is called
+    with each.
     """
     rows = []
     for name, (scenario, coupling) in loops.items():
@@ -140,7 +141,7 @@ def attempts(
     return rows
 
 
-def _ladders(x: Array, channels: int, kind: Pass) -> Crowd:
+def _ladders(x: Array, channels: int, kind: _Pass) -> Crowd:
     """Logs of masses and stiffnesses, (2 channels links, nsim), as lossless humans.
 
     Where one person holds all devices, three more rows are the body's mass and stiffness and the cross stiffness.
@@ -155,15 +156,15 @@ def _ladders(x: Array, channels: int, kind: Pass) -> Crowd:
     return Crowd(links, (tuple(range(1, channels + 1)),), bodies)
 
 
-def _losses(x: Array, scenario: Scenario, F: Lti, kind: Pass) -> Array:
-    """Minus the largest growth [1/s] among the audible modes, for every column of x."""
+def _losses(x: Array, scenario: Scenario, F: Lti, kind: _Pass) -> Array:
+    """Minus the largest growth [1/s] among the modes looked at, for every column of x."""
     loops = exact_loops(variants(scenario.device, _ladders(x.reshape(x.shape[0], -1), scenario.channels, kind)), F)
     values = np.linalg.eigvals(loops.A)
-    heard = np.abs(np.angle(values)) / (2 * np.pi * F.T) >= kind.audible
-    return -np.log(np.where(heard, np.abs(values), 1e-300).max(axis=1)) / F.T
+    fast = np.abs(np.angle(values)) / (2 * np.pi * F.T) >= kind.min_frequency_hz
+    return -np.log(np.where(fast, np.abs(values), 1e-300).max(axis=1)) / F.T
 
 
 def _worst(scenario: Scenario, F: Lti, crowd: Crowd, evaluated: int) -> Worst:
-    modes = dominant_modes(exact_loops(variants(scenario.device, crowd), F))
-    radius, growth, frequency = (float(a[0]) for a in (modes.spectral_radius, modes.growth, modes.frequency_hz))
+    mode = dominant_mode(exact_loops(variants(scenario.device, crowd), F))
+    radius, growth, frequency = (float(a[0]) for a in (mode.spectral_radius, mode.growth, mode.frequency_hz))
     return Worst(crowd.humans(0), crowd.persons(0), radius, growth, frequency, evaluated)

@@ -2,38 +2,38 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from controller.coupling import Coupling, NoCoupling
 from design.result import COUPLING, Design, bare, number, of_kind, one_of, whole
-from sim.crowds import ENGINES, Findings, Question
-from sim.crowds import validate as examine_all
-from sim.engines import INTEGRATORS, LEAPFROG
-from sim.report import stability_part
-from sim.run import ENGINES as ALONE
-from sim.run import Progress, assemble
-from sim.run import simulate as close_loop
+from sim import crowds
+from sim.engines import INTEGRATORS
+from sim.run import ENGINES, Progress, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, require_linear
-from sim.stability import LEAST, MOST, check_substeps, default_substeps
+from sim.stability import stability_part
+from sim.stepping import MOST, settle
 from sim.switching import switching
-from sim.trace import Result
+from sim.trace import Trace
 
-MOST_HUMANS = 1_000_000
-SCENARIO = 'a Scenario, as load("omega-pair") gives it'
+_MOST_HUMANS = 1_000_000
+_SCENARIO = 'a Scenario, as load("omega-pair") gives it'
 
 
 def simulate(
     scenario: Scenario,
     coupling: Coupling | Design | None = None,
     engine: str = "mujoco",
-    integrator: str = "RK4",
+    integrator: str | None = None,
     substeps: int | None = None,
     seed: int = 0,
-) -> Result:
+) -> Trace:
     """The scenario's run, from rest, for `scenario.duration` seconds.
 
     `coupling` None is the loop without one; `engine` is "mujoco" or "exact" (the linear loop, no Coulomb friction);
-    `substeps` MuJoCo steps per period, None for what the plant asks (4 or more); `seed` draws delays that vary.
+    `integrator` of MuJoCo, None for "exponential", or "RK4" where a device has Coulomb friction; `substeps` steps per
+    period, None for what the plant asks; `seed` draws delays that vary.
 
-    Returns a Result of N samples and m channels: t (N,) [s], x (N, m) and x_handle (N, m) [m], v_handle (N, m) [m/s],
+    Returns a Trace of N samples and m channels: t (N,) [s], x (N, m) and x_handle (N, m) [m], v_handle (N, m) [m/s],
     f (N, m) [N] (the devices feel -f) and `meta`, with the scenario's digest and `meta["stability"]`: growth rates
     [1/s] of the trace and of the exact loop, the verdict, ticks at the force limit (None under delays that vary).
 
@@ -41,33 +41,29 @@ def simulate(
     is not possible, TypeError for an argument of another type, SingularLoop where the algebraic loop of environment and
     coupling has no solution.
     """
-    of_kind("scenario", scenario, Scenario, SCENARIO)
+    of_kind("scenario", scenario, Scenario, _SCENARIO)
     alone, seed = _bare(coupling), whole("seed", seed, 0)
-    one_of("engine", engine, ALONE)
-    one_of("integrator", integrator, (*INTEGRATORS, LEAPFROG))
+    one_of("engine", engine, ENGINES)
+    if integrator is not None:
+        one_of("integrator", integrator, tuple(INTEGRATORS))
     if substeps is not None:
         substeps = whole("substeps", substeps, 1, MOST)
-    assembly = assemble(scenario, alone)
+    simulation = assemble(scenario, alone)
     if scenario.switches:
-        assembly, _ = switching(assembly, alone, seed, scenario.samples)
-    warnings: list[str] = []
-    if engine == "mujoco" and substeps is None:
-        substeps = default_substeps(assembly, integrator)
-    elif engine == "mujoco" and substeps is not None:
-        warnings = check_substeps(assembly, integrator, substeps)
-    record = close_loop(assembly, engine, integrator, substeps or LEAST)
-    mujoco = engine == "mujoco"
+        simulation, _ = switching(simulation, alone, seed, scenario.samples)
+    integrator, substeps, remarks = settle(simulation, engine, integrator, substeps)
+    trace = run(simulation, make_engine(simulation, engine, integrator, substeps))
     meta = {
         "scenario": scenario.name,
         "scenario_digest": scenario.digest,
         "engine": engine,
-        "integrator": integrator if mujoco else None,
-        "substeps": substeps if mujoco else None,
+        "integrator": integrator,
+        "substeps": substeps,
         "seed": seed,
-        "stability": None if scenario.switches else stability_part(assembly, record),
-        "remarks": warnings,
+        "stability": None if scenario.switches else stability_part(simulation, trace),
+        "remarks": remarks,
     }
-    return Result.from_record(assembly, record, meta)
+    return replace(trace, meta=meta)
 
 
 def validate(
@@ -79,12 +75,13 @@ def validate(
     duration: float = 2.0,
     shards: int = 1,
     progress: Progress = lambda done, total: None,
-) -> Findings:
+) -> crowds.Findings:
     """Let `humans` random passive humans (one per device each time) hold the devices, without voluntary motion.
 
     They are drawn from `scenario.population`; number i depends on `seed` and i alone. `engine` is "exact", "mujoco" or
     "both"; `duration` [s] of the traces, 0 for none (then growth rates are those of the period maps alone); `shards`
-    local processes (a script that asks for more than 1 needs `if __name__ == "__main__"`).
+    local processes (a script that asks for more than 1 needs `if __name__ == "__main__"`); `progress` is
+    called with the parts done and all of them.
 
     Returns Findings, n = humans: `exact` and `mujoco` (n,) growth rates [1/s], positive where a human makes the loop
     unstable, `radius` (n,) of the exact loop, `frequency` (n,) [Hz], `disagreements` (n,) of the engines, and more.
@@ -92,17 +89,17 @@ def validate(
     Raises InputError for walls or Coulomb friction (verdicts are of linear loops), ValueError for numbers out of range,
     TypeError for an argument of another type.
     """
-    of_kind("scenario", scenario, Scenario, SCENARIO)
+    of_kind("scenario", scenario, Scenario, _SCENARIO)
     alone = _bare(coupling)
     require_linear(scenario, "validate")
-    humans, seed = whole("humans", humans, 1, MOST_HUMANS), whole("seed", seed, 0)
+    humans, seed = whole("humans", humans, 1, _MOST_HUMANS), whole("seed", seed, 0)
     shards = whole("shards", shards, 1)
-    one_of("engine", engine, ENGINES)
+    one_of("engine", engine, crowds.ENGINES)
     duration = number("duration", duration, "a number of seconds")
     if not (duration == 0 or duration >= 4 * scenario.T):
         raise InputError(f"duration is {duration:g}, allowed are 0 and {4 * scenario.T:g} s or more")
     links = getattr(scenario.population, "links", 1)  # of a user's own population there are none
-    return examine_all(Question(scenario, alone, seed, humans, links, engine, duration), shards, progress)
+    return crowds.validate(crowds.Validation(scenario, alone, seed, humans, links, engine, duration), shards, progress)
 
 
 def _bare(coupling: Coupling | Design | None) -> Coupling:

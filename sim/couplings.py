@@ -1,4 +1,4 @@
-"""The coupling that a command was asked for: a name, or a file."""
+"""The coupling that a command was asked for, by name or in a file, and what a stored one is worth in a loop."""
 
 from __future__ import annotations
 
@@ -13,65 +13,6 @@ from design.certificate import Stored, switching_promise, verify
 from design.designs import KINDS, design_by_kind
 from design.result import PUBLISHED, DesignFailed
 from sim.scenario import InputError, Scenario
-
-# ----------------------------------------------------------------------------------------------------
-# Stored couplings as a command meets them: read, fitted to its loop, and doubted.
-
-
-def read_coupling(path: str | Path) -> Stored:
-    """A stored coupling. Raises InputError where there is none that can be read."""
-    try:
-        return store.load(path)
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from None
-    except store.BadFile as error:
-        raise InputError(str(error)) from None
-
-
-def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
-    """The stored coupling in a loop of so many channels at T [s]. Raises InputError where it cannot stand there."""
-    if len(stored.loop.delta) != channels:
-        raise InputError(f"{path} couples {len(stored.loop.delta)} channels, the loop has {channels}")
-    coupling = stored.coupling.build(T)
-    if isinstance(coupling, Compliance | InternalModel | ForceFilter) and stored.loop.T != T:
-        raise InputError(f"{path}: its coefficients are for T = {stored.loop.T:g} s, the loop has {T:g} s")
-    return coupling
-
-
-@dataclass(frozen=True)
-class Standing:
-    """What a coupling's file is worth in a loop."""
-
-    notes: tuple[str, ...]  # what a reader should know of it
-    switching: DelayRange | None = None  # the file proves that any switching of the delays within it is safe here
-
-
-def standing(stored: Stored, loop: Loop) -> Standing:
-    """Whether the certificate on file holds, and what it says of the coupling in this loop."""
-    try:
-        reason = verify(stored).reason if stored.certificate else None
-    except (ValueError, ArithmeticError) as error:
-        reason = str(error)
-    notes = [f"the certificate in the coupling's file does not hold: {reason}"] if reason else []
-    delays = ("theta", "jitter", "lam")  # lam matters to transparency only
-    differ = [n for n in loop.__struct_fields__ if n not in delays and getattr(loop, n) != getattr(stored.loop, n)]
-    proved = stored.certificate is not None and not reason and not differ
-    switching = stored.loop.jitter if proved else None
-    if switching and switching.contains(loop.jitter or DelayRange(loop.theta, loop.theta)):
-        if loop.theta != stored.loop.theta or loop.jitter not in (None, switching):
-            here = switching_promise(loop.jitter) if loop.jitter else f"the constant theta = {list(loop.theta)}"
-            notes.append(f"the file proves {switching_promise(switching)}, which covers {here}")
-        return Standing(tuple(notes), switching)
-    differ += ["theta"] if loop.theta != stored.loop.theta else []
-    if loop.jitter and proved:
-        made_for = switching_promise(switching) if switching else "constant delays"
-        notes.append(f"the file proves {made_for}: {switching_promise(loop.jitter)} are judged anew here")
-    if differ:
-        notes.append(
-            f"the coupling was stored for another loop (different {', '.join(differ)}), and is judged anew here"
-        )
-    return Standing(tuple(notes), switching)
-
 
 NAMES = ("none", "published", *KINDS)
 
@@ -101,7 +42,9 @@ def choose(scenario: Scenario, case: str, name: str | None = None, condition: st
     if name == "none":
         return Chosen(name, NoCoupling(), condition or "closed-loop")
     if name == "published":
-        return _published(scenario, case, condition)
+        if scenario.channels != 2:
+            raise InputError(f"--coupling published: the paper prints gains for 2 channels, not {scenario.channels}")
+        return Chosen(name, PUBLISHED[case], condition or "theorem4")
     if name in KINDS:
         try:
             design = design_by_kind(scenario.loop(case), name, condition)
@@ -110,20 +53,65 @@ def choose(scenario: Scenario, case: str, name: str | None = None, condition: st
         except ValueError as error:
             raise InputError(str(error)) from None
         return Chosen(name, design.coupling, design.condition, design.phi)
-    return _from_file(scenario, case, name, condition)
-
-
-def _published(scenario: Scenario, case: str, condition: str | None) -> Chosen:
-    if scenario.channels != 2:
-        raise InputError(f"--coupling published: the paper prints gains for 2 channels, not {scenario.channels}")
-    return Chosen("published", PUBLISHED[case], condition or "theorem4")
-
-
-def _from_file(scenario: Scenario, case: str, name: str, condition: str | None) -> Chosen:
     if Path(name).suffix != ".json":
         raise InputError(f"--coupling is {name!r}, allowed are {', '.join(NAMES)} or a FILE.json")
     stored = read_coupling(name)
     coupling = fitted(stored, name, scenario.channels, scenario.T)
     made_for = stored.certificate.condition if stored.certificate else "closed-loop"
-    there = standing(stored, scenario.loop(case))
-    return Chosen(Path(name).name, coupling, condition or made_for, notes=there.notes, switching=there.switching)
+    checked = check_stored(stored, scenario.loop(case))
+    return Chosen(Path(name).name, coupling, condition or made_for, notes=checked.notes, switching=checked.switching)
+
+
+def read_coupling(path: str | Path) -> Stored:
+    """A stored coupling. Raises InputError where there is none that can be read."""
+    try:
+        return store.load(path)
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from None
+    except store.BadFile as error:
+        raise InputError(str(error)) from None
+
+
+def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
+    """The stored coupling in a loop of so many channels at T [s]. Raises InputError where it cannot stand there."""
+    if len(stored.loop.delta) != channels:
+        raise InputError(f"{path} couples {len(stored.loop.delta)} channels, the loop has {channels}")
+    coupling = stored.coupling.build(T)
+    if isinstance(coupling, Compliance | InternalModel | ForceFilter) and stored.loop.T != T:
+        raise InputError(f"{path}: its coefficients are for T = {stored.loop.T:g} s, the loop has {T:g} s")
+    return coupling
+
+
+@dataclass(frozen=True)
+class FileCheck:
+    """What a coupling's file is worth in a loop."""
+
+    notes: tuple[str, ...]  # what a reader should know of it
+    switching: DelayRange | None = None  # the file proves that any switching of the delays within it is safe here
+
+
+def check_stored(stored: Stored, loop: Loop) -> FileCheck:
+    """Whether the certificate on file holds, and what it says of the coupling in this loop."""
+    try:
+        reason = verify(stored).reason if stored.certificate else None
+    except (ValueError, ArithmeticError) as error:
+        reason = str(error)
+    notes = [f"the certificate in the coupling's file does not hold: {reason}"] if reason else []
+    delays = ("theta", "jitter", "lam")  # lam matters to transparency only
+    differ = [n for n in loop.__struct_fields__ if n not in delays and getattr(loop, n) != getattr(stored.loop, n)]
+    proved = stored.certificate is not None and not reason and not differ
+    switching = stored.loop.jitter if proved else None
+    if switching and switching.contains(loop.jitter or DelayRange(loop.theta, loop.theta)):
+        if loop.theta != stored.loop.theta or loop.jitter not in (None, switching):
+            here = switching_promise(loop.jitter) if loop.jitter else f"the constant theta = {list(loop.theta)}"
+            notes.append(f"the file proves {switching_promise(switching)}, which covers {here}")
+        return FileCheck(tuple(notes), switching)
+    differ += ["theta"] if loop.theta != stored.loop.theta else []
+    if loop.jitter and proved:
+        made_for = switching_promise(switching) if switching else "constant delays"
+        notes.append(f"the file proves {made_for}: {switching_promise(loop.jitter)} are judged anew here")
+    if differ:
+        notes.append(
+            f"the coupling was stored for another loop (different {', '.join(differ)}), and is judged anew here"
+        )
+    return FileCheck(tuple(notes), switching)

@@ -1,4 +1,10 @@
-"""A validation over local processes: batches go to whoever is free; the merged result is that of a single run."""
+"""Many random passive humans on one loop: drawn, decided by both engines, in batches over processes or a cluster.
+
+Human i depends on the seed and i alone, whoever draws it and with whom. Batches are always the same ones, so that the
+merged result of shards and of a cluster is that of a single run, bit for bit (a cluster's workers need this package
+and the same versions of NumPy, SciPy and MuJoCo). MuJoCo decides by the map of its Runge-Kutta integrator, which shares
+nothing with the exact engine but the model; its traces take the exponential one, at a fifth of the cost.
+"""
 
 from __future__ import annotations
 
@@ -23,21 +29,32 @@ from controller.environment import Member
 from controller.lti import Array
 from models.human import Population
 from models.scene import Crowd, HumanSets, Variants, variants
-from sim.engines import ExactBatchEngine, MujocoBatchEngine, hold
-from sim.run import Assembly, Progress, assemble
+from sim.engines import EXPONENTIAL, ExactBatchEngine, MujocoBatchEngine, hold
+from sim.run import Progress, Simulation, assemble
 from sim.scenario import InputError, Scenario
-from sim.stability import ClosedLoop, Trace, disagree, dominant_modes, exact_loops, knock, mujoco_loops
+from sim.stability import (
+    ClosedLoop,
+    ImpulseTest,
+    disagree,
+    dominant_mode,
+    exact_loops,
+    impulse_test,
+    mujoco_loops,
+)
 from sim.switching import Switched, switched_crowd
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client
+    from distributed import Future as DaskFuture
 
-
-# ----------------------------------------------------------------------------------------------------
-# Random passive humans, each from its own seed: human i is the same whoever draws it, and with whom.
-
-
+ENGINES = ("exact", "mujoco", "both")
 MIXED = 0  # as a number of links: half the humans are simple, half are networks of two links
+BATCH = 125  # humans that are decided together
+
+_PATIENCE = 3.0  # [s] for a scheduler to answer, and again for its first worker
+
+
+# ---- random passive humans, each from its own seed
 
 
 def draw(population: Population, channels: int, seed: int, index: int, links: int) -> Array:
@@ -49,17 +66,6 @@ def draw(population: Population, channels: int, seed: int, index: int, links: in
     count = int(rng.integers(1, 3)) if links == MIXED else links
     low, high = np.log([population.mass, population.damping, population.stiffness]).T
     return np.exp(rng.uniform(low, high, size=(channels, count, 3)))
-
-
-def draw_bodies(population: Population, persons: int, seed: int, index: int) -> Array:
-    """Bodies of the persons with this index who hold several devices: (persons, 5) as in Crowd, from the same ranges.
-
-    Drawn apart from the links, which are the same whether or not somebody holds several devices.
-    """
-    rng = np.random.default_rng(np.random.SeedSequence((seed, index, 1)))
-    ranges = (population.mass, population.damping, population.stiffness, population.damping, population.stiffness)
-    low, high = np.log(ranges).T
-    return np.exp(rng.uniform(low, high, size=(persons, 5)))
 
 
 def crowds(
@@ -77,22 +83,8 @@ def crowds(
     drawn = {i: draw(population, channels, seed, i, links) for i in indices}
     for count in sorted({values.shape[1] for values in drawn.values()}):
         group = [i for i, values in drawn.items() if values.shape[1] == count]
-        bodies = np.stack([draw_bodies(population, len(holds), seed, i) for i in group])
+        bodies = np.stack([_draw_bodies(population, len(holds), seed, i) for i in group])
         yield np.array(group), Crowd(np.stack([drawn[i] for i in group]), holds, bodies)
-
-
-def crowds_of(
-    scenario: Scenario, seed: int, indices: Iterable[int], links: int
-) -> Iterator[tuple[NDArray[np.intp], Crowd | HumanSets]]:
-    """`crowds` for a scenario: of its population, and held together as its persons hold its devices.
-
-    A user's own population draws from the same seeds, with the persons as they stand in the scenario.
-    """
-    if not isinstance(scenario.population, Population):
-        yield from _own_crowds(scenario, seed, indices)
-        return
-    holds = tuple(person.holds for person in scenario.person)
-    yield from crowds(scenario.population, scenario.channels, seed, indices, links, holds)
 
 
 def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], HumanSets]]:
@@ -107,23 +99,23 @@ def _own_crowds(scenario: Scenario, seed: int, indices: Iterable[int]) -> Iterat
         yield np.array(group), HumanSets(tuple(drawn[i] for i in group), scenario.person)
 
 
-def crowd_of(scenario: Scenario, seed: int, index: int, links: int) -> Crowd | HumanSets:
-    """The one set of humans with this index."""
-    ((_, crowd),) = crowds_of(scenario, seed, [index], links)
-    return crowd
+def _draw_bodies(population: Population, persons: int, seed: int, index: int) -> Array:
+    """Bodies of the persons with this index who hold several devices: (persons, 5) as in Crowd, from the same ranges.
+
+    Drawn apart from the links, which are the same whether or not somebody holds several devices.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence((seed, index, 1)))
+    ranges = (population.mass, population.damping, population.stiffness, population.damping, population.stiffness)
+    low, high = np.log(ranges).T
+    return np.exp(rng.uniform(low, high, size=(persons, 5)))
 
 
-# ----------------------------------------------------------------------------------------------------
-# One batch of a validation: everything that is found out about a range of human indices.
-
-
-BATCH = 125  # humans that are decided together; always the same ones, so that shards repeat the single run exactly
-ENGINES = ("exact", "mujoco", "both")
+# ---- what is asked, and what is found
 
 
 @dataclass(frozen=True)
-class Question:
-    """What is asked about every human."""
+class Validation:
+    """A loop, the humans that are to hold it, and how they are decided."""
 
     scenario: Scenario
     coupling: Coupling
@@ -149,10 +141,21 @@ class Question:
         """What the humans of this index meet, None for the scenario's own environment: each in turn."""
         return self.environments[index % len(self.environments)] if self.environments else None
 
-    def scenario_of(self, index: int) -> Scenario:
-        """The scenario with the environment that the humans of this index meet."""
-        member = self.environment(index)
-        return self.scenario.replace(environment=member.network, box=None) if member else self.scenario
+    def crowds(self, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], Crowd | HumanSets]]:
+        """The humans of these indices, held together as the scenario's persons hold its devices.
+
+        A user's own population draws from the same seeds, with the persons as they stand in the scenario.
+        """
+        scenario = self.scenario
+        if not isinstance(scenario.population, Population):
+            return _own_crowds(scenario, self.seed, indices)
+        holds = tuple(person.holds for person in scenario.person)
+        return crowds(scenario.population, scenario.channels, self.seed, indices, self.links, holds)
+
+    def crowd(self, index: int) -> Crowd | HumanSets:
+        """The one set of humans with this index."""
+        ((_, crowd),) = self.crowds([index])
+        return crowd
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,22 +186,7 @@ class Findings:
         return disagree(self.exact, self.mujoco) | disagree(self.exact, self.trace) | switching
 
 
-@threadpool_limits.wrap(limits=1, user_api="blas")  # the same bits in every process, wherever it runs
-def examine(question: Question, indices: Sequence[int], ticked: Callable[[int], None] = lambda ticks: None) -> Findings:
-    """Decide and simulate the humans of `indices`, who all meet the same environment.
-
-    `ticked` hears of every tick simulated for all of them.
-    """
-    scenario = question.scenario_of(indices[0])
-    assembly = assemble(scenario, question.coupling)
-    parts = [
-        _group(question, assembly, index, crowd, ticked)
-        for index, crowd in crowds_of(scenario, question.seed, indices, question.links)
-    ]
-    return merge(parts)
-
-
-def merge(parts: Sequence[Findings], interrupted: bool = False) -> Findings:
+def _merge(parts: Sequence[Findings], interrupted: bool = False) -> Findings:
     """The findings of several batches as one, whatever their order."""
     arrays = [f.name for f in fields(Findings) if f.name not in ("simulated", "interrupted")]
     order = np.argsort(np.concatenate([p.index for p in parts]) if parts else np.zeros(0), kind="stable")
@@ -208,46 +196,59 @@ def merge(parts: Sequence[Findings], interrupted: bool = False) -> Findings:
     return Findings(**joined, simulated=math.fsum(p.simulated for p in parts), interrupted=interrupted)
 
 
+# ---- one batch
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")  # the same bits in every process, wherever it runs
+def examine(
+    validation: Validation, indices: Sequence[int], ticked: Callable[[int], None] = lambda ticks: None
+) -> Findings:
+    """Decide and simulate the humans of `indices`, who all meet the same environment.
+
+    `ticked` is called with the number of ticks that were simulated for all of them.
+    """
+    scenario, member = validation.scenario, validation.environment(indices[0])
+    if member:
+        scenario = scenario.replace(environment=member.network, box=None)
+    simulation = assemble(scenario, validation.coupling)
+    return _merge([_group(validation, simulation, *group, ticked) for group in validation.crowds(indices)])
+
+
 def _group(
-    question: Question,
-    assembly: Assembly,
+    validation: Validation,
+    simulation: Simulation,
     index: NDArray[np.intp],
     crowd: Crowd | HumanSets,
     ticked: Callable[[int], None],
 ) -> Findings:
-    scenario, nowhere = question.scenario, np.full(len(crowd), np.nan)
+    scenario, nowhere = validation.scenario, np.full(len(crowd), np.nan)
     held_by = variants(scenario.device, crowd)
-    loops = exact_loops(held_by, assembly.F)
-    modes, mujoco = dominant_modes(loops), nowhere
-    if question.engine != "exact":
-        mujoco = dominant_modes(mujoco_loops(held_by, assembly.process, nthread=question.threads)).growth
-    traces = _traces(question, assembly, held_by, loops, ticked) if question.ticks else []
-    exact = next((t for name, t in traces if name == "exact"), None)
-    last = traces[-1][1] if traces else None
+    loops = exact_loops(held_by, simulation.F)
+    mode, mujoco = dominant_mode(loops), nowhere
+    if validation.engine != "exact":
+        mujoco = dominant_mode(mujoco_loops(held_by, simulation.process, nthread=validation.threads)).growth
+    exact, last = _tests(validation, simulation, held_by, loops, ticked) if validation.ticks else (None, None)
     switched = Switched(nowhere, nowhere)
     if scenario.switches:
-        with_mujoco = question.engine != "exact" and question.ticks > 0
-        arguments = (held_by, index, question.seed, question.duration, with_mujoco, question.threads)
-        switched = switched_crowd(assembly, question.coupling, *arguments)
-    ports = crowd.ports
-    mass = np.stack([port.mass.sum(axis=1) for port in ports], axis=1)  # (n, channels)
-    damping = np.stack([port.damping.min(axis=1) for port in ports], axis=1)
+        with_mujoco = validation.engine != "exact" and validation.ticks > 0
+        arguments = (held_by, index, validation.seed, validation.duration, with_mujoco, validation.threads)
+        switched = switched_crowd(simulation, validation.coupling, *arguments)
     return Findings(
         index=index,
-        radius=modes.spectral_radius,
-        exact=modes.growth,
-        frequency=modes.frequency_hz,
+        radius=mode.spectral_radius,
+        exact=mode.growth,
+        frequency=mode.frequency_hz,
         mujoco=mujoco,
         trace=last.growth if last else nowhere,
         clipped=last.clipped if last else np.zeros(len(crowd), dtype=int),
         energy=exact.least_energy if exact else nowhere,
         audited=exact.audited if exact else nowhere,
         settling=exact.settling if exact else nowhere,
-        mass=_geometric_mean(mass),
-        damping=_geometric_mean(damping),
+        mass=_geometric_mean(np.stack([port.mass.sum(axis=1) for port in crowd.ports], axis=1)),
+        damping=_geometric_mean(np.stack([port.damping.min(axis=1) for port in crowd.ports], axis=1)),
         switching=switched.exact,
         switching_mujoco=switched.mujoco,
-        simulated=sum(t.simulated for _, t in traces),
+        simulated=sum(test.simulated for test in dict.fromkeys((exact, last)) if test),
     )
 
 
@@ -257,61 +258,114 @@ def _geometric_mean(values: Array) -> Array:
         return np.exp(np.log(values).mean(axis=1))
 
 
-def _traces(
-    question: Question, assembly: Assembly, held_by: Variants, loops: ClosedLoop, ticked: Callable[[int], None]
-) -> list[tuple[str, Trace]]:
-    """The exact engine's trace always, since it costs next to nothing; MuJoCo's after it, where that is asked."""
-    process, delta, T = assembly.process, np.array(question.scenario.delta), question.scenario.T
-    exact = ExactBatchEngine(hold(held_by.plants(), T), process.force_limit)
-    traces = [("exact", knock(process, exact, held_by.scene, loops, delta, question.ticks))]
-    if question.engine != "exact":
-        batch = MujocoBatchEngine(held_by.scene, T, nsim=len(held_by), nthread=question.threads, fields=held_by.fields)
-        traces.append(("mujoco", knock(process, batch, held_by.scene, loops, delta, question.ticks, ticked)))
-    return traces
+def _tests(
+    validation: Validation,
+    simulation: Simulation,
+    held_by: Variants,
+    loops: ClosedLoop,
+    ticked: Callable[[int], None],
+) -> tuple[ImpulseTest, ImpulseTest]:
+    """The exact engine's impulse test, which costs next to nothing, and MuJoCo's, or again the first."""
+    process, T = simulation.process, validation.scenario.T
+    settings = held_by.scene, loops, np.array(validation.scenario.delta), validation.ticks
+    exact = impulse_test(process, ExactBatchEngine(hold(held_by.plants(), T), process.force_limit), *settings)
+    if validation.engine == "exact":
+        return exact, exact
+    threads, n = validation.threads, len(held_by)
+    engine = MujocoBatchEngine(held_by.scene, T, EXPONENTIAL, 1, n, threads, held_by.fields)
+    return exact, impulse_test(process, engine, *settings, ticked)
 
 
-# ----------------------------------------------------------------------------------------------------
-# A validation on an existing Dask cluster: each batch is a task, a lost worker's tasks are done again by another.
-#
-# The workers need this package and the same versions of NumPy, SciPy and MuJoCo; with those the merged result is that
-# of a single run, bit for bit. Dask is an optional extra, imported only when a cluster is asked for.
+# ---- all batches: here, in processes, on a cluster
 
 
-PATIENCE = 3.0  # [s] for a scheduler to answer, and again for its first worker
+def validate(validation: Validation, shards: int = 1, progress: Progress = lambda done, total: None) -> Findings:
+    """Examine every batch; from the keyboard it stops with the batches that are done."""
+    return _here(validation, progress) if shards == 1 else _in_processes(validation, shards, progress)
 
-_one_at_a_time = threading.Lock()  # MuJoCo's clock and warning handler are global to a process
+
+def _here(validation: Validation, progress: Progress) -> Findings:
+    batches, parts = validation.batches(), []
+    ticks = max(1, validation.ticks)
+    done = 0
+
+    def ticked(count: int) -> None:
+        nonlocal done
+        done += count
+        progress(done, ticks * len(batches))
+
+    try:
+        for n, batch in enumerate(batches, start=1):
+            parts.append(examine(validation, batch, ticked))
+            done = n * ticks
+            progress(done, ticks * len(batches))
+    except KeyboardInterrupt:
+        return _merge(parts, interrupted=True)
+    return _merge(parts)
+
+
+def _in_processes(validation: Validation, shards: int, progress: Progress) -> Findings:
+    parts: list[Findings] = []
+    batches, alone = validation.batches(), replace(validation, threads=1)
+    # a forked child would inherit locks of MuJoCo's threads and of the progress bar
+    context = multiprocessing.get_context("spawn")
+    strangers = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(shards, mp_context=context, initializer=_ignore_interrupts)
+    futures: list[Future[Findings]] = []
+    try:
+        futures += [pool.submit(examine, alone, batch) for batch in batches]
+        for future in as_completed(futures):
+            parts.append(future.result())
+            progress(len(parts), len(batches))
+    except KeyboardInterrupt:
+        finished = [f.result() for f in futures if f.done() and not f.cancelled() and not f.exception()]
+        for worker in set(multiprocessing.active_children()) - strangers:
+            worker.terminate()  # a batch takes half a minute, and keeps nothing before its end
+        return _merge(finished, interrupted=True)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+    return _merge(parts)
+
+
+def _ignore_interrupts() -> None:
+    """Ctrl-C reaches every process of a terminal; only the one that merges may act on it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def validate_on_cluster(
-    question: Question, address: str, progress: Progress = lambda done, total: None, patience: float = PATIENCE
+    validation: Validation, address: str, progress: Progress = lambda done, total: None, patience: float = _PATIENCE
 ) -> Findings:
-    """Examine every batch on the cluster whose scheduler is at `address`; Ctrl-C stops with the batches that are done.
+    """Examine every batch on the Dask cluster whose scheduler is at `address`; Ctrl-C keeps the batches that are done.
 
-    Raises InputError where there is no cluster, no worker, or no package on the workers.
+    A lost worker's batches are done again by another. Raises InputError where there is no cluster, no worker, or no
+    package on the workers. Dask is an optional extra, imported only here.
     """
     parts: list[Findings] = []
-    batches, alone = question.batches(), replace(question, threads=1)
+    batches, alone = validation.batches(), replace(validation, threads=1)
     with _client(address, patience) as client:
         from distributed import as_completed
 
-        tasks = client.map(examine_batch, [alone] * len(batches), batches, pure=False)
+        tasks = client.map(_examine_alone, [alone] * len(batches), batches, pure=False)
         try:
             for task in as_completed(tasks, loop=client.loop):
                 parts.append(_result(task, address))
                 progress(len(parts), len(batches))
         except KeyboardInterrupt:
             client.cancel(tasks)
-            return merge(parts, interrupted=True)
-    return merge(parts)
+            return _merge(parts, interrupted=True)
+    return _merge(parts)
 
 
-def examine_batch(question: Question, indices: Sequence[int]) -> Findings:
+_one_at_a_time = threading.Lock()  # MuJoCo's clock and warning handler are global to a process
+
+
+def _examine_alone(validation: Validation, indices: Sequence[int]) -> Findings:
     """`examine`, one at a time in every worker process, however many threads that has."""
     with _one_at_a_time:
-        return examine(question, indices)
+        return examine(validation, indices)
 
 
-def _result(task: Future, address: str) -> Findings:
+def _result(task: DaskFuture, address: str) -> Findings:
     from distributed import KilledWorker
 
     try:
@@ -337,12 +391,12 @@ def _client(address: str, patience: float) -> Iterator[Client]:
     for name in ("distributed", "distributed.client"):  # what goes wrong is said once, in our words
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
-    async def knock() -> None:
+    async def reach() -> None:
         comm = await connect(coerce_to_address(address), timeout=patience, **Security().get_connection_args("client"))
         await comm.close()
 
     try:
-        asyncio.run(knock())  # a Client that finds nobody complains once more when it is collected
+        asyncio.run(reach())  # a Client that finds nobody complains once more when it is collected
         client = Client(address, timeout=patience, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         raise InputError(f"--dask {address}: no cluster there: {error}; expected HOST:PORT of a scheduler") from None
@@ -352,56 +406,3 @@ def _client(address: str, patience: float) -> Iterator[Client]:
         except TimeoutError:
             raise InputError(f"--dask {address}: that cluster has no workers") from None
         yield client
-
-
-def validate(question: Question, shards: int = 1, progress: Progress = lambda done, total: None) -> Findings:
-    """Examine every batch; from the keyboard it stops with the batches that are done."""
-    return _here(question, progress) if shards == 1 else _in_processes(question, shards, progress)
-
-
-def _here(question: Question, progress: Progress) -> Findings:
-    batches, parts = question.batches(), []
-    ticks = max(1, question.ticks)
-    done = 0
-
-    def ticked(count: int) -> None:
-        nonlocal done
-        done += count
-        progress(done, ticks * len(batches))
-
-    try:
-        for n, batch in enumerate(batches, start=1):
-            parts.append(examine(question, batch, ticked))
-            done = n * ticks
-            progress(done, ticks * len(batches))
-    except KeyboardInterrupt:
-        return merge(parts, interrupted=True)
-    return merge(parts)
-
-
-def _in_processes(question: Question, shards: int, progress: Progress) -> Findings:
-    parts: list[Findings] = []
-    batches, alone = question.batches(), replace(question, threads=1)
-    # a forked child would inherit locks of MuJoCo's threads and of the progress bar
-    context = multiprocessing.get_context("spawn")
-    strangers = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(shards, mp_context=context, initializer=_deaf_to_the_keyboard)
-    futures: list[Any] = []
-    try:
-        futures += [pool.submit(examine, alone, batch) for batch in batches]
-        for future in as_completed(futures):
-            parts.append(future.result())
-            progress(len(parts), len(batches))
-    except KeyboardInterrupt:
-        finished = [f.result() for f in futures if f.done() and not f.cancelled() and not f.exception()]
-        for worker in set(multiprocessing.active_children()) - strangers:
-            worker.terminate()  # a batch takes half a minute, and keeps nothing before its end
-        return merge(finished, interrupted=True)
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-    return merge(parts)
-
-
-def _deaf_to_the_keyboard() -> None:
-    """Ctrl-C reaches every process of a terminal; only the one that merges may act on it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,4 +1,14 @@
-"""What the loop asks of a plant, and where the outside forces come from."""
+"""Engines: what moves the plant between two samples, for one simulation or for many at once.
+
+    exact         s+ = A s + B [w; f], the matrix exponential of the plant under held inputs (no Coulomb friction)
+    exponential   s+ = s + h phi1(h J) [v; qacc], exponential Rosenbrock-Euler: accelerations by one mj_forward a step,
+                  J from the compiled model's matrices; exact on a linear scene, whatever its stiffness and the step
+    RK4, ..       steps of MuJoCo's own integrators, whose number per period sim.stepping decides
+
+All of them read their inputs from the rows of a step buffer and write the next row, with no copy in between. The
+exponential engine shares J with the exact one, so it checks forces and assembly, not the stepping in time: for that
+there is RK4.
+"""
 
 from __future__ import annotations
 
@@ -6,58 +16,64 @@ import ctypes
 import glob
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import mujoco
 import numpy as np
-from mujoco import mj_step
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.sparse.csgraph import connected_components
 
 from controller.lti import Array
-from controller.process import Tape
-from models.scene import Plant, Scene, impeded
-from sim.scenario import InputError, Scenario
+from controller.process import StepBuffer
+from models.scene import Plant, Scene, Variants, impeded, plant
+from sim.files import InputError
 
-# ----------------------------------------------------------------------------------------------------
-# The matrix exponential of many small matrices at once.
-#
-# scipy.linalg.expm does the same, but hands every matrix to a BLAS that wakes all its threads for it: on busy cores
-# that made the batched verdicts several times slower than their arithmetic. Each result depends on its own matrix
-# only.
+#: the integrator of ours, which reads MuJoCo's accelerations
+EXPONENTIAL = "exponential"
 
+#: name -> what MuJoCo's model is set to, for the exponential one, where it decides nothing, to RK4
+INTEGRATORS = {
+    EXPONENTIAL: mujoco.mjtIntegrator.mjINT_RK4,
+    "RK4": mujoco.mjtIntegrator.mjINT_RK4,
+    "Euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
+}
 
-ORDER = 13  # of the diagonal Padé approximant, Higham (2005), table 2.3
-LARGEST = 5.37  # 1-norm up to which that order has the accuracy of double precision
-_PADE = [math.comb(ORDER, k) * math.factorial(2 * ORDER - k) / math.factorial(2 * ORDER) for k in range(ORDER + 1)]
-
-
-def expm_each(matrices: Array) -> Array:
-    """exp of each of (nsim, n, n) matrices, by scaling and squaring."""
-    norm = np.abs(matrices).sum(axis=1).max(axis=1)
-    halvings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, LARGEST) / LARGEST))).astype(int)
-    a, b = matrices * (0.5**halvings)[:, None, None], _PADE
-    one = np.eye(matrices.shape[1])
-    a2 = a @ a
-    a4 = a2 @ a2
-    a6 = a4 @ a2
-    odd = a @ (a6 @ (b[13] * a6 + b[11] * a4 + b[9] * a2) + b[7] * a6 + b[5] * a4 + b[3] * a2 + b[1] * one)
-    even = a6 @ (b[12] * a6 + b[10] * a4 + b[8] * a2) + b[6] * a6 + b[4] * a4 + b[2] * a2 + b[0] * one
-    result = np.linalg.solve(even - odd, even + odd)
-    for done in range(halvings.max(initial=0)):
-        unfinished = halvings > done
-        result[unfinished] = result[unfinished] @ result[unfinished]
-    return result
+LEAST = 4  # steps per period of MuJoCo's own integrators
 
 
-# ----------------------------------------------------------------------------------------------------
-# The plant between samples by the matrix exponential: exact for a held input.
+class Engine(Protocol):
+    """Advances the plant by one period at a time, reading and writing a buffer."""
+
+    def start(self, buffer: StepBuffer) -> None:
+        """Take the plant state of row 0 as the state at the first tick."""
+        ...
+
+    def advance(self, k: int, /) -> None:
+        """Hold the plant input of row k for T, then write the plant state of row k + 1."""
+        ...
+
+    def troubled(self) -> bool:
+        """Whether the engine itself has reported numbers that it cannot go on with."""
+        ...
+
+
+def default_integrator(scene: Scene) -> str:
+    """exponential where the scene is smooth; RK4 where something rubs, which is nearer there at equal cost."""
+    rubs = scene.model.dof_frictionloss.any() or scene.model.tendon_frictionloss.any()
+    return "RK4" if rubs else EXPONENTIAL
+
+
+# ---- the exact engine
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +94,10 @@ def hold(plant: Plant, T: float) -> HeldPlant:
     *many, n, inputs = plant.B.shape
     generator = np.zeros((*many, n + inputs, n + inputs))
     generator[..., :n, :n], generator[..., :n, n:] = plant.A, plant.B
-    step = expm_each(generator * T) if many else expm(generator * T)
+    if many:
+        step = _expm_in_units(generator * T, np.concatenate([_units(plant.A, T), np.ones((*many, inputs))], axis=1))
+    else:
+        step = expm(generator * T)
     return HeldPlant(step[..., :n, :n], step[..., :n, n:], plant.C, T)
 
 
@@ -90,10 +109,10 @@ class ExactEngine:
         self._high = force_limit[:, None]
         self._low = -self._high
 
-    def start(self, tape: Tape) -> None:
-        self._rows, self._states, self._forces = tape.plant_row, tape.plant_state, tape.force
+    def start(self, buffer: StepBuffer) -> None:
+        self._rows, self._states, self._forces = buffer.plant_row, buffer.plant_state, buffer.force
 
-    def advance(self, k: int) -> None:
+    def advance(self, k: int, /) -> None:
         force = self._forces[k]
         np.minimum(force, self._high, out=force)
         np.maximum(force, self._low, out=force)
@@ -103,49 +122,98 @@ class ExactEngine:
         return False
 
 
-# ----------------------------------------------------------------------------------------------------
-# Many different plants at once by the matrix exponential: one product of small matrices with slabs of simulations.
-#
-# The simulation index is last and contiguous. What devices and humans do not share splits the plant into separate
-# blocks (one device with its human each), found from the zeros of the matrices; only they are multiplied.
-
-
-Which = NDArray[np.intp]
-
-
 class ExactBatchEngine:
-    """Simulation j of the tape moves by A[j], B[j] of the plants, after the actuators' limits."""
+    """Simulation j of the buffer moves by A[j], B[j] of the plants, after the actuators' limits."""
 
     def __init__(self, plants: HeldPlant, force_limit: Array) -> None:
-        product = np.concatenate([plants.A, plants.B], axis=2)  # (nsim, 2n, 2n + inputs)
-        self._rows, self._columns = _blocks(np.any(product != 0, axis=0))
-        valid = (self._rows >= 0)[:, :, None] & (self._columns >= 0)[:, None, :]
-        parts = product[:, self._rows[:, :, None], self._columns[:, None, :]] * valid
-        self._matrices = np.ascontiguousarray(np.moveaxis(parts, 0, -1))  # (blocks, rows, columns, nsim)
-        self._moved = np.empty((*self._rows.shape, product.shape[0]))
-        self._kept = self._rows >= 0
-        self._whole = bool(self._kept.all())
+        self._product = _each_by_its_own(np.concatenate([plants.A, plants.B], axis=2))
         self._high = force_limit[:, None]
         self._low = -self._high
 
-    def start(self, tape: Tape) -> None:
-        self._slabs, self._states, self._forces = tape.plant_row, tape.plant_state, tape.force
+    def start(self, buffer: StepBuffer) -> None:
+        self._slabs, self._states, self._forces = buffer.plant_row, buffer.plant_state, buffer.force
 
-    def advance(self, k: int) -> None:
+    def advance(self, k: int, /) -> None:
         force = self._forces[k]
         np.minimum(force, self._high, out=force)
         np.maximum(force, self._low, out=force)
-        np.einsum("crkn,ckn->crn", self._matrices, self._slabs[k].take(self._columns, axis=0), out=self._moved)
-        if self._whole:
-            self._states[k + 1][self._rows] = self._moved
-        else:
-            self._states[k + 1][self._rows[self._kept]] = self._moved[self._kept]
+        self._product(self._slabs[k], self._states[k + 1])
 
     def troubled(self) -> bool:
         return False
 
 
-def _blocks(pattern: NDArray[np.bool_]) -> tuple[Which, Which]:
+def expm_each(matrices: Array) -> Array:
+    """exp of each of (nsim, n, n) matrices, by scaling and squaring; a result depends on its own matrix only.
+
+    scipy.linalg.expm hands every matrix to a BLAS that wakes all its threads for it: on busy cores that made verdicts
+    about many humans several times slower than their arithmetic.
+    """
+    norm = np.abs(matrices).sum(axis=1).max(axis=1)
+    halvings = np.maximum(0, np.ceil(np.log2(np.maximum(norm, _LARGEST) / _LARGEST))).astype(int)
+    a, b = matrices * (0.5**halvings)[:, None, None], _PADE
+    one = np.eye(matrices.shape[1])
+    a2 = a @ a
+    a4 = a2 @ a2
+    a6 = a4 @ a2
+    odd = a @ (a6 @ (b[13] * a6 + b[11] * a4 + b[9] * a2) + b[7] * a6 + b[5] * a4 + b[3] * a2 + b[1] * one)
+    even = a6 @ (b[12] * a6 + b[10] * a4 + b[8] * a2) + b[6] * a6 + b[4] * a4 + b[2] * a2 + b[0] * one
+    result = np.linalg.solve(even - odd, even + odd)
+    for done in range(halvings.max(initial=0)):
+        unfinished = halvings > done
+        result[unfinished] = result[unfinished] @ result[unfinished]
+    return result
+
+
+def _units(A: Array, h: float) -> Array:
+    """What to measure the states of s' = A s in, (nsim, 2n), where exp(h A) is asked for.
+
+    Velocities in units of a rate near the fastest mode's: then a stiff plant has no larger norm than that mode times h,
+    and its exponential is rounded by 1e-16 instead of 1e-11. Powers of two, which round nothing themselves.
+    """
+    n = A.shape[2] // 2
+    fastest = np.sqrt(np.abs(A[:, n:, :n]).max(axis=(1, 2)))
+    unit = np.ones(A.shape[:2])
+    unit[:, n:] = 2.0 ** np.ceil(np.log2(np.maximum(fastest, 1 / h)))[:, None]
+    return unit
+
+
+def _expm_in_units(matrices: Array, unit: Array) -> Array:
+    """exp of (nsim, n, n) matrices, computed with entry i of what they act on measured in unit[:, i]."""
+    return expm_each(matrices * unit[:, None, :] / unit[:, :, None]) * unit[:, :, None] / unit[:, None, :]
+
+
+_ORDER = 13  # of the diagonal Padé approximant, Higham (2005), table 2.3
+_LARGEST = 5.37  # 1-norm up to which that order has the accuracy of double precision
+_PADE = [math.comb(_ORDER, k) * math.factorial(2 * _ORDER - k) / math.factorial(2 * _ORDER) for k in range(_ORDER + 1)]
+
+_Product = Callable[[Array, Array], object]  # (columns, nsim), (rows, nsim): writes the second
+_Which = NDArray[np.intp]
+
+
+def _each_by_its_own(matrices: Array) -> _Product:
+    """The product of (nsim, rows, columns) matrices with a slab, the simulation last and contiguous in it.
+
+    What devices and humans do not share splits a plant into separate blocks (one device with its human each), found
+    from the zeros of the matrices; only they are multiplied.
+    """
+    rows, columns = _blocks(np.any(matrices != 0, axis=0))
+    valid = (rows >= 0)[:, :, None] & (columns >= 0)[:, None, :]
+    parts = matrices[:, rows[:, :, None], columns[:, None, :]] * valid
+    blocks = np.ascontiguousarray(np.moveaxis(parts, 0, -1))  # (blocks, rows, columns, nsim)
+    moved = np.empty((*rows.shape, matrices.shape[0]))
+    kept, index = rows >= 0, ...
+    if not kept.all():
+        index, rows = kept, rows[kept]
+
+    def multiply(slab: Array, out: Array) -> None:
+        np.einsum("crkn,ckn->crn", blocks, slab.take(columns, axis=0), out=moved)
+        out[rows] = moved[index]
+
+    return multiply
+
+
+def _blocks(pattern: NDArray[np.bool_]) -> tuple[_Which, _Which]:
     """Rows and columns of the independent blocks of a (2n, 2n + inputs) pattern of nonzeros.
 
     Shapes (blocks, rows) and (blocks, columns); smaller blocks are filled up with -1.
@@ -161,28 +229,17 @@ def _blocks(pattern: NDArray[np.bool_]) -> tuple[Which, Which]:
     return _filled([r for r, _ in pairs]), _filled([c for _, c in pairs])
 
 
-def _filled(lists: list[Which]) -> Which:
+def _filled(lists: list[_Which]) -> _Which:
     table = np.full((len(lists), max(part.size for part in lists)), -1)
     for row, part in zip(table, lists, strict=True):
         row[: part.size] = part
     return table
 
 
-# ----------------------------------------------------------------------------------------------------
-# The plant between samples by MuJoCo: `substeps` steps of one of its integrators per period.
+# ---- MuJoCo's engines
 
-
-#: name -> (MuJoCo's integrator, its order for the sampled position)
-INTEGRATORS = {
-    "RK4": (mujoco.mjtIntegrator.mjINT_RK4, 4),
-    "Euler": (mujoco.mjtIntegrator.mjINT_EULER, 1),
-    "implicit": (mujoco.mjtIntegrator.mjINT_IMPLICIT, 1),
-    "implicitfast": (mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 1),
-    "discrete": (mujoco.mjtIntegrator.mjINT_DISCRETE, 1),
-}
-
-#: an integrator of ours: MuJoCo's Euler, read and started half a step apart, which makes it second order
-LEAPFROG = "Euler2"
+#: fields of a model that its mass, damping and stiffness matrices are made of
+_MECHANICAL = ("body_mass", "jnt_stiffness", "dof_damping", "tendon_stiffness", "tendon_damping")
 
 
 class MujocoEngine:
@@ -192,64 +249,50 @@ class MujocoEngine:
         self.model = discretised(scene, T, integrator, substeps)
         self.data = mujoco.MjData(self.model)
         self.substeps = substeps
+        self._forward = partial(mujoco.mj_forward, self.model, self.data)
+        self._step = partial(mujoco.mj_step, self.model, self.data, substeps)
+        self._sight = np.zeros(self.model.nq + 2 * self.model.nv)  # [q; v; qacc]
+        self.advance: Callable[[int], None] = self._by_steps
+        if integrator == EXPONENTIAL:
+            (move,) = _rosenbrock(_rates(scene, None), T / substeps)
+            self._move, self.advance = move.dot, self._by_exponentials
 
-    def start(self, tape: Tape) -> None:
+    def start(self, buffer: StepBuffer) -> None:
         n, nv = self.model.nq, self.model.nq + self.model.nv
-        self._q, self._v = ([row[part, 0] for row in tape.plant_state] for part in (slice(n), slice(n, nv)))
-        self._inputs = [row[:, 0] for row in tape.plant_input]
+        self._s = [row[:, 0] for row in buffer.plant_state]
+        self._q, self._v = ([row[part] for row in self._s] for part in (slice(n), slice(n, nv)))
+        self._inputs = [row[:, 0] for row in buffer.plant_input]
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
         self._qpos[...], self._qvel[...] = self._q[0], self._v[0]
+        self._qacc, self._qacc_seen, self._seen = self.data.qacc, self._sight[nv:], self._sight[:nv]
+        self._seen[...] = self._s[0]
 
-    def advance(self, k: int) -> None:
+    def _by_steps(self, k: int, /) -> None:
         self._ctrl[...] = self._inputs[k]
-        mj_step(self.model, self.data, self.substeps)
+        self._step()
         self._q[k + 1][...] = self._qpos
         self._v[k + 1][...] = self._qvel
 
-    def troubled(self) -> bool:
-        return any(warning.number for warning in self.data.warning)
-
-
-class LeapfrogEngine:
-    """Euler2: MuJoCo's Euler steps read as a leapfrog, second order at Euler's cost.
-
-    Its positions are those of half a step later, q + h v/2: they start there and are read as q - h v/2. Where
-    damping D acts on mass M, the mass D h/expm1(D h/M) makes MuJoCo's implicit damping decay by exactly
-    exp(-D h/M) in a step. Raises ValueError for damping across a spring, which MuJoCo's Euler takes explicitly.
-    """
-
-    def __init__(self, scene: Scene, T: float, integrator: str = LEAPFROG, substeps: int = 4) -> None:
-        if scene.model.tendon_damping.any():
-            raise ValueError(f"{integrator} needs all damping to act against ground, here some acts across a spring")
-        self.model = discretised(scene, T, "Euler", substeps)
-        h, bodies = self.model.opt.timestep, self.model.dof_bodyid  # one body per joint
-        rate = np.ravel(self.model.dof_damping) * h / self.model.body_mass[bodies]
-        self.model.body_mass[bodies] *= np.where(rate > 0, rate / np.expm1(np.where(rate > 0, rate, 1.0)), 1.0)
-        self.data = mujoco.MjData(self.model)
-        mujoco.mj_setConst(self.model, self.data)  # MuJoCo keeps a second copy of the masses of simple bodies
-        self.substeps = substeps
-        self._lead = h / 2
-
-    def start(self, tape: Tape) -> None:
-        n, nv = self.model.nq, self.model.nq + self.model.nv
-        self._q, self._v = ([row[part, 0] for row in tape.plant_state] for part in (slice(n), slice(n, nv)))
-        self._inputs = [row[:, 0] for row in tape.plant_input]
-        self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
-        self._qpos[...], self._qvel[...] = self._q[0] + self._lead * self._v[0], self._v[0]
-
-    def advance(self, k: int) -> None:
+    def _by_exponentials(self, k: int, /) -> None:
         self._ctrl[...] = self._inputs[k]
-        mj_step(self.model, self.data, self.substeps)
-        np.multiply(self._qvel, -self._lead, out=self._q[k + 1])
-        self._q[k + 1] += self._qpos
-        self._v[k + 1][...] = self._qvel
+        after = self._s[k + 1]
+        for _ in range(self.substeps):
+            self._forward()
+            self._qacc_seen[...] = self._qacc
+            self._move(self._sight, after)
+            self._seen[...] = after
+            self._qpos[...], self._qvel[...] = self._q[k + 1], self._v[k + 1]
 
     def troubled(self) -> bool:
         return any(warning.number for warning in self.data.warning)
 
 
 class MujocoBatchEngine:
-    """All simulations of a tape in one mujoco.batch.Batch, bit for bit as MujocoEngine steps each one."""
+    """All simulations of a buffer in one mujoco.batch.Batch.
+
+    Steps are those of MujocoEngine for each one, bit for bit; the exponential integrator's products are summed in
+    another order, so they differ by rounding.
+    """
 
     def __init__(
         self,
@@ -273,18 +316,57 @@ class MujocoBatchEngine:
         # position and velocity lie side by side in a state row, so one copy reads both
         self._state = self.batch.state[:, time:motion].T
         self._ctrl = self.batch.bind("ctrl").T
+        self._sight = np.zeros((len(self._state) + model.nv, nsim))  # [q; v; qacc]
+        self._seen, self._qacc_seen = self._sight[: len(self._state)], self._sight[len(self._state) :]
+        self.advance: Callable[[int], None] = self._by_steps
+        if integrator == EXPONENTIAL:
+            moves = _rosenbrock(_rates(scene, fields), T / substeps)
+            self._move: _Product = _each_by_its_own(moves) if fields else moves[0].dot
+            self._qacc, self.advance = self.batch.bind("qacc").T, self._by_exponentials
 
-    def start(self, tape: Tape) -> None:
-        self._state[...] = tape.s[0]
-        self._inputs, self._states = tape.plant_input, tape.plant_state
+    def start(self, buffer: StepBuffer) -> None:
+        self._state[...] = self._seen[...] = buffer.s[0]
+        self._inputs, self._states = buffer.plant_input, buffer.plant_state
 
-    def advance(self, k: int) -> None:
+    def _by_steps(self, k: int, /) -> None:
         self._ctrl[...] = self._inputs[k]
         self.batch.step(nstep=self.substeps)
         self._states[k + 1][...] = self._state
 
+    def _by_exponentials(self, k: int, /) -> None:
+        self._ctrl[...] = self._inputs[k]
+        after = self._states[k + 1]
+        for _ in range(self.substeps):
+            self.batch.forward()
+            self._qacc_seen[...] = self._qacc
+            self._move(self._sight, after)
+            self._seen[...] = after
+            self._state[...] = after
+
     def troubled(self) -> bool:
         return bool(np.any(self.batch.warning))
+
+
+def _rates(scene: Scene, fields: Mapping[str, Array] | None) -> Array:
+    """J of s' = J s + .., (nsim or 1, 2n, 2n), from the matrices of the compiled model, or of every variant of it."""
+    if not fields:
+        return plant(scene.model).A[None]
+    nsim = len(next(iter(fields.values())))
+    same = {name: np.tile(getattr(scene.model, name).astype(float), (nsim, 1)) for name in _MECHANICAL}
+    return Variants(scene, {**same, **fields}).plants().A
+
+
+def _rosenbrock(J: Array, h: float) -> Array:
+    """What makes s + h phi1(h J) [v; a] of [q; v; a], (nsim, 2n, 3n), for J (nsim, 2n, 2n) and a step of h seconds.
+
+    phi1(X) = X^-1 (e^X - I) is the upper right block of exp [[X, I], [0, 0]].
+    """
+    nsim, states, _ = J.shape
+    n, unit = states // 2, np.tile(_units(J, h), 2)
+    generator = np.zeros((nsim, 2 * states, 2 * states))
+    generator[:, :states, :states], generator[:, :states, states:] = h * J, np.eye(states)
+    phi = h * _expm_in_units(generator, unit)[:, :states, states:]
+    return np.concatenate([np.broadcast_to(np.eye(states, n), (nsim, states, n)), phi + np.eye(states, k=-n)], axis=2)
 
 
 def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
@@ -297,7 +379,7 @@ def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoc
         raise InputError("a human has an impedance (A, B, C, D), which MuJoCo does not simulate: use the exact engine")
     model = copy(scene.model)
     model.opt.timestep = T / substeps
-    model.opt.integrator = INTEGRATORS[integrator][0]
+    model.opt.integrator = INTEGRATORS[integrator]
     return model
 
 
@@ -343,37 +425,3 @@ def _profiler_clock() -> ctypes.c_void_p | None:
         except (OSError, ValueError):
             continue
     return None
-
-
-class Engine(Protocol):
-    """Advances the plant by one period at a time, reading and writing a tape."""
-
-    def start(self, tape: Tape) -> None:
-        """Take the plant state of row 0 as the state at the first tick."""
-        ...
-
-    def advance(self, k: int) -> None:
-        """Hold the plant input of row k for T, then write the plant state of row k + 1."""
-        ...
-
-    def troubled(self) -> bool:
-        """Whether the engine itself has reported numbers that it cannot go on with."""
-        ...
-
-
-def outside_forces(scenario: Scenario, scene: Scene, first: int, ticks: int, voluntary: bool = True) -> Array:
-    """Outside forces [N] at ticks first .. first + ticks - 1, sampled at kT, shape (ticks, outside).
-
-    The voluntary motion reaches the end of each human, the tap reaches one handle.
-    """
-    t = np.arange(first, first + ticks) * scenario.T
-    w = np.zeros((ticks, scene.outside))
-    if voluntary:
-        for human, column in zip(scenario.human, scene.pushed, strict=True):
-            w[:, column] += human.voluntary_force(t)
-    if scenario.tap:
-        tap = scenario.tap
-        begin, end = (round(t / scenario.T, 9) for t in (tap.start, tap.start + tap.duration))
-        k = np.arange(first, first + ticks)
-        w[(k >= begin) & (k < end), scene.tapped[tap.channel - 1]] += tap.force
-    return w

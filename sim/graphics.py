@@ -8,18 +8,18 @@ from __future__ import annotations
 import os
 import sys
 
-OURS = "HAPTIC_LOOP_GL"  # the same, for us and the processes that we start
+_OURS = "HAPTIC_LOOP_GL"  # the same, for us and the processes that we start
 
 
 def set_aside() -> None:
     """In a command of ours, before MuJoCo is imported; a script's own MuJoCo keeps what it was given."""
     if _command_starts() and "MUJOCO_GL" in os.environ:
-        os.environ[OURS] = os.environ.pop("MUJOCO_GL")
+        os.environ[_OURS] = os.environ.pop("MUJOCO_GL")
 
 
 def asked() -> str:
     """What the user has asked for, in lower case; empty where nothing."""
-    return (os.environ.get(OURS) or os.environ.get("MUJOCO_GL") or "").lower().strip()
+    return (os.environ.get(_OURS) or os.environ.get("MUJOCO_GL") or "").lower().strip()
 
 
 def _command_starts() -> bool:

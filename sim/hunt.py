@@ -10,12 +10,11 @@ outside force.
 The criterion, fixed before the first search: a counterexample is a hand and a start from which contact goes on in every
 quarter of a run and the rms speed in the last quarter is at least that in the second, in a run of the asked length and
 again in two runs from the same start, four and sixteen times as long. A speed below 1e-6 of the first quarter's is
-rounding, not motion; a force of LIMIT is growth.
+rounding, not motion; a force of 1e6 N is growth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,21 +23,24 @@ from controller.coupling import SpringDamper
 from controller.environment import GROUND, Network, Spring, Wall
 from controller.loop import Loop
 from controller.lti import Array
-from controller.process import Process, Tape
+from controller.process import Process, StepBuffer
 from design.certificate import closed_loop_of, theorem4_of
 from models.device import RigidDevice
 from models.human import Human, Link
 from models.scene import Crowd, variants
-from sim.engines import Engine, ExactBatchEngine, hold, profiler_off, quiet_warnings
-from sim.run import assemble, stretch
+from sim.engines import Engine, ExactBatchEngine, hold
+from sim.run import assemble, run_blocks
 from sim.scenario import Scenario
 from sim.stability import close
 
-# ----------------------------------------------------------------------------------------------------
-# Many loops left alone from given states: how often their walls are hit, and whether the motion dies out.
+LENGTHS = (1, 4, 16)  # of the runs that a counterexample must survive, in terms of the asked length
+_POOL, _MIN_FREQUENCY_HZ = 20, 5.0  # hands looked at for one that is let go; of the modes looked at
+_LIMIT = 1e6  # [N], so that growth ends before numbers do
+_ROUNDING = 1e-6  # of the first quarter's speed
+_SPARE = 1e-4  # share of the damping beyond what the frozen states require
+_BLOCK = 64  # ticks between two looks at a buffer
 
-
-STRETCH = 64  # ticks between two looks at a tape
+# ---- many loops left alone from given states: how often their walls are hit, and whether the motion dies out
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,50 +52,39 @@ class Bounces:
     clipped: Array  # (windows, nsim) ticks with a force at its limit
 
 
-def bounce(
-    process: Process,
-    engine: Engine,
-    start: Array,
-    ticks: int,
-    windows: int = 4,
-    outside: int = 0,
-    ticked: Callable[[int], None] = lambda ticks: None,
-) -> Bounces:
+def bounce(process: Process, engine: Engine, start: Array, ticks: int, windows: int = 4, outside: int = 0) -> Bounces:
     """Simulate from the plant states `start`, (2n, nsim), with `outside` outside forces, all zero.
 
-    `ticks` is rounded down to whole windows of whole stretches. Raises ValueError where there is no wall, or no
-    tick.
+    `ticks` is rounded down to whole windows of whole blocks. Raises ValueError where there is no wall, or no tick.
     """
-    if process.contact is None:
+    walls = process.contact
+    if walls is None:
         raise ValueError("process has no walls, so nothing can bounce")
-    per_window = ticks // (windows * STRETCH)
-    if per_window < 1:
-        raise ValueError(f"ticks is {ticks}, expected at least {windows * STRETCH}: {windows} windows of {STRETCH}")
+    blocks = ticks // (windows * _BLOCK)
+    if blocks < 1:
+        raise ValueError(f"ticks is {ticks}, expected at least {windows * _BLOCK}: {windows} windows of {_BLOCK}")
     n, nsim = start.shape
-    tape = Tape(process, STRETCH, n, outside, nsim)
-    tape.s[0] = start
     limit = process.force_limit[:, None]
     made, square, clipped = (np.zeros((windows, nsim)) for _ in range(3))
-    before = np.zeros((1, len(process.contact.walls), nsim), dtype=bool)
-    with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
-        engine.start(tape)
-        for i in np.repeat(np.arange(windows), per_window):
-            stretch(tape, engine, STRETCH)
-            touching = process.contact.depths(tape.z) > 0
-            made[i] += (touching & ~np.concatenate([before, touching[:-1]])).sum(axis=(0, 1))
-            square[i] += (tape.s[:STRETCH, n // 2 :] ** 2).mean(axis=1).sum(axis=0)
-            clipped[i] += (np.abs(tape.f[:STRETCH]) >= limit).any(axis=1).sum(axis=0)
-            before = touching[-1:]
-            tape.rewind(STRETCH)
-            ticked(STRETCH)
-    return Bounces(made, np.sqrt(square / (per_window * STRETCH)), clipped)
+    before = np.zeros((1, len(walls.walls), nsim), dtype=bool)
+
+    def look(buffer: StepBuffer, first: int, count: int) -> None:
+        nonlocal before
+        i = first // (blocks * _BLOCK)
+        touching = walls.depths(buffer.z) > 0
+        made[i] += (touching & ~np.concatenate([before, touching[:-1]])).sum(axis=(0, 1))
+        square[i] += (buffer.s[:count, n // 2 :] ** 2).mean(axis=1).sum(axis=0)
+        clipped[i] += (np.abs(buffer.f[:count]) >= limit).any(axis=1).sum(axis=0)
+        before = touching[-1:]
+
+    def at_rest(first: int, count: int) -> Array:
+        return np.zeros((count, outside))
+
+    run_blocks(process, engine, at_rest, windows * blocks * _BLOCK, start, look, _BLOCK)
+    return Bounces(made, np.sqrt(square / (blocks * _BLOCK)), clipped)
 
 
-LENGTHS = (1, 4, 16)  # of the runs that a counterexample must survive, in terms of the asked length
-POOL, AUDIBLE = 20, 5.0  # hands looked at for one that is let go; [Hz]
-LIMIT = 1e6  # [N], so that growth ends before numbers do
-ROUNDING = 1e-6  # of the first quarter's speed
-SPARE = 1e-4  # share of the damping beyond what the frozen states require
+# ---- the search
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,10 +130,10 @@ def draw(seed: int, index: int) -> Case | None:
     network = Network(("tip",), (spring,), {"mass": mass}, tuple(walls))
     coupling = SpringDamper(np.array([K]), np.array([B]))
     loop = Loop(T, (theta,), (0,), (theta,), (1.0,), network)
-    frozen, whatever = closed_loop_of(loop, coupling).ratio * (1 + SPARE), theorem4_of(loop, coupling).ratio
+    frozen, whatever = closed_loop_of(loop, coupling).ratio * (1 + _SPARE), theorem4_of(loop, coupling).ratio
     if not 0.01 < frozen < min(whatever, 20.0):
         return None
-    device = RigidDevice(mass=between(0.01, 0.25), damping=frozen, force_limit=LIMIT)
+    device = RigidDevice(mass=between(0.01, 0.25), damping=frozen, force_limit=_LIMIT)
     scenario = Scenario(f"draw {index}", T, (theta,), (0,), (device,), (Human((Link(0.1, 0.0, 100.0),)),), network)
     return Case(scenario, coupling, whatever / frozen)
 
@@ -150,7 +141,7 @@ def draw(seed: int, index: int) -> Case | None:
 def attack(case: Case, index: int, seed: int, hands: int, seconds: float) -> Found:
     """Let lossless hands go, and follow those that keep moving for longer."""
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, 1)))
-    links = np.zeros((POOL * hands, 1, 1, 3))
+    links = np.zeros((_POOL * hands, 1, 1, 3))
     for column, (low, high) in ((0, (1e-3, 3.0)), (2, (1.0, 1e5))):
         links[:, 0, 0, column] = np.exp(rng.uniform(np.log(low), np.log(high), len(links)))
     shaky = np.argsort(_decay(case, links[hands:]))[: hands // 2] + hands
@@ -170,14 +161,14 @@ def attack(case: Case, index: int, seed: int, hands: int, seconds: float) -> Fou
 
 
 def _decay(case: Case, links: Array) -> Array:
-    """Of each hand: the slowest decay [1/s] among the modes above AUDIBLE, over all frozen states, (nsim,)."""
+    """Of each hand: the slowest decay [1/s] among the modes above 5 Hz, over all frozen states, (nsim,)."""
     loop, T = assemble(case.scenario, case.coupling), case.scenario.T
     plants = hold(variants(case.scenario.device, Crowd(links)).plants(), T)
     slowest = np.full(len(links), np.inf)
     for F in loop.process.frozen().values():
         values = np.linalg.eigvals(close(plants, F).A)
-        heard = np.abs(np.angle(values)) / (2 * np.pi * T) >= AUDIBLE
-        slowest = np.minimum(slowest, -np.log(np.where(heard, np.abs(values), 1e-300).max(axis=1)) / T)
+        fast = np.abs(np.angle(values)) / (2 * np.pi * T) >= _MIN_FREQUENCY_HZ
+        slowest = np.minimum(slowest, -np.log(np.where(fast, np.abs(values), 1e-300).max(axis=1)) / T)
     return slowest
 
 
@@ -188,8 +179,8 @@ def _let_go(case: Case, links: Array, start: Array, seconds: float) -> tuple[Arr
     seen = bounce(loop.process, engine, start, round(seconds / case.scenario.T), outside=sets.scene.outside)
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.nan_to_num(seen.speed[-1] / seen.speed[1], nan=np.inf)
-        moving = ~(seen.speed[-1] <= ROUNDING * seen.speed[0])
-    grown = seen.clipped.sum(axis=0) > 0  # to a force of LIMIT, from a start of 0.3 m/s
+        moving = ~(seen.speed[-1] <= _ROUNDING * seen.speed[0])
+    grown = seen.clipped.sum(axis=0) > 0  # to a force of 1e6 N, from a start of 0.3 m/s
     return np.where(grown, np.inf, np.where(moving, ratio, 0.0)), seen.made + grown
 
 

@@ -1,6 +1,6 @@
 """Every picture that a command writes, in one style: readable in black and white and by the colour-blind.
 
-Each function takes what its command reports (a Result, a Map, or the report as it stands in JSON), writes one PNG and
+Each function takes what its command reports (a Trace, a Map, or the report as it stands in JSON), writes one PNG and
 returns its path.
 """
 
@@ -22,7 +22,7 @@ from matplotlib.ticker import NullFormatter
 from controller.lti import Array
 from sim.files import write
 from sim.stability import MARGINAL
-from sim.trace import Result
+from sim.trace import Trace
 from sim.zwidth import MODEL_KEPT, UNDECIDED, Map
 
 mpl.use("Agg")
@@ -92,7 +92,7 @@ _SAME = 1e-6  # [%] what rounding leaves between two forces that are one
 
 
 def plot_run(
-    result: Result, path: Path, title: str, frequency_hz: float, ideal: tuple[Array, float | None] | None = None
+    result: Trace, path: Path, title: str, frequency_hz: float, ideal: tuple[Array, float | None] | None = None
 ) -> Path:
     """Displacements and forces over the whole run, and about six periods of `frequency_hz` where forces turn sharply.
 
@@ -118,7 +118,7 @@ def plot_run(
     return _save(figure, path)
 
 
-def _draw_ideal(axes: Array, result: Result, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
+def _draw_ideal(axes: Array, result: Trace, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
     """The ideal forces, broad and pale in each device's colour; cut where they are more than three times as large."""
     forces, percent = ideal
     label = "pale: ideal environment"
@@ -133,7 +133,7 @@ def _draw_ideal(axes: Array, result: Result, ideal: tuple[Array, float | None], 
         axis.set_ylim(max(low, -most), min(high, most))
 
 
-def _sharpest(result: Result, frequency_hz: float) -> slice:
+def _sharpest(result: Trace, frequency_hz: float) -> slice:
     """Six periods where the forces turn most sharply; more where they turn less than six times in them."""
     n = result.t.size
     T = result.t[1] - result.t[0] if n > 1 else 1.0

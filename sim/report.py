@@ -17,25 +17,16 @@ from design.certificate import ANY, CAVEATS, assess, certificate_part, finite
 from design.conditions import Requirement
 from design.result import CONDITION_NAMES, PRINTED_TAU_DB, PUBLISHED, listed
 from design.transparency import Transparency, decibels
-from models.human import Human, Person
+from models.human import Person
 from sim.adversary import Worst
 from sim.couplings import Chosen
-from sim.crowds import MIXED, Findings, Question, crowd_of
+from sim.crowds import MIXED, Findings, Validation
 from sim.engines import ExactBatchEngine, HeldPlant
-from sim.run import Assembly, Record
+from sim.run import Simulation
 from sim.scenario import Scenario, load
-from sim.stability import (
-    Mode,
-    clipped_ticks,
-    close,
-    dominant_mode,
-    frozen_modes,
-    measured_growth,
-    unstable,
-    verdict,
-    worst_mode,
-)
-from sim.switching import Period, certified_part, knocked, unlimited
+from sim.stability import close, dominant_mode, eigenvalue_part, impulse_growth, unlimited, unstable
+from sim.switching import Period, certified_part
+from sim.trace import Trace
 
 # ----------------------------------------------------------------------------------------------------
 # Certificates, couplings and transparency.
@@ -83,86 +74,6 @@ def transparency_part(figures: Transparency) -> dict[str, Any]:
 # What a run was worth: one dictionary for machines, and the same as tables for people.
 
 
-def stability_part(assembly: Assembly, record: Record) -> dict[str, Any]:
-    """Measured on the trace, and from the eigenvalues of the exact loop; of walls, in the worst contact state."""
-    mode = worst_mode(assembly)
-    limit = assembly.process.force_limit
-    contact = _contact(assembly, record) if assembly.process.contact else {}
-    if contact.get("ticks"):
-        growth, reason = None, f"contact was made {contact['made']} times, and a growth rate is of one linear loop"
-    elif assembly.friction:
-        growth, reason = None, "with Coulomb friction there is no growth rate; the eigenvalues are those without it"
-    else:
-        loop = close(assembly.plant, assembly.F)
-        growth, reason = measured_growth(loop, dominant_mode(loop), record, limit)
-    if record.diverged:
-        reason = "the simulation left the range of finite numbers: reported as unstable"
-    part: dict[str, Any] = {
-        "verdict": "unstable" if record.diverged else None if growth is None else verdict(growth),
-        "clipped_ticks": int(clipped_ticks(record, limit).sum()),
-        "growth_rate_per_s": growth,
-        "frequency_hz": _strongest_line(record, assembly.scenario.T),
-        **_eigenvalues(mode),
-    }
-    part |= {"contact": contact} if contact else {}
-    return part | ({"reason": reason} if reason else {})
-
-
-def _eigenvalues(mode: Mode) -> dict[str, Any]:
-    """What the eigenvalues of the exact loop say."""
-    return {
-        "exact_verdict": mode.verdict,
-        "exact_growth_rate_per_s": finite(mode.growth),
-        "exact_frequency_hz": mode.frequency_hz,
-        "spectral_radius": mode.spectral_radius,
-    }
-
-
-def _contact(assembly: Assembly, record: Record) -> dict[str, Any]:
-    """How often the walls were touched in a run, and the linear loops that they switch between."""
-    walls = assembly.process.contact
-    assert walls is not None
-    touching = walls.depths(record.z[:, :, 0]) > 0
-    states = [
-        {
-            "touching": [i + 1 for i, on in enumerate(state) if on],
-            "exact_growth_rate_per_s": finite(mode.growth),
-            "exact_frequency_hz": mode.frequency_hz,
-            "exact_verdict": mode.verdict,
-        }
-        for state, mode in frozen_modes(assembly).items()
-    ]
-    return {
-        "made": int((touching[1:] & ~touching[:-1]).sum() + touching[:1].sum()),
-        "ticks": int(touching.any(axis=1).sum()),
-        "frozen": states,
-    }
-
-
-def error_part(
-    record: Record, exact: Record | None, assembly: Assembly, unstable: bool | None = None
-) -> dict[str, Any]:
-    """Device positions against the exact engine's closed loop, where there is one.
-
-    `unstable` where its eigenvalues do not say it.
-    """
-    if exact is None:
-        reason = "the exact engine is linear and has no Coulomb friction to compare with"
-        return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
-    limit, m = assembly.process.force_limit, assembly.process.channels
-    n = min(record.s.shape[0], exact.s.shape[0])
-    clipped = clipped_ticks(exact, limit)[:n] | clipped_ticks(record, limit)[:n]
-    if unstable is None:
-        unstable = worst_mode(assembly).verdict == "unstable"
-    linear = int(np.argmax(clipped)) if unstable and clipped.any() else n
-    relative, largest = _distance(record.s[:linear, :m], exact.s[:linear, :m])
-    if linear == n:
-        return {"position_relative_rms": relative, "position_max_m": largest}
-    until = f"the unstable run first clips at t = {linear * assembly.scenario.T:.3f} s"
-    reason = f"{until}; up to there the relative rms is {relative:.1e}, and its growth multiplies any difference"
-    return {"position_relative_rms": None, "position_max_m": None, "reason": reason}
-
-
 def remarks(outcome: dict[str, Any]) -> list[str]:
     """What a reader must know to read the figures rightly."""
     lines = []
@@ -190,25 +101,6 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
     if outcome.get("jitter"):
         lines.append(f"Delays that vary: {outcome['jitter']['covers']}.")
     return [*lines, CAVEATS]
-
-
-def _distance(a: Array, b: Array) -> tuple[float | None, float | None]:
-    size = float(np.sqrt(np.mean(b**2))) if b.size else 0.0
-    if size == 0:
-        return None, None
-    return float(np.sqrt(np.mean((a - b) ** 2))) / size, float(np.abs(a - b).max())
-
-
-def _strongest_line(record: Record, T: float) -> float | None:
-    """The strongest line above 10 Hz in the last quarter of the forces: what one hears and feels."""
-    tail = record.f[-(record.f.shape[0] // 4) :, :, 0]
-    if tail.shape[0] < 64:
-        return None
-    window = np.hanning(tail.shape[0])[:, None]
-    spectrum = np.abs(np.fft.rfft((tail - tail.mean(axis=0)) * window, axis=0)).sum(axis=1)
-    frequency = np.fft.rfftfreq(tail.shape[0], T)
-    spectrum[frequency < 10.0] = 0.0
-    return float(frequency[np.argmax(spectrum)]) if spectrum.any() else None
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -271,13 +163,13 @@ JUDGED = 4.0  # [s] at most of the linear loop from which a growth is read: late
 
 
 def delays_part(
-    assembly: Assembly, chosen: Chosen, period: Period | None, ticks: int, certified: bool
+    simulation: Simulation, chosen: Chosen, period: Period | None, ticks: int, certified: bool
 ) -> dict[str, Any] | None:
     """All that a report says of delays that vary; None where the scenario has no jitter."""
-    scenario = assembly.scenario
+    scenario = simulation.scenario
     if scenario.jitter is None:
         return None
-    met = _delays_met(assembly, period, ticks) if scenario.switches else {}
+    met = _delays_met(simulation, period, ticks) if scenario.switches else {}
     return delay_range_part(scenario.jitter) | met | certified_part(scenario, chosen, certified)
 
 
@@ -293,7 +185,7 @@ def delay_range_part(jitter: Jitter) -> dict[str, Any]:
     }
 
 
-def _delays_met(switched: Assembly, period: Period | None, ticks: int) -> dict[str, Any]:
+def _delays_met(switched: Simulation, period: Period | None, ticks: int) -> dict[str, Any]:
     """The delays that a run met, and the growth of its linear loop under them."""
     delays = switched.process.delays
     assert delays is not None
@@ -326,36 +218,37 @@ def _age(used: Ticks) -> dict[str, Any] | None:
     return {name: values.tolist() for name, values in figures.items()}
 
 
-def _growth_under_delays(switched: Assembly, ticks: int) -> tuple[float, float]:
-    """(rate [1/s], window [s]) of the exact linear loop after a knock, under the run's first delays."""
+def _growth_under_delays(switched: Simulation, ticks: int) -> tuple[float, float]:
+    """(rate [1/s], window [s]) of the exact linear loop after an impulse, under the run's first delays."""
     T, plant = switched.scenario.T, switched.plant
     judged = max(4, min(ticks, round(JUDGED / T)))
     one = HeldPlant(plant.A[None], plant.B[None], plant.C, T)
     process = unlimited(switched.process)
     engine = ExactBatchEngine(one, process.force_limit)
-    return float(knocked(process, engine, switched.scene, plant.A.shape[0], judged, 1).rate[0]), judged * T
+    rate, _ = impulse_growth(process, engine, switched.scene, plant.A.shape[0], judged)
+    return float(rate[0]), judged * T
 
 
-def switched_stability_part(assembly: Assembly, record: Record, jitter: dict[str, Any]) -> dict[str, Any]:
+def switched_stability_part(simulation: Simulation, trace: Trace, jitter: dict[str, Any]) -> dict[str, Any]:
     """As report.stability_part, for a loop that switches: it has no eigenvalue of its own but over a period."""
     worst = jitter["period"] or jitter
-    constant = _eigenvalues(dominant_mode(close(assembly.plant, assembly.F)))
-    verdict = "unstable" if record.diverged or "unstable" in (worst["verdict"], jitter["verdict"]) else "stable"
+    constant = eigenvalue_part(dominant_mode(close(simulation.plant, simulation.F)))
+    verdict = "unstable" if trace.diverged or "unstable" in (worst["verdict"], jitter["verdict"]) else "stable"
     return {
         "verdict": verdict,
-        "clipped_ticks": int(clipped_ticks(record, assembly.process.force_limit).sum()),
+        "clipped_ticks": int(trace.clipped(simulation.process.force_limit).sum()),
         "growth_rate_per_s": worst["growth_rate_per_s"],
-        "frequency_hz": _strongest_line(record, assembly.scenario.T),
+        "frequency_hz": trace.dominant_frequency_hz(),
         **constant,
         "reason": _how(jitter)
-        + f"; the eigenvalues are those of the constant delay theta = {listed(assembly.scenario.theta)}",
+        + f"; the eigenvalues are those of the constant delay theta = {listed(simulation.scenario.theta)}",
     }
 
 
 def _how(jitter: dict[str, Any]) -> str:
     if jitter["period"]:
         return f"growth by the eigenvalues of the product over the {jitter['period']['ticks']} ticks of a period"
-    return f"growth of the linear loop after a knock, over {jitter['judged_s']:.3g} s under the run's delays"
+    return f"growth of the linear loop after an impulse, over {jitter['judged_s']:.3g} s under the run's delays"
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -366,7 +259,7 @@ SETTLING = 4  # decay times of the slowest mode in a trace whose hands must be s
 ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
 
 
-def validation_part(question: Question, findings: Findings, certified: bool, wall: float) -> dict[str, Any]:
+def validation_part(question: Validation, findings: Findings, certified: bool, wall: float) -> dict[str, Any]:
     """The contract of `sim.validate --json`."""
     bad, mujoco = unstable(findings.exact), question.engine != "exact"
     disagreements = int(findings.disagreements.sum())
@@ -431,7 +324,7 @@ def adversary_part(worst: Worst, ratio: float, certified: bool) -> dict[str, Any
     }
 
 
-def _humans(humans: tuple[Human, ...]) -> list[dict[str, Any]]:
+def _humans(humans: tuple[Any, ...]) -> list[dict[str, Any]]:
     """Links of each channel's human."""
     names = ("mass", "damping", "stiffness")
     return [{"links": [{name: getattr(link, name) for name in names} for link in human.links]} for human in humans]
@@ -442,15 +335,15 @@ def _persons(persons: tuple[Person, ...]) -> list[dict[str, Any]]:
     return [msgspec.to_builtins(person) for person in persons]
 
 
-def _identified(question: Question, index: int) -> dict[str, Any]:
-    crowd = crowd_of(question.scenario, question.seed, index, question.links)
+def _identified(question: Validation, index: int) -> dict[str, Any]:
+    crowd = question.crowd(index)
     who = {"human": _humans(crowd.humans(0)), "person": _persons(crowd.persons(0))}
     member = question.environment(index)
     where = {"environment": member.name, "network": msgspec.to_builtins(member.network)} if member else {}
     return {"seed": question.seed, "index": index} | who | where
 
 
-def _environments(question: Question, findings: Findings, bad: NDArray[np.bool_]) -> dict[str, Any]:
+def _environments(question: Validation, findings: Findings, bad: NDArray[np.bool_]) -> dict[str, Any]:
     """Which environments the loops had, and in which of them a loop was unstable."""
     if not question.environments:
         return {"of": "the nominal environment", "count": 1}
@@ -463,7 +356,7 @@ def _environments(question: Question, findings: Findings, bad: NDArray[np.bool_]
     }
 
 
-def _worst(question: Question, findings: Findings) -> dict[str, Any] | None:
+def _worst(question: Validation, findings: Findings) -> dict[str, Any] | None:
     if not findings.index.size:
         return None
     k = int(np.argmax(findings.radius))
@@ -475,7 +368,7 @@ def _worst(question: Question, findings: Findings) -> dict[str, Any] | None:
     return figures | _identified(question, int(findings.index[k]))
 
 
-def _traces(question: Question, findings: Findings) -> dict[str, Any] | None:
+def _traces(question: Validation, findings: Findings) -> dict[str, Any] | None:
     if not question.ticks or not findings.index.size:
         return None
     measured, stable = np.isfinite(findings.trace), ~unstable(findings.exact)

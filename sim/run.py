@@ -1,9 +1,16 @@
-"""From a scenario and a coupling to a trace: the joint where the two worlds meet."""
+"""From a scenario and a coupling to a trace: the computer's side and the plant, closed tick by tick.
+
+    trace = run(assemble(scenario, coupling), "mujoco")
+
+A tick samples the positions, computes the forces, limits and holds them, and advances the plant by T: see
+controller.process for the order of these steps and sim.engines for what advances the plant.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -12,98 +19,35 @@ from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.environment import environment, held
 from controller.loop import force_map
 from controller.lti import Array, Lti
-from controller.process import Process, Tape, contact
-from models.device import Device
+from controller.process import Process, StepBuffer, contact
 from models.scene import Scene, build, plant
 from sim.engines import (
-    LEAPFROG,
+    EXPONENTIAL,
+    LEAST,
     Engine,
     ExactEngine,
     HeldPlant,
-    LeapfrogEngine,
     MujocoEngine,
+    default_integrator,
     hold,
-    outside_forces,
     profiler_off,
     quiet_warnings,
 )
 from sim.scenario import InputError, Scenario
-
-# ----------------------------------------------------------------------------------------------------
-# The closed loop: a process and a plant, tick by tick.
-
-
-STRETCH = 1024  # ticks between two looks at the clock, the keyboard and the numbers
-
-Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces (ticks, outside)
-Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
-
-
-@dataclass(frozen=True, eq=False)
-class Record:
-    """What every tick saw. Axes: tick, entry, simulation."""
-
-    z: Array  # (N, order, nsim) process state
-    s: Array  # (N, 2n, nsim) plant state: positions [m], velocities [m/s]
-    w: Array  # (N, outside, nsim) outside forces [N]
-    f: Array  # (N, m, nsim) forces fed back [N], within the limits
-    diverged: bool  # the engine gave up, or a number stopped being finite, within the last stretch
-    interrupted: bool  # stopped from the keyboard
-
-
-def run(
-    process: Process,
-    engine: Engine,
-    outside: Outside,
-    ticks: int,
-    start: Array,
-    progress: Progress = lambda done, ticks: None,
-) -> Record:
-    """Close the loop for `ticks` periods from the plant state `start`, shape (2n, nsim)."""
-    width = outside(0, 0).shape[1]
-    tape = Tape(process, min(STRETCH, ticks), start.shape[0], width, start.shape[1])
-    tape.s[0] = start
-    engine.start(tape)
-    parts: list[tuple[Array, ...]] = []
-    done, diverged, interrupted = 0, False, False
-    try:
-        while done < ticks and not diverged:
-            count = min(tape.ticks, ticks - done)
-            tape.w[:count] = outside(done, count)[:, :, None]
-            with np.errstate(over="ignore", invalid="ignore"):  # a diverging run is reported, not warned about
-                stretch(tape, engine, count)
-            finite = np.isfinite(tape.s[:count]).all(axis=(1, 2)) & np.isfinite(tape.f[:count]).all(axis=(1, 2))
-            diverged = engine.troubled() or not finite.all()
-            count = count if finite.all() else int(np.argmin(finite))
-            tape.saturate(count)
-            parts.append(tuple(part[:count].copy() for part in (tape.z, tape.s, tape.w, tape.f)))
-            tape.rewind(count)
-            done += count
-            progress(done, ticks)
-    except KeyboardInterrupt:  # what was finished is kept
-        interrupted = True
-    z, s, w, f = (np.concatenate(column) for column in zip(*parts, strict=True)) if parts else _nothing(tape)
-    return Record(z, s, w, f, diverged, interrupted)
-
-
-def stretch(tape: Tape, engine: Engine, ticks: int) -> None:
-    """Close the loop for the first `ticks` rows of the tape."""
-    tick, advance = tape.tick, engine.advance
-    for k in range(ticks):
-        tick(k)
-        advance(k)
-
-
-def _nothing(tape: Tape) -> tuple[Array, ...]:
-    return tuple(part[:0] for part in (tape.z, tape.s, tape.w, tape.f))
-
+from sim.trace import Trace
 
 ENGINES = ("mujoco", "exact")
 
+Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the hands (ticks, outside) [N]
+Look = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
+Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
+
+_BLOCK = 1024  # ticks between two looks at the clock, the keyboard and the numbers
+
 
 @dataclass(frozen=True, eq=False)
-class Assembly:
-    """A scenario with its coupling, ready to run."""
+class Simulation:
+    """A scenario with its coupling, ready to run: what the computer does every tick, and the plant that it moves."""
 
     scenario: Scenario
     E: Lti  # what is to be felt: the environment, with every wall touching
@@ -118,7 +62,7 @@ class Assembly:
         return any(device.friction for device in self.scenario.device)
 
     @property
-    def smooth(self) -> Assembly:
+    def smooth(self) -> Simulation:
         """The same without Coulomb friction in the scene, which is what linear verdicts are about."""
         if not self.friction:
             return self
@@ -132,63 +76,142 @@ class Assembly:
         return list(self.process.frozen().values())[-1] if self.process.contact else self.F
 
 
-def assemble(scenario: Scenario, coupling: Coupling) -> Assembly:
-    """Build both worlds. Raises SingularLoop where the algebraic loop has no solution, InputError for walls that no
-    V stands before.
+def assemble(scenario: Scenario, coupling: Coupling) -> Simulation:
+    """Build both sides of the loop.
+
+    Raises SingularLoop where the algebraic loop of environment and coupling has no solution, InputError for walls that
+    no compliance V stands before.
     """
-    if scenario.environment.walls and not isinstance(coupling, NoCoupling | SpringDamper | Compliance):
-        raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
     network, delays = scenario.environment, (scenario.theta, scenario.psi)
+    if network.walls and not isinstance(coupling, NoCoupling | SpringDamper | Compliance):
+        raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
     E = environment(held(network), scenario.T)
     walled = contact(network, coupling, *delays, scenario.T) if network.walls else None
     F = walled.open if walled else force_map(E, coupling, *delays)
-    process = Process(F, _each(scenario.device, "force_limit"), _each(scenario.device, "encoder_step"), walled)
+    limits, steps = (np.array([getattr(d, of) for d in scenario.device]) for of in ("force_limit", "encoder_step"))
     scene = build(scenario.device, scenario.human, scenario.person)
-    return Assembly(scenario, E, F, process, scene, hold(plant(scene.model), scenario.T))
+    return Simulation(scenario, E, F, Process(F, limits, steps, walled), scene, hold(plant(scene.model), scenario.T))
 
 
-def simulate(
-    assembly: Assembly,
-    engine: str = "mujoco",
-    integrator: str = "RK4",
-    substeps: int = 4,
-    voluntary: bool = True,
-    samples: int | None = None,
+def run(
+    simulation: Simulation,
+    engine: Engine | str = "mujoco",
+    outside: Outside | None = None,
+    ticks: int | None = None,
+    start: Array | None = None,
     progress: Progress = lambda done, ticks: None,
-) -> Record:
-    """The scenario's run, from rest; `samples` ticks of it where that is given."""
-    scenario, scene = assembly.scenario, assembly.scene
+) -> Trace:
+    """Close the loop and return what every tick saw.
 
-    def outside(first: int, ticks: int) -> Array:
-        return outside_forces(scenario, scene, first, ticks, voluntary)
+    `engine` is an engine or the name of one, with its default step; `outside`, `ticks` and the plant state `start`,
+    (states, 1), are those of the scenario and rest where they are not given. The trace ends early where numbers stop
+    being finite, the engine reports trouble, or the keyboard interrupts.
+    """
+    process, scenario = simulation.process, simulation.scenario
+    engine = make_engine(simulation, engine) if isinstance(engine, str) else engine
+    outside = outside or partial(outside_forces, scenario, simulation.scene)
+    ticks = scenario.samples if ticks is None else ticks
+    start = np.zeros((simulation.plant.A.shape[0], 1)) if start is None else start
+    blocks: list[tuple[Array, ...]] = []
+    diverged = interrupted = False
 
-    rest = np.zeros((assembly.plant.A.shape[0], 1))
-    with profiler_off(), quiet_warnings():
-        plant_engine = make_engine(assembly, engine, integrator, substeps)
-        return run(
-            assembly.process, plant_engine, outside, scenario.samples if samples is None else samples, rest, progress
-        )
+    def keep(buffer: StepBuffer, first: int, count: int) -> bool:
+        nonlocal diverged
+        finite = np.isfinite(buffer.s[:count]).all(axis=(1, 2)) & np.isfinite(buffer.f[:count]).all(axis=(1, 2))
+        diverged = engine.troubled() or not finite.all()
+        count = count if finite.all() else int(np.argmin(finite))
+        buffer.saturate(count)
+        blocks.append(tuple(rows[:count, :, 0].copy() for rows in (buffer.z, buffer.s, buffer.w, buffer.f)))
+        progress(first + count, ticks)
+        return diverged
+
+    try:
+        run_blocks(process, engine, outside, ticks, start, keep, _BLOCK)
+    except KeyboardInterrupt:  # what was finished is kept
+        interrupted = True
+    n, m, handles = simulation.scene.model.nq, process.channels, list(simulation.scene.handles)
+    nothing = [np.empty((0, width)) for width in (process.F.order, len(start), simulation.scene.outside, m)]
+    z, s, w, f = (np.concatenate(rows) for rows in zip(nothing, *blocks, strict=True))
+    return Trace(
+        t=np.arange(len(s)) * scenario.T,
+        x=process.measured(s[:, :m]),
+        f=f,
+        x_handle=s[:, handles],
+        v_handle=s[:, n:][:, handles],
+        w=w,
+        z=z,
+        s=s,
+        diverged=diverged,
+        interrupted=interrupted,
+    )
+
+
+def run_blocks(
+    process: Process, engine: Engine, outside: Outside, ticks: int, start: Array, look: Look, block: int = 32
+) -> None:
+    """Close the loop for `ticks` periods from the plant states `start`, (states, nsim), and look at it block by block.
+
+    Row 0 of the buffer is the block's first tick. So few ticks in a block that it stays in the processor's cache.
+    """
+    buffer = StepBuffer(process, min(block, ticks), start.shape[0], outside(0, 0).shape[1], start.shape[1])
+    buffer.s[0] = start
+    # a diverging run is reported, not warned about
+    with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
+        engine.start(buffer)
+        for first in range(0, ticks, block):
+            count = min(block, ticks - first)
+            buffer.w[:count] = outside(first, count)[:, :, None]
+            run_block(buffer, engine, count)
+            if look(buffer, first, count):
+                return
+            buffer.rewind(count)
+
+
+def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
+    """Close the loop for the first `ticks` rows of the buffer."""
+    tick, advance = buffer.tick, engine.advance
+    for k in range(ticks):
+        tick(k)  # sample x, compute f and z+
+        advance(k)  # limit f, hold -f on the actuators for T, move the plant
+
+
+def outside_forces(scenario: Scenario, scene: Scene, first: int, ticks: int, voluntary: bool = True) -> Array:
+    """Outside forces [N] at ticks first .. first + ticks - 1, sampled at kT, shape (ticks, outside).
+
+    The voluntary motion reaches the end of each human, the tap reaches one handle.
+    """
+    k = np.arange(first, first + ticks)
+    w = np.zeros((ticks, scene.outside))
+    if voluntary:
+        for human, column in zip(scenario.human, scene.pushed, strict=True):
+            w[:, column] += human.voluntary_force(k * scenario.T)
+    if tap := scenario.tap:
+        begin, end = (round(t / scenario.T, 9) for t in (tap.start, tap.start + tap.duration))
+        w[(k >= begin) & (k < end), scene.tapped[tap.channel - 1]] += tap.force
+    return w
 
 
 def make_engine(
-    assembly: Assembly, engine: str, integrator: str = "RK4", substeps: int = 4, T: float | None = None
+    simulation: Simulation,
+    engine: str,
+    integrator: str | None = None,
+    substeps: int | None = None,
+    T: float | None = None,
 ) -> Engine:
     """The engine of that name for one simulation, which MuJoCo advances by T seconds (default: the scenario's).
 
-    Raises ValueError for a name that is none.
+    Without an integrator it is the scene's default, without substeps they are 1 of the exponential one and 4 of others.
+    Raises ValueError for an unknown name, and for Coulomb friction before the exact engine.
     """
+    if engine not in ENGINES:
+        raise ValueError(f"engine is {engine!r}, allowed are {', '.join(ENGINES)}")
     if engine == "exact":
-        if assembly.friction:
+        if simulation.friction:
             raise ValueError("the devices have Coulomb friction, which the exact engine, being linear, does not model")
-        return ExactEngine(assembly.plant, assembly.process.force_limit)
-    if engine == "mujoco":
-        kind = LeapfrogEngine if integrator == LEAPFROG else MujocoEngine
-        return kind(assembly.scene, assembly.scenario.T if T is None else T, integrator, substeps)
-    raise ValueError(f"engine is {engine!r}, allowed are {', '.join(ENGINES)}")
-
-
-def _each(devices: tuple[Device, ...], name: str) -> Array:
-    return np.array([getattr(device, name) for device in devices])
+        return ExactEngine(simulation.plant, simulation.process.force_limit)
+    integrator = integrator or default_integrator(simulation.scene)
+    count = substeps if substeps is not None else 1 if integrator == EXPONENTIAL else LEAST
+    return MujocoEngine(simulation.scene, simulation.scenario.T if T is None else T, integrator, count)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,8 @@
-"""Humans as a TOML file, one [[human]] per channel: how a human that was found is kept and replayed."""
+"""What a run is made of, read strictly from TOML: an unknown key or an impossible number never passes.
+
+A scenario holds devices, humans, environment, delays and timing of one loop. Humans may come from a file of their own,
+one [[human]] per channel: how a human that was found is kept and replayed.
+"""
 
 from __future__ import annotations
 
@@ -21,16 +25,12 @@ from models.device import MOST_DAMPING, Device, passivity_level, require, with_d
 from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
 from sim.files import InputError, write
 
-# ----------------------------------------------------------------------------------------------------
-# What a run is made of, read strictly from TOML: an unknown key or an impossible number never passes.
-
-
 CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
 LONGEST_DELAY = 1000  # [samples]; every one is a state
-Delays = tuple[int, ...]
+_Delays = tuple[int, ...]
 
 
 class Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -52,13 +52,13 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     name: str
     T: float  # sampling period [s]
-    theta: Delays  # transmission delays [samples] (4)
-    psi: Delays  # environment delays [samples] (5)
+    theta: _Delays  # transmission delays [samples] (4)
+    psi: _Delays  # environment delays [samples] (5)
     device: tuple[Device, ...]
     human: tuple[Human, ...]
     environment: Network
     box: Box | None = None  # what else the environment may be
-    lam: Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
+    lam: _Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
     person: tuple[Person, ...] = ()  # those who hold several devices
     tap: Tap | None = None
     duration: float = 15.0  # [s]
@@ -180,13 +180,7 @@ def load(source: str | Path = DEFAULT) -> Scenario:
         kind = type(source).__name__
         raise InputError(f"scenario is {source!r} ({kind}), expected a TOML file or one of: {', '.join(built_in())}")
     path = SCENARIOS / f"{source}.toml" if str(source) in built_in() else Path(source)
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        names = ", ".join(built_in())
-        raise InputError(f"scenario {source}: {error.strerror}; give a TOML file or one of: {names}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"scenario {source}: not a text file in UTF-8") from None
+    text = _read(path, f"scenario {source}", f"; give a TOML file or one of: {', '.join(built_in())}")
     return parse(text, str(source))
 
 
@@ -194,18 +188,118 @@ def parse(text: str, source: str = "scenario") -> Scenario:
     """A scenario from TOML text. Raises InputError, with the path of the field and the value that came."""
     if not isinstance(text, str):
         raise TypeError(f"text is of type {type(text).__name__}, expected a str: the scenario itself, in TOML")
+    scenario: Scenario = _converted(text, Scenario, source)
+    try:
+        environment(scenario.environment, scenario.T)
+    except ValueError as error:
+        raise InputError(f"{source}: environment: {error}") from None
+    return scenario
+
+
+def built_in() -> list[str]:
+    """Names of the scenarios that come with the program."""
+    return sorted(path.stem for path in SCENARIOS.glob("*.toml"))
+
+
+def require_linear(scenario: Scenario, what: str) -> None:
+    """Raises InputError where a loop has walls or Coulomb friction, for what decides linear loops only."""
+    for i, device in enumerate(scenario.device):
+        if device.friction:
+            instead = "sim.run and sim.zwidth simulate it"
+            raise InputError(f"device[{i}].friction is {device.friction:g} N: {what} decides linear loops; {instead}")
+    if scenario.environment.walls:
+        raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
+
+
+def require_constant_delay(scenario: Scenario, what: str) -> None:
+    """Raises InputError where a scenario's delays vary, for what would not make them vary."""
+    if scenario.jitter is not None:
+        instead = "sim.run simulates it"
+        raise InputError(f"jitter: {what} takes the delays that its link has; take the table out, {instead}")
+
+
+# ---- humans in a file of their own
+
+
+class HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole file."""
+
+    human: tuple[Human, ...]
+    person: tuple[Person, ...] = ()
+
+
+def load_humans(path: str | Path, channels: int) -> HumanFile:
+    """The humans of a file, one per channel, and who holds several devices.
+
+    A Python file is run, and says who they are: `humans`, and `persons` if it likes, of any class (models.human.Hand).
+    Raises InputError with one line that names the file and the field.
+    """
+    what = "[[human]] tables"
+    if Path(path).suffix == ".py":
+        names, what = _run_file(path), "`humans`"
+        people = HumanFile(tuple(names.get("humans", ())), tuple(names.get("persons", ())))
+    else:
+        people = _converted(_read(Path(path), f"--human {path}"), HumanFile, f"--human {path}")
+    if len(people.human) != channels:
+        raise InputError(f"--human {path} has {len(people.human)} {what}, expected {channels} (one per channel)")
+    try:
+        check_holds([person.holds for person in people.person], channels)
+    except ValueError as error:
+        raise InputError(f"--human {path}: {error}") from None
+    return people
+
+
+def _run_file(path: str | Path) -> dict[str, Any]:
+    """The names that a Python file defines. Raises InputError where it cannot be read."""
+    try:
+        return runpy.run_path(str(path))
+    except OSError as error:
+        raise InputError(f"--human {path}: {error.strerror}") from None
+
+
+def save_humans(path: Path, humans: tuple[Any, ...], remark: str, persons: tuple[Person, ...] = ()) -> Path:
+    """Write humans and persons without voluntary motion so that reading gives the same numbers.
+
+    `remark` becomes a comment.
+    """
+    lines = [f"# {line}" for line in remark.splitlines()]
+    for human in humans:
+        rows = (
+            f"    {{ mass = {x.mass!r}, damping = {x.damping!r}, stiffness = {x.stiffness!r} }}," for x in human.links
+        )
+        lines += ["", "[[human]]", "links = [", *rows, "]"]
+    for person in persons:
+        body = [f"{name} = {getattr(person, name)!r}" for name in ("mass", "damping", "stiffness")]
+        cross = f"cross = {{ damping = {person.cross.damping!r}, stiffness = {person.cross.stiffness!r} }}"
+        lines += ["", "[[person]]", f"holds = {list(person.holds)}", *body, cross]
+    return write(path, "\n".join(lines) + "\n")
+
+
+# ---- strictness: what a file may hold, and how its errors are worded
+
+
+def _read(path: Path, name: str, hint: str = "") -> str:
+    """The text of a file that the user named. Raises InputError."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{name}: {error.strerror}{hint}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{name}: not a text file in UTF-8") from None
+
+
+def _converted(text: str, kind: Any, source: str) -> Any:
+    """TOML text as `kind`. Raises InputError with the path of the field and the value that came."""
     try:
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{source}: not valid TOML: {error}") from None
     try:
-        scenario = msgspec.convert(raw, Scenario)
-        environment(scenario.environment, scenario.T)
+        return msgspec.convert(raw, kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_located(str(error), raw)}") from None
     except ValueError as error:
-        raise InputError(f"{source}: environment: {error}") from None
-    return scenario
+        raise InputError(f"{source}: {error}") from None
 
 
 class _Damping(msgspec.Struct, frozen=True):
@@ -265,11 +359,6 @@ def _contents(part: Any) -> Any:
     return part.tolist() if isinstance(part, np.ndarray | np.generic) else [type(part).__qualname__, vars(part)]
 
 
-def built_in() -> list[str]:
-    """Names of the scenarios that come with the program."""
-    return sorted(path.stem for path in SCENARIOS.glob("*.toml"))
-
-
 def _located(message: str, raw: dict[str, Any]) -> str:
     """'Expected `int`, got `float` - at `$.theta[0]`' as 'theta[0] = 1.5: expected `int`, got `float`'."""
     match = re.fullmatch(r"(.*?)(?: - at `(?:key in )?\$\.?(.*)`)?", message, flags=re.DOTALL)
@@ -305,75 +394,3 @@ _STRUCTS = (
     Scenario, Tap, Jitter, Human, Link, Voluntary, Person, Cross, Population, Network, Spring, Wall, Box,
     UncertainSpring, *get_args(Device)
 )  # fmt: skip
-
-
-class HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole file."""
-
-    human: tuple[Human, ...]
-    person: tuple[Person, ...] = ()
-
-
-def load_humans(path: str | Path, channels: int) -> HumanFile:
-    """The humans of a file, one per channel, and who holds several devices.
-
-    A Python file is run, and says who they are: `humans`, and `persons` if it likes, of any class (models.human.Hand).
-    Raises InputError with one line that names the file and the field.
-    """
-    try:
-        if Path(path).suffix == ".py":
-            names = runpy.run_path(str(path))
-            people = HumanFile(tuple(names.get("humans", ())), tuple(names.get("persons", ())))
-        else:
-            people = msgspec.convert(tomllib.loads(Path(path).read_text(encoding="utf-8")), HumanFile)
-    except OSError as error:
-        raise InputError(f"--human {path}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"--human {path}: not a text file in UTF-8") from None
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"--human {path}: not valid TOML: {error}") from None
-    except msgspec.ValidationError as error:
-        raise InputError(f"--human {path}: {error}") from None
-    what = "`humans`" if Path(path).suffix == ".py" else "[[human]] tables"
-    if len(people.human) != channels:
-        raise InputError(f"--human {path} has {len(people.human)} {what}, expected {channels} (one per channel)")
-    try:
-        check_holds([person.holds for person in people.person], channels)
-    except ValueError as error:
-        raise InputError(f"--human {path}: {error}") from None
-    return people
-
-
-def save_humans(path: Path, humans: tuple[Human, ...], remark: str, persons: tuple[Person, ...] = ()) -> Path:
-    """Write humans and persons without voluntary motion so that reading gives the same numbers.
-
-    `remark` becomes a comment.
-    """
-    lines = [f"# {line}" for line in remark.splitlines()]
-    for human in humans:
-        rows = (
-            f"    {{ mass = {x.mass!r}, damping = {x.damping!r}, stiffness = {x.stiffness!r} }}," for x in human.links
-        )
-        lines += ["", "[[human]]", "links = [", *rows, "]"]
-    for person in persons:
-        body = [f"{name} = {getattr(person, name)!r}" for name in ("mass", "damping", "stiffness")]
-        cross = f"cross = {{ damping = {person.cross.damping!r}, stiffness = {person.cross.stiffness!r} }}"
-        lines += ["", "[[person]]", f"holds = {list(person.holds)}", *body, cross]
-    return write(path, "\n".join(lines) + "\n")
-
-
-def require_linear(scenario: Scenario, what: str) -> None:
-    """Raises InputError where a loop has walls or Coulomb friction, for a command whose verdicts are of linear ones."""
-    for i, device in enumerate(scenario.device):
-        if device.friction:
-            instead = "sim.run and sim.zwidth simulate it"
-            raise InputError(f"device[{i}].friction is {device.friction:g} N: {what} decides linear loops; {instead}")
-    if scenario.environment.walls:
-        raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
-
-
-def require_constant_delay(scenario: Scenario, what: str) -> None:
-    """Raises InputError where a scenario's delays vary, for a command that would not make them vary."""
-    if scenario.jitter is not None:
-        instead = "sim.run simulates it"
-        raise InputError(f"jitter: {what} takes the delays that its link has; take the table out, {instead}")

@@ -1,9 +1,20 @@
-"""What is certified of a coupling where delays vary: by its file, or judged anew, and what that covers."""
+"""Delays that vary: the loop as a system that switches, its worst switching, and what certificates say of it.
+
+The loop is linear, with one matrix for each set of ages of the forces in use. Its state is
+xi = [s; z; g_1[k-1] .. g_1[k-d_1]; g_2[k-1] ..]: plant, process block G (without Theta), forces on their way.
+
+The worst delays are sought greedily. The loop starts from an impulse on every handle. At every tick and on every
+channel the device is handed, of the forces that a delay in [lo, hi] allows, the one that brakes it least or pushes it
+most: the largest -f v. Ages grow by one per tick at most, as they do where packets are held. Of all windows of that
+sequence that may be repeated, the one whose product of mode matrices has the largest spectral radius per tick is the
+worst period found: a proof of instability where it exceeds 1.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 from typing import Any
 
@@ -15,36 +26,80 @@ from controller.coupling import Coupling
 from controller.delay import LOST, Jitter, Ticks, realising
 from controller.loop import DelayRange, force_map
 from controller.lti import Array, Lti
-from controller.process import Process, Tape
+from controller.process import Process, StepBuffer
 from design.certificate import switching_part, switching_promise, switching_requirement
 from design.conditions import Requirement
 from models.scene import Scene, Variants
 from sim.couplings import Chosen
-from sim.engines import Engine, ExactBatchEngine, HeldPlant, MujocoBatchEngine, hold, profiler_off, quiet_warnings
-from sim.run import Assembly, stretch
+from sim.engines import ExactBatchEngine, HeldPlant, MujocoBatchEngine, hold
+from sim.run import Simulation
 from sim.scenario import Scenario
-from sim.stability import knock_forces
+from sim.stability import impulse_forces, impulse_growth, unlimited
 
-# ----------------------------------------------------------------------------------------------------
-# The loop with delays that vary: a linear system that switches, one matrix per set of ages of the forces in use.
-#
-# State xi = [s; z; g_1[k-1] .. g_1[k-d_1]; g_2[k-1] ..]: plant, process block G (without Theta), forces on their way.
-
-
-STRETCH = 32  # ticks of a tape: few, so that it stays in the processor's cache
-
-
-def without_theta(assembly: Assembly, coupling: Coupling) -> Lti:
-    """G = (I + Psi E V)^-1 Psi E: the forces as they leave for the devices."""
-    return force_map(assembly.E, coupling, (0,) * assembly.process.channels, assembly.scenario.psi)
+_SEARCHED = 1600  # ticks of greedy switching in which the worst period is sought
+_LONGEST_PERIOD = 250  # [ticks]
+_STARTS = 6  # windows begin at so many ticks of the greedy sequence
+_MOST_ENDS = 256  # constant delays, each at an end of its range, that are compared
+_SHORTEST = 4  # ticks that are drawn at least: a growth compares quarters
+_STREAM = 5  # keeps these draws apart from those of the humans with the same seed and index
 
 
-def with_delays(assembly: Assembly, coupling: Coupling, delays: Ticks) -> Assembly:
+@dataclass(frozen=True, eq=False)
+class Period:
+    """Switching that repeats, with the exact growth of the loop under it."""
+
+    ages: Ticks  # (period, m)
+    delays: Ticks  # (period, m) of the packets that make these ages
+    growth: float  # [1/s]
+    spectral_radius: float  # of the product over one period
+
+
+# ---- one run
+
+
+def switching(
+    simulation: Simulation, coupling: Coupling, seed: int, ticks: int, index: int = 0
+) -> tuple[Simulation, Period | None]:
+    """The loop with the scenario's varying delays, and their period where they are adversarial."""
+    jitter = simulation.scenario.jitter
+    assert jitter is not None
+    period = worst_switching(simulation, coupling, jitter) if jitter.pattern == "adversarial" else None
+    given = period.delays if period else None
+    delays = _draw_delays(simulation.scenario, seed, index, max(ticks, _SHORTEST), given)
+    return with_delays(simulation, coupling, delays[:, :, None]), period
+
+
+def with_delays(simulation: Simulation, coupling: Coupling, delays: Ticks) -> Simulation:
     """The same loop with packets that take `delays` (ticks, m, nsim or 1) in place of the constant theta.
 
-    `assembly.F` stays that of the constant theta: certificates and transparency are about it.
+    `simulation.F` stays that of the constant theta: certificates and transparency are about it.
     """
-    return replace(assembly, process=replace(assembly.process, F=without_theta(assembly, coupling), delays=delays))
+    process = replace(simulation.process, F=without_theta(simulation, coupling), delays=delays)
+    return replace(simulation, process=process)
+
+
+def worst_switching(simulation: Simulation, coupling: Coupling, jitter: Jitter) -> Period:
+    """The periodic switching within the range that was found to grow fastest in this loop."""
+    G, plant = without_theta(simulation, coupling), simulation.plant
+    one = HeldPlant(plant.A[None], plant.B[None], plant.C, plant.T)
+    ages = greedy_ages(replace(simulation.process, F=G), one, simulation.scene, jitter, _SEARCHED)
+    return _worst_period(ages[:, :, 0], plant, G, jitter)
+
+
+def without_theta(simulation: Simulation, coupling: Coupling) -> Lti:
+    """G = (I + Psi E V)^-1 Psi E: the forces as they leave for the devices."""
+    return force_map(simulation.E, coupling, (0,) * simulation.process.channels, simulation.scenario.psi)
+
+
+def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, given: Ticks | None = None) -> Ticks:
+    """Delays (ticks, m) of run number `index`; they depend on (seed, index) and the scenario only."""
+    assert scenario.jitter is not None
+    rows = np.array([scenario.theta]) if scenario.jitter.pattern == "constant" else given
+    rng = np.random.default_rng(np.random.SeedSequence((seed, index, _STREAM)))
+    return scenario.jitter.draw(rng, ticks, rows)
+
+
+# ---- the worst delays
 
 
 def mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[int]) -> Array:
@@ -70,117 +125,46 @@ def mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[i
     return A
 
 
-@dataclass(frozen=True, eq=False)
-class Growth:
-    """What a knock becomes under given delays; one entry per simulation."""
-
-    # (nsim,) [1/s] of the handles' speeds, last quarter over second; inf where numbers overflow, -inf at exact rest
-    rate: Array
-    clipped: NDArray[np.bool_]  # (nsim,) whether any force reached its limit
-
-
-def knocked(process: Process, engine: Engine, scene: Scene, states: int, ticks: int, nsim: int) -> Growth:
-    """Knock every handle, leave them alone, and compare their speeds early and late.
-
-    With force limits of infinity this is the linear loop, whose growth does not depend on the size of the knock.
-    """
-    T, speeds = process.F.T, [scene.model.nv + handle for handle in scene.handles]
-    limit = process.force_limit[:, None]
-    tape = Tape(process, min(STRETCH, ticks), states, scene.outside, nsim)
-    quarter, early, late, clipped = ticks // 4, np.zeros(nsim), np.zeros(nsim), np.zeros(nsim, dtype=bool)
-    with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        engine.start(tape)
-        for first in range(0, ticks, tape.ticks):
-            count = min(tape.ticks, ticks - first)
-            tape.w[:count] = knock_forces(scene, T, first, count)[:, :, None]
-            stretch(tape, engine, count)
-            clipped |= (np.abs(tape.f[:count]) >= limit).any(axis=(0, 1))
-            square, k = (tape.s[:count, speeds] ** 2).sum(axis=1), np.arange(first, first + count)
-            early += square[(k >= quarter) & (k < 2 * quarter)].sum(axis=0)
-            late += square[k >= ticks - quarter].sum(axis=0)
-            tape.rewind(count)
-        rate = np.log(late / early) / 2 / ((ticks - 2 * quarter) * T)
-    rate = np.where(late == 0, -np.inf, np.where(np.isnan(rate), np.inf, rate))
-    return Growth(rate, clipped)
-
-
-def unlimited(process: Process) -> Process:
-    """The linear process: no force limits, no encoder steps."""
-    return replace(process, force_limit=np.full(process.channels, np.inf), encoder_step=np.zeros(process.channels))
-
-
-# ----------------------------------------------------------------------------------------------------
-# The worst delays for a loop: greedy switching, and the periodic switching in it that grows fastest, exactly.
-#
-# Greedy: the loop starts from a knock on every handle. At every tick and on every channel the device is handed, of
-# the forces that a delay in [lo, hi] allows, the one that brakes it least or pushes it most: the largest -f v. Ages
-# grow by one per tick at most, as they do where packets are held. Periodic: of all windows of that sequence that may
-# be repeated, the one whose product of mode matrices has the largest spectral radius per tick: a proof of instability
-# where it exceeds 1.
-
-
-LONGEST_PERIOD = 250  # [ticks]
-STARTS = 6  # windows begin at so many ticks of the greedy sequence
-MOST_ENDS = 256  # constant delays, each at an end of its range, that are compared
-
-
 def greedy_ages(process: Process, plants: HeldPlant, scene: Scene, jitter: Jitter, ticks: int) -> Ticks:
     """Ages (ticks, m, nsim) that feed the linear loop of every plant; `process` is that without Theta."""
     nsim, states, nv = plants.A.shape[0], plants.A.shape[1], scene.model.nv
     m, free = process.channels, np.full(process.channels, np.inf)
     lo, hi = (np.array(side)[:, None] for side in (jitter.lo, jitter.hi))
     depth = int(hi.max()) + 1
-    tape = Tape(replace(process, force_limit=free, delays=None), 1, states, scene.outside, nsim)
+    buffer = StepBuffer(replace(process, force_limit=free, delays=None), 1, states, scene.outside, nsim)
     engine = ExactBatchEngine(plants, free)
-    engine.start(tape)
-    pushed = knock_forces(scene, process.F.T, 0, ticks)
+    engine.start(buffer)
+    pushed = impulse_forces(scene, process.F.T, 0, ticks)
     sent, age = np.zeros((depth, m, nsim)), np.broadcast_to(hi, (m, nsim))
     candidate = np.arange(depth)[:, None, None]
     ages = np.empty((ticks, m, nsim), dtype=np.int64)
     for k in range(ticks):
-        tape.w[0] = pushed[k][:, None]
-        tape.tick(0)
-        sent = np.concatenate([tape.f[0][None], sent[:-1]])  # sent[n] left n ticks ago
+        buffer.w[0] = pushed[k][:, None]
+        buffer.tick(0)
+        sent = np.concatenate([buffer.f[0][None], sent[:-1]])  # sent[n] left n ticks ago
         allowed = (candidate >= lo) & (candidate <= np.minimum(hi, age + 1))
-        age = np.argmin(np.where(allowed, sent * tape.s[0][nv : nv + m], np.inf), axis=0)
-        tape.f[0] = np.take_along_axis(sent, age[None], axis=0)[0]
+        age = np.argmin(np.where(allowed, sent * buffer.s[0][nv : nv + m], np.inf), axis=0)
+        buffer.f[0] = np.take_along_axis(sent, age[None], axis=0)[0]
         engine.advance(0)
-        tape.rewind(1)
+        buffer.rewind(1)
         ages[k] = age
         if k % 32 == 31 and not pushed[k:].any():  # the choice does not depend on the scale
-            size = np.maximum(np.abs(tape.s[0]).max(axis=0), 1e-200)
-            tape.s[0] /= size
-            tape.z[0] /= size
+            size = np.maximum(np.abs(buffer.s[0]).max(axis=0), 1e-200)
+            buffer.s[0] /= size
+            buffer.z[0] /= size
             sent /= size
     return ages
 
 
-@dataclass(frozen=True, eq=False)
-class Period:
-    """Switching that repeats, with the exact growth of the loop under it."""
-
-    ages: Ticks  # (period, m)
-    delays: Ticks  # (period, m) of the packets that make these ages
-    growth: float  # [1/s]
-    spectral_radius: float  # of the product over one period
-
-
-def worst_period(ages: Ticks, plant: HeldPlant, G: Lti, jitter: Jitter) -> Period:
+def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, jitter: Jitter) -> Period:
     """The fastest growing repetition of a window of `ages` (ticks, m), or of one delay at an end of its range."""
     ticks = ages.shape[0]
-    cache: dict[tuple[int, ...], Array] = {}
-
-    def matrix(row: Array) -> Array:
-        key = tuple(int(n) for n in row)
-        if key not in cache:
-            cache[key] = mode_matrix(plant, G, jitter.hi, key)
-        return cache[key]
-
+    matrix = cache(lambda *now: mode_matrix(plant, G, jitter.hi, now))
     best, chosen = -np.inf, ages[:1]
-    starts = np.linspace(ticks // 3, max(ticks - LONGEST_PERIOD, ticks // 3), STARTS, dtype=int)
-    ends = [np.array([row]) for row in product(*zip(jitter.lo, jitter.hi, strict=True))][:MOST_ENDS]
-    for window in [*(ages[start : start + LONGEST_PERIOD] for start in starts), *ends]:
-        products, scale = _running_products([matrix(row) for row in window])
+    starts = np.linspace(ticks // 3, max(ticks - _LONGEST_PERIOD, ticks // 3), _STARTS, dtype=int)
+    ends = [np.array([row]) for row in product(*zip(jitter.lo, jitter.hi, strict=True))][:_MOST_ENDS]
+    for window in [*(ages[start : start + _LONGEST_PERIOD] for start in starts), *ends]:
+        products, scale = _running_products([matrix(*row) for row in window.tolist()])
         radius = np.abs(np.linalg.eigvals(products)).max(axis=1)
         periods = np.arange(1, len(window) + 1)
         growth = (np.log(np.maximum(radius, 1e-300)) + scale) / (periods * G.T)
@@ -206,62 +190,23 @@ def _running_products(matrices: list[Array]) -> tuple[Array, Array]:
     return np.stack(products), np.array(scales)
 
 
-# ----------------------------------------------------------------------------------------------------
-# The delays of a run: drawn from a scenario's jitter and a seed, or found worst for its loop.
+# ---- many humans under delays that vary: each meets delays of its own, drawn or found worst, in one batch
 
-
-SEARCHED = 1600  # ticks of greedy switching in which the worst period is sought
-SHORTEST = 4  # ticks that are drawn at least: a growth compares quarters
-STREAM = 5  # keeps these draws apart from those of the humans with the same seed and index
-
-
-def draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, given: Ticks | None = None) -> Ticks:
-    """Delays (ticks, m) of run number `index`; they depend on (seed, index) and the scenario only."""
-    assert scenario.jitter is not None
-    rows = np.array([scenario.theta]) if scenario.jitter.pattern == "constant" else given
-    rng = np.random.default_rng(np.random.SeedSequence((seed, index, STREAM)))
-    return scenario.jitter.draw(rng, ticks, rows)
-
-
-def switching(
-    assembly: Assembly, coupling: Coupling, seed: int, ticks: int, index: int = 0
-) -> tuple[Assembly, Period | None]:
-    """The loop with the scenario's varying delays, and their period where they are adversarial."""
-    jitter = assembly.scenario.jitter
-    assert jitter is not None
-    period = adversary(assembly, coupling, jitter) if jitter.pattern == "adversarial" else None
-    delays = draw_delays(assembly.scenario, seed, index, max(ticks, SHORTEST), period.delays if period else None)
-    return with_delays(assembly, coupling, delays[:, :, None]), period
-
-
-def adversary(assembly: Assembly, coupling: Coupling, jitter: Jitter) -> Period:
-    """The periodic switching within the range that was found to grow fastest in this loop."""
-    G = without_theta(assembly, coupling)
-    process, plant = replace(assembly.process, F=G), assembly.plant
-    one = HeldPlant(plant.A[None], plant.B[None], plant.C, plant.T)
-    ages = greedy_ages(process, one, assembly.scene, jitter, SEARCHED)
-    return worst_period(ages[:, :, 0], plant, G, jitter)
-
-
-# ----------------------------------------------------------------------------------------------------
-# Many humans under delays that vary: each meets delays of its own, drawn or found worst, in one batch.
-
-
-SHORTEST_CROWD = 2.0  # [s] of every trace: a growth of 1 1/s stands out from how a knock spreads
-DOUBTFUL = 1.0  # [1/s]: a slower growth may be two modes that beat, and is judged again ..
-LONGER = 5  # .. on traces so many times as long
+_SHORTEST_CROWD = 2.0  # [s] of every trace: a growth of 1 1/s stands out from how an impulse spreads
+_DOUBTFUL = 1.0  # [1/s]: a slower growth may be two modes that beat, and is judged again ..
+_LONGER = 5  # .. on traces so many times as long
 
 
 @dataclass(frozen=True, eq=False)
 class Switched:
-    """Growth [1/s] of the handles' speeds after a knock, (nsim,) each."""
+    """Growth [1/s] of the handles' speeds after an impulse, (nsim,) each."""
 
     exact: Array  # of the linear loop
     mujoco: Array  # of MuJoCo's; nan where it was not asked for, or a force reached its limit
 
 
 def switched_crowd(
-    assembly: Assembly,
+    simulation: Simulation,
     coupling: Coupling,
     held_by: Variants,
     index: NDArray[np.intp],
@@ -270,65 +215,58 @@ def switched_crowd(
     mujoco: bool,
     threads: int = 0,
 ) -> Switched:
-    """Knock every set of humans under the delays of its index, which depend on (seed, index) and the loop only."""
-    ticks = round(max(duration, SHORTEST_CROWD) / assembly.scenario.T)
-    found = _knocked(assembly, coupling, held_by, index, seed, ticks, mujoco, threads)
-    doubtful = (found.exact > 0) & (found.exact < DOUBTFUL)
+    """The impulse test for every set of humans, under the delays of its index: of (seed, index) and the loop only."""
+    scenario, nsim, scene = simulation.scenario, len(held_by), held_by.scene
+    plants = hold(held_by.plants(), scenario.T)
+    states = plants.A.shape[1]
+    free = replace(simulation.process, F=without_theta(simulation, coupling))
+
+    def judged(ticks: int) -> Switched:
+        process = replace(free, delays=_crowd_delays(scenario, free, scene, plants, index, seed, ticks))
+        endless = unlimited(process)
+        exact, _ = impulse_growth(endless, ExactBatchEngine(plants, endless.force_limit), scene, states, ticks, nsim)
+        if not mujoco:
+            return Switched(exact, np.full(nsim, np.nan))
+        engine = MujocoBatchEngine(scene, scenario.T, nsim=nsim, nthread=threads, fields=held_by.fields)
+        own, clipped = impulse_growth(process, engine, scene, states, ticks, nsim)
+        return Switched(exact, np.where(clipped, np.nan, own))
+
+    ticks = round(max(duration, _SHORTEST_CROWD) / scenario.T)
+    found = judged(ticks)
+    doubtful = (found.exact > 0) & (found.exact < _DOUBTFUL)
     if not doubtful.any():
         return found
-    longer = _knocked(assembly, coupling, held_by, index, seed, LONGER * ticks, mujoco, threads)
+    longer = judged(_LONGER * ticks)
     return Switched(np.where(doubtful, longer.exact, found.exact), np.where(doubtful, longer.mujoco, found.mujoco))
 
 
-def _knocked(
-    assembly: Assembly,
-    coupling: Coupling,
-    held_by: Variants,
-    index: NDArray[np.intp],
-    seed: int,
-    ticks: int,
-    mujoco: bool,
-    threads: int,
-) -> Switched:
-    T, nsim, scene = assembly.scenario.T, len(held_by), held_by.scene
-    plants = hold(held_by.plants(), T)
-    process = replace(assembly.process, F=without_theta(assembly, coupling))
-    process = replace(process, delays=_delays(assembly, process, held_by, plants, index, seed, ticks))
-    linear, states = unlimited(process), plants.A.shape[1]
-    exact = knocked(linear, ExactBatchEngine(plants, linear.force_limit), scene, states, ticks, nsim).rate
-    if not mujoco:
-        return Switched(exact, np.full(nsim, np.nan))
-    engine = MujocoBatchEngine(scene, T, nsim=nsim, nthread=threads, fields=held_by.fields)
-    seen = knocked(process, engine, scene, states, ticks, nsim)
-    return Switched(exact, np.where(seen.clipped, np.nan, seen.rate))
-
-
-def _delays(
-    assembly: Assembly,
+def _crowd_delays(
+    scenario: Scenario,
     process: Process,
-    held_by: Variants,
+    scene: Scene,
     plants: HeldPlant,
     index: NDArray[np.intp],
     seed: int,
     ticks: int,
 ) -> Ticks:
-    jitter = assembly.scenario.jitter
-    assert jitter is not None
-    given = [None] * len(index)
-    if jitter.pattern == "adversarial":
-        worst = realising(greedy_ages(process, plants, held_by.scene, jitter, ticks))
+    """(ticks, m, nsim)"""
+    assert scenario.jitter is not None
+    given: list[Ticks | None] = [None] * len(index)
+    if scenario.jitter.pattern == "adversarial":
+        worst = realising(greedy_ages(process, plants, scene, scenario.jitter, ticks))
         given = [worst[:, :, j] for j in range(len(index))]
-    rows = [
-        draw_delays(assembly.scenario, seed, int(i), ticks, own) for i, own in zip(index.tolist(), given, strict=True)
-    ]
-    return np.stack(rows, axis=2)
+    numbered = zip(index.tolist(), given, strict=True)
+    return np.stack([_draw_delays(scenario, seed, i, ticks, own) for i, own in numbered], axis=2)
+
+
+# ---- what is certified: by the coupling's file, or judged anew
 
 
 def certified_part(scenario: Scenario, chosen: Chosen, certified: bool) -> dict[str, Any]:
     """The jitter-proof requirement, and what the certificates cover; `certified` is about the constant theta."""
     assert scenario.jitter is not None
     if not scenario.switches:
-        return {"jitter_proof": None, "on_file": None} | coverage(scenario.jitter, certified, None)
+        return {"jitter_proof": None, "on_file": None} | _coverage(scenario.jitter, certified, None)
     span = scenario.delay_range
     loop = scenario.loop("I").switching(span)  # the case does not matter to stability
     found = switching_requirement(loop, chosen.coupling)
@@ -336,19 +274,10 @@ def certified_part(scenario: Scenario, chosen: Chosen, certified: bool) -> dict[
     figures = switching_part(found, loop.sent(chosen.coupling), span)
     proof = _how_proved(found.requirement, on_file)
     parts = {"jitter_proof": figures, "on_file": on_file and msgspec.to_builtins(on_file)}
-    return parts | coverage(scenario.jitter, certified, proof, figures["playout"]["certified"])
+    return parts | _coverage(scenario.jitter, certified, proof, figures["playout"]["certified"])
 
 
-def _how_proved(requirement: Requirement, on_file: DelayRange | None) -> str:
-    """What shows that any switching within the range is safe, "" where nothing does."""
-    if on_file:
-        return f"proved in the coupling's file for {switching_promise(on_file)}"
-    if not requirement.certified:
-        return ""
-    return "proved exactly" if requirement.proof == "rational" else "by a refined sweep, without an exact proof"
-
-
-def coverage(jitter: Jitter, certified: bool, proof: str | None, buffered: bool = False) -> dict[str, Any]:
+def _coverage(jitter: Jitter, certified: bool, proof: str | None, buffered: bool = False) -> dict[str, Any]:
     """Whether what is certified covers these delays: {"covered", "covers"}.
 
     `certified` is about the constant theta, `proof` says what shows that every switching within the range is safe
@@ -373,3 +302,12 @@ def coverage(jitter: Jitter, certified: bool, proof: str | None, buffered: bool 
         "covered": False,
         "covers": f"{constants}; this coupling is not jitter-proof, so switching is not covered; {advice}",
     }
+
+
+def _how_proved(requirement: Requirement, on_file: DelayRange | None) -> str:
+    """What shows that any switching within the range is safe, "" where nothing does."""
+    if on_file:
+        return f"proved in the coupling's file for {switching_promise(on_file)}"
+    if not requirement.certified:
+        return ""
+    return "proved exactly" if requirement.proof == "rational" else "by a refined sweep, without an exact proof"

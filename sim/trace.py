@@ -1,11 +1,24 @@
-"""What an ideal environment would have done: the force of Lambda E for the displacements that a run measured."""
+"""What a run returns, as files, and what its displacements show: does something oscillate, and does it grow?
+
+Displacements alone are looked at, for where nobody knows the states of the loop: the trace of a bridge, a stored one,
+a loop that is not linear. An oscillation is what is left of a part of a trace without its slow motion, split into
+octaves. Two questions are asked of it:
+
+oscillation   does it go on in the second half of a trace? The half is cut into two windows; it does if in some octave
+              the amplitude in the last window exceeds a threshold and is at least SUSTAINED of that in the window
+              before. A decaying oscillation is not one however large it still is, and one below the threshold is not
+              one however long it lasts. Octaves are looked at apart, so that a slow mode that decays does not hide a
+              fast one that grows.
+growth        how fast does it grow? An oscillation that grows like exp(g t) is exp(g hop) times larger in each
+              window than in the one before: g is the slope of a line through logarithms. It is a figure about motion,
+              not a verdict about a loop: a person who shakes the handle harder and harder grows too.
+"""
 
 from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
 from zipfile import BadZipFile
@@ -13,20 +26,22 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.delay import delay
-from controller.lti import Array, Lti, frozen
-from sim.files import write
-from sim.run import Assembly, Record
-from sim.scenario import InputError
-from sim.stability import PERIODS, octaves
+from controller.lti import Array, frozen
+from sim.files import InputError, write
 
-# ----------------------------------------------------------------------------------------------------
-# The trace of a run as files: npz for programs, CSV for spreadsheets.
+_MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # axes of what files keep
+_STATES = {"z": 2, "s": 2}
+
+#: what NumPy and zipfile raise of a file that is no npz, is damaged, or holds something else
+DAMAGED = (KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True, eq=False)
-class Result:
-    """What was measured at every tick, and under which settings. Arrays are read-only."""
+class Trace:
+    """What every tick saw, and under which settings. Arrays are read-only.
+
+    The states z and s have no columns where nobody recorded them, as in a file or on a real device.
+    """
 
     t: Array  # (N,) [s], sample k at k T
     x: Array  # (N, m) device displacements as the encoders gave them [m]
@@ -34,32 +49,47 @@ class Result:
     x_handle: Array  # (N, m) [m]
     v_handle: Array  # (N, m) [m/s]
     w: Array  # (N, outside) outside forces [N]
-    meta: dict[str, Any]
+    meta: dict[str, Any] = field(default_factory=dict)
+    z: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, order) states of the process
+    s: Array = field(default_factory=lambda: np.empty((0, 0)))  # (N, 2n) of the plant: positions [m], velocities [m/s]
+    diverged: bool = False  # the engine gave up, or a number stopped being finite, soon after the last tick
+    interrupted: bool = False  # stopped from the keyboard
 
     def __post_init__(self) -> None:
-        for name, ndim in _ARRAYS.items():
-            value = frozen(getattr(self, name), ndim, name)
+        for name, ndim in (_MEASURED | _STATES).items():
+            value = getattr(self, name)
+            value = frozen(value if name in _MEASURED or np.size(value) else np.empty((len(self.t), 0)), ndim, name)
             object.__setattr__(self, name, value)
             if value.shape[0] != self.t.shape[0]:
                 raise ValueError(f"{name} has {value.shape[0]} samples, t has {self.t.shape[0]}")
         if self.f.shape != self.x.shape:
             raise ValueError(f"f has {self.f.shape[1]} channels, x has {self.x.shape[1]}")
 
-    @classmethod
-    def from_record(cls, assembly: Assembly, record: Record, meta: dict[str, Any]) -> Self:
-        """The one simulation of a record, in the scenario's terms."""
-        m, handles = assembly.process.channels, list(assembly.scene.handles)
-        s = record.s[:, :, 0]
-        n = assembly.scene.model.nq
-        t = np.arange(s.shape[0]) * assembly.scenario.T
-        x = assembly.process.measured(s[:, :m])
-        return cls(t, x, record.f[:, :, 0], s[:, handles], s[:, n:][:, handles], record.w[:, :, 0], meta)
+    def clipped(self, force_limit: Array) -> NDArray[np.bool_]:
+        """(N,) whether any force was at its limit, (m,) [N], at a tick."""
+        return np.any(np.abs(self.f) >= force_limit, axis=1)
+
+    def ticks_before_clipping(self, force_limit: Array) -> int:
+        """Ticks before the first clipped one; all of them where there is none."""
+        clipped = self.clipped(force_limit)
+        return int(np.argmax(clipped)) if clipped.any() else clipped.size
+
+    def dominant_frequency_hz(self) -> float | None:
+        """The strongest line above 10 Hz in the last quarter of the forces, what one hears and feels; None if short."""
+        tail = self.f[-(self.f.shape[0] // 4) :]
+        if tail.shape[0] < 64:
+            return None
+        window = np.hanning(tail.shape[0])[:, None]
+        spectrum = np.abs(np.fft.rfft((tail - tail.mean(axis=0)) * window, axis=0)).sum(axis=1)
+        frequency = np.fft.rfftfreq(tail.shape[0], float(self.t[1]))
+        spectrum[frequency < 10.0] = 0.0
+        return float(frequency[np.argmax(spectrum)]) if spectrum.any() else None
 
     def save_npz(self, path: Path) -> Path:
-        """Arrays and metadata (as JSON text), compressed, without pickle."""
+        """What was measured and the metadata (as JSON text), compressed, without pickle."""
 
         def content(file: BinaryIO) -> None:
-            arrays = {name: getattr(self, name) for name in _ARRAYS}
+            arrays = {name: getattr(self, name) for name in _MEASURED}
             np.savez_compressed(file, allow_pickle=False, meta=np.array(json.dumps(self.meta)), **arrays)
 
         return write(path, content)
@@ -69,7 +99,7 @@ class Result:
         """A trace written by `save_npz`. Raises InputError where it is none."""
         try:
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                return cls(**{name: archive[name] for name in _ARRAYS}, meta=json.loads(str(archive["meta"])))
+                return cls(**{name: archive[name] for name in _MEASURED}, meta=json.loads(str(archive["meta"])))
         except OSError as error:
             raise InputError(f"{path}: {error.strerror or error}") from None
         except DAMAGED as error:
@@ -87,45 +117,96 @@ class Result:
         return write(path, content)
 
 
-#: what NumPy and zipfile raise of a file that is no npz, is damaged, or holds something else
-DAMAGED = (KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, BadZipFile, zlib.error)
-_ARRAYS = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}
+# ---- octaves, and whether something goes on oscillating
+
+_PERIODS = 4  # in a window, of the slowest oscillation that is seen: of fewer the window function mixes octaves
+_CUBIC = 3  # degree of the polynomial that is the slow part of a hand at rest or under a constant force
+SUSTAINED = 0.95
+RUNAWAY = 1e3  # [m] no handle moves that far: the trace has diverged
 
 
-# ----------------------------------------------------------------------------------------------------
-# Does an oscillation grow? From displacements alone, where nobody knows the states: a bridge's trace, any stored one.
-#
-# sim.stability projects a run on a mode of the loop whose humans are known. Of a real device there are displacements
-# only, and the person moves as they like. So the second half of a stretch of ticks is cut into overlapping windows,
-# the slow part of each is taken out, and the rest is split into octaves (sim.oscillation). An oscillation that grows
-# like exp(g t) is exp(g hop) times larger in each window than in the one before: g is the slope of a line through
-# logarithms.
-#
-# It is a figure about motion, not a verdict about a loop: a person who shakes the handle harder and harder grows too.
+@dataclass(frozen=True, eq=False)
+class Oscillation:
+    """One entry per simulation."""
+
+    sustained: NDArray[np.bool_]  # (nsim,) the verdict
+    amplitude: Array  # (nsim,) [m] of the strongest octave that is sustained, else of the strongest one; inf: diverged
+    frequency_hz: Array  # (nsim,) [Hz] the strongest line in that octave; nan: diverged
 
 
-WINDOW = 1.0  # [s] at most
-TREND = 7  # degree of the polynomial that is the slow part: of 15 mm at 0.6 Hz it leaves less than a micrometre
-WINDOWS = 7  # in the second half of a stretch, each half over the next, at least
-NEEDED = 4  # of them, one after the other, that an oscillation is seen in
-SHORTEST = 200  # ticks
-FLOOR = 3.0  # times what the encoders' rounding puts into an octave: less is not an oscillation
-CLEAR = 4.0  # standard errors, of a line through as few as four points
-FINEST = 1e-9  # [m] step taken for an ideal encoder: floating-point noise is no oscillation
+def slowest_seen(duration: float) -> float:
+    """[Hz] the lowest frequency that `oscillation` sees in a trace of that many seconds."""
+    return 4 * _PERIODS / duration
+
+
+def oscillation(x: Array, T: float, threshold: float) -> Oscillation:
+    """Of positions x (ticks, m, nsim) [m] in the second half of traces, sampled every T seconds."""
+    half = x.shape[0] // 2
+    diverged = ~(np.abs(x) < RUNAWAY).all(axis=(0, 1))
+    calm = np.where(diverged, 0.0, x)
+    before, _, _ = _octaves(calm[:half], T, _CUBIC)
+    after, line, _ = _octaves(calm[half : 2 * half], T, _CUBIC)  # (octaves, m, nsim)
+    lasting = (after > threshold) & (after >= SUSTAINED * before)
+    shown = np.where(lasting | ~lasting.any(axis=(0, 1)), after, 0.0).reshape(-1, x.shape[2])
+    at = np.argmax(shown, axis=0)[None]
+    amplitude = np.take_along_axis(shown, at, axis=0)[0]
+    frequency = np.take_along_axis(line.reshape(-1, x.shape[2]), at, axis=0)[0]
+    return Oscillation(
+        np.any(lasting, axis=(0, 1)) | diverged,
+        np.where(diverged, np.inf, amplitude),
+        np.where(diverged, np.nan, frequency),
+    )
+
+
+def _octaves(x: Array, T: float, trend: int) -> tuple[Array, Array, Array]:
+    """Of x (ticks, m, nsim) without a polynomial of degree `trend`: amplitude of each octave (that of a sinusoid of its
+    power) and frequency [Hz] of its strongest line, both (octaves, m, nsim), and its part of all lines, (octaves,).
+    """
+    ticks = x.shape[0]
+    window = np.hanning(ticks)
+    basis, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, ticks), trend + 1))
+    flat = x.reshape(ticks, -1)
+    fast = flat - basis @ (basis.T @ flat)
+    # a sinusoid of amplitude a has power a^2/2; a window w keeps sum w^2 of ticks
+    power = 4 * np.abs(np.fft.rfft(window[:, None] * fast, axis=0)) ** 2 / (ticks * (window**2).sum())
+    frequency = np.fft.rfftfreq(ticks, T)
+    lowest = _PERIODS / (ticks * T) * (1 - 1e-9)
+    octave = np.floor(np.log2(np.maximum(frequency, lowest / 2) / lowest)).astype(int)
+    amplitudes, lines, parts = [], [], []
+    for k in range(octave.max() + 1):
+        rows = np.flatnonzero(octave == k)
+        if rows.size:
+            amplitudes.append(np.sqrt(power[rows].sum(axis=0)))
+            lines.append(frequency[rows][np.argmax(power[rows], axis=0)])
+            parts.append(rows.size / octave.size)
+    shape = (len(amplitudes), *x.shape[1:])
+    return np.array(amplitudes).reshape(shape), np.array(lines).reshape(shape), np.array(parts)
+
+
+# ---- how fast an oscillation grows
+
+_WINDOW = 1.0  # [s] at most
+_TREND = 7  # degree of the polynomial that is the slow part: of 15 mm at 0.6 Hz it leaves less than a micrometre
+_WINDOWS = 7  # in the second half of such a part, each half over the next, at least
+_NEEDED = 4  # of them, one after the other, that an oscillation is seen in
+_SHORTEST = 200  # ticks
+_FLOOR = 3.0  # times what the encoders' rounding puts into an octave: less is not an oscillation
+_CLEAR = 4.0  # standard errors, of a line through as few as four points
+_FINEST = 1e-9  # [m] step taken for an ideal encoder: floating-point noise is no oscillation
 
 
 @dataclass(frozen=True)
 class Growth:
-    """The strongest oscillation in a stretch of a trace, or why there is none to tell of."""
+    """The strongest oscillation in a part of a trace, or why no rate can be given."""
 
     first: int  # ticks [first, stop) that were looked at
     stop: int
-    growth_rate_per_s: float | None
-    error_per_s: float | None  # standard error of the line
-    frequency_hz: float | None
-    amplitude_m: float | None  # of its octave, where it was seen last
-    slowest_hz: float | None  # slower oscillations are not seen
-    trend: str | None  # grows | decays | neither: by more than CLEAR standard errors
+    growth_rate_per_s: float | None = None
+    error_per_s: float | None = None  # standard error of the line
+    frequency_hz: float | None = None
+    amplitude_m: float | None = None  # of its octave, where it was seen last
+    slowest_hz: float | None = None  # slower oscillations are not seen
+    trend: str | None = None  # grows | decays | neither: by more than _CLEAR standard errors
     reason: str | None = None
 
     def part(self) -> dict[str, Any]:
@@ -141,27 +222,25 @@ def growth(x: Array, T: float, encoder_step: Array, first: int = 0) -> Growth:
     that decays does not hide one that grows.
     """
     n, stop = len(x), first + len(x)
-    if n < SHORTEST:
-        return Growth(
-            first, stop, None, None, None, None, None, None, f"only {n} ticks; a growth rate needs {SHORTEST}"
-        )
+    if n < _SHORTEST:
+        return Growth(first, stop, reason=f"only {n} ticks; a growth rate needs {_SHORTEST}")
     begin = n // 2
-    while not (lines := _lines(x[begin:], T, encoder_step)).found and n - begin >= 2 * SHORTEST:
+    while not (lines := _lines(x[begin:], T, encoder_step)).found and n - begin >= 2 * _SHORTEST:
         begin = (begin + n) // 2
     if not lines.found:
         begin = begin if lines.brief else n // 2
         lines = lines if lines.brief else _lines(x[begin:], T, encoder_step)
         what = "something oscillates, too briefly for a rate," if lines.brief else "nothing oscillates"
         reason = f"{what} above {1e6 * lines.floor:.2g} um"
-        return Growth(first + begin, stop, None, None, None, None, lines.slowest, None, reason)
-    growing = [one for one in lines.found if one[0] > CLEAR * one[1]]
+        return Growth(first + begin, stop, slowest_hz=lines.slowest, reason=reason)
+    growing = [one for one in lines.found if one[0] > _CLEAR * one[1]]
     rate, error, frequency, size = max(growing or lines.found, key=lambda one: one[3])
-    trend = "grows" if growing else "decays" if rate < -CLEAR * error else "neither"
+    trend = "grows" if growing else "decays" if rate < -_CLEAR * error else "neither"
     return Growth(first + begin, stop, rate, error, frequency, size, lines.slowest, trend)
 
 
 class _Lines(NamedTuple):
-    """What oscillates in a stretch."""
+    """What oscillates in a part of a trace."""
 
     found: list[tuple[float, float, float, float]]  # rate and its error [1/s], frequency [Hz], amplitude [m], by octave
     brief: bool  # something does, in too few windows
@@ -170,20 +249,20 @@ class _Lines(NamedTuple):
 
 
 def _lines(x: Array, T: float, encoder_step: Array) -> _Lines:
-    hop = min(round(WINDOW / T), 2 * len(x) // (WINDOWS + 1)) // 2
+    hop = min(round(_WINDOW / T), 2 * len(x) // (_WINDOWS + 1)) // 2
     windows = [x[start : start + 2 * hop] for start in range(0, len(x) - 2 * hop + 1, hop)]
-    amplitude, line, part = map(np.array, zip(*(octaves(w[:, :, None], T, TREND) for w in windows), strict=True))
+    amplitude, line, part = map(np.array, zip(*(_octaves(w[:, :, None], T, _TREND) for w in windows), strict=True))
     seen = np.sqrt(np.square(amplitude[..., 0]).sum(axis=2))  # (windows, octaves): a mode moves all channels
     # rounding is white with a variance of step^2/12, and a sinusoid's amplitude is the root of twice its power
-    floor = FLOOR * np.sqrt(2 * part[0] * np.square(encoder_step).sum() / 12)
+    floor = _FLOOR * np.sqrt(2 * part[0] * np.square(encoder_step).sum() / 12)
     found = []
     for k in range(seen.shape[1]):
         at = _longest(seen[:, k] > floor[k])
-        if len(at) >= NEEDED:
+        if len(at) >= _NEEDED:
             rate, error = _slope(np.log(seen[at, k]), hop * T)
             strongest = np.argmax(amplitude[at[-1], k, :, 0])
             found.append((rate, error, float(line[at[-1], k, strongest, 0]), float(seen[at[-1], k])))
-    return _Lines(found, bool((seen > floor).any()), float(floor.max()), PERIODS / (2 * hop * T))
+    return _Lines(found, bool((seen > floor).any()), float(floor.max()), _PERIODS / (2 * hop * T))
 
 
 def _longest(on: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -201,32 +280,32 @@ def _slope(values: Array, spacing: float) -> tuple[float, float]:
     return slope, float(np.sqrt(rest @ rest / (n - 2) / (t @ t)))
 
 
-def growths(result: Result) -> list[Growth]:
-    """One entry per stretch of a trace in which the loop was one linear loop: `run.steady_ticks` of its metadata.
+def growths(trace: Trace) -> list[Growth]:
+    """One entry per part of a trace in which the loop was one linear loop: `run.steady_ticks` of its metadata.
 
     Where a trace does not name any, all of it is one. Raises InputError where what it names is none of it.
     """
-    n, m = result.x.shape
-    run = result.meta.get("run") if isinstance(result.meta, dict) else None
+    n, m = trace.x.shape
+    run = trace.meta.get("run") if isinstance(trace.meta, dict) else None
     run = run if isinstance(run, dict) else {}
     stretches, step = run.get("steady_ticks", [[0, n]]), run.get("encoder_step_m", [0.0] * m)
     try:
         ends = np.array([(int(first), int(stop)) for first, stop in stretches], dtype=int).reshape(-1, 2)
-        steps = np.maximum(np.array(step, dtype=float).reshape(m), FINEST)
+        steps = np.maximum(np.array(step, dtype=float).reshape(m), _FINEST)
     except (TypeError, ValueError):
         raise InputError("the trace's run.steady_ticks or run.encoder_step_m are no numbers for its channels") from None
     if np.any(ends[:, 0] < 0) or np.any(ends[:, 1] > n) or np.any(ends[:, 0] > ends[:, 1]):
         raise InputError(f"the trace's run.steady_ticks are {ends.tolist()}, it has {n} ticks")
-    if not np.isfinite(result.x).all() or not np.isfinite(steps).all():
+    if not np.isfinite(trace.x).all() or not np.isfinite(steps).all():
         raise InputError("the trace has displacements or encoder steps that are not finite")
-    T = float(result.t[1] - result.t[0]) if n > 1 else 0.0
+    T = float(trace.t[1] - trace.t[0]) if n > 1 else 0.0
     if n > 1 and not 0 < T < np.inf:
         raise InputError(f"the trace's samples are {T:g} s apart")
-    return [growth(result.x[first:stop], T, steps, first) for first, stop in ends.tolist()]
+    return [growth(trace.x[first:stop], T, steps, first) for first, stop in ends.tolist()]
 
 
-def told(part: dict[str, Any], T: float) -> str:
-    """One stretch in words, from its plain data."""
+def format_growth(part: dict[str, Any], T: float) -> str:
+    """The growth of one part of a trace in words, from its plain data."""
     where = f"ticks {part['first']} to {part['stop']} ({(part['stop'] - part['first']) * T:.2f} s)"
     above = "" if part["slowest_hz"] is None else f" (from {part['slowest_hz']:.3g} Hz up)"
     if part["reason"]:
@@ -235,54 +314,7 @@ def told(part: dict[str, Any], T: float) -> str:
     return f"{where}: {rate}{above}, {1e3 * part['amplitude_m']:.2g} mm at last: {part['trend']}"
 
 
-@dataclass(frozen=True, eq=False)
-class Likeness:
-    """Two answers to the same displacements, from rest at t = 0 and over the whole run, before any force limit."""
-
-    asked: Array  # (N, m) what the coupled loop asks of the motors, F x [N]
-    ideal: Array  # (N, m) what the delay-matched environment itself would ask, Lambda E x [N]
-    reason: str | None = None  # why the two cannot be compared
-
-    def part(self) -> dict[str, Any]:
-        """rms(asked - ideal)/rms(ideal) in percent, over all ticks and channels; None with a reason where undefined."""
-        asked, ideal, apart = _rms(self.asked), _rms(self.ideal), _rms(self.asked - self.ideal)
-        part: dict[str, Any] = {"error_percent": None, "asked_rms_n": asked, "ideal_rms_n": ideal}
-        if self.reason:
-            return part | {"ideal_rms_n": None, "reason": self.reason}
-        if not np.isfinite([asked, ideal, apart]).all():
-            return part | {"asked_rms_n": None, "ideal_rms_n": None, "reason": "the run left the range of numbers"}
-        if ideal == 0:
-            return part | {"reason": "the ideal environment would have rendered no force"}
-        return part | {"error_percent": 100 * apart / ideal}
-
-
-def likeness(assembly: Assembly, record: Record, lam: Sequence[int]) -> Likeness:
-    """The run's forces before their limits, and those of Lambda E, for the displacements that the encoders gave.
-
-    Where delays switch, the forces are those that arrived, within their limits. Of walls there is no linear ideal.
-    """
-    process = assembly.process
-    x = process.measured(record.s[:, : process.channels, 0])
-    if process.contact:
-        return Likeness(record.f[:, :, 0], record.f[:, :, 0], "walls have no linear ideal to compare with")
-    F = process.F
-    asked = record.f[:, :, 0] if process.delays is not None else record.z[:, :, 0] @ F.C.T + x @ F.D.T
-    return Likeness(asked, response(delay(lam, F.T) @ assembly.E, x))
-
-
-def response(G: Lti, x: Array) -> Array:
-    """y = G x from rest; x (N, inputs), y (N, outputs)."""
-    states = np.zeros((x.shape[0] + 1, G.order))
-    driven = x @ G.B.T
-    with np.errstate(over="ignore", invalid="ignore"):  # an unstable run may leave the range of numbers
-        for k in range(x.shape[0]):
-            states[k + 1] = G.A @ states[k] + driven[k]
-        return states[:-1] @ G.C.T + x @ G.D.T
-
-
-def _rms(f: Array) -> float:
-    with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.sqrt(np.mean(f**2))) if f.size else 0.0
+Result = Trace  # its name in earlier versions
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from controller.environment import GROUND, Network, Wall, environment, frozen_st
 from controller.gains import Gains, Stack, force_maps
 from controller.loop import Loop, force_map
 from controller.lti import Array, Lti, SingularLoop
-from controller.process import Contact, Process, Tape, contact
+from controller.process import Contact, Process, StepBuffer, contact
 from design.audit import Subject, edge
 from design.certificate import CONDITIONS, theorem4_of
 from design.conditions import (
@@ -46,9 +46,11 @@ from models.human import Population
 from models.scene import Crowd, Scene, variants
 from sim.crowds import crowds
 from sim.engines import HeldPlant, MujocoBatchEngine, hold, profiler_off, quiet_warnings
-from sim.run import stretch
+from sim.run import run_block
 from sim.scenario import InputError
-from sim.stability import MARGINAL, RUNAWAY, Oscillation, close, oscillation, pace, slowest_seen
+from sim.stability import MARGINAL, close
+from sim.stepping import pace
+from sim.trace import RUNAWAY, Oscillation, oscillation, slowest_seen
 
 # ----------------------------------------------------------------------------------------------------
 # What a K-B map asks of the loop it is about, whatever K and B are gains of.
@@ -312,7 +314,7 @@ def motors_and_handles(scene: Scene) -> tuple[int, ...]:
 Transition = Callable[[Array, Array], object]  # [z; x] (order + m, nsim) -> writes [f; z+] (m + order, nsim)
 
 
-class ManyProcesses(Tape):
+class ManyProcesses(StepBuffer):
     """All processes have the same order, number of walls, force limits and encoder steps."""
 
     def __init__(self, processes: Sequence[Process], ticks: int, plant_states: int, outside: int) -> None:
@@ -414,7 +416,7 @@ def simulate_trials(
         while done < ticks:
             count = min(tape.ticks, ticks - done)
             tape.w[:count] = press_forces(scene, T, press, done, count)[:, :, None]
-            stretch(tape, engine, count)
+            run_block(tape, engine, count)
             kept.append(tape.s[:count, seen].copy())
             tape.rewind(count)
             done += count

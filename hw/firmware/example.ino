@@ -7,7 +7,7 @@
  * haptic_frame.h beside it.
  *
  * Yours to change: the pins, the numbers of INFO (measure them; docs/protocol.md says what the host does with each), and
- * the five functions. Everything that keeps hands whole is in haptic_link.h: leave it as it is. */
+ * the functions below them. Everything that keeps hands whole is in haptic_link.h: leave it as it is. */
 #include <Arduino.h>
 
 #include "haptic_link.h"
@@ -18,7 +18,12 @@ static const uint8_t ENCODER_A[AXES] = {2, 4}, ENCODER_B[AXES] = {3, 5};
 static const uint8_t MOTOR_PWM[AXES] = {9, 10}, MOTOR_DIRECTION[AXES] = {7, 8};
 static const uint8_t ENABLE = 6;       /* of both drivers; pulled down outside: an unpowered board means no force */
 static const uint8_t STOP_BUTTON = 11; /* normally closed, to ground: pressed, unplugged and broken all read HIGH */
-static const uint16_t FULL_FORCE = 24000; /* steps of 500 uN at PWM 255, here 12 N: from your motor's constant */
+/* A step of force is a step of the PWM, no finer: what INFO says of it, the host's limits rest on. Teensy 4 has up to 15
+ * bits; a board whose analogWrite knows no more than 8 has steps of 47 mN at 12 N, and no analogWriteResolution(). */
+static const uint8_t PWM_BITS = 12;
+static const uint16_t FULL_STEPS = (uint16_t)((1UL << PWM_BITS) - 1);
+static const uint32_t FULL_FORCE_UN = 12000000; /* at full PWM, from your motor's constant */
+static const uint32_t WATCHDOG_MS = 20;         /* the board resets itself where no tick came for so long */
 
 static hl_device device;
 static volatile int32_t position[AXES];
@@ -34,7 +39,7 @@ static void edge(uint8_t axis) /* one count for every edge of channel A */
 static void edge0() { edge(0); }
 static void edge1() { edge(1); }
 
-/* ---- the five functions: what only you know --------------------------------------------------------------------- */
+/* ---- the functions: what only you know -------------------------------------------------------------------------- */
 
 static void readEncoders(int32_t *counts)
 {
@@ -49,7 +54,7 @@ static void writeForces(const int16_t *force)
   for (uint8_t a = 0; a < AXES; a++) {
     int32_t size = force[a] < 0 ? -(int32_t)force[a] : force[a];
     digitalWrite(MOTOR_DIRECTION[a], force[a] < 0 ? HIGH : LOW);
-    analogWrite(MOTOR_PWM[a], (int)(size * 255 / FULL_FORCE));
+    analogWrite(MOTOR_PWM[a], (int)size);
   }
   digitalWrite(ENABLE, hl_running(&device) ? HIGH : LOW);
 }
@@ -80,6 +85,33 @@ static void serialWrite(const uint8_t *data, size_t n)
 
 static uint32_t timeUs() { return (uint32_t)micros(); }
 
+/* The board's own watchdog. Without one a loop that hangs leaves the last PWM standing, and hl_tick, which would take it
+ * away, is never called. Reset, the pins float and ENABLE is pulled down. */
+#if defined(__IMXRT1062__) /* Teensy 4: the RTWDOG of the i.MX RT1060, on its 32 kHz clock */
+static void watchdogStart()
+{
+  CCM_CCGR5 |= CCM_CCGR5_WDOG3(3);
+  noInterrupts();
+  WDOG3_CNT = 0xD928C520u; /* unlock */
+  while (!(WDOG3_CS & WDOG_CS_ULK)) {}
+  WDOG3_TOVAL = WATCHDOG_MS * 32;
+  WDOG3_WIN = 0;
+  WDOG3_CS = WDOG_CS_EN | WDOG_CS_UPDATE | WDOG_CS_CLK(1) | WDOG_CS_CMD32EN;
+  while (!(WDOG3_CS & WDOG_CS_RCS)) {}
+  interrupts();
+}
+static void watchdogFeed() { WDOG3_CNT = 0xB480A602u; }
+#elif defined(__AVR__)
+#include <avr/wdt.h>
+static void watchdogStart() { wdt_enable(WDTO_30MS); }
+static void watchdogFeed() { wdt_reset(); }
+#elif defined(BOARD_WATCHDOG) /* yours: void BOARD_WATCHDOG(uint32_t ms) starts it with ms > 0, and feeds it with 0 */
+static void watchdogStart() { BOARD_WATCHDOG(WATCHDOG_MS); }
+static void watchdogFeed() { BOARD_WATCHDOG(0); }
+#else
+#error "no watchdog for this board: define BOARD_WATCHDOG (see above)"
+#endif
+
 /* ---- the loop: leave as it is ----------------------------------------------------------------------------------- */
 
 void setup()
@@ -87,7 +119,7 @@ void setup()
   hl_info info = {"example 1", 1, PERIOD_US * 1000, AXES, {}};
   for (uint8_t a = 0; a < AXES; a++) {
     /* damping [uN s/m], pm per count, uN per step, largest force [steps], workspace [counts] */
-    hl_axis axis = {1370000, 10000000, 500, FULL_FORCE, 8000};
+    hl_axis axis = {1370000, 10000000, (FULL_FORCE_UN + FULL_STEPS / 2) / FULL_STEPS, FULL_STEPS, 8000};
     info.axis[a] = axis;
     pinMode(ENCODER_A[a], INPUT_PULLUP);
     pinMode(ENCODER_B[a], INPUT_PULLUP);
@@ -99,9 +131,11 @@ void setup()
   pinMode(STOP_BUTTON, INPUT_PULLUP);
   attachInterrupt(digitalPinToInterrupt(ENCODER_A[0]), edge0, CHANGE);
   attachInterrupt(digitalPinToInterrupt(ENCODER_A[1]), edge1, CHANGE);
+  if (PWM_BITS > 8) analogWriteResolution(PWM_BITS);
   Serial.begin(2000000); /* boards with native USB ignore the rate */
   if (!hl_init(&device, &info)) /* a number above is impossible: ENABLE stays low */
     for (;;) delay(1000);
+  watchdogStart();
   due = timeUs() + PERIOD_US;
 }
 
@@ -130,5 +164,6 @@ void loop()
   readEncoders(counts);
   size_t n = hl_tick(&device, timeUs(), counts, force, out);
   writeForces(force);
+  watchdogFeed(); /* here and nowhere else: a loop that turns without ticks must not feed it */
   serialWrite(out, n);
 }

@@ -11,7 +11,7 @@ from design.certificate import assess, promise_of
 from design.conditions import Requirement
 from design.designs import KINDS
 from sim.couplings import Chosen, choose
-from sim.run import Assembly, assemble
+from sim.run import Simulation, assemble
 from sim.scenario import LONGEST_DELAY, InputError, Scenario
 from sim.stability import Mode, worst_mode
 
@@ -141,7 +141,7 @@ class PreparedLoop:
     menu: Menu
     label: str  # as the user calls the coupling
     chosen: Chosen
-    assembly: Assembly
+    assembly: Simulation
     mode: Mode  # of the exact linear loop; before walls, of the worst contact state
     requirements: dict[str, Requirement]
     promise: str | None

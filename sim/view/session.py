@@ -21,12 +21,12 @@ from typing import Any
 import numpy as np
 
 from controller.lti import Array, Lti, SingularLoop
-from controller.process import Tape
+from controller.process import StepBuffer
 from design.certificate import certificate_part, finite
 from design.result import DesignFailed
 from models.scene import Plant, Scene, plant
-from sim.engines import ExactEngine, HeldPlant, hold, outside_forces
-from sim.run import stretch
+from sim.engines import ExactEngine, HeldPlant, hold
+from sim.run import outside_forces, run_block
 from sim.scenario import InputError
 from sim.view.events import Couple, Delay, Event, PreparedLoop, Push, Restart, Script, changed, words
 
@@ -231,7 +231,7 @@ class Session:
             w[:, scene.tapped[self._grip.channel]] += self._grip.pull
         tape.w[:count] = w[:, :, None]
         with np.errstate(over="ignore", invalid="ignore"):  # a process that runs away is noticed below
-            stretch(tape, self._engine, count)
+            run_block(tape, self._engine, count)
         self._tick += count
         if not (np.isfinite(tape.s[: count + 1]).all() and np.isfinite(tape.z[: count + 1]).all()):
             self._happen(Restart())
@@ -259,7 +259,7 @@ class Session:
         """Go on with another process from the plant state s."""
         process = prepared.assembly.process
         outside = prepared.assembly.plant.B.shape[1] - process.channels
-        tape = Tape(process, _STRETCH, s.size, outside)
+        tape = StepBuffer(process, _STRETCH, s.size, outside)
         tape.s[0, :, 0] = s
         tape.z[0, :, 0] = rest(process.F, s[: process.channels])
         self.prepared, self._tape = prepared, tape
@@ -313,8 +313,8 @@ def _facts(prepared: PreparedLoop) -> dict[str, Any]:
         "coupling": prepared.label,
         "theta": list(prepared.scenario.theta),
         "psi": list(prepared.scenario.psi),
-        "exact_growth_rate_per_s": finite(prepared.mode.growth),
-        "exact_frequency_hz": prepared.mode.frequency_hz,
+        "exact_growth_rate_per_s": finite(float(prepared.mode.growth)),
+        "exact_frequency_hz": float(prepared.mode.frequency_hz),
         "certificates": {name: certificate_part(need) for name, need in prepared.requirements.items()},
         "promise": prepared.promise,
     }

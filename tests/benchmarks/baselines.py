@@ -28,8 +28,8 @@ from controller.environment import environment, realise
 from controller.lti import Array, Lti
 from design import design_coupling
 from models.scene import Crowd, variants
-from sim.engines import HeldPlant, hold, outside_forces
-from sim.run import assemble
+from sim.engines import HeldPlant, hold
+from sim.run import assemble, outside_forces
 from sim.scenario import Scenario, load
 
 STEP = 1e-5  # [m] of the encoders

@@ -18,9 +18,8 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from hw.emulator.plant import EmulatedPlant, nobody
-from hw.identify.excitation import chirp
-from hw.identify.fit import Estimate, identify
+from hw.emulator import EmulatedPlant, nobody
+from hw.identify import Estimate, chirp, identify
 from models.device import RigidDevice
 from sim.scenario import load
 

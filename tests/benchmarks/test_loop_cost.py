@@ -11,7 +11,7 @@ import pytest
 
 from design.result import CASE_I
 from sim.engines import discretised, profiler_off
-from sim.run import assemble, simulate
+from sim.run import assemble, make_engine, run
 from sim.scenario import load
 
 pytestmark = pytest.mark.benchmark(group="loop")
@@ -35,16 +35,16 @@ def raw_steps(assembly, integrator: str, substeps: int, ticks: int) -> None:
 def test_loop_over_raw_stepping(benchmark, integrator, substeps):
     """Alternates both in one run and prints the median ratio; asserts only what does not depend on the clock."""
     assembly = assemble(load(), CASE_I)
-    exact = simulate(assembly, "exact")
+    exact = run(assembly, "exact")
     ratios, loops = [], []
 
     def once():
         raw = seconds(lambda: raw_steps(assembly, integrator, substeps, assembly.scenario.samples))
-        loops.append(seconds(lambda: simulate(assembly, "mujoco", integrator, substeps)))
+        loops.append(seconds(lambda: run(assembly, make_engine(assembly, "mujoco", integrator, substeps))))
         ratios.append(loops[-1] / raw)
 
     benchmark.pedantic(once, rounds=9, iterations=1, warmup_rounds=1)
-    record = simulate(assembly, "mujoco", integrator, substeps)
+    record = run(assembly, make_engine(assembly, "mujoco", integrator, substeps))
     error = np.sqrt(np.mean((record.s[:, :2] - exact.s[:, :2]) ** 2) / np.mean(exact.s[:, :2] ** 2))
     duration = assembly.scenario.duration
     print(
@@ -56,7 +56,7 @@ def test_loop_over_raw_stepping(benchmark, integrator, substeps):
 
 def test_exact_engine(benchmark):
     assembly = assemble(load(), CASE_I)
-    benchmark.pedantic(lambda: simulate(assembly, "exact"), rounds=9, iterations=1, warmup_rounds=1)
+    benchmark.pedantic(lambda: run(assembly, "exact"), rounds=9, iterations=1, warmup_rounds=1)
     median = benchmark.stats.stats.median if benchmark.stats else float("nan")
     print(f"\nexact: {assembly.scenario.duration / median:.0f} x real time, the reference for errors")
     assert assembly.scenario.samples == 12500

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 
 from controller.coupling import NoCoupling
-from controller.process import Tape
+from controller.process import StepBuffer
 from design.conditions import this_environment
 from design.result import CASE_I
 from models.scene import variants
 from sim.adversary import attempts
 from sim.crowds import crowds
 from sim.engines import ExactBatchEngine, MujocoBatchEngine, hold, profiler_off
-from sim.run import assemble, stretch
+from sim.run import assemble, run_block
 from sim.scenario import load
-from sim.stability import disagree, dominant_modes, exact_loops, mujoco_loops, unstable
+from sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable
 
 pytestmark = pytest.mark.benchmark(group="validation")
 HUMANS = 1000
@@ -37,11 +37,11 @@ def test_verdicts(benchmark, held_by, coupling, request):
     assembly = assemble(load(), coupling)
 
     def once():
-        return dominant_modes(exact_loops(held_by, assembly.F)).growth
+        return dominant_mode(exact_loops(held_by, assembly.F)).growth
 
     exact = benchmark.pedantic(once, rounds=7, iterations=1, warmup_rounds=1)
     begin = time.perf_counter()
-    mujoco = dominant_modes(mujoco_loops(held_by, assembly.process)).growth
+    mujoco = dominant_mode(mujoco_loops(held_by, assembly.process)).growth
     wall = time.perf_counter() - begin
     median = benchmark.stats.stats.median if benchmark.stats else float("nan")
     wrong = int(disagree(exact, mujoco).sum())
@@ -57,7 +57,7 @@ def test_batched_exact_engine(benchmark, held_by):
     assembly, ticks, short = assemble(load(), CASE_I), 960, 32
     plants = hold(held_by.plants(), assembly.scenario.T)
     engine = ExactBatchEngine(plants, assembly.process.force_limit)
-    tape = Tape(assembly.process, short, plants.A.shape[1], held_by.scene.outside, HUMANS)
+    tape = StepBuffer(assembly.process, short, plants.A.shape[1], held_by.scene.outside, HUMANS)
     rng = np.random.default_rng(0)
     tape.s[0] = 1e-4 * rng.normal(size=tape.s[0].shape)
     engine.start(tape)
@@ -67,7 +67,7 @@ def test_batched_exact_engine(benchmark, held_by):
         tape.s[0], tape.z[0] = np.split(start, [tape.s.shape[1]])
         begin = time.process_time()
         for _ in range(ticks // short):
-            stretch(tape, engine, short)
+            run_block(tape, engine, short)
             tape.rewind(short)
         used.append(time.process_time() - begin)
 
@@ -87,7 +87,7 @@ def test_mujoco_batch_over_raw_stepping(benchmark, held_by, substeps):
     assembly, ticks, short, nsim = assemble(load(), CASE_I), 160, 32, 200
     T, fields = assembly.scenario.T, {name: rows[:nsim] for name, rows in held_by.fields.items()}
     engine, bare = (MujocoBatchEngine(held_by.scene, T, "RK4", substeps, nsim, fields=fields) for _ in range(2))
-    tape = Tape(assembly.process, short, 2 * held_by.scene.model.nv, held_by.scene.outside, nsim)
+    tape = StepBuffer(assembly.process, short, 2 * held_by.scene.model.nv, held_by.scene.outside, nsim)
     tape.s[0] = 1e-4
     engine.start(tape)
     ratios = []
@@ -99,14 +99,14 @@ def test_mujoco_batch_over_raw_stepping(benchmark, held_by, substeps):
         raw = time.perf_counter() - begin
         begin = time.perf_counter()
         for _ in range(ticks // short):
-            stretch(tape, engine, short)
+            run_block(tape, engine, short)
             tape.rewind(short)
         ratios.append((time.perf_counter() - begin) / raw)
 
     with profiler_off():
         benchmark.pedantic(once, rounds=9, iterations=1, warmup_rounds=1)
-    exact = dominant_modes(exact_loops(held_by, assembly.F)).growth
-    mujoco = dominant_modes(mujoco_loops(held_by, assembly.process, substeps=substeps)).growth
+    exact = dominant_mode(exact_loops(held_by, assembly.F)).growth
+    mujoco = dominant_mode(mujoco_loops(held_by, assembly.process, substeps=substeps)).growth
     error, wrong = np.abs(mujoco - exact).max(), int(disagree(exact, mujoco).sum())
     print(
         f"\nMuJoCo batch RK4 x {substeps}: loop / raw steps {np.median(ratios):.2f} (median of {len(ratios)}), growth "

@@ -14,7 +14,7 @@ from controller.coupling import SpringDamper
 from design.certificate import Stored, prove, save
 from sim import run as loop
 from sim.scenario import InputError, load
-from sim.trace import Result
+from sim.trace import Trace
 
 SECTIONS = {"case", "scenario", "coupling", "certificate", "certificates", "promise", "transparency", "stability"}
 SECTIONS |= {"run", "error", "files"}
@@ -39,7 +39,7 @@ def test_case_none_is_figure_5(tmp_path):
     assert stability["clipped_ticks"] > 1000
     assert report["error"]["position_relative_rms"] is None
     assert "first clips" in report["error"]["reason"]
-    trace = Result.load_npz(tmp_path / "out" / "trace.npz")
+    trace = Trace.load_npz(tmp_path / "out" / "trace.npz")
     assert np.abs(trace.f).max() == 12.0
 
 
@@ -89,7 +89,7 @@ def test_running_twice_gives_the_same_files(tmp_path):
     names = sorted(p.name for p in (tmp_path / "out").iterdir())
     assert names == ["figure.png", "report.json", "scene.xml", "trace.csv", "trace.npz"]
     table = np.genfromtxt(tmp_path / "out" / "trace.csv", delimiter=",", names=True)
-    trace = Result.load_npz(tmp_path / "out" / "trace.npz")
+    trace = Trace.load_npz(tmp_path / "out" / "trace.npz")
     np.testing.assert_allclose(table["x1_m"], trace.x[:, 0], rtol=1e-8)
     assert trace.meta["case"] == "I"
 
@@ -181,21 +181,21 @@ def test_json_on_standard_output_is_only_json(tmp_path):
 
 
 def test_interrupting_keeps_what_was_simulated(tmp_path, monkeypatch):
-    """Ctrl-C in the third stretch: the first two are written, and the exit code says so."""
-    stretch, calls = loop.stretch, []
+    """Ctrl-C in the third block: the first two are written, and the exit code says so."""
+    block, calls = loop.run_block, []
 
     def interrupted(*args):
         calls.append(args)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        stretch(*args)
+        block(*args)
 
-    monkeypatch.setattr(loop, "stretch", interrupted)
+    monkeypatch.setattr(loop, "run_block", interrupted)
     code, report = run(tmp_path, "--coupling", "published")
-    trace = Result.load_npz(tmp_path / "out" / "trace.npz")
+    trace = Trace.load_npz(tmp_path / "out" / "trace.npz")
     assert code == 130
     assert report["run"]["interrupted"]
-    assert trace.t.size == report["run"]["samples"] == 2 * loop.STRETCH
+    assert trace.t.size == report["run"]["samples"] == 2 * loop._BLOCK
     assert report["error"]["position_relative_rms"] < 1e-6
 
 
@@ -207,4 +207,4 @@ def test_a_trace_that_is_none(tmp_path, content, message):
     if content is not None:
         path.write_bytes(content)
     with pytest.raises(InputError, match=message):
-        Result.load_npz(path)
+        Trace.load_npz(path)

@@ -14,7 +14,7 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Wall, environment, held
 from controller.loop import force_map
 from controller.lti import SingularLoop
-from controller.process import Complementarity, Process, Tape, contact
+from controller.process import Complementarity, Process, StepBuffer, contact
 from design.audit import Subject, report
 from design.certificate import FROZEN, NotProved, assess, prove
 from design.conditions import this_environment
@@ -24,7 +24,7 @@ from models.scene import variants
 from sim.crowds import crowds
 from sim.engines import ExactBatchEngine, MujocoBatchEngine, hold
 from sim.hunt import bounce
-from sim.run import assemble, simulate
+from sim.run import assemble, run
 from sim.scenario import SCENARIOS, InputError, load, parse
 
 T = 1e-3
@@ -41,9 +41,9 @@ def walled(network: Network, coupling, theta, psi) -> Process:
     return Process(walls.open, np.full(walls.channels, np.inf), np.zeros(walls.channels), walls)
 
 
-def drive(process: Process, x: np.ndarray) -> Tape:
+def drive(process: Process, x: np.ndarray) -> StepBuffer:
     """The tape after displacements (ticks, m, nsim)."""
-    tape = Tape(process, len(x), x.shape[1], nsim=x.shape[2])
+    tape = StepBuffer(process, len(x), x.shape[1], nsim=x.shape[2])
     for k, row in enumerate(x):
         tape.x[k] = row
         tape.tick(k)
@@ -200,7 +200,7 @@ def test_random_hands_on_walls_come_to_rest_under_theorem4(name, humans, seconds
 def test_both_engines_see_the_same_contacts():
     """RK4 x 4 against the exact hold on a bouncing trace: 1e-6 of the motion, and the same number of contacts."""
     loop = assemble(load("one-wall").replace(duration=2.0), SpringDamper([900.0], [0.4]))
-    exact, own = simulate(loop, "exact"), simulate(loop, "mujoco")
+    exact, own = run(loop, "exact"), run(loop, "mujoco")
     depths = [loop.process.contact.depths(record.z) > 0 for record in (exact, own)]
     np.testing.assert_array_equal(*depths)
     assert (depths[0][1:] & ~depths[0][:-1]).sum() >= 1

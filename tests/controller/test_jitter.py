@@ -7,7 +7,7 @@ from controller.coupling import SpringDamper
 from controller.delay import LOST, HeldLine, Jitter, ages, newest, packet_delays, realising
 from controller.environment import FIGURE_4, environment
 from controller.loop import force_map
-from controller.process import Process, Tape
+from controller.process import Process, StepBuffer
 
 T = 1.2e-3
 COUPLING = SpringDamper([7806, 3137], [0.105, 1.68])
@@ -58,7 +58,7 @@ def test_a_constant_delay_is_the_linear_block():
     constant = np.tile(np.array([1, 2])[None, :, None], (200, 1, 1))
     forces = []
     for process in (Process(G, NO_LIMIT, IDEAL, delays=constant), Process(F, NO_LIMIT, IDEAL)):
-        tape = Tape(process, 50, 2)
+        tape = StepBuffer(process, 50, 2)
         for first in range(0, 200, 50):  # stretches: the line goes on where it was
             for k in range(50):
                 tape.x[k] = x[first + k]
@@ -142,7 +142,7 @@ def test_a_process_refuses_delays_that_do_not_fit():
     G = force_map(environment(FIGURE_4, T), COUPLING, (0, 0), (0, 0))
     with pytest.raises(ValueError, match="1 channels, expected 2"):
         Process(G, NO_LIMIT, IDEAL, delays=np.zeros((5, 1, 1)))
-    tape = Tape(Process(G, NO_LIMIT, IDEAL, delays=np.zeros((1, 2, 1))), 2, 2)
+    tape = StepBuffer(Process(G, NO_LIMIT, IDEAL, delays=np.zeros((1, 2, 1))), 2, 2)
     tape.tick(0)
     with pytest.raises(ValueError, match="given for 1 ticks"):
         tape.tick(1)

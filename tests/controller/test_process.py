@@ -7,7 +7,7 @@ from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.loop import force_map
 from controller.lti import Lti
-from controller.process import Process, Tape
+from controller.process import Process, StepBuffer
 
 T = 1e-3
 NONE = np.zeros(1)
@@ -15,7 +15,7 @@ NONE = np.zeros(1)
 
 def drive(process: Process, x: np.ndarray) -> np.ndarray:
     """Forces for given displacements (ticks, m), tick by tick."""
-    tape = Tape(process, len(x), x.shape[1])
+    tape = StepBuffer(process, len(x), x.shape[1])
     for k, row in enumerate(x):
         tape.x[k] = row[:, None]
         tape.tick(k)
@@ -75,7 +75,7 @@ def test_the_coupling_is_spring_and_damper_in_parallel():
 def test_many_simulations_are_each_one_alone():
     F = force_map(environment(FIGURE_4, T), SpringDamper([900.0, 500.0], [0.4, 0.5]), [1, 2], [0, 1])
     x = np.random.default_rng(1).normal(size=(20, 2, 5))
-    tape = Tape(process(F), 20, 2, nsim=5)
+    tape = StepBuffer(process(F), 20, 2, nsim=5)
     for k in range(20):
         tape.x[k] = x[k]
         tape.tick(k)
@@ -87,7 +87,7 @@ def test_many_simulations_are_each_one_alone():
 def test_rewinding_continues_the_run():
     F = force_map(environment(FIGURE_4, T), SpringDamper([900.0, 500.0], [0.4, 0.5]), [1, 2], [0, 0])
     x = np.random.default_rng(2).normal(size=(20, 2))
-    tape = Tape(process(F), 10, 2)
+    tape = StepBuffer(process(F), 10, 2)
     parts = []
     for stretch in (x[:7], x[7:17], x[17:]):
         for k, row in enumerate(stretch):
@@ -105,7 +105,7 @@ def test_encoders_round_to_whole_steps():
 
 def test_encoders_do_not_move_the_device():
     """What the loop sees is rounded, where the device is stays: else a free device would creep from step to step."""
-    tape = Tape(process(wall(1000.0), step=1e-3), 2, 2)
+    tape = StepBuffer(process(wall(1000.0), step=1e-3), 2, 2)
     tape.x[0] = 0.6e-3
     tape.tick(0)
     assert tape.f[0, 0, 0] == pytest.approx(1.0)
@@ -122,7 +122,7 @@ def test_encoders_do_not_move_the_device():
         (lambda: Process(wall(1.0), np.array([0.0]), NONE), "expected positive forces"),
         (lambda: Process(wall(1.0), np.array([1.0]), np.array([-1.0])), "expected steps >= 0"),
         (lambda: Process(wall(1.0), np.array([1.0, 1.0]), NONE), "2 entries for 1 channels"),
-        (lambda: Tape(process(wall(1.0)), 1, 0), "must be the positions"),
+        (lambda: StepBuffer(process(wall(1.0)), 1, 0), "must be the positions"),
     ],
 )
 def test_what_cannot_be_built(build, message):

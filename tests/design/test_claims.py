@@ -9,6 +9,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from driven import driven
 from scipy.signal import dlsim, lfilter
 
 from controller.coupling import NoCoupling, SpringDamper
@@ -21,9 +22,9 @@ from design.result import CASE_I, CASE_II, PRINTED_TAU_DB
 from design.spring_damper import step
 from models.device import RigidDevice
 from models.human import Human, Link, Population
-from sim.run import assemble, make_engine, run, simulate
+from sim.run import assemble, make_engine, run
 from sim.scenario import load
-from sim.stability import clipped_ticks, close, dominant_mode
+from sim.stability import close, dominant_mode
 
 T, THETA, DELTA = 1.2e-3, (1, 2), 1.37
 W = np.unique(np.concatenate([np.geomspace(1e-5, np.pi, 40_001), np.linspace(1e-4, np.pi, 40_001)]))
@@ -82,13 +83,12 @@ def test_sampled_energy_balance_of_devices_and_hands():
     for pushing in (0.0, 3.0):
         w = pushing * rng.normal(size=(3000, 2))
         start = rng.normal(size=(8, 1)) * np.repeat([1e-3, 0.2], 4)[:, None]
-        record = run(assembly.process, make_engine(assembly, "exact"), lambda first, n, w=w: w[first : first + n],
-                     len(w), start)  # fmt: skip
-        assert not clipped_ticks(record, assembly.process.force_limit).any()
-        q, v = np.split(record.s[:, :, 0], 2, axis=1)
+        record = run(assembly, "exact", lambda first, n, w=w: w[first : first + n], len(w), start)
+        assert not record.clipped(assembly.process.force_limit).any()
+        q, v = np.split(record.s, 2, axis=1)
         stored = (v**2 @ masses) / 2 + (14500 * (q[:, :2] - q[:, 2:]) ** 2 + 200 * q[:, 2:] ** 2).sum(axis=1) / 2
         dq = np.diff(q, axis=0)
-        f, dx, dh = record.f[:-1, :, 0], dq[:, :2], dq[:, 2:]
+        f, dx, dh = record.f[:-1], dq[:, :2], dq[:, 2:]
         given = np.cumsum((-f * dx + w[:-1] * dh - DELTA / T * dx**2).sum(axis=1))
         assert (stored[1:] <= stored[0] + given + 1e-12).all()
         if not pushing:
@@ -149,10 +149,10 @@ def test_without_coupling_only_the_compliant_device_oscillates():
 
 def test_figure_6_is_quiet_with_the_printed_gains():
     for coupling in (CASE_I, CASE_II):
-        record = simulate(assemble(load(), coupling), "exact")
+        record = run(assemble(load(), coupling), "exact")
         assert np.abs(record.f).max() < 0.7
         assert 0.0155 < np.abs(record.s[:, :2]).max() < 0.016
-        fast = np.diff(record.f[-4000:, :, 0], axis=0)
+        fast = np.diff(record.f[-4000:], axis=0)
         assert np.abs(fast).max() < 0.01  # no oscillation left in the last 4.8 s, only the motion of the hands
 
 
@@ -370,7 +370,9 @@ def test_saturation_is_outside_every_certificate():
 
     def late(assembly):
         engine = make_engine(assembly, "exact")
-        record = run(assembly.process, engine, lambda first, n: np.zeros((n, assembly.scene.outside)), 20_000, starts)
+        record = driven(
+            assembly.process, engine, lambda first, n: np.zeros((n, assembly.scene.outside)), 20_000, starts
+        )
         return record.s[-8000:, :2]
 
     tail = late(assembly)

@@ -16,7 +16,7 @@ from controller.coupling import SpringDamper as Gains
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.loop import Loop, force_map
 from controller.lti import Lti
-from controller.process import Process, Tape
+from controller.process import Process, StepBuffer
 from design.certificate import Stored, prove, save
 from design.export import process_block, sequential, trial
 from sim.scenario import InputError
@@ -84,7 +84,7 @@ def test_the_process_of_the_simulator_differs_by_rounding_alone(data):
     block = process_block(Stored.of(LOOP, data))
     test, G = trial(block), block.system
     limits = np.full(2, np.inf)
-    tape = Tape(Process(G, limits, np.zeros(2)), len(test.inputs), plant_states=2)
+    tape = StepBuffer(Process(G, limits, np.zeros(2)), len(test.inputs), plant_states=2)
     for k, x in enumerate(test.inputs):
         tape.x[k, :, 0] = x
         tape.tick(k)

@@ -125,7 +125,10 @@ def test_the_command_draws_and_reports(tmp_path, capsys):
     assert here["rms_mismatch_db"] == pytest.approx(-34.9, abs=0.1)
     assert free["relative_mismatch_db"] is None  # safe without any coupling: no mismatch at all
     assert free["reason"] is None
-    assert any("without effect: --functions, --diagonal" in " ".join(line.split()) for line in capsys.readouterr().out.split("·"))
+    assert any(
+        "without effect: --functions, --diagonal" in " ".join(line.split())
+        for line in capsys.readouterr().out.split("·")
+    )
     assert len(damping["theorem4"]) == 3
     assert "closed-loop" not in damping
     assert any("(here)" in line for line in report["gains"])

@@ -36,7 +36,7 @@ from design.certificate import (
 from design.conditions import jitter_proof, this_environment
 from design.exact import Matrix
 from design.maps import blocks
-from hw.plan import ladder
+from hw.control import certified_couplings
 from sim.scenario import load as scenario_of
 
 T, DELTA = 1.2e-3, (1.37, 1.37)
@@ -363,7 +363,8 @@ def test_the_bridge_says_how_long_a_force_may_be_held(tmp_path):
     """Ages under isolated missed answers, from the line itself, lie within what the file proves."""
     loop = change(LOOP, theta=(1, 1), lam=(1, 1))
     save(Stored.of(loop, SOFT, prove(loop, SOFT, "closed-loop")), tmp_path / "one.json")
-    first, second = ladder(scenario_of().replace(theta=(1, 1)), "I", str(tmp_path / "one.json"), None, 1, spare=1)
+    scenario = scenario_of().replace(theta=(1, 1))
+    first, second = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)
     assert first.remarks() == ["a force that is held through 1 missed answer is covered by the file's proof"]
     missed = np.ones((40, 2, 1), dtype=np.int64)
     missed[5::3] = LOST

@@ -18,6 +18,9 @@ void pinMode(uint8_t pin, uint8_t mode);
 int digitalRead(uint8_t pin);
 void digitalWrite(uint8_t pin, uint8_t level);
 void analogWrite(uint8_t pin, int value);
+void analogWriteResolution(int bits);
+#define BOARD_WATCHDOG stub_watchdog
+void stub_watchdog(uint32_t ms);
 unsigned long micros();
 void delay(unsigned long ms);
 void noInterrupts();

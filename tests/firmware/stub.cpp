@@ -9,6 +9,9 @@ static std::vector<uint8_t> outgoing;
 static int pins[64], room = 1 << 20;
 static unsigned long clock_us;
 static void (*handlers[64])();
+static int resolution = 8;
+static uint32_t watchdog_ms;
+static unsigned long fed_us;
 
 StubSerial Serial;
 void StubSerial::begin(unsigned long) {}
@@ -30,6 +33,12 @@ void pinMode(uint8_t, uint8_t) {}
 int digitalRead(uint8_t pin) { return pins[pin]; }
 void digitalWrite(uint8_t pin, uint8_t level) { pins[pin] = level; }
 void analogWrite(uint8_t pin, int value) { pins[pin] = value; }
+void analogWriteResolution(int bits) { resolution = bits; }
+void stub_watchdog(uint32_t ms)
+{
+    if (ms) watchdog_ms = ms;
+    fed_us = clock_us;
+}
 unsigned long micros() { return clock_us; }
 void delay(unsigned long) {}
 void noInterrupts() {}
@@ -38,6 +47,8 @@ uint8_t digitalPinToInterrupt(uint8_t pin) { return pin; }
 void attachInterrupt(uint8_t pin, void (*handler)(), int) { handlers[pin] = handler; }
 
 extern "C" {
+int stub_resolution() { return resolution; }
+int stub_bites() { return watchdog_ms && clock_us - fed_us > 1000 * watchdog_ms; }
 void stub_setup() { setup(); }
 void stub_loop(unsigned long now)
 {

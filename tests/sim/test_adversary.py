@@ -51,8 +51,8 @@ def test_where_the_condition_binds_slowly_it_is_tight():
 
 
 def both_hands(monkeypatch):
-    monkeypatch.setattr(adversary, "PASSES", tuple(kind for kind in adversary.PASSES if kind.held))
-    assert adversary.PASSES
+    monkeypatch.setattr(adversary, "_PASSES", tuple(kind for kind in adversary._PASSES if kind.held))
+    assert adversary._PASSES
 
 
 def test_one_person_in_both_hands_is_found_too(monkeypatch):

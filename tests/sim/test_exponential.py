@@ -1,21 +1,317 @@
-"""The batched matrix exponential against extended precision, closed forms, and itself in other company."""
+"""The exponential engine: exact on linear scenes, first order where it cannot be, and MuJoCo's forces drive it.
 
+`growth` is in 1/s; errors of maps are relative to the map's largest entry, in units where a velocity counts as much as
+the position that the fastest spring turns it into.
+"""
+
+import mujoco
 import numpy as np
+import pytest
+from driven import Driven, driven
 from scipy.linalg import expm
 
-from sim.engines import expm_each
+from controller.coupling import NoCoupling
+from controller.process import Process, StepBuffer
+from design.result import CASE_I
+from models.device import CompliantDevice
+from models.human import Human, Link
+from models.scene import Crowd, Plant, plant, variants
+from sim.engines import (
+    EXPONENTIAL,
+    INTEGRATORS,
+    Engine,
+    ExactBatchEngine,
+    MujocoBatchEngine,
+    MujocoEngine,
+    default_integrator,
+    expm_each,
+    hold,
+)
+from sim.run import assemble, make_engine, run
+from sim.scenario import InputError, load
+from sim.stability import exact_growth
+from sim.stepping import cheapest, check_substeps, default_substeps, measured_hold, pace, simulated_growth
+
+SCENARIO = load()
+RUBBING = SCENARIO.replace(device=(CompliantDevice(friction=0.5),) * 2)
+
+
+def stiff(transmission: float):
+    return assemble(SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=transmission),) * 2), CASE_I)
+
+
+def knocked(assembly, engine: Engine, ticks: int, start=None) -> Driven:
+    """A run that the voluntary motion of nobody disturbs: 5 N on both handles for 20 ticks."""
+
+    def outside(first, count):
+        w = np.zeros((count, assembly.scene.outside))
+        w[: max(0, 20 - first), list(assembly.scene.tapped)] = 5.0
+        return w
+
+    begin = np.zeros((assembly.plant.A.shape[0], 1)) if start is None else start
+    return driven(assembly.process, engine, outside, ticks, begin)
+
+
+@pytest.fixture(scope="module")
+def assembly():
+    return assemble(SCENARIO, CASE_I)
+
+
+# ---- exactness
 
 
 def longer(matrix):
-    """exp by a Taylor series in extended precision: exp(A) - 1 of A / 2^20, doubled twenty times."""
-    part = matrix.astype(np.longdouble) / 2**20
+    """exp in extended precision: a Taylor series of exp(A / 2^40) - 1, doubled forty times."""
+    part = matrix.astype(np.longdouble) / np.longdouble(2) ** 40
     term, less_one = np.eye(len(matrix), dtype=np.longdouble), 0
     for k in range(1, 12):
         term = term @ part / k
         less_one = less_one + term
-    for _ in range(20):
+    for _ in range(40):
         less_one = 2 * less_one + less_one @ less_one
     return (less_one + np.eye(len(matrix))).astype(float)
+
+
+@pytest.mark.parametrize("T", [1e-5, 1.2e-3, 1e-2, 0.1])
+@pytest.mark.parametrize("stiffness", [14500.0, 1.45e6, 1e9])
+def test_one_step_is_exact_whatever_the_stiffness(stiffness, T):
+    """The measured map against the exponential, by scipy and in extended precision: the phase of the fastest mode, up
+    to 1.5e4 rad here, multiplies the rounding of its frequency, in scipy's result more than in the engine's."""
+    loop = stiff(stiffness)
+    continuous, fastest = plant(loop.scene.model), np.sqrt(stiffness / 0.06)
+    states, inputs = continuous.B.shape
+    generator = np.zeros((states + inputs, states + inputs))
+    generator[:states, :states], generator[:states, states:] = continuous.A, continuous.B
+    unit = np.r_[np.ones(states // 2), np.full(states // 2, fastest), np.ones(inputs)]
+    step = measured_hold(loop, "mujoco", EXPONENTIAL, 1, T)
+    own = np.hstack([step.A, step.B]) * unit / unit[:states, None]
+    allowed = 1e-14 * (1 + fastest * T)
+    exact, scipys = longer(generator * T * unit / unit[:, None]), expm(generator * T) * unit / unit[:, None]
+    assert np.abs(own - exact[:states]).max() <= allowed * np.abs(exact[:states]).max()
+    assert np.abs(own - scipys[:states]).max() <= 10 * allowed * np.abs(exact[:states]).max()
+
+
+@pytest.mark.parametrize("coupling", [NoCoupling(), CASE_I], ids=["no coupling", "published"])
+@pytest.mark.parametrize("stiffness", [14500.0, 1.45e6])
+def test_growth_is_the_exact_loops(stiffness, coupling):
+    loop = assemble(SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=stiffness),) * 2), coupling)
+    assert simulated_growth(loop, EXPONENTIAL, 1) == pytest.approx(exact_growth(loop), abs=1e-9)
+    # the agreed accuracy of four Runge-Kutta steps is five decades behind, where they are enough at all
+    if stiffness == 14500.0 and coupling is CASE_I:
+        assert abs(simulated_growth(loop, "RK4", 4) - exact_growth(loop)) > 1e-5
+
+
+def test_a_run_is_the_exact_engines_through_saturation_and_all():
+    """Half the devices' forces are clipped here; what MuJoCo clips and what the exact engine clips is the same."""
+    devices = tuple(device.__class__(force_limit=0.05) for device in SCENARIO.device)
+    loop = assemble(SCENARIO.replace(device=devices), CASE_I)
+    own, exact = (knocked(loop, make_engine(loop, name), 500) for name in ("mujoco", "exact"))
+    assert (np.abs(exact.f) >= 0.05).any()
+    np.testing.assert_allclose(own.s, exact.s, rtol=1e-9, atol=1e-13)
+
+
+def test_more_substeps_change_nothing(assembly):
+    one, three = (knocked(assembly, make_engine(assembly, "mujoco", EXPONENTIAL, n), 500).s for n in (1, 3))
+    np.testing.assert_allclose(one, three, rtol=1e-9, atol=1e-13)
+
+
+# ---- where it cannot be exact
+
+
+def test_the_forces_are_mujocos(assembly):
+    """Springs changed behind the engine's back show: J is the old one, the accelerations are the new ones'. With a
+    wrong J the method is still consistent, of first order: halving the step halves what is left."""
+    wrong = 1.5
+    errors = []
+    for substeps in (8, 16):
+        engine = MujocoEngine(assembly.scene, SCENARIO.T, EXPONENTIAL, substeps)
+        engine.model.tendon_stiffness[...] *= wrong
+        errors.append(_one_period(assembly.process, engine, assembly.scene.outside))
+    truth = hold(plant(engine.model), SCENARIO.T).A
+    old = hold(plant(assembly.scene.model), SCENARIO.T).A
+    first, second = (np.abs(step - truth).max() for step in errors)
+    assert np.abs(old - truth).max() > 5 * first
+    assert np.log2(first / second) == pytest.approx(1, abs=0.2)
+
+
+def _one_period(process: Process, engine: Engine, outside: int):
+    """What an engine does with every basis state."""
+    columns = []
+    tape = StepBuffer(process, 1, 8, outside)
+    for unit in 1e-6 * np.eye(8):
+        tape.s[0, :, 0] = unit
+        engine.start(tape)
+        engine.advance(0)
+        columns.append(tape.s[1, :, 0] / 1e-6)
+    return np.stack(columns, axis=1)
+
+
+def test_of_first_order_where_devices_rub():
+    """Against 64 Runge-Kutta steps. Coulomb friction switches within a step: 9e-6 m at 8 steps, where RK4 has 2e-9."""
+    loop = assemble(RUBBING, CASE_I)
+
+    def positions(integrator, substeps):
+        return knocked(loop, make_engine(loop, "mujoco", integrator, substeps), 800).s[:, :2]
+
+    truth = positions("RK4", 64)
+    errors = [np.sqrt(np.mean((positions(EXPONENTIAL, n) - truth) ** 2)) for n in (8, 16)]
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(1, abs=0.3)
+    assert np.sqrt(np.mean((positions("RK4", 4) - truth) ** 2)) < errors[1] / 30
+
+
+def test_springs_need_mujocos_position_stage(assembly):
+    """A tendon's length is found in that stage: mj_forwardSkip without it leaves the old spring forces."""
+    data = mujoco.MjData(assembly.scene.model)
+    mujoco.mj_forward(assembly.scene.model, data)
+    data.qpos[0] = 1e-3
+    mujoco.mj_forwardSkip(assembly.scene.model, data, mujoco.mjtStage.mjSTAGE_POS, 1)
+    skipped = data.qacc.copy()
+    mujoco.mj_forward(assembly.scene.model, data)
+    # 14500 N/m through 1 mm on a motor of 0.06 kg
+    assert data.qacc[0] == pytest.approx(-14.5 / 0.06, rel=1e-9)
+    assert skipped[0] == 0.0
+
+
+# ---- many at once
+
+
+def hands(count: int) -> Crowd:
+    rng = np.random.default_rng(0)
+    return Crowd(np.exp(rng.uniform(np.log([0.01, 0.1, 1.0]), np.log([3.0, 30.0, 2000.0]), (count, 2, 1, 3))))
+
+
+def test_a_batch_is_a_loop_over_single_engines(assembly):
+    """One simulation bit for bit; of several only the sums of their products run in another order."""
+    start = 1e-3 * np.random.default_rng(0).normal(size=(8, 3))
+
+    def batch(nsim, nthread=1):
+        return MujocoBatchEngine(assembly.scene, SCENARIO.T, EXPONENTIAL, 1, nsim, nthread)
+
+    alone = [knocked(assembly, make_engine(assembly, "mujoco"), 300, start[:, [i]]).s for i in range(3)]
+    for i in range(3):
+        np.testing.assert_array_equal(knocked(assembly, batch(1), 300, start[:, [i]]).s, alone[i])
+    together = knocked(assembly, batch(3), 300, start).s
+    np.testing.assert_allclose(together, np.concatenate(alone, axis=2), rtol=1e-10, atol=1e-15)
+    np.testing.assert_array_equal(together, knocked(assembly, batch(3, nthread=2), 300, start).s)
+
+
+@pytest.mark.parametrize("substeps", [1, 2])
+def test_many_hands_are_each_their_own_scene(substeps):
+    """Against an engine for each one's own compiled scene, and against the exact batch."""
+    crowd = hands(5)
+    held_by = variants(SCENARIO.device, crowd)
+    loop = assemble(SCENARIO, CASE_I)
+    start = 1e-3 * np.random.default_rng(1).normal(size=(8, 5))
+    batch = MujocoBatchEngine(held_by.scene, SCENARIO.T, EXPONENTIAL, substeps, 5, fields=held_by.fields)
+    together = knocked(loop, batch, 300, start).s
+    for i in range(5):
+        own = assemble(SCENARIO.replace(human=crowd.humans(i)), CASE_I)
+        alone = knocked(own, make_engine(own, "mujoco", EXPONENTIAL, substeps), 300, start[:, [i]]).s
+        np.testing.assert_allclose(together[:, :, [i]], alone, rtol=1e-9, atol=1e-13)
+    exact = ExactBatchEngine(hold(held_by.plants(), SCENARIO.T), loop.process.force_limit)
+    np.testing.assert_allclose(together, knocked(loop, exact, 300, start).s, rtol=1e-9, atol=1e-13)
+
+
+def test_many_sampled_plants_are_as_exact_as_one():
+    """The stack of exponentials against scipy's of each: both round by 1e-16 of the largest entry."""
+    plants = variants(SCENARIO.device, hands(20)).plants()
+    together = hold(plants, SCENARIO.T)
+    for i in range(20):
+        alone = hold(Plant(plants.A[i], plants.B[i], plants.C), SCENARIO.T)
+        for own, one in ((together.A[i], alone.A), (together.B[i], alone.B)):
+            np.testing.assert_allclose(own, one, rtol=1e-12, atol=1e-14 * np.abs(one).max())
+
+
+# ---- which one, and how many substeps
+
+
+def test_the_default_follows_from_the_scene(assembly):
+    rubbing = assemble(RUBBING, CASE_I)
+    assert (default_integrator(assembly.scene), default_substeps(assembly, EXPONENTIAL)) == (EXPONENTIAL, 1)
+    assert (default_integrator(rubbing.scene), default_substeps(rubbing, "RK4")) == ("RK4", 4)
+    # no rule asks for more on a stiff linear scene, where Runge-Kutta takes 32
+    assert default_substeps(stiff(1.45e6), EXPONENTIAL) == 1
+    assert default_substeps(stiff(1.45e6), "RK4") == 32
+    assert check_substeps(stiff(1.45e6), EXPONENTIAL, 1) == []
+    assert check_substeps(rubbing, EXPONENTIAL, 8) == [
+        "exponential x 8: of first order where devices rub, RK4 is nearer at equal cost."
+    ]
+    assert default_substeps(rubbing, EXPONENTIAL) == 4
+
+
+def test_an_engine_without_a_name_of_its_integrator_takes_the_default(assembly):
+    rubbing = assemble(RUBBING, CASE_I)
+    for loop, integrator, substeps in ((assembly, EXPONENTIAL, 1), (rubbing, "RK4", 4)):
+        named = knocked(loop, make_engine(loop, "mujoco", integrator, substeps), 100).s
+        np.testing.assert_array_equal(knocked(loop, make_engine(loop, "mujoco"), 100).s, named)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda a: make_engine(a, "drake"), "engine is 'drake', allowed are mujoco, exact"),
+        (lambda a: make_engine(a, "mujoco", "Euler2"), f"integrator is 'Euler2', allowed are {', '.join(INTEGRATORS)}"),
+        (lambda a: make_engine(a, "mujoco", EXPONENTIAL, 0), "substeps is 0, allowed are whole numbers from 1"),
+        (lambda a: make_engine(assemble(RUBBING, CASE_I), "exact"), "have Coulomb friction, which the exact engine"),
+    ],
+)
+def test_what_is_refused_is_named(assembly, call, message):
+    with pytest.raises(ValueError, match=message):
+        call(assembly)
+
+
+def test_a_heavy_hand_on_a_light_handle_needs_no_substeps():
+    """The hard case of the rule: a 1 g handle without human damping, where Runge-Kutta asks for 24 steps at least."""
+    device = CompliantDevice(handle_mass=1e-3)
+    human = Human((Link(0.0, 0.0, 300.0),))
+    loop = assemble(SCENARIO.replace(device=(device,) * 2, human=(human,) * 2), CASE_I)
+    assert pace(plant(loop.scene.model).A).substeps(SCENARIO.T) >= 24
+    assert simulated_growth(loop, EXPONENTIAL, 1) == pytest.approx(exact_growth(loop), abs=1e-9)
+
+
+# ---- which one keeps an error
+
+
+def test_the_cheapest_on_a_smooth_scene_is_one_exponential_step(assembly):
+    found = cheapest(assembly, 1e-9, ticks=500)
+    assert (found.integrator, found.substeps) == (EXPONENTIAL, 1)
+    assert found.error < 1e-11
+    assert found.cpu_s > 0
+
+
+def test_where_devices_rub_the_asked_error_is_kept_with_the_fewest_steps():
+    """The reference knows 64 steps, which the search does not look at."""
+    loop, ticks = assemble(RUBBING, CASE_I), 1500
+
+    def positions(integrator, substeps):
+        return run(loop, make_engine(loop, "mujoco", integrator, substeps), ticks=ticks).s[:, :2]
+
+    def missed(*setting):
+        return np.sqrt(np.mean((positions(*setting) - truth) ** 2) / np.mean(truth**2))
+
+    truth = positions("RK4", 64)
+    for asked, expected in ((1e-2, EXPONENTIAL), (1e-4, "RK4"), (1e-6, "RK4")):
+        found = cheapest(loop, asked, ticks)
+        assert found.integrator == expected
+        assert missed(found.integrator, found.substeps) <= found.error <= asked
+        if found.substeps > 1:
+            assert missed("RK4", found.substeps // 2) > asked / 4
+
+
+@pytest.mark.parametrize(
+    ("scenario", "error", "message"),
+    [
+        (SCENARIO, 0.0, "--error is 0, expected a positive relative error"),
+        (SCENARIO, 1e-18, "--error 1e-18: the engine that is exact here is within .*, by rounding"),
+        (RUBBING, 1e-18, "--error 1e-18: RK4 comes within .* with up to 128 substeps"),
+    ],
+)
+def test_errors_that_nothing_keeps(scenario, error, message):
+    with pytest.raises(InputError, match=message):
+        cheapest(assemble(scenario, CASE_I), error, ticks=100)
+
+
+# ---- the exponential of many small matrices
 
 
 def test_it_is_the_exponential_over_many_sizes_and_norms():

@@ -5,12 +5,13 @@ import json
 import numpy as np
 import pytest
 
-from cli import run, trace
+from cli import run as command
+from cli import trace
 from controller.coupling import NoCoupling
-from sim.run import assemble, simulate
+from sim.run import assemble, run
 from sim.scenario import InputError, load
-from sim.stability import before_clipping, close, dominant_mode
-from sim.trace import Result, growth, growths
+from sim.stability import close, dominant_mode
+from sim.trace import Trace, growth, growths
 
 T, STEP = 1.2e-3, np.full(2, 1e-6)
 
@@ -64,9 +65,9 @@ def test_the_exact_engines_growth_without_its_states():
     """The loop without coupling, people moving: its eigenvalue, to the 1e-3 1/s that sim.stability is held to."""
     assembly = assemble(load().replace(duration=6.0), NoCoupling())
     exact = dominant_mode(close(assembly.plant, assembly.F)).growth
-    record = simulate(assembly, "exact")
-    ticks = before_clipping(record, assembly.process.force_limit)
-    found = growth(record.s[:ticks, :2, 0], T, STEP)
+    record = run(assembly, "exact")
+    ticks = record.ticks_before_clipping(assembly.process.force_limit)
+    found = growth(record.x[:ticks], T, STEP)
     assert found.growth_rate_per_s == pytest.approx(exact, abs=1e-3)
 
 
@@ -76,7 +77,7 @@ def test_too_few_ticks_say_so():
 
 def test_the_command_reads_what_sim_run_writes(tmp_path, capsys):
     options = ["--case", "none", "--engine", "exact", "--duration", "9", "--no-plot", "--out", str(tmp_path)]
-    assert run.main(options) == 0
+    assert command.main(options) == 0
     capsys.readouterr()
     path = tmp_path / "trace.npz"
     assert trace.main([str(path), "--plot", str(tmp_path / "again.png"), "--json", "-"]) == 0
@@ -92,7 +93,7 @@ def test_the_command_reads_what_sim_run_writes(tmp_path, capsys):
 def made(x, meta):
     n = len(x)
     unknown = np.full((n, 2), np.nan)
-    return Result(T * np.arange(n), x, np.zeros((n, 2)), unknown, unknown, np.zeros((n, 0)), meta)
+    return Trace(T * np.arange(n), x, np.zeros((n, 2)), unknown, unknown, np.zeros((n, 0)), meta)
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,10 @@ import pytest
 from cli.run import main
 from controller.coupling import NoCoupling, SpringDamper
 from design.result import CASE_I
-from sim.run import Assembly, Record, assemble, simulate
+from sim.accuracy import ForceError, force_error, response
+from sim.run import Simulation, assemble, run
 from sim.scenario import load
-from sim.trace import Likeness, Result, likeness, response
+from sim.trace import Trace
 
 SCENARIO = load()
 
@@ -34,19 +35,19 @@ def by_hand(T: float, x: np.ndarray, late: tuple[int, ...]) -> np.ndarray:
     return shifted
 
 
-def record_of(assembly: Assembly, seconds: float) -> Record:
-    return simulate(assembly, "exact", samples=round(seconds / SCENARIO.T))
+def record_of(assembly: Simulation, seconds: float) -> Trace:
+    return run(assembly, "exact", ticks=round(seconds / SCENARIO.T))
 
 
 @pytest.mark.parametrize(("case", "late"), [("I", (1, 2)), ("II", (0, 0))])
 def test_the_ideal_force_is_the_networks_for_the_measured_motion(case, late):
     assembly = assemble(SCENARIO, CASE_I)
     record = record_of(assembly, 2.0)
-    alike = likeness(assembly, record, SCENARIO.loop(case).lam)
-    expected = by_hand(SCENARIO.T, record.s[:, :2, 0], late)
+    alike = force_error(assembly, record, SCENARIO.loop(case).lam)
+    expected = by_hand(SCENARIO.T, record.x, late)
     # 1700 ticks of a lightly damped mass in another order of operations
     np.testing.assert_allclose(alike.ideal, expected, atol=1e-9 * np.abs(expected).max())
-    part, asked = alike.part(), record.f[:, :, 0]
+    part, asked = alike.part(), record.f
     np.testing.assert_allclose(alike.asked, asked, atol=1e-12)  # nothing is clipped here
     error = np.sqrt(((asked - expected) ** 2).sum() / (expected**2).sum())
     assert part["error_percent"] == pytest.approx(100 * error, rel=1e-6)
@@ -65,16 +66,16 @@ def test_a_loop_without_coupling_is_ideal_even_where_its_motors_clip():
     assembly = assemble(SCENARIO.replace(theta=(2, 3)), NoCoupling())
     record = record_of(assembly, 6.0)
     assert np.abs(record.f).max() == 12.0
-    part = likeness(assembly, record, (2, 3)).part()
+    part = force_error(assembly, record, (2, 3)).part()
     assert part["asked_rms_n"] > np.sqrt(np.mean(record.f**2))
     assert part["error_percent"] < 1e-8
 
 
 def test_undefined_errors_have_a_reason():
     still = np.zeros((5, 2))
-    assert Likeness(still, still).part()["reason"] == "the ideal environment would have rendered no force"
-    assert Likeness(still[:0], still[:0]).part()["error_percent"] is None
-    lost = Likeness(still + 1, np.full((5, 2), 1e200)).part()
+    assert ForceError(still, still).part()["reason"] == "the ideal environment would have rendered no force"
+    assert ForceError(still[:0], still[:0]).part()["error_percent"] is None
+    lost = ForceError(still + 1, np.full((5, 2), 1e200)).part()
     assert lost["error_percent"] is None
     assert lost["asked_rms_n"] is None
     json.dumps(lost, allow_nan=False)
@@ -91,7 +92,7 @@ def test_the_command_ranks_the_designs(tmp_path):
     assert errors["optimal", None] < 2
     assert errors["optimal", None] < errors["spring-damper", "closed-loop"] / 5
     assert errors["spring-damper", "closed-loop"] < errors["spring-damper", "theorem4"] / 2
-    trace = Result.load_npz(tmp_path / "trace.npz")
+    trace = Trace.load_npz(tmp_path / "trace.npz")
     expected = by_hand(SCENARIO.T, trace.x, (1, 2))
     error = np.sqrt(((trace.f - expected) ** 2).sum() / (expected**2).sum())
     assert errors["spring-damper", "closed-loop"] == pytest.approx(100 * error, rel=1e-6)

@@ -12,7 +12,7 @@ from sim.couplings import choose
 from sim.crowds import draw
 from sim.run import assemble
 from sim.scenario import load
-from sim.stability import disagree, dominant_modes, exact_loops, mujoco_loops, unstable
+from sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable
 
 DEVICES = ("omega-pair", "omega-pair-rigid")
 HUMANS = 1000
@@ -45,7 +45,7 @@ def held(scenario: str, lossless: bool) -> Variants:
 @cache
 def exact_growth(scenario: str, lossless: bool) -> np.ndarray:
     """(HUMANS,) [1/s], with the optimal coupling."""
-    return dominant_modes(exact_loops(held(scenario, lossless), assemble(load(scenario), optimal()).F)).growth
+    return dominant_mode(exact_loops(held(scenario, lossless), assemble(load(scenario), optimal()).F)).growth
 
 
 def test_the_same_coupling_is_designed_for_both():
@@ -71,7 +71,7 @@ def test_the_same_hands_upset_the_loop_without_coupling(scenario):
     F = assemble(load(scenario), NoCoupling()).F
     upset = {}
     for lossless in (False, True):
-        growth = dominant_modes(exact_loops(held(scenario, lossless), F)).growth
+        growth = dominant_mode(exact_loops(held(scenario, lossless), F)).growth
         upset[lossless] = int((growth > DESTABILISED).sum())
     compliant = scenario == "omega-pair"
     assert upset[False] > 800 if compliant else upset[False] == 0
@@ -83,7 +83,7 @@ def test_the_same_hands_upset_the_loop_without_coupling(scenario):
 def test_mujoco_says_the_same(scenario, lossless):
     """The eigenvalues of MuJoCo's own one-period map, for all of them."""
     assembly = assemble(load(scenario), optimal())
-    mujoco = dominant_modes(mujoco_loops(held(scenario, lossless), assembly.process)).growth
+    mujoco = dominant_mode(mujoco_loops(held(scenario, lossless), assembly.process)).growth
     assert mujoco.max() < DESTABILISED
     assert not disagree(exact_growth(scenario, lossless), mujoco).any()
 

@@ -9,7 +9,7 @@ from cli.run import main
 from design.result import CASE_I
 from models.human import Human, Link, Person, Port, state_space
 from sim import load, simulate, validate
-from sim.crowds import crowd_of
+from sim.crowds import Validation
 from sim.run import assemble
 from sim.scenario import InputError
 from sim.stability import close, dominant_mode
@@ -131,7 +131,7 @@ def test_its_verdicts_are_those_of_each_hand_alone():
     scenario = SCENARIO.replace(population=Muscles(Light))
     found = validate(scenario, CASE_I, humans=6, duration=0.0, engine="exact")
     for i in (0, 5):
-        hands = crowd_of(scenario, 0, i, 1).humans(0)
+        hands = Validation(scenario, CASE_I, 0, 20, 1, "exact", 0.0).crowd(i).humans(0)
         assembly = assemble(scenario.replace(human=hands), CASE_I)
         assert found.exact[i] == pytest.approx(dominant_mode(close(assembly.plant, assembly.F)).growth, abs=1e-9)
 

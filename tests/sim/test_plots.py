@@ -7,7 +7,7 @@ import pytest
 from matplotlib import pyplot as plt
 
 from sim import plots
-from sim.trace import Result
+from sim.trace import Trace
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ T = 1e-3
 def trace(f, x=None):
     f = np.asarray(f, dtype=float)
     x = 1e-3 * f if x is None else x
-    return Result(T * np.arange(len(f)), x, f, x, x, np.zeros((len(f), 1)), {})
+    return Trace(T * np.arange(len(f)), x, f, x, x, np.zeros((len(f), 1)), {})
 
 
 def test_a_run_is_drawn_whole_and_where_it_turns():

@@ -1,4 +1,4 @@
-"""The substep rule, the engine's own one-period map that checks it, and the second-order reading of Euler."""
+"""The substep rule, the engine's own one-period map that checks it."""
 
 import json
 
@@ -9,21 +9,13 @@ from cli.run import main
 from controller.coupling import NoCoupling
 from design.result import CASE_I
 from models.device import CompliantDevice
-from models.human import Human, Link
+from models.human import Human, Link, Person
 from models.scene import plant
-from sim.engines import INTEGRATORS, LEAPFROG
-from sim.run import assemble, simulate
+from sim.engines import INTEGRATORS
+from sim.run import assemble, make_engine, run
 from sim.scenario import SCENARIOS, InputError, load
-from sim.stability import (
-    Pace,
-    check_substeps,
-    default_substeps,
-    exact_growth,
-    measured_hold,
-    pace,
-    simulated_growth,
-    step_radius,
-)
+from sim.stability import exact_growth
+from sim.stepping import Pace, check_substeps, default_substeps, measured_hold, pace, simulated_growth, step_radius
 
 SCENARIO = load()
 STIFF = SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=1e6),) * 2)
@@ -57,14 +49,14 @@ def test_the_exact_engine_is_its_own_map(assembly):
 
 
 # `discrete` keeps a memory of its own from step to step, so no map of position and velocity is all of it
-@pytest.mark.parametrize("integrator", [*sorted(set(INTEGRATORS) - {"discrete"}), LEAPFROG])
+@pytest.mark.parametrize("integrator", sorted(set(INTEGRATORS) - {"discrete"}))
 def test_the_map_is_what_a_run_does(assembly, integrator):
     """Stepping the map closed with the process gives the simulated trace."""
-    record = simulate(assembly, "mujoco", integrator, 4, samples=300)
+    record = run(assembly, make_engine(assembly, "mujoco", integrator, 4), ticks=300)
     held = measured_hold(assembly, "mujoco", integrator, 4)
     for k in range(299):
-        follows = held.A @ record.s[k, :, 0] + held.B @ np.concatenate([record.w[k, :, 0], record.f[k, :, 0]])
-        np.testing.assert_allclose(follows, record.s[k + 1, :, 0], rtol=1e-9, atol=1e-12)
+        follows = held.A @ record.s[k] + held.B @ np.concatenate([record.w[k], record.f[k]])
+        np.testing.assert_allclose(follows, record.s[k + 1], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize(("substeps", "wrong"), [(1, True), (4, False)])
@@ -108,26 +100,12 @@ def test_edges_of_the_stable_regions(integrator, edge):
         assert (step_radius(shorter, integrator, 1) <= 1 + 1e-6) == stable
 
 
-def test_euler2_is_second_order(assembly):
-    """Halving the step divides the error by four."""
-    exact = simulate(assembly, "exact", samples=500).s
-    errors = [np.abs(simulate(assembly, "mujoco", LEAPFROG, n, samples=500).s - exact)[:, :2].max() for n in (8, 16)]
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(2, abs=0.2)
-
-
-def test_euler2_decays_exactly():
-    """A free body with damping: MuJoCo's implicit step becomes exp(-D h/M)."""
-    free = Human((Link(0.3, 3.0, 0.0),))
-    scenario = load("three-rigid").replace(human=(free,) * 3)
-    loop = assemble(scenario, NoCoupling())
-    held = measured_hold(loop, "mujoco", LEAPFROG, 3)
-    n = held.A.shape[0] // 2
-    np.testing.assert_allclose(held.A[n : n + 2, n : n + 2], loop.plant.A[n : n + 2, n : n + 2], rtol=1e-9, atol=1e-12)
-
-
-def test_euler2_refuses_damping_across_springs(tmp_path):
-    with pytest.raises(InputError, match=r"--integrator Euler2: .* across a spring"):
-        main(["--scenario", "three-rigid", "--integrator", "Euler2", "--out", str(tmp_path / "o")])
+def test_the_rule_knows_who_holds_devices_that_rub():
+    """Coulomb friction is taken out of the scene for the rule; a person who holds both devices stays in it."""
+    person, device = Person((1, 2), 20.0, 1.0, 100.0), CompliantDevice(friction=0.5)
+    loop = assemble(SCENARIO.replace(person=(person,), device=(device,) * 2), CASE_I)
+    assert loop.smooth.scene.model.nv == loop.scene.model.nv == 5
+    assert default_substeps(loop, "RK4") == 4
 
 
 def test_run_uses_and_reports_the_rule(tmp_path):
@@ -135,6 +113,7 @@ def test_run_uses_and_reports_the_rule(tmp_path):
     text = (SCENARIOS / "omega-pair.toml").read_text()
     path.write_text(text.replace("transmission_stiffness = 14500", "transmission_stiffness = 1e6"))
     options = ["--scenario", str(path), "--coupling", "published", "--duration", "0.3", "--no-plot"]
+    options += ["--integrator", "RK4"]
     options += ["--out", str(tmp_path / "o"), "--json", str(tmp_path / "r.json")]
     assert main(options) == 0
     assert json.loads((tmp_path / "r.json").read_text())["run"]["substeps"] == 26

@@ -15,7 +15,7 @@ from models.scene import variants
 from sim.couplings import choose
 from sim.crowds import crowds
 from sim.scenario import load
-from sim.stability import dominant_modes, exact_loops
+from sim.stability import dominant_mode, exact_loops
 from sim.zwidth import MODEL_KEPT, Surroundings, holders
 
 PAIR, STAR = load("omega-pair"), load("three-rigid")
@@ -117,7 +117,7 @@ def test_the_population_meets_the_pair_of_the_cell(optimal):
     for i, stable in ((0, True), (1, False)):
         growth = crowd.growth(F[i])[0]
         for index, some in crowds(ground.population, 2, 1, range(12), 1):
-            modes = dominant_modes(exact_loops(variants(ground.devices, some), F[i]))
+            modes = dominant_mode(exact_loops(variants(ground.devices, some), F[i]))
             np.testing.assert_allclose(growth[index], modes.growth, atol=1e-6)
         assert (growth < 0).all() == stable
 

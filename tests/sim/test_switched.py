@@ -11,23 +11,23 @@ from cli.run import main
 from cli.validate import main as validate
 from controller.coupling import SpringDamper
 from controller.delay import Jitter, ages, realising
-from controller.process import Tape
+from controller.process import StepBuffer
 from design import certificate as store
 from models.scene import Crowd, plant, variants
 from sim.crowds import draw
 from sim.engines import ExactBatchEngine, ExactEngine, HeldPlant
-from sim.run import assemble, simulate
+from sim.run import assemble
+from sim.run import run as close_loop
 from sim.scenario import SCENARIOS, InputError, load, parse
+from sim.stability import impulse_growth, unlimited
 from sim.switching import (
-    adversary,
     greedy_ages,
-    knocked,
     mode_matrix,
     switched_crowd,
     switching,
-    unlimited,
     with_delays,
     without_theta,
+    worst_switching,
 )
 
 STIFF = SpringDamper([7806, 3137], [0.105, 1.68])  # certified for the constants (1, 2) in the default environment
@@ -55,7 +55,7 @@ def test_the_product_of_mode_matrices_is_the_simulated_map():
     G = without_theta(ASSEMBLY, STIFF)
     moved = with_delays(ASSEMBLY, STIFF, realising(wanted)[:, :, None])
     states = moved.plant.A.shape[0]
-    tape = Tape(unlimited(moved.process), ticks, states, moved.scene.outside)
+    tape = StepBuffer(unlimited(moved.process), ticks, states, moved.scene.outside)
     tape.s[0, :, 0] = rng.normal(size=states)
     engine = ExactEngine(moved.plant, np.full(2, np.inf))
     engine.start(tape)
@@ -76,14 +76,14 @@ def test_the_product_of_mode_matrices_is_the_simulated_map():
 
 def test_constant_delays_give_the_trace_of_the_constant_loop():
     delays = np.tile(np.array([1, 2])[None, :, None], (300, 1, 1))
-    varying = simulate(with_delays(ASSEMBLY, STIFF, delays), "exact", samples=300)
-    constant = simulate(ASSEMBLY, "exact", samples=300)
+    varying = close_loop(with_delays(ASSEMBLY, STIFF, delays), "exact", ticks=300)
+    constant = close_loop(ASSEMBLY, "exact", ticks=300)
     np.testing.assert_allclose(varying.s, constant.s, rtol=0, atol=1e-12 * np.abs(constant.s).max())
 
 
 def test_the_worst_period_grows_more_than_any_constant_delay():
     """(1, 2) is certified; switching within 1 to 2 makes the loop with its ordinary humans grow, exactly."""
-    worst = adversary(ASSEMBLY, STIFF, Jitter((1, 1), (2, 2), "adversarial"))
+    worst = worst_switching(ASSEMBLY, STIFF, Jitter((1, 1), (2, 2), "adversarial"))
     assert worst.growth > 1.5  # found by a search: 2.05 1/s at the time of writing
     assert set(np.unique(worst.ages)) <= {1, 2}
     period, held = len(worst.ages), own_hold()
@@ -114,7 +114,7 @@ def test_greedy_ages_repeat_the_trajectory_that_chose_them():
     for each in (delays, drawn):
         free = replace(unlimited(process), delays=each)
         engine = ExactBatchEngine(held, free.force_limit)
-        rates.append(knocked(free, engine, ASSEMBLY.scene, held.A.shape[1], ticks, 1).rate[0])
+        rates.append(impulse_growth(free, engine, ASSEMBLY.scene, held.A.shape[1], ticks)[0][0])
     assert rates[0] > 0 > rates[1]
 
 

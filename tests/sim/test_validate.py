@@ -10,6 +10,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from driven import driven
 
 from cli import run as run_command
 from cli.validate import main
@@ -22,20 +23,11 @@ from sim import crowds as examine_module
 from sim import crowds as shards
 from sim import report as verdict_report
 from sim.couplings import choose
-from sim.crowds import BATCH, MIXED, Findings, Question, crowds, crowds_of, draw, validate
+from sim.crowds import BATCH, MIXED, Findings, Validation, crowds, draw, validate
 from sim.engines import ExactBatchEngine, ExactEngine, hold
-from sim.run import assemble, run, simulate
+from sim.run import assemble, run
 from sim.scenario import InputError, load
-from sim.stability import (
-    close,
-    disagree,
-    dominant_mode,
-    dominant_modes,
-    exact_loops,
-    knock_forces,
-    mujoco_loops,
-    unstable,
-)
+from sim.stability import close, disagree, dominant_mode, exact_loops, impulse_forces, mujoco_loops, unstable
 
 SCENARIO = load()
 TWO = "[[human]]\nlinks = [{mass = 1.0, damping = 0, stiffness = 0}]\n" * 2
@@ -67,6 +59,10 @@ def test_stacked_plants_are_those_of_each_model(devices, links):
         np.testing.assert_array_equal(stacked.C, alone.C)
 
 
+def asked(scenario):
+    return Validation(scenario, CASE_I, 7, 20, 2, "exact", 0.0)
+
+
 HELD = SCENARIO.replace(person=(Person((2, 1), 20.0, 1.0, 100.0),))
 
 
@@ -74,7 +70,7 @@ HELD = SCENARIO.replace(person=(Person((2, 1), 20.0, 1.0, 100.0),))
 def test_people_in_both_hands_are_stacked_and_simulated_alike(devices):
     """Each row of the crowd is the scene built for it, and MuJoCo's map agrees with the exact one as for others."""
     scenario = HELD.replace(device=devices)
-    ((_, people),) = crowds_of(scenario, 7, range(20), 2)
+    ((_, people),) = asked(scenario).crowds(range(20))
     held_by = variants(devices, people)
     stacked = held_by.plants()
     for i in range(5):
@@ -82,17 +78,17 @@ def test_people_in_both_hands_are_stacked_and_simulated_alike(devices):
         np.testing.assert_allclose(stacked.A[i], alone.A, rtol=1e-12, atol=1e-12 * np.abs(alone.A).max())
         np.testing.assert_allclose(stacked.B[i], alone.B, rtol=1e-13, atol=0)
     assembly = assemble(scenario, CASE_I)
-    exact = dominant_modes(exact_loops(held_by, assembly.F)).growth
-    np.testing.assert_allclose(dominant_modes(mujoco_loops(held_by, assembly.process)).growth, exact, atol=1e-3)
+    exact = dominant_mode(exact_loops(held_by, assembly.F)).growth
+    np.testing.assert_allclose(dominant_mode(mujoco_loops(held_by, assembly.process)).growth, exact, atol=1e-3)
     # the arms are the same as of people who hold one device each
-    np.testing.assert_array_equal(people.links, next(crowds_of(SCENARIO, 7, range(20), 2))[1].links)
+    np.testing.assert_array_equal(people.links, next(asked(SCENARIO).crowds(range(20)))[1].links)
 
 
 def test_both_engines_simulate_a_person_who_moves_both_hands():
     """RK4 x 4 against the exact solution, voluntary motion and its reaction on the body included."""
     scenario = HELD.replace(duration=1.5)
     assembly = assemble(scenario, CASE_I)
-    mujoco, exact = simulate(assembly), simulate(assembly, "exact")
+    mujoco, exact = run(assembly), run(assembly, "exact")
     assert np.abs(exact.s[:, :2]).max() > 1e-3
     positions, n = slice(assembly.scene.model.nq), assembly.scene.model.nq
     np.testing.assert_allclose(mujoco.s[:, positions], exact.s[:, positions], atol=1e-7)
@@ -121,7 +117,7 @@ def test_a_scenario_with_a_person_is_validated_with_random_people(tmp_path):
 def test_batched_eigenvalues_are_those_of_each_loop(coupling, links):
     people = crowd(20, links)
     F = assemble(SCENARIO, coupling).F
-    modes = dominant_modes(exact_loops(variants(SCENARIO.device, people), F))
+    modes = dominant_mode(exact_loops(variants(SCENARIO.device, people), F))
     for i in range(len(people)):
         scene = build(SCENARIO.device, people.humans(i))
         mode = dominant_mode(close(hold(plant(scene.model), SCENARIO.T), F))
@@ -136,8 +132,8 @@ def test_mujoco_maps_are_the_exact_maps(devices):
     scenario = SCENARIO.replace(device=devices)
     assembly = assemble(scenario, CASE_I)
     held_by = variants(devices, crowd(40, 2))
-    exact = dominant_modes(exact_loops(held_by, assembly.F)).growth
-    mujoco = dominant_modes(mujoco_loops(held_by, assembly.process)).growth
+    exact = dominant_mode(exact_loops(held_by, assembly.F)).growth
+    mujoco = dominant_mode(mujoco_loops(held_by, assembly.process)).growth
     np.testing.assert_allclose(mujoco, exact, atol=1e-3)
 
 
@@ -150,13 +146,13 @@ def test_batch_engine_is_the_exact_engine(devices):
     rest = np.zeros((plants.A.shape[1], len(people)))
 
     def outside(first, ticks):
-        return knock_forces(held_by.scene, SCENARIO.T, first, ticks)
+        return impulse_forces(held_by.scene, SCENARIO.T, first, ticks)
 
-    together = run(process, ExactBatchEngine(plants, process.force_limit), outside, 400, rest)
+    together = driven(process, ExactBatchEngine(plants, process.force_limit), outside, 400, rest)
     assert (np.abs(together.f) == 0.2).any()
     for i in range(len(people)):
         one = hold(plant(build(devices, people.humans(i)).model), SCENARIO.T)
-        alone = run(process, ExactEngine(one, process.force_limit), outside, 400, rest[:, :1])
+        alone = driven(process, ExactEngine(one, process.force_limit), outside, 400, rest[:, :1])
         # sums in another order, and a clipped unstable loop multiplies rounding
         np.testing.assert_allclose(together.s[:, :, i], alone.s[:, :, 0], rtol=1e-6, atol=1e-11)
 
@@ -172,7 +168,7 @@ def test_a_human_depends_on_seed_and_index_only():
 
 def test_shards_repeat_the_single_run_bit_for_bit():
     """Verdicts and MuJoCo's traces, long enough for a growth rate on each."""
-    question = Question(SCENARIO, CASE_I, 0, 2 * BATCH + 10, MIXED, "both", 0.3)
+    question = Validation(SCENARIO, CASE_I, 0, 2 * BATCH + 10, MIXED, "both", 0.3)
     assert len(question.batches()) > 2
     alone, shared = validate(question), validate(question, shards=2)
     for field in fields(Findings):
@@ -186,11 +182,11 @@ def test_shards_repeat_the_single_run_bit_for_bit():
 
 def test_designed_coupling_holds_for_everyone():
     coupling = choose(SCENARIO, "I").coupling
-    findings = validate(Question(SCENARIO, coupling, 0, 200, 1, "both", 0.0))
+    findings = validate(Validation(SCENARIO, coupling, 0, 200, 1, "both", 0.0))
     assert not unstable(findings.exact).any()
     assert not unstable(findings.mujoco).any()
     assert not findings.disagreements.any()
-    traced = validate(Question(SCENARIO, coupling, 0, 12, MIXED, "both", 1.0))
+    traced = validate(Validation(SCENARIO, coupling, 0, 12, MIXED, "both", 1.0))
     np.testing.assert_allclose(traced.trace, traced.exact, atol=1e-3)
     assert not traced.clipped.any()
     assert (traced.energy >= 0).all()
@@ -199,7 +195,7 @@ def test_designed_coupling_holds_for_everyone():
 
 
 def test_without_coupling_most_are_unstable_and_the_energy_audit_sees_it():
-    findings = validate(Question(SCENARIO, NoCoupling(), 0, 200, 1, "exact", 2.0))
+    findings = validate(Validation(SCENARIO, NoCoupling(), 0, 200, 1, "exact", 2.0))
     assert unstable(findings.exact).mean() > 0.6
     assert findings.energy.min() < 0
     np.testing.assert_allclose(findings.trace, findings.exact, atol=1e-6)
@@ -262,7 +258,7 @@ def test_ctrl_c_keeps_the_batches_that_are_done(tmp_path, monkeypatch):
 def test_ctrl_c_ends_the_batches_that_run_in_other_processes():
     """A batch of an hour and a half of simulated time each would otherwise be waited for."""
     scenario = load("omega-pair")
-    question = Question(scenario, SpringDamper([500, 500], [0.4, 0.4]), 0, 250, 1, "mujoco", 50_000.0)
+    question = Validation(scenario, SpringDamper([500, 500], [0.4, 0.4]), 0, 250, 1, "mujoco", 50_000.0)
     before = set(multiprocessing.active_children())
     timer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT))
     timer.start()
@@ -276,7 +272,7 @@ def test_ctrl_c_ends_the_batches_that_run_in_other_processes():
 @pytest.mark.parametrize("duration", [0.5, 60.0])
 def test_hands_that_had_no_time_to_rest_are_no_verdict(duration):
     """Against the slowest eigenvalue of the same humans, by the exact engine."""
-    question = Question(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", duration)
+    question = Validation(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", duration)
     found = validate(question)
     traces = verdict_report.validation_part(question, found, True, 1.0)["traces"]
     assert traces["slowest_decay_s"] == pytest.approx(-1 / found.exact.max())

@@ -13,7 +13,7 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, Wall, environment
 from controller.gains import Gains, force_maps
 from controller.loop import force_map
-from controller.process import Process, Tape, contact
+from controller.process import Process, StepBuffer, contact
 from design.frequency import on_circle, suprema
 from design.maps import closed_loop_ratios, theorem4_ratios
 from models.device import CompliantDevice, RigidDevice
@@ -23,7 +23,8 @@ from sim import zwidth as gain_map
 from sim.crowds import crowds
 from sim.engines import discretised
 from sim.scenario import InputError, load
-from sim.stability import dominant_modes, exact_loops, oscillation, slowest_seen
+from sim.stability import dominant_mode, exact_loops
+from sim.trace import oscillation, slowest_seen
 from sim.zwidth import Effects, Grid, Ground, ManyProcesses, Plan, draw_map, holders, in_slices, make_grid, one_sided
 
 DELTA, T = 1.37, 1e-3
@@ -181,7 +182,7 @@ def test_the_population_is_decided_as_one_by_one(links):
     F = ground.force_maps(ground.gains([1500.0], [0.4]))[0][0]
     growth, audible = crowd.growth(F)
     for index, some in crowds(ground.population, 1, 3, range(30), links):
-        modes = dominant_modes(exact_loops(variants(ground.devices, some), F))
+        modes = dominant_mode(exact_loops(variants(ground.devices, some), F))
         np.testing.assert_allclose(growth[index], modes.growth, atol=1e-7)
     assert (audible <= growth + 1e-9).all()
     assert (growth > 0).any()
@@ -249,7 +250,7 @@ def test_many_processes_are_each_as_alone(walls):
         processes = [Process(stack[i], limit, step) for i in range(2)]
     x = rng.normal(scale=1e-3, size=(20, 2))
     together = ManyProcesses(processes, 20, 2, 0)
-    alone = [Tape(process, 20, 2) for process in processes]
+    alone = [StepBuffer(process, 20, 2) for process in processes]
     for k in range(20):
         together.s[k, 0] = x[k]
         together.tick(k)

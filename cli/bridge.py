@@ -1,0 +1,169 @@
+"""python -m hw.bridge: drive a device over a serial port with a coupling that is certified for the delay measured.
+
+port -> handshake -> delay -> coupling and certificate -> arm -> run -> ramp out -> trace and report
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from cli.options import (
+    DOES_NOT_HOLD,
+    DONE,
+    INTERRUPTED,
+    Parser,
+    add_loop_options,
+    add_output_options,
+    out_folder,
+    scenario_from,
+    seed_from,
+)
+from cli.render import console
+from cli.session_cli import (
+    add_link_options,
+    add_safety_options,
+    check_link,
+    hold_session,
+    limits_from,
+    measured_link,
+    number,
+)
+from design.certificate import CAVEATS, CONDITIONS
+from hw.control import CertifiedCoupling, certified_couplings
+from hw.limits import Stage
+from hw.monitor import Ages
+from hw.recording import Recorder, outcome, save
+from hw.session import session_for
+from sim.couplings import NAMES
+from sim.files import write_json
+from sim.scenario import InputError, require_constant_delay, require_linear
+from sim.trace import format_growth
+
+LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
+
+
+def main(argv: list[str]) -> int:
+    """One session. 0: it ended as planned, 1: refused, stopped, lost or e-stop, 130: interrupted, after a ramp."""
+    args = _parser().parse_args(argv)
+    scenario, seed, settings = scenario_from(args), seed_from(args), check_link(args)
+    require_linear(scenario, "hw.bridge")
+    require_constant_delay(scenario, "hw.bridge")
+    seconds = number(args, "duration", 0.1, LONGEST, scenario.duration)
+    if args.case == "none":
+        raise InputError("--case none has no coupling, so there is nothing that could be certified")
+    session = session_for(
+        scenario, replace(settings, rereference=not args.no_rereference), **limits_from(args, scenario)
+    )
+    session.record = recorder = Recorder(scenario.channels)
+    out = out_folder(args, "bridge")
+
+    def plan(ages: Ages) -> Sequence[CertifiedCoupling]:
+        link = measured_link(args, ages, scenario.T)
+        programs = certified_couplings(scenario, args.case, args.coupling, args.condition, link)
+        print_certificate(ages, link, programs, console(args))
+        return programs
+
+    live = hold_session(args, session, plan, seconds, seed, out)
+    report = outcome(args.case, session, recorder, live.dropped, float(args.pace))
+    try:  # first, for a disk may be full
+        print_session(report, console(args))
+    except OSError:
+        if signal.SIGHUP not in live.signals:
+            raise
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - the terminal is gone, and with it whoever would read this
+    report["files"] = [str(p) for p in save(out, session, recorder, report, not args.no_plot)]
+    console(args).print("files: " + ", ".join(report["files"]), soft_wrap=True)
+    if args.json:
+        write_json(args.json, report)
+    if set(live.signals) - {signal.SIGUSR1}:
+        return INTERRUPTED
+    return DONE if session.stage == Stage.FINISHED else DOES_NOT_HOLD
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = Parser(
+        "hw.bridge",
+        "Drive a device over a serial port with a coupling that is certified for the delay measured.",
+        "python -m hw.bridge --rehearse --case I --duration 2",
+    )
+    add_loop_options(parser)
+    add_link_options(parser)
+    add_safety_options(parser)
+    names = ", ".join(NAMES)
+    parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
+    parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
+    parser.add_argument("--duration", metavar="SECONDS", help="of forces at full gain (default: the scenario's)")
+    parser.add_argument("--no-plot", action="store_true", help="write no picture")
+    add_output_options(parser)
+    return parser
+
+
+def print_certificate(ages: Ages, link: int, programs: Sequence[CertifiedCoupling], console: Console) -> None:
+    """What was measured, and what is certified for it: printed before anything is armed."""
+    at = {p: int(np.percentile(ages.values, p)) for p in (50, 99)}
+    console.print(
+        f"answers are {at[50]} us old, {at[99]} us at the 99th percentile, {ages.missing} of "
+        f"{len(ages.values) + ages.missing} never arrived: a link of {link} tick{'s' if link > 1 else ''}"
+    )
+    table = Table(title="certified for the delay measured, and softer in reserve")
+    table.add_column("coupling", min_width=13)
+    for column in ("K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "promise"):
+        table.add_column(column)
+    for program in programs:
+        part = program.part()
+        certificate = next(c for c in (part["certificate"], *part["certificates"].values()) if c["certified"])
+        coupling = part["coupling"]
+        table.add_row(
+            f"{coupling['kind']}, theta = {', '.join(map(str, part['theta']))}",
+            *(_list(coupling[name]) for name in "KB"),
+            f"{_list(certificate['required_damping'])} ({certificate['condition']}, {certificate['proof']})",
+            _list(certificate["available_damping"]),
+            part["promise"],
+        )
+    console.print(table)
+    for program in programs:
+        for remark in program.remarks():
+            console.print(f"[dim]·[/] theta = {list(program.scenario.theta)}: {remark}", highlight=False)
+    if len(programs) == 1:
+        console.print("no reserve: nothing softer is certified, so late answers end the session")
+
+
+def print_session(report: dict[str, Any], console: Console) -> None:
+    """The log, then what the link did."""
+    table = Table(title=f"case {report['case']} · {report['scenario']}")
+    for column in ("after", "stage", "cause"):
+        table.add_column(column, justify="right" if column == "after" else "left")
+    for event in report["session"]["log"]:
+        table.add_row(f"{event['t_s']:.3f} s", _colour(event["stage"]), event["cause"])
+    console.print(table)
+    link = report["link"]
+    if link["age_us"]:
+        ages = ", ".join(f"{name} {us / 1000:.2f} ms" for name, us in link["age_us"].items())
+        console.print(
+            f"link: {link['rate_hz']:.0f} answers a second, {link['missed_percent']:.2f} % missed; age {ages}"
+        )
+    for i, part in enumerate(report["growth"], start=1):
+        console.print(f"growth at full gain, arming {i}, {format_growth(part, report['run']['T_s'])}")
+    counted = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in link["counters"].items() if n)
+    console.print(f"counted: {counted or 'nothing'}")
+    console.print(f"[dim]·[/] {CAVEATS}")
+
+
+def _list(values: Sequence[float | None] | None) -> str:
+    return "-" if values is None else ", ".join("inf" if v is None else f"{v:.5g}" for v in values)
+
+
+def _colour(stage: str) -> str:
+    colours = {Stage.FINISHED: "green", Stage.REFUSED: "yellow", Stage.STOPPED: "red", Stage.LOST: "red"}
+    colour = (colours | {Stage.ESTOP: "red"}).get(Stage(stage))
+    return f"[{colour}]{stage}[/]" if colour else stage

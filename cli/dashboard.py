@@ -1,0 +1,98 @@
+"""The live view of a session, in a process of its own: drawing a table takes longer than a tick.
+
+The bridge writes one line of JSON a few times a second; this process draws the last one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from contextlib import suppress
+from typing import Any
+
+from rich.live import Live
+from rich.table import Table
+
+from cli.render import Screen
+from hw.session import Session
+
+WIDTH = 72  # columns
+BAR = 30  # characters of a bar
+COUNTED = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale")
+
+
+def snapshot(session: Session) -> dict[str, Any]:
+    """What the view shows, as plain data."""
+    drive = session.drive
+    return {
+        "stage": str(session.stage),
+        "cause": session.cause,
+        "x_mm": [1e3 * x for x in (drive.x or ())] if drive else [],
+        "f": list(drive.force) if drive else [],
+        "cap": list(session.limits.cap),
+        "gain": session.gain,
+        "theta": session.config.theta if session.config else None,
+        "margin_us": session.link.least_margin,
+        "counters": {name: getattr(session.counters, name) for name in COUNTED}
+        | {"host_errors": session.decoder.rejected},
+    }
+
+
+def view(data: dict[str, Any], width: int = WIDTH) -> Table:
+    """One snapshot as a table, in a terminal of `width` columns."""
+    table = Table(title=f"{data['stage']}: {data['cause']}", width=min(width, WIDTH), show_header=False)
+    table.add_column("what", width=16 if width >= WIDTH else 7)
+    table.add_column("now")
+    for i, (x, f, cap) in enumerate(zip(data["x_mm"], data["f"], data["cap"], strict=False), start=1):
+        table.add_row(f"axis {i}", f"{x:+8.3f} mm  {f:+7.3f} N  {_bar(f / cap) if width >= WIDTH else ''}")
+    margin = "-" if data["margin_us"] is None else f"at least {data['margin_us']} us in the last ticks"
+    table.add_row("margin", f"{margin}; theta = {data['theta']}, gain {data['gain']:.2f}")
+    table.add_row("counted", ", ".join(f"{name} {n}" for name, n in data["counters"].items()))
+    table.add_row("keys", "a arm · s stop · space e-stop · q quit")
+    return table
+
+
+def _bar(part: float) -> str:
+    """A force between its limits: the bar grows from the middle."""
+    half = BAR // 2
+    n = round(min(1.0, abs(part)) * half)
+    return ("█" * n).rjust(half) + "│" + " " * half if part < 0 else " " * half + "│" + ("█" * n).ljust(half)
+
+
+class Dashboard:
+    """The view's process, fed without waiting for it."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "cli.dashboard"], stdin=subprocess.PIPE, start_new_session=True
+        )
+        assert self._process.stdin is not None
+        self._pipe = self._process.stdin.fileno()
+        os.set_blocking(self._pipe, False)
+
+    def __call__(self, session: Session) -> None:
+        """Show the session as it is now; a view that does not keep up misses a picture."""
+        with suppress(OSError):
+            os.write(self._pipe, (json.dumps(snapshot(session)) + "\n").encode())
+
+    def close(self) -> None:
+        """Leave the last picture on the screen."""
+        assert self._process.stdin is not None
+        with suppress(OSError):
+            self._process.stdin.close()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout=2.0)
+
+
+def main() -> None:
+    """Draw what comes in until nothing comes any more."""
+    with Live(console=Screen(stderr=True), auto_refresh=False) as live:
+        for line in sys.stdin:
+            with suppress(ValueError):
+                live.update(view(json.loads(line), live.console.width), refresh=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,162 @@
+"""python -m hw.identify: how much damping does a device guarantee? From a chirp of a small force and a free release.
+
+Nobody holds the device. The chirp passes through the same session as the bridge, with all its limits, capped at its own
+amplitude.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from cli.options import (
+    DOES_NOT_HOLD,
+    DONE,
+    INTERRUPTED,
+    Parser,
+    add_loop_options,
+    add_output_options,
+    numbers,
+    out_folder,
+    scenario_from,
+    seed_from,
+)
+from cli.render import console, progress
+from cli.session_cli import add_link_options, check_link, hold_session, measured_link, number
+from hw.identify import Estimate, Excitation, capped, chirp, estimate, held
+from hw.limits import Stage
+from hw.monitor import Ages
+from hw.recording import Recorder, outcome, result_of
+from hw.session import Session, session_for
+from sim.files import write, write_json
+from sim.scenario import InputError, Scenario, require_constant_delay, require_linear
+
+LIMITS = (
+    "The bound is a statement about this record: 95 % confidence that the viscous friction of the model (motor, "
+    "transmission, handle) is at least this, where residuals are correlated over at most 60 ticks. It does not see "
+    "friction that changes with position, temperature or wear, gravity, or motions faster than the chirp. Nor can it "
+    "tell a hand from the device: whoever holds or touches the handle adds damping, and the bound is then too high. "
+    "Dry friction is taken to reverse within a few mm/s; where it takes 10 mm/s, bounds 2 % too high were seen. "
+    "Coulomb friction is left out of delta: it dissipates too, but ever less than a viscous damper as speed grows."
+)
+
+
+def main(argv: list[str]) -> int:
+    """Identify every axis. 0: each has a bound above zero, 1: not, or the session did not end as planned."""
+    args = _parser().parse_args(argv)
+    scenario, seed, settings = scenario_from(args), seed_from(args), check_link(args)
+    require_linear(scenario, "hw.identify")
+    require_constant_delay(scenario, "hw.identify")
+    force, seconds = number(args, "force", 0.05, 6.0), number(args, "seconds", 0.5, 30.0)
+    low, high = numbers("--band", args.band, float, 2)
+    if not 0.5 <= low < high <= 0.4 / scenario.T:
+        raise InputError(f"--band is {args.band}, expected LOW,HIGH within 0.5 to {0.4 / scenario.T:.0f} Hz")
+    coulomb = number(args, "coulomb", 0.0, 10.0)
+    out = out_folder(args, "identify")
+    asks_nothing = scenario.replace(delta=(1e-6,) * scenario.channels)  # what the damping is, is the question
+    session = session_for(asks_nothing, replace(settings, test_encoders=False), cap=force)
+    session.record = recorder = Recorder(scenario.channels)
+
+    def plan(ages: Ages) -> Sequence[Excitation]:
+        link = measured_link(args, ages, scenario.T)
+        return [chirp(scenario.channels, scenario.T, link, force, (low, high), seconds)]
+
+    played = 1.5 * seconds + 0.1  # from full gain on: the lead has the ramp
+    live = hold_session(args, session, plan, played, seed, out, nobody=True, coulomb=coulomb)
+    report, estimates = _identified(session, recorder, scenario, live.dropped, float(args.pace))
+    report["files"] = [str(p) for p in _save(out, session, recorder, scenario, estimates, report)]
+    _print(report, console(args))
+    if args.json:
+        write_json(args.json, report)
+    if live.signals:
+        return INTERRUPTED
+    return DONE if session.stage == Stage.FINISHED and report["bounded"] else DOES_NOT_HOLD
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = Parser(
+        "hw.identify",
+        "Estimate mass, friction and transmission of a device that nobody holds, and a lower bound of its damping.",
+        "python -m hw.identify --rehearse",
+    )
+    add_loop_options(parser)
+    add_link_options(parser)
+    parser.add_argument("--force", default="1", metavar="NEWTON", help="amplitude of the chirp (default 1)")
+    parser.add_argument("--band", default="3,200", metavar="LOW,HIGH", help="of the chirp [Hz] (default 3,200)")
+    parser.add_argument("--seconds", default="2.5", metavar="SECONDS", help="of the chirp (default 2.5)")
+    parser.add_argument("--coulomb", default="0", metavar="NEWTON", help="dry friction of an emulated device")
+    add_output_options(parser)
+    return parser
+
+
+def _identified(
+    session: Session, recorder: Recorder, scenario: Scenario, dropped: int, pace: float
+) -> tuple[dict[str, Any], list[Estimate]]:
+    report = outcome("identify", session, recorder, dropped, pace)
+    estimates: list[Estimate] = []
+    if session.stage == Stage.FINISHED and len(recorder):
+        try:
+            with progress("estimating") as move:
+                estimates = estimate(recorder, session, scenario, move)
+        except ValueError as error:
+            report["reason"] = str(error)
+    else:
+        report["reason"] = f"the session ended in {session.stage}: {session.cause}"
+    report["warnings"] = warnings = held(estimates, scenario, session)
+    estimates = capped(estimates, scenario, session)
+    report["axes"] = [asdict(e) for e in estimates]
+    report["bounded"] = bool(estimates) and all(e.delta > 0 for e in estimates) and not warnings
+    report["limits"] = LIMITS
+    return report, estimates
+
+
+def _save(
+    out: Path,
+    session: Session,
+    recorder: Recorder,
+    scenario: Scenario,
+    estimates: list[Estimate],
+    report: dict[str, Any],
+) -> list[Path]:
+    files = []
+    if len(recorder):
+        result = result_of(recorder, session.units, scenario.T, report)
+        files.append(result.save_npz(out / "trace.npz"))
+    if report["bounded"]:
+        files.append(write(out / "devices.toml", "\n".join(map(_table, estimates))))
+    files.append(out / "report.json")
+    write_json(files[-1], report | {"files": [str(p) for p in files]})
+    return files
+
+
+def _table(e: Estimate) -> str:
+    """One [[device]] table for a scenario file."""
+    lines = ["[[device]]", f"damping = {e.viscous:.6g}", f"delta = {np.floor(1e6 * e.delta) / 1e6:.6f}"]
+    if e.stiffness is None:
+        return "\n".join([*lines, 'kind = "rigid"', f"mass = {e.mass:.6g}", ""])
+    masses = [f"motor_mass = {e.motor_mass:.6g}", f"handle_mass = {e.mass - e.motor_mass:.6g}"]
+    return "\n".join([*lines, 'kind = "compliant"', *masses, f"transmission_stiffness = {e.stiffness:.6g}", ""])
+
+
+def _print(report: dict[str, Any], console: Console) -> None:
+    table = Table(title=f"{report['scenario']}, identified")
+    for column in ("axis", "mass [kg]", "viscous [N s/m]", "Coulomb [N]", "mode [Hz]", "delta at least", "residual"):
+        table.add_column(column, justify="right")
+    for i, axis in enumerate(report["axes"], start=1):
+        mode = "-" if axis["mode_hz"] is None else f"{axis['mode_hz']:.2f}"
+        figures = [f"{axis[name]:.5g} ± {2 * axis['errors'][name]:.2g}" for name in ("mass", "viscous", "coulomb")]
+        table.add_row(str(i), *figures, mode, f"{axis['delta']:.4f}", f"{axis['steps']:.2g} encoder steps")
+    console.print(table)
+    if "reason" in report:
+        console.print(f"nothing was identified: {report['reason']}")
+    for warning in report["warnings"]:
+        console.print(f"[yellow]{warning}[/]")
+    console.print(f"[dim]·[/] {LIMITS}")
+    console.print("files: " + ", ".join(report["files"]), soft_wrap=True)

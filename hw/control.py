@@ -1,0 +1,309 @@
+"""From a displacement to the force that answers it: the controller, its certificate for the measured delay, its tick.
+
+The link takes `link` ticks from a sample to the latch of its force, for every axis. Channels whose delay theta_i
+in the scenario is longer wait for the rest, theta_i - link, on the host: the loop has the scenario's delays as long
+as the link is no slower, and longer ones where it is.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from operator import sub
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from controller.coupling import Coupling
+from controller.environment import environment
+from controller.loop import force_map
+from controller.lti import Array, Lti
+from design.certificate import assess, certificate_part, promise_of
+from design.conditions import Requirement
+from design.result import DesignFailed
+from hw.limits import Fault, Gain, Heat, Limits, Units, check_jolt, check_jump, check_range, check_speed, shape
+from hw.monitor import Ages, ClockMonitor, CommandMonitor, Counters, EncoderMonitor, EncoderTest, LinkSettings
+from hw.protocol import MAX_THETA, Config, State
+from sim.couplings import Chosen, choose
+from sim.report import coupling_part
+from sim.scenario import InputError, Scenario
+
+_SPEED_SECONDS = 0.01  # over which a speed is taken: one count of the coarsest encoder is 0.03 m/s
+_FALLBACK = ("spring-damper", "theorem4")  # what softer couplings are where the one asked for cannot be had
+
+
+class Controller(Protocol):
+    """What answers a displacement with a force, tick by tick."""
+
+    T: float  # [s]
+
+    def step(self, x: Sequence[float]) -> Array:
+        """Forces fed back (m,) [N] for the displacements x (m,) [m]."""
+        ...
+
+
+class LinearController:
+    """[f; z+] = [C D; A B] [z; x], from rest. Allocates nothing per tick but the force that it returns."""
+
+    def __init__(self, F: Lti) -> None:
+        self.F, self.T = F, F.T
+        n, m = F.order, F.inputs
+        self._product = np.ascontiguousarray(np.block([[F.A, F.B], [F.C, F.D]]))
+        self._input, self._output = np.zeros(n + m), np.zeros(n + F.outputs)
+        self._order = n
+
+    def step(self, x: Sequence[float]) -> Array:
+        """Forces (m,) [N] for the displacements x (m,) [m]; the state moves on by one tick."""
+        n = self._order
+        self._input[n:] = x
+        np.dot(self._product, self._input, out=self._output)
+        self._input[:n] = self._output[:n]
+        return self._output[n:].copy()
+
+
+def host_controller(scenario: Scenario, coupling: Coupling, link: int) -> LinearController:
+    """F as the host runs it, at rest: the link adds the remaining delay. Raises ValueError where link is too long."""
+    E = environment(scenario.environment, scenario.T)
+    host = [n - link for n in scenario.theta]
+    return LinearController(force_map(E, coupling, host, scenario.psi))
+
+
+def fill(previous: Sequence[float], x: Sequence[float], ticks: int) -> list[tuple[float, ...]]:
+    """Displacements for `ticks` ticks of which only the last was received: a straight line from `previous` to x.
+
+    A step would look to a damper like a blow of (dx/T) times its B.
+    """
+    line = [tuple(a + (b - a) * (i / ticks) for a, b in zip(previous, x, strict=True)) for i in range(1, ticks)]
+    return [*line, tuple(x)]
+
+
+class TraceRow(NamedTuple):
+    """One tick of a trace. Where `state` is None no STATE came: x is filled in and nothing was sent."""
+
+    tick: int  # modulo 2^16
+    x: tuple[float, ...]  # (m,) [m]
+    asked: Array  # (m,) [N] by the controller
+    gain: float
+    sent: tuple[int, ...]  # [steps]
+    state: State | None
+    arming: int = 0  # which arming of the session this belongs to
+    test: tuple[float, ...] | None = None  # (m,) [N] that encoders are tested with, behind the gain
+
+
+class Drive:
+    """The coupling at work, from one arming to the next end."""
+
+    def __init__(
+        self,
+        controller: Controller,
+        units: Units,
+        config: Config,
+        limits: Limits,
+        settings: LinkSettings,
+        counters: Counters,
+        record: Callable[[TraceRow], None],
+        arming: int = 0,
+    ) -> None:
+        self.controller, self.units, self.config, self.limits = controller, units, config, limits
+        self.T = T = controller.T
+        self.gain = Gain(limits, T)
+        self.force = (0.0,) * config.axes  # [N] the last one sent
+        self.x: tuple[float, ...] | None = None  # [m] of the last STATE
+        self.reference: tuple[int, ...] | None = None  # [counts] that positions are counted from
+        self._rereference = settings.rereference
+        self._test = EncoderTest(limits.cap, T) if settings.test_encoders else None
+        self._encoders, self._heat = EncoderMonitor(units.encoder_step, units.force_step, T), Heat(limits, T)
+        self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] over which a speed is taken
+        self._recent: deque[tuple[int, tuple[float, ...]]] = deque()  # ticks since arming, and x [m]
+        self._ticks = 0  # since arming
+        self._before: tuple[float, ...] | None = None  # [m] of the STATE before that, where none is missing
+        self._counters, self._record, self._arming = counters, record, arming
+        self._commands, self._clock = CommandMonitor(config), ClockMonitor(limits, T)
+
+    def step(self, state: State, ticks: int, direction: int, now: int) -> tuple[int, ...]:
+        """The force [steps] that answers `state`, which came at `now` [us], `ticks` after the one before.
+
+        The gain rises (direction 1), falls (-1) or stays (0); it rises once every encoder has answered its test.
+        Raises Fault where the device, an encoder or the controller is out of bounds.
+        """
+        if self.x is None:
+            ticks = 1  # what went before does not count
+        self._clock.check(state, ticks, now)
+        absolute = self.units.positions(state.counts)
+        check_range(absolute, self.units.reach)
+        if self.reference is None:
+            self.reference = state.counts if self._rereference else (0,) * state.axes
+        x = absolute
+        if any(self.reference):
+            x = self.units.positions(tuple(map(sub, state.counts, self.reference)))
+        self._check_motion(x, ticks)
+        self._counters.unlike += self._commands.unlike(state, ticks)
+        self._encoders.check(state.counts, state.applied, ticks)
+        if self.limits.continuous:
+            self._heat.check(self.units.forces(state.applied), ticks)
+        if ticks > 1 and self.x is not None:
+            self._miss(state, fill(self.x, x, ticks)[:-1])
+        asked = self.controller.step(x)
+        test = self._test.force(state.counts, ticks) if self._test and direction > 0 else None
+        if direction > 0 and test is None:
+            self._test = None
+            self.gain.rise(ticks)
+        elif direction < 0:
+            self.gain.fall(ticks)
+        shaped = shape(asked.tolist(), self.force, self.gain.value, self.limits, self.T, test)
+        self._before, self.x, self.force = self.x if ticks == 1 else None, x, shaped.force
+        self._counters.clipped += shaped.clipped
+        self._counters.slowed += shaped.slowed
+        steps = self.units.steps(shaped.force, self.config.cap)
+        self._commands.tell(state.tick, steps)
+        self._record(TraceRow(state.tick, x, asked, self.gain.value, steps, state, self._arming, test))
+        return steps
+
+    def _check_motion(self, x: tuple[float, ...], ticks: int) -> None:
+        """Raise Fault where no hand moves to x (m,) [m] within so many ticks."""
+        if self.x is not None:
+            check_jump(x, self.x, ticks, self.limits)
+            if ticks == 1 and self._before is not None:
+                check_jolt(x, self.x, self._before, self.limits)
+        self._ticks += ticks
+        recent = self._recent
+        while recent and recent[0][0] < self._ticks - self._window:
+            recent.popleft()
+        if recent and (since := self._ticks - recent[0][0]) >= self._window // 2:
+            check_speed(x, recent[0][1], since * self.T, self.limits)
+        recent.append((self._ticks, x))
+
+    def _miss(self, state: State, positions: list[tuple[float, ...]]) -> None:
+        """The controller moves on through ticks of which no STATE came."""
+        for back, x in zip(range(len(positions), 0, -1), positions, strict=True):
+            tick, asked = (state.tick - back) & 0xFFFF, self.controller.step(x)
+            self._record(TraceRow(tick, x, asked, self.gain.value, (), None, self._arming))
+
+
+# couplings that are certified for a link
+
+
+def link_delay(ages: Ages, T_us: float, quantile: float, guard_us: float) -> int:
+    """Ticks from a sample to its latch: what a fraction of the answers keeps, with a guard, and at least one."""
+    needed = ages.quantile(quantile) + guard_us
+    return max(1, int(-(-needed // T_us)))
+
+
+class Program(Protocol):
+    """What a session can be armed with."""
+
+    @property
+    def link(self) -> int:
+        """Ticks from a sample to the latch of its force."""
+        ...
+
+    @property
+    def certified(self) -> bool:
+        """Whether every passive human is safe with it."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """For the log."""
+        ...
+
+    def controller(self) -> Controller:
+        """A fresh one, at rest."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class CertifiedCoupling:
+    """A coupling with the delay that it is certified for."""
+
+    link: int  # [ticks]
+    scenario: Scenario  # with the delays of this loop
+    case: str
+    chosen: Chosen
+    requirements: dict[str, Requirement]
+
+    @property
+    def certified(self) -> bool:
+        return any(requirement.certified for requirement in self.requirements.values())
+
+    @property
+    def name(self) -> str:
+        return f"{self.chosen.kind} for theta = {list(self.scenario.theta)}"
+
+    @property
+    def held(self) -> int:
+        """Missed answers in a row through which the device may hold a force: so much the coupling's file proves."""
+        span = self.chosen.switching
+        return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
+
+    def controller(self) -> LinearController:
+        return host_controller(self.scenario, self.chosen.coupling, self.link)
+
+    def part(self) -> dict[str, Any]:
+        """As plain data: coupling, certificates, promise."""
+        return {
+            "link_delay": self.link,
+            "theta": list(self.scenario.theta),
+            "coupling": coupling_part(self.chosen.kind, self.chosen.coupling, self.scenario.T),
+            "certificate": certificate_part(self.requirements[self.chosen.condition]),
+            "certificates": {name: certificate_part(r) for name, r in self.requirements.items()},
+            "promise": promise_of(self.requirements, self.scenario.loop(self.case)),
+            "remarks": self.remarks(),
+        }
+
+    def remarks(self) -> list[str]:
+        """What a reader should know of the coupling's file."""
+        if self.held < 1:
+            return list(self.chosen.notes)
+        answers = "1 missed answer" if self.held == 1 else f"{self.held} missed answers in a row"
+        return [*self.chosen.notes, f"a force that is held through {answers} is covered by the file's proof"]
+
+
+def certified_coupling(
+    scenario: Scenario, case: str, name: str | None, condition: str | None, link: int, given: Coupling | None = None
+) -> CertifiedCoupling:
+    """The coupling `name`, or the one that is `given`, for a link of `link` ticks, with its certificates.
+
+    Raises Fault where no coupling is certified for it, InputError where the request contradicts itself.
+    """
+    if link > MAX_THETA:
+        raise Fault(f"the link takes {link} ticks, the protocol carries at most theta = {MAX_THETA}")
+    slower = scenario.replace(theta=tuple(max(n, link) for n in scenario.theta))
+    try:
+        chosen = Chosen("given", given, "closed-loop") if given else choose(slower, case, name, condition)
+    except DesignFailed as error:
+        raise Fault(f"no coupling for a link of {link} ticks: {error}") from None
+    requirements = assess(slower.loop(case), chosen.coupling, chosen.phi)
+    made = CertifiedCoupling(min(slower.theta), slower, case, chosen, requirements)
+    if not made.certified:
+        named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"
+        raise Fault(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(made)}")
+    return made
+
+
+def certified_couplings(
+    scenario: Scenario, case: str, name: str | None, condition: str | None, link: int, spare: int = 2
+) -> tuple[CertifiedCoupling, ...]:
+    """The coupling for the measured delay and up to `spare` softer ones, each for one tick more.
+
+    A softer one is of the same kind or from the same file; where that is not certified for the longer delay, it is
+    the spring-damper by Theorem 4, which promises the most. Raises Fault where the first coupling is not certified;
+    where no softer one is, the ladder ends.
+    """
+    found, wanted = [certified_coupling(scenario, case, name, condition, link)], [(name, condition), _FALLBACK]
+    while len(found) <= spare and wanted:
+        kind, by = wanted[0]
+        try:
+            found.append(certified_coupling(scenario, case, kind, by, found[-1].link + 1))
+        except (Fault, InputError):
+            wanted.pop(0)
+    return tuple(found)
+
+
+def _shortfall(made: CertifiedCoupling) -> str:
+    needs = []
+    for name, requirement in made.requirements.items():
+        figures = ", ".join(f"{b:.4g}" for b in requirement.required)
+        needs.append(requirement.reason or f"{name} needs {figures} of {requirement.available[0]:g} N s/m")
+    return "; ".join(needs)

@@ -1,0 +1,514 @@
+"""A device that is not there: the scenario's plant under the firmware's own state machine, with faults to order.
+
+Faults are what a cable, a process or a device can do wrong. They are written KIND[=VALUE][@START[+DURATION]], with
+`up:` (device to host) or `down:` in front for one direction of the line, `axis2:` for another axis than the first:
+
+    drop=0.1          a tenth of all frames never arrives
+    up:flip=0.02@1+2  from 1 s after arming, for 2 s, one bit of every fiftieth STATE is wrong
+    stall=0.03@1      the device freezes for 30 ms, 1 s after arming
+    unplug@1          the cable is pulled, 1 s after arming
+    axis2:freeze@1    encoder 2 shows the same count from 1 s after arming on
+
+Without @ a fault is there from the start. Every draw comes from a seeded generator.
+"""
+
+from __future__ import annotations
+
+import heapq
+import os
+import re
+import select
+import subprocess
+import sys
+import termios
+import time
+import tty
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from itertools import count
+from typing import Self
+
+import numpy as np
+
+from controller.lti import Array
+from hw.device import RUNNING, Device
+from hw.protocol import PROTOCOL, Force, Info, Phase, distance
+from models.device import require
+from models.human import Human, Link
+from models.scene import build, plant
+from sim.engines import hold
+from sim.run import outside_forces
+from sim.scenario import InputError, Scenario
+
+_FOREVER = 1e9  # [s]
+_STRETCH = 1000  # ticks of outside forces that are computed at once
+_SUBSTEPS = 8  # per tick where there is Coulomb friction
+_SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
+FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
+_ENCODER_STEP = 1e-6  # [m] where the scenario has ideal encoders
+_REACH = 0.1  # [m] assumed: the workspace is +-10 cm
+_SETTLED = 50  # ticks at full cap after which the person starts to move
+_FARTHEST = 2**31 - 1  # [counts]
+_LINGER_US = 50_000  # after the cable was pulled: the device comes to rest by itself
+_PATIENCE = 60.0  # [s] for the emulator to load MuJoCo and print its path
+
+
+#: kind -> (what VALUE is, least, most, default), for the line
+LINE = {
+    "flip": ("probability per frame that one bit is wrong", 0.0, 1.0, 0.01),
+    "drop": ("probability per frame that it is lost", 0.0, 1.0, 0.1),
+    "truncate": ("probability per frame that its end is lost", 0.0, 1.0, 0.1),
+    "garbage": ("mean number of random bytes before a frame", 0.0, 1000.0, 4.0),
+    "duplicate": ("probability per frame that it comes twice", 0.0, 1.0, 0.1),
+    "reorder": ("probability per frame that the one after it overtakes it", 0.0, 1.0, 0.1),
+    "delay": ("seconds by which every frame is late", 0.0, 10.0, 1e-3),
+    "jitter": ("mean of an exponential extra delay in seconds", 0.0, 10.0, 1e-4),
+}
+#: kind -> the same, for the device
+DEVICE = {
+    "stall": ("seconds for which the device freezes", 0.0, 10.0, 0.01),
+    "unplug": ("no value", 0.0, 0.0, 0.0),
+    "reset": ("no value", 0.0, 0.0, 0.0),
+    "leap": ("ticks by which its tick number leaps", 1.0, 32000.0, 300.0),
+    "stuck": ("no value: it holds its force, without a watchdog and whatever STOP says", 0.0, 0.0, 0.0),
+    "period": ("length of a tick in T", 0.5, 4.0, 2.0),
+    "estop": ("no value: the emergency stop at the device", 0.0, 0.0, 0.0),
+    "trip": ("no value: a fault that the firmware found", 0.0, 0.0, 0.0),
+}
+#: kind -> the same, for one axis of it
+AXIS = {
+    "jump": ("millimetres by which its encoder jumps", -1000.0, 1000.0, 5.0),
+    "freeze": ("no value: its encoder shows the same count for ever", 0.0, 0.0, 0.0),
+    "toggle": ("no value: one channel of its encoder is dead, so that it toggles between two counts", 0.0, 0.0, 0.0),
+    "saturate": ("millimetres beyond which its encoder shows no more", -1000.0, 1000.0, 5.0),
+    "shake": ("millimetres by which its encoder is wrong at every other tick", -1000.0, 1000.0, 2.0),
+    "drift": ("metres per second that its encoder shows beside its motion", -10.0, 10.0, 2.0),
+    "own": ("newtons that its motor has while armed, whatever it is told", -12.0, 12.0, 2.0),
+}
+_KINDS = LINE | DEVICE | AXIS
+_FORM = re.compile(r"(?:(up|down|axis[1-8]):)?([a-z]+)(?:=([^@+]+))?(?:@([^+]+)(?:\+(.+))?)?")
+
+
+@dataclass(frozen=True)
+class FaultInjection:
+    """One thing that goes wrong."""
+
+    kind: str
+    value: float
+    where: str = "both"  # up | down | both: direction of the line; axis1 ..: of the device
+    start: float | None = None  # [s] after arming; None: always
+    duration: float = _FOREVER  # [s]
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """The fault that `text` describes. Raises InputError naming what is wrong with it."""
+        match = _FORM.fullmatch(text)
+        if not match or match[2] not in _KINDS:
+            names = ", ".join(_KINDS)
+            raise InputError(f"--fault is {text!r}, expected KIND[=VALUE][@START[+DURATION]], KIND one of {names}")
+        where, kind, value, start, duration = match.groups()
+        if where in ("up", "down") and kind not in LINE:
+            raise InputError(f"--fault {text}: {kind} happens to the device, not to one direction of the line")
+        if where and where.startswith("axis") and kind not in AXIS:
+            raise InputError(f"--fault {text}: {kind} does not happen to one axis; {', '.join(AXIS)} do")
+        what, low, high, default = _KINDS[kind]
+        try:
+            given = default if value is None else float(value)
+            begins = None if start is None else float(start)
+            lasts = _FOREVER if duration is None else float(duration)
+            require(f"{kind} ({what})", given, low, high, "")
+            require("START", begins or 0.0, 0.0, _FOREVER, "s")
+            require("DURATION", lasts, 1e-6, _FOREVER, "s")
+            if kind == "leap" and given != int(given):
+                raise ValueError(f"VALUE is {given:g}, expected a whole number of ticks")
+        except ValueError as error:
+            raise InputError(f"--fault {text}: {str(error).strip()}") from None
+        return cls(kind, given, where or ("axis1" if kind in AXIS else "both"), begins, lasts)
+
+    @property
+    def axis(self) -> int:
+        """Which axis it happens to, from 0."""
+        return int(self.where.removeprefix("axis")) - 1
+
+    def active(self, since_armed: float | None) -> bool:
+        """Whether it happens now, `since_armed` seconds after arming (None: not armed yet)."""
+        if self.start is None:
+            return True
+        return since_armed is not None and self.start <= since_armed < self.start + self.duration
+
+
+class Line:
+    """One direction of the link: frames go in, bytes come out later, some of them wrong."""
+
+    def __init__(self, direction: str, faults: tuple[FaultInjection, ...], seed: int, latency_us: float = 0.0) -> None:
+        self._faults = [u for u in faults if u.kind in LINE and u.where in (direction, "both")]
+        self._rng = np.random.default_rng([seed, direction == "up"])
+        self._latency = latency_us
+        self._held: bytes | None = None  # a frame that lets the next one pass
+
+    def send(self, frame: bytes, now_us: float, since_armed: float | None) -> list[tuple[float, bytes]]:
+        """When which bytes arrive [us]: the frame with what happens to it."""
+        frames, due = [frame], now_us + self._latency
+        for fault in self._faults:
+            if fault.active(since_armed):
+                if fault.kind == "delay":
+                    due += 1e6 * fault.value
+                elif fault.kind == "jitter":
+                    due += 1e6 * float(self._rng.exponential(fault.value))
+                else:
+                    frames = [out for one in frames for out in self._strike(fault, one)]
+        return [(due, out) for out in frames]
+
+    def _strike(self, fault: FaultInjection, frame: bytes) -> list[bytes]:
+        rng = self._rng
+        if fault.kind == "garbage":
+            return [rng.bytes(int(rng.poisson(fault.value))) + frame]
+        struck = rng.random() < fault.value
+        if fault.kind == "reorder":
+            held, self._held = self._held, None
+            if held is not None:
+                return [frame, held]
+            if struck:
+                self._held = frame
+                return []
+            return [frame]
+        if not struck:
+            return [frame]
+        if fault.kind == "flip":
+            i, bit = int(rng.integers(len(frame))), int(rng.integers(8))
+            return [frame[:i] + bytes([frame[i] ^ (1 << bit)]) + frame[i + 1 :]]
+        if fault.kind == "truncate":
+            return [frame[: int(rng.integers(len(frame)))]]
+        return [] if fault.kind == "drop" else [frame, frame]
+
+
+class EmulatedPlant:
+    """The devices and their passive humans between ticks, by the matrix exponential.
+
+    The person starts to move at the first tick after `begin`, so that a session can be armed at rest. With `coulomb`
+    [N] every motor has dry friction too, which is held for an eighth of a tick.
+    """
+
+    def __init__(self, scenario: Scenario, encoder_step: Array, coulomb: float = 0.0) -> None:
+        self.coulomb, self._substeps = coulomb, _SUBSTEPS if coulomb else 1
+        self.scenario, self.encoder_step = scenario, encoder_step
+        self.scene = build(scenario.device, scenario.human, scenario.person)
+        held = hold(plant(self.scene.model), scenario.T / self._substeps)
+        self._product = np.hstack([held.A, held.B])
+        self.s = np.zeros(held.A.shape[0])
+        self._limit = np.array([device.force_limit for device in scenario.device])
+        self._outside, self._first, self.tick = np.zeros((0, self.scene.outside)), 0, None
+
+    @property
+    def channels(self) -> int:
+        return self.scenario.channels
+
+    def begin(self) -> None:
+        """From the next tick on the scenario's outside forces act, voluntary motion and tap."""
+        self.tick = 0 if self.tick is None else self.tick
+
+    def counts(self) -> tuple[int, ...]:
+        """What the encoders show [counts]."""
+        return tuple(int(n) for n in np.round(self.s[: self.channels] / self.encoder_step))
+
+    def advance(self, f: Array) -> None:
+        """Hold the forces f (m,) [N] for one period; the device feels -f."""
+        w = np.zeros(self.scene.outside) if self.tick is None else self._next_outside()
+        f, m, n = np.clip(f, -self._limit, self._limit), self.channels, self.scene.model.nq
+        for _ in range(self._substeps):
+            friction = self.coulomb * np.tanh(self.s[n : n + m] / _SLIP) if self.coulomb else 0.0
+            self.s = self._product @ np.concatenate([self.s, w, f + friction])
+
+    def _next_outside(self) -> Array:
+        assert self.tick is not None
+        row = self.tick - self._first
+        if not row < len(self._outside):
+            self._first, row = self.tick, 0
+            self._outside = outside_forces(self.scenario, self.scene, self._first, _STRETCH)
+        self.tick += 1
+        return self._outside[row]
+
+
+def nobody(scenario: Scenario) -> Scenario:
+    """The scenario's devices with nobody at their handles, and no tap."""
+    return scenario.replace(human=(Human((Link(0.0, 0.0, 0.0),)),) * scenario.channels, tap=None)
+
+
+def info_of(scenario: Scenario) -> Info:
+    """What the emulated device says of itself: the scenario's devices, in the units of the wire."""
+    encoder = [round(1e12 * (device.encoder_step or _ENCODER_STEP)) for device in scenario.device]
+    return Info(
+        version=PROTOCOL,
+        firmware="emulator",
+        serial=1,
+        period_ns=round(1e9 * scenario.T),
+        osp_damping=tuple(round(1e6 * delta) for delta in scenario.delta),
+        encoder_step=tuple(encoder),
+        force_step=(FORCE_STEP,) * scenario.channels,
+        hard_limit=tuple(min(0x7FFF, round(1e6 * d.force_limit / FORCE_STEP)) for d in scenario.device),
+        range=tuple(round(1e12 * _REACH / step) for step in encoder),
+    )
+
+
+class Emulator:
+    """Ticks when it is told to. Knows no clock of its own."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        faults: tuple[FaultInjection, ...] = (),
+        info: Info | None = None,
+        coulomb: float = 0.0,
+    ) -> None:
+        self.info = info or info_of(scenario)
+        self.device = Device(self.info)
+        self.plant = EmulatedPlant(scenario, 1e-12 * np.array(self.info.encoder_step, dtype=float), coulomb)
+        self.force_step = 1e-6 * np.array(self.info.force_step, dtype=float)
+        self.armed_at: int | None = None  # [us] of the first arming: faults are timed from here
+        self.begun_at: int | None = None  # tick at which the person began to move
+        self.unplugged = False
+        self.stalled_until = 0  # [us]
+        self.stretch = 1.0  # length of a tick in T
+        self.applied: Array = np.zeros(scenario.channels)  # [N] by the motors
+        self._offset = [0] * scenario.channels  # [counts] of an encoder that jumped
+        self._encoder: dict[int, Callable[[int], int]] = {}  # by axis: what a broken encoder makes of its count
+        for fault in faults:
+            if fault.kind in AXIS and fault.axis >= scenario.channels:
+                raise ValueError(
+                    f"--fault {fault.kind} is for {fault.where}, the scenario has {scenario.channels} channels"
+                )
+        self._waiting = list(faults)
+        self._ready = 0
+
+    def since_armed(self, now: int) -> float | None:
+        """Seconds since the first arming."""
+        return None if self.armed_at is None else 1e-6 * (now - self.armed_at)
+
+    def receive(self, data: bytes, now: int) -> None:
+        """Bytes from the host; a device without a cable, or frozen, hears nothing."""
+        if not self.unplugged and now >= self.stalled_until:
+            self.device.receive(data, now)
+
+    def tick(self, now: int) -> bytes:
+        """A period begins: sample, latch, answer. `now` is the device's clock [us]; advance() goes with every tick."""
+        self._misbehave(now)
+        counts = tuple(
+            max(-_FARTHEST, min(_FARTHEST, self._encoder.get(i, int)(n + o)))
+            for i, (n, o) in enumerate(zip(self.plant.counts(), self._offset, strict=True))
+        )
+        steps, data = self.device.tick(now, counts)
+        if self.device.phase in RUNNING and self.armed_at is None:
+            self.armed_at = now
+        self._wake_person()
+        self.applied = np.array(steps) * self.force_step
+        return b"" if self.unplugged else data
+
+    def advance(self) -> None:
+        """The plant moves on by a period, while the answer is on its way."""
+        self.plant.advance(-self.applied)
+
+    def _in_counts(self, fault: FaultInjection) -> int:
+        return round(1e-3 * fault.value / (1e-12 * self.info.encoder_step[fault.axis]))
+
+    def _broken(self, fault: FaultInjection) -> Callable[[int], int]:
+        """What an encoder that breaks now makes of its counts."""
+        step = self.info.encoder_step[fault.axis]
+        now, most = self.plant.counts()[fault.axis] + self._offset[fault.axis], self._in_counts(fault)
+        match fault.kind:
+            case "freeze":
+                return lambda n: now
+            case "toggle":
+                return lambda n: now + (n - now) % 2
+            case "saturate":
+                return lambda n: min(n, most) if most >= 0 else max(n, most)
+            case "drift":
+                each, begun = fault.value * 1e-9 * self.info.period_ns, self.device.k
+                return lambda n: n + round(each / (1e-12 * step) * distance(self.device.k, begun))
+        return lambda n: n + most * (self.device.k % 2)
+
+    def _wake_person(self) -> None:
+        config = self.device.config
+        self._ready += config is not None and self.armed_at is not None and self.device.run >= config.ramp_in
+        if self._ready >= _SETTLED and self.begun_at is None:
+            self.begun_at = self.device.k
+            self.plant.begin()
+
+    def _misbehave(self, now: int) -> None:
+        for fault in [u for u in self._waiting if u.active(self.since_armed(now))]:
+            self._waiting.remove(fault)
+            match fault.kind:
+                case "stall":
+                    self.stalled_until = now + round(1e6 * fault.value)
+                case "unplug":
+                    self.unplugged = True
+                case "reset":
+                    self.device = Device(self.info)
+                case "jump":
+                    self._offset[fault.axis] += self._in_counts(fault)
+                case "freeze" | "toggle" | "saturate" | "shake" | "drift":
+                    self._encoder[fault.axis] = self._broken(fault)
+                case "leap":
+                    self.device.k = (self.device.k + round(fault.value)) & 0xFFFF
+                case "own":
+                    self.device = _wilful(self.device, fault.axis, round(fault.value / self.force_step[fault.axis]))
+                case "stuck":
+                    self.device.halt = lambda cause: None
+                case "period":
+                    self.stretch = fault.value
+                case "estop":
+                    self.device.estop()
+                case "trip":
+                    self.device.fault()
+
+
+def _wilful(device: Device, axis: int, force: int) -> Device:
+    """The same device with a motor that has `force` [steps] while it is armed, whatever it is told."""
+    obeys = device.latch
+
+    def latch(frame: Force | None) -> None:
+        obeys(frame)
+        if device.phase in (Phase.ARMED, Phase.HOLDING):
+            device.applied = (*device.applied[:axis], force, *device.applied[axis + 1 :])
+
+    device.latch = latch
+    return device
+
+
+# in real time, behind a pseudo-terminal
+
+
+class Terminal:
+    """A pseudo-terminal whose far end a host can open by its path."""
+
+    def __init__(self) -> None:
+        self.master, self._slave = os.openpty()
+        self.path = os.ttyname(self._slave)
+        tty.setraw(self._slave, termios.TCSANOW)
+        os.set_blocking(self.master, False)
+
+    def read(self) -> bytes:
+        try:
+            return os.read(self.master, 4096)
+        except OSError:  # nothing there, or nobody
+            return b""
+
+    def write(self, data: bytes) -> None:
+        with suppress(OSError):  # nobody reads: a cable keeps nothing either
+            os.write(self.master, data)
+
+    def unplug(self) -> None:
+        """Close both ends: whoever has the path open sees the device disappear."""
+        for end in (self.master, self._slave):
+            os.close(end)
+
+
+class RealTimeEmulator:
+    """The emulator in real time. Its timer never catches up.
+
+    Where this process was held up, the missed time is taken out of the device's clock, since catching up would look to
+    the host like answers that came too late.
+    """
+
+    def __init__(self, emulator: Emulator, terminal: Terminal, up: Line, down: Line, T: float, pace: float) -> None:
+        self.emulator, self.terminal = emulator, terminal
+        self._up, self._down = up, down
+        self._period, self._pace = 1e6 * T, pace
+        self._start = time.monotonic_ns()
+        self._lost = 0.0  # [us] that this process was held up
+        self.late = 0  # ticks that began more than half a period late
+        self._queue: list[tuple[float, int, Callable[[bytes], None], bytes]] = []
+        self._number = count()
+        self._partial = b""
+
+    def now(self) -> float:
+        """The device's clock [us]."""
+        return (time.monotonic_ns() - self._start) * self._pace / 1000 - self._lost
+
+    def run(self, seconds: float, asked_to_stop: Callable[[], bool]) -> None:
+        """Tick until the time is over, the cable is pulled or somebody stops it."""
+        due, unplugged_at = self._period, None
+        while not asked_to_stop() and self.now() < 1e6 * seconds:
+            self._wait(due)
+            now = self.now()
+            if now < due:
+                continue
+            if not self.emulator.unplugged:
+                self._hear(self.terminal.read(), due)  # what came while this process was held up is not late
+            if now - due > self._period / 2:  # held up: the device's timer was not
+                self.late += 1
+                self._lost += now - due
+            self._send(self.emulator.tick(round(due)), due)
+            self.emulator.advance()
+            due = max(due + self._period * self.emulator.stretch, self.emulator.stalled_until)
+            if self.emulator.unplugged and unplugged_at is None:
+                unplugged_at = due
+                self.terminal.unplug()
+            if unplugged_at is not None and due > unplugged_at + _LINGER_US:
+                return
+
+    def _wait(self, due: float) -> None:
+        """Until the next tick is due or bytes come or go, and see to those first."""
+        first = min(due, self._queue[0][0]) if self._queue else due
+        timeout = max(0.0, 1e-6 * (first - self.now()) / self._pace)
+        if self.emulator.unplugged:
+            time.sleep(timeout)
+            return
+        if select.select([self.terminal.master], [], [], timeout)[0]:
+            self._hear(self.terminal.read(), min(self.now(), due))
+        while self._queue and self._queue[0][0] <= self.now():
+            _, _, deliver, data = heapq.heappop(self._queue)
+            deliver(data)
+
+    def _hear(self, data: bytes, now: float) -> None:
+        *frames, self._partial = (self._partial + data).split(b"\0")
+        if len(self._partial) > 4096:
+            self._partial = b""
+        for frame in filter(None, frames):
+            for when, part in self._down.send(frame + b"\0", now, self.emulator.since_armed(round(now))):
+                if when <= now:
+                    self.emulator.receive(part, round(now))
+                else:
+                    self._later(when, lambda part: self.emulator.receive(part, round(self.now())), part)
+
+    def _send(self, data: bytes, now: float) -> None:
+        for when, part in self._up.send(data, now, self.emulator.since_armed(round(now))) if data else []:
+            if when <= now:
+                self.terminal.write(part)
+            else:
+                self._later(when, self.terminal.write, part)
+
+    def _later(self, when: float, deliver: Callable[[bytes], None], data: bytes) -> None:
+        heapq.heappush(self._queue, (when, next(self._number), deliver, data))
+
+
+@contextmanager
+def spawned(options: Sequence[str]) -> Iterator[str]:
+    """The path of an emulator in a process of its own, started with `options`, for as long as it is needed."""
+    child = subprocess.Popen(
+        [sys.executable, "-m", "hw.emulator", f"--parent={os.getpid()}", *options],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,  # Ctrl-C is for the bridge, which ramps out first
+        text=True,
+    )
+    assert child.stdout is not None
+    assert child.stderr is not None
+    try:
+        ready = select.select([child.stdout], [], [], _PATIENCE)[0]
+        path = child.stdout.readline().strip() if ready else ""
+        if not path:
+            child.terminate()
+            said = child.stderr.read().strip().splitlines() or ["it said nothing"]
+            raise InputError(f"the emulator did not start: {said[-1].removeprefix('error: ')}")
+        yield path
+    finally:
+        child.terminate()
+        child.communicate()
+
+
+if __name__ == "__main__":
+    from cli.main import door
+
+    door("emulator")

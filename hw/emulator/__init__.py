@@ -1,1 +1,0 @@
-"""python -m hw.emulator: a device that is not there."""

@@ -1,0 +1,308 @@
+"""Every fault of a link, a device, a controller or a person that we could think of, in virtual time.
+
+Each case is a whole session of bridge and emulated device: what happens, what it must end in, and how soon. Time to
+zero force counts from the fault to the tick from which on no motor does anything.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from controller.lti import Array
+from hw.control import CertifiedCoupling, certified_couplings, link_delay
+from hw.emulator import Emulator, FaultInjection, info_of
+from hw.limits import ENDED, Limits, Stage
+from hw.monitor import Ages, LinkSettings
+from hw.protocol import Info
+from hw.rehearsal import Plan, Rehearsal
+from hw.session import Session
+from sim.scenario import Scenario, load
+
+WHEN = 0.45  # [s] after arming: the gain is 1 after 0.25 s, the person moves after 0.31 s
+_LASTS = 0.75  # [s] after arming that a case is watched
+_T_MS = 1.2
+
+#: bounds on the time to zero [ms], each with one tick for the sampling of the fault
+_AT_ONCE = 2 * _T_MS  # an e-stop is taken at the next tick
+_STOP = 8 * _T_MS  # the frame that shows it, the STOP, 5 ticks of ramp
+_WATCHDOG = 12 * _T_MS  # theta, 4 ticks held, 5 of ramp, one to notice
+_DEAD = 300.0  # a force has to change by more than 1 N first
+_SILENCE = 6.0 + 1.0 + 8 * _T_MS  # the host's time-out, looked at every millisecond, then a STOP
+
+Call = Callable[[Session, int], bytes]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A fault, the stage it must end in, and words that must be in the cause."""
+
+    name: str
+    stage: Stage
+    cause: str = ""  # a regular expression
+    faults: tuple[str, ...] = ()
+    within: float | None = None  # [ms] from the fault to zero force; None: forces go on
+    action: Call | None = None  # done at WHEN
+    host_stall: float = 0.0  # [s] at WHEN
+    info: Callable[[Info], Info] | None = None  # a device that says something else of itself
+    baud: int | None = None
+    continuous: tuple[float, ...] = ()  # [N] that the motors stand for ever
+    coupling: str | None = None
+    designed: bool = False  # the coupling for the measured delay, in place of one made beforehand
+    counted: tuple[str, ...] = ()  # counters that must not be zero
+    first_tick: int = 0
+    period: float = 1.0  # of the device's clock, in T
+    lasts: float = _LASTS  # [s] after arming
+
+
+def spoiled(force: float) -> Call:
+    """A controller that from now on asks for `force` [N]."""
+
+    def call(session: Session, now: int) -> bytes:
+        def step(x: Sequence[float]) -> Array:
+            if np.isneginf(force):
+                raise ZeroDivisionError("division by zero")
+            return np.full(len(x), force)
+
+        assert session.drive is not None
+        session.drive.controller.step = step
+        return b""
+
+    return call
+
+
+def person(what: str) -> Call:
+    """What a person asks for: stop or estop."""
+    return lambda session, now: getattr(session, what)("asked to", now)
+
+
+def at(text: str) -> tuple[str, ...]:
+    """The fault `text` from WHEN on."""
+    return tuple(f"{part}@{WHEN}" for part in text.split())
+
+
+G, A = Stage, Stage.ARMED
+_LATE = at("down:jitter=0.0007")
+CASES = (
+    Case("nothing", A),
+    Case("ticks wrap around", A, first_tick=65000),
+    # the line, a little
+    Case("5 % of STATEs lost", A, faults=at("up:drop=0.05"), counted=("gaps", "misses")),
+    Case("5 % of FORCEs lost", A, faults=at("down:drop=0.05"), counted=("misses",)),
+    Case("bits of STATEs flipped", A, faults=at("up:flip=0.05"), counted=("gaps", "host_errors")),
+    Case("bits of FORCEs flipped", A, faults=at("down:flip=0.05"), counted=("misses", "device_errors")),
+    Case("STATEs cut short", A, faults=at("up:truncate=0.03"), counted=("gaps", "host_errors")),
+    Case("FORCEs cut short", A, faults=at("down:truncate=0.03"), counted=("misses", "device_errors")),
+    Case("a little garbage", A, faults=at("garbage=0.03"), counted=("gaps", "host_errors", "device_errors")),
+    Case("STATEs twice", A, faults=at("up:duplicate=0.3"), counted=("duplicates",)),
+    Case("FORCEs twice", A, faults=at("down:duplicate=0.3")),
+    Case("STATEs out of order", A, faults=at("up:reorder=0.03"), counted=("stale", "gaps")),
+    Case("FORCEs out of order", A, faults=at("down:reorder=0.03"), counted=("late", "misses")),
+    Case("0.5 ms later both ways", A, faults=at("delay=0.0005")),
+    Case("device freezes for 4 ms", A, faults=at("stall=0.004")),
+    Case("host freezes for 4 ms", A, host_stall=0.004, counted=("misses",)),
+    Case("handshake over a bad line", A, faults=("drop=0.04", "flip=0.01"), counted=("gaps",)),
+    # the line, too much
+    Case("no STATE arrives", G.LOST, "no new STATE", at("up:drop=1"), _SILENCE),
+    Case("no FORCE arrives", G.STOPPED, "cause watchdog", at("down:drop=1"), _WATCHDOG),
+    Case("nothing arrives", G.LOST, "no new STATE", at("drop=1"), _WATCHDOG),
+    Case("every STATE damaged", G.LOST, "no new STATE", at("up:flip=1"), _SILENCE),
+    Case("every FORCE damaged", G.STOPPED, "cause watchdog", at("down:flip=1"), _WATCHDOG),
+    Case("every frame cut short", G.LOST, "no new STATE", at("truncate=1"), _WATCHDOG),
+    Case("noise all the time", G.LOST, "no new STATE", at("up:garbage=60"), _SILENCE),
+    Case("noise at the device", G.STOPPED, "cause watchdog", at("down:garbage=60"), _WATCHDOG),
+    Case("40 % of FORCEs lost", G.STOPPED, "no answer in time|watchdog", at("down:drop=0.4"), 300.0),
+    Case("2 ms later both ways", G.STOPPED, "cause watchdog", at("delay=0.002"), _WATCHDOG + 4.0),
+    Case("host freezes for 20 ms", G.STOPPED, "in ramp|in stopped", within=_WATCHDOG, host_stall=0.02),
+    Case("cable pulled", G.LOST, "port is gone", at("unplug"), _WATCHDOG),
+    # the delay
+    Case("answers get late", G.DISARMED, "theta = 2", _LATE, 500.0, designed=True, counted=("late",), lasts=1.2),
+    Case("late, nothing softer", G.STOPPED, "nothing softer", _LATE, 500.0, counted=("late",), lasts=1.2),
+    Case("a slow link from the start", A, faults=("delay=0.004",), designed=True),
+    Case("a link too slow", G.REFUSED, "at most theta = 15", ("delay=0.012",), designed=True),
+    Case("a coupling not certified", G.REFUSED, "published is not certified", coupling="published", designed=True),
+    Case("no coupling", G.REFUSED, "without coupling is not certified", coupling="none", designed=True),
+    # while the gain rises
+    Case("answers late in ramp-in", G.DISARMED, "theta = 2", ("down:jitter=0.0007@0.02",), _AT_ONCE, designed=True),
+    Case("no FORCE in ramp-in", G.STOPPED, "cause watchdog", ("down:drop=1@0.1",), _AT_ONCE),
+    Case("many FORCEs lost in ramp-in", G.STOPPED, "no answer in time|watchdog", ("down:drop=0.4@0.02",), _AT_ONCE),
+    Case(
+        "tick number leaps in ramp-in", G.STOPPED, "leapt by 301, the watchdog allows 5", ("leap=300@0.03",), _AT_ONCE
+    ),
+    # the measurement
+    Case("a third of FORCEs lost from the start", G.REFUSED, "% of the answers never reached", ("down:drop=0.33",)),
+    Case("3 % lost from the start", G.REFUSED, "no delay keeps 99 %", ("down:drop=0.03",), designed=True),
+    # the device
+    Case("tick number leaps by 300", G.STOPPED, "leapt by 301", at("leap=300"), _STOP),
+    Case("tick number leaps by 3", G.STOPPED, "by its own clock", at("leap=3"), _STOP),
+    Case("a force of its own", G.STOPPED, "it was told .*, and so for 5 ticks", at("own=2"), _STOP + 6 * _T_MS),
+    Case("the other force of axis 2", G.STOPPED, "it was told", at("axis2:own=-2"), _STOP + 6 * _T_MS),
+    Case("a force of its own in ramp-in", G.STOPPED, "it was told", ("own=2@0.05",), _AT_ONCE),
+    Case("a tick lasts twice as long", G.STOPPED, "by its own clock", at("period=2"), 2 * _STOP + 6 * _T_MS),
+    Case("clock drifts by 2 %", G.STOPPED, "lasts 12.. us by its own clock", at("period=1.02"), 250.0),
+    Case("clock drifts by 0.5 %", A, faults=at("period=1.005")),
+    Case("device freezes for 20 ms", G.LOST, "no new STATE", at("stall=0.02"), 20.0 + _WATCHDOG),
+    Case("device resets", G.LOST, "no new STATE", at("reset"), _AT_ONCE),
+    Case("encoder jumps by 2 mm", A, faults=at("jump=2")),
+    Case("encoder jumps by 5 mm", G.STOPPED, "encoder 1 jumped by", at("jump=5"), _STOP),
+    Case("encoder jumps by -5 mm", G.STOPPED, "encoder 1 jumped by", at("jump=-5"), _STOP),
+    Case("encoder 2 jumps by 5 mm", G.STOPPED, "encoder 2 jumped by", at("axis2:jump=5"), _STOP),
+    Case("encoder 2 jumps by -5 mm", G.STOPPED, "encoder 2 jumped by", at("axis2:jump=-5"), _STOP),
+    Case("encoder shakes by 2 mm", G.STOPPED, "encoder 1 shakes", at("shake=2"), _STOP + 2 * _T_MS),
+    Case("encoder 2 shakes by -2 mm", G.STOPPED, "encoder 2 shakes", at("axis2:shake=-2"), _STOP + 2 * _T_MS),
+    Case("a handle at 1.5 m/s", G.STOPPED, "axis 1 moves at 1", at("drift=1.5"), _STOP + 12 * _T_MS),
+    Case("handle 2 at -1.5 m/s", G.STOPPED, "axis 2 moves at 1", at("axis2:drift=-1.5"), _STOP + 12 * _T_MS),
+    Case("encoder out of its range", G.STOPPED, r"encoder 1 is at \d.*its range is", ("jump=200",)),
+    Case("encoder 2 out of its range", G.STOPPED, "encoder 2 is at -.*its range is", ("axis2:jump=-200",)),
+    Case("encoder dead before", G.STOPPED, "axis 1 does not follow: it moved by 0 counts", ("freeze",), _AT_ONCE),
+    Case("encoder 2 dead before", G.STOPPED, "axis 2 does not follow: it moved by 0", ("axis2:freeze",), _AT_ONCE),
+    Case("a channel of it dead before", G.STOPPED, "axis 1 does not follow", ("toggle",), _AT_ONCE),
+    Case("encoder dies", G.STOPPED, "axis 1 does not follow", at("freeze"), _DEAD),
+    Case("encoder 2 dies", G.STOPPED, "axis 2 does not follow", at("axis2:freeze"), _DEAD),
+    Case("both encoders die", G.STOPPED, "axis . does not follow", at("freeze axis2:freeze"), _DEAD, lasts=1.5),
+    Case("a channel of encoder 2 dies", G.STOPPED, "axis 2 does not follow", at("axis2:toggle"), _DEAD),
+    Case("encoder 2 saturates", G.STOPPED, "axis 2 does not follow|2 jumped", at("axis2:saturate=1"), lasts=2.0),
+    Case("e-stop at the device", G.ESTOP, "estop_device", at("estop"), _AT_ONCE),
+    Case("e-stop at the device before", G.REFUSED, "refuses the configuration: estop", ("estop",)),
+    Case("a motor gets hot", G.STOPPED, "motor . gets hot", within=1500.0, continuous=(0.2, 0.2), lasts=2.5),
+    Case("firmware finds a fault", G.STOPPED, "cause device", at("trip"), _STOP),
+    Case("device clock runs 5 % fast", G.REFUSED, "by its own clock", period=1.05),
+    # the controller
+    Case("controller asks for nan", G.STOPPED, "nan, nan N, which is no force", within=_STOP, action=spoiled(np.nan)),
+    Case("controller asks for inf", G.STOPPED, "inf, inf N, which is no force", within=_STOP, action=spoiled(np.inf)),
+    Case("controller raises", G.STOPPED, "ZeroDivisionError", within=_STOP, action=spoiled(-np.inf)),
+    Case("controller asks for 100 N", A, action=spoiled(100.0), counted=("clipped", "slowed")),
+    # people
+    Case("planned stop", G.FINISHED, "asked to", within=100.0 + _STOP, action=person("stop")),
+    Case("e-stop at the host", G.ESTOP, "asked to", within=_AT_ONCE, action=person("estop")),
+    # the handshake
+    Case("another protocol", G.REFUSED, "version 2", info=lambda i: i._replace(version=2)),
+    Case(
+        "one axis",
+        G.REFUSED,
+        "1 axis, the scenario 2",
+        info=lambda i: i._replace(**{n: getattr(i, n)[:1] for n in i._fields[4:]}),
+    ),
+    Case("another period", G.REFUSED, "every 1000000 ns", info=lambda i: i._replace(period_ns=1_000_000)),
+    Case("a weak motor", G.REFUSED, "can do 6 N", info=lambda i: i._replace(hard_limit=(30000, 15000))),
+    Case("little damping", G.REFUSED, "guarantees 1 N s/m", info=lambda i: i._replace(osp_damping=(10**6, 10**6))),
+    Case(
+        "coarse motors",
+        G.REFUSED,
+        "force step of axis 1 is 3 N, at most 0.75 N",
+        info=lambda i: i._replace(force_step=(3_000_000,) * 2, hard_limit=(4, 4)),
+    ),
+    Case(
+        "coarse encoders",
+        G.REFUSED,
+        "count of axis 1 is 0.5 mm, at most 0.3 mm",
+        info=lambda i: i._replace(encoder_step=(500_000_000,) * 2, range=(200, 200)),
+    ),
+    Case("115200 baud", G.REFUSED, "4167 us, more than T = 1200 us", baud=115200),
+    Case("921600 baud", A, baud=921600),
+    Case("nobody there", G.LOST, "no answer to HELLO", ("up:drop=1",)),
+)
+
+
+_MEASURED = 100  # answers whose age is measured: enough for a line that does not vary
+
+
+@dataclass(frozen=True)
+class FaultOutcome:
+    """What a case came to."""
+
+    fault: str
+    stage: str
+    cause: str
+    zero_force_ms: float | None  # from the fault on; None: not asked, or forces go on
+    allowed_ms: float | None
+    wrong: tuple[str, ...]  # empty where it went as it must
+
+    @property
+    def holds(self) -> bool:
+        return not self.wrong
+
+
+def rehearse_faults() -> list[FaultOutcome]:
+    """Every case with the default scenario and lively people, in virtual time; some seconds in all."""
+    scenario = lively(load())
+    made = certified_couplings(scenario, "I", None, None, 1, spare=1)
+    return [rehearse_case(case, scenario, made)[1] for case in CASES]
+
+
+def lively(scenario: Scenario) -> Scenario:
+    """People who move at full amplitude soon after arming, so that a fault finds a force to take away."""
+    people = tuple(
+        msgspec.structs.replace(h, voluntary=h.voluntary and msgspec.structs.replace(h.voluntary, ease=0.1, phase=0.8))
+        for h in scenario.human
+    )
+    return scenario.replace(human=people)
+
+
+def rehearse_case(
+    case: Case, scenario: Scenario, made: tuple[CertifiedCoupling, ...]
+) -> tuple[Rehearsal, FaultOutcome]:
+    """One case. `made` are couplings for a link of one tick, and softer ones."""
+    info = info_of(scenario)
+    cap = tuple(d.force_limit for d in scenario.device)
+    session = Session(
+        scenario, Limits(cap, continuous=case.continuous, thermal=1.0), LinkSettings(case.baud, _MEASURED)
+    )
+    faults = tuple(FaultInjection.parse(text) for text in case.faults)
+    emulator = Emulator(scenario, faults, case.info(info) if case.info else info)
+    emulator.device.k = case.first_tick
+    rehearsal = Rehearsal(
+        session,
+        emulator,
+        _plan(case, scenario, made),
+        faults,
+        actions=[(WHEN, case.action)] if case.action else (),
+        host_stalls=[(WHEN, case.host_stall)] if case.host_stall else (),
+        clock=case.period,
+    )
+    rehearsal.run_until_armed(case.lasts)
+    timed = case.within is not None and rehearsal.armed_us is not None
+    to_zero = rehearsal.zero_after(WHEN) if timed else None
+    zero_ms = None if to_zero is None else 1e3 * to_zero
+    wrong = tuple(_wrong(case, rehearsal, zero_ms))
+    return rehearsal, FaultOutcome(case.name, str(session.stage), session.cause, zero_ms, case.within, wrong)
+
+
+def _plan(case: Case, scenario: Scenario, made: tuple[CertifiedCoupling, ...]) -> Plan:
+    def plan(ages: Ages) -> tuple[CertifiedCoupling, ...]:
+        if not case.designed:
+            return made[:1]
+        link = link_delay(ages, 1e6 * scenario.T, 0.99, 100.0)
+        if (link, case.coupling) == (1, None):
+            return made
+        return certified_couplings(scenario, "I", case.coupling, None, link, spare=0)
+
+    return plan
+
+
+def _wrong(case: Case, rehearsal: Rehearsal, zero_ms: float | None) -> list[str]:
+    """What did not go as it must."""
+    session, wrong = rehearsal.session, []
+    if session.stage != case.stage:
+        wrong.append(f"ended in {session.stage} ({session.cause}), expected {case.stage}")
+    if not re.search(case.cause, session.cause):
+        wrong.append(f"the cause is {session.cause!r}, expected {case.cause!r}")
+    if case.within is not None and (zero_ms is None or zero_ms > case.within):
+        wrong.append(f"zero force after {zero_ms} ms, allowed are {case.within:g} ms")
+    for name in case.counted:
+        if not (session.decoder.rejected if name == "host_errors" else getattr(session.counters, name)):
+            wrong.append(f"nothing counted as {name}")
+    if session.stage != Stage.ARMED and np.any(rehearsal.moments[-1].applied):
+        wrong.append("a motor still has a force")
+    cap = max(session.limits.cap)
+    if any(np.abs(m.applied).max() > cap for m in rehearsal.moments):
+        wrong.append(f"a motor had more than {cap:g} N")
+    if session.stage in ENDED:
+        session.arm(session.now + 1)
+        if session.stage not in ENDED:
+            wrong.append("it could be armed again")
+    return wrong

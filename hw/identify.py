@@ -1,0 +1,546 @@
+"""Mass, friction and transmission of one axis from a record of forces and displacements, and a bound on its friction.
+
+The excitation is a chirp of a small force, then silence: a force that does not depend on the motion closes no loop, so
+no certificate is needed. The estimate is output error: the parameters whose simulated displacement is nearest to the
+encoder's in the least-squares sense, where a standstill counts as few samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from math import tanh
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+from scipy.optimize import OptimizeResult, least_squares
+
+from controller.lti import Array, frozen
+from hw.control import Controller
+from hw.recording import Recorder
+from hw.session import Session
+from models.device import RigidDevice
+from sim.scenario import Scenario
+
+_APART = 1  # [counts] that noise may move an encoder at rest: it reads two neighbours in turn
+_WORTH = 5.0  # samples that one standstill counts as
+_Flags = NDArray[np.bool_]
+_COULOMB = 2  # where Coulomb friction is among the parameters
+_SHIFT = 1e-5  # of log parameters, and of Coulomb friction in newtons, for derivatives
+_UNEXPLAINED = 0.7, 1.5e-3  # encoder steps rms (rounding alone leaves 0.29), or this part of the motion's rms
+_SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
+_COARSE, _FINE = 3, 8  # substeps of a tick for which it is held: in a search, and at its end
+_LEAD = 0.3  # [s] of zero force, in which the gain comes up
+_MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a mode is looked for first
+_PARTS = (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mass, that the motor may have
+_STARTS = 2  # of the search in time
+_SPECTRUM = 250  # frequencies that are compared first
+_FLOOR = 1e-12  # of a ratio whose logarithm is taken
+_OUTLIER = 0.1  # of a logarithm, from which it counts less: friction spoils the low frequencies, a resonance is narrow
+_BANDWIDTH = 60  # [ticks] over which residuals may be correlated
+_RECORDS = 40  # that might have been
+_ROUNDING = 1 / 12  # variance of an error that is uniform within a step
+_WIDEST = 0.2  # standard deviations of the parameters' logarithms beyond which they are not drawn
+_EVALUATIONS = 60, 30  # of a search without Coulomb friction and with it, less those for derivatives
+_POLISH = 15  # steps at the end, with friction integrated more finely
+_ENOUGH = 1e-6  # part of the sum of squares, from which on a step is the last one
+_ONE_SIDED_95 = 1.6449  # normal quantile
+_VAGUE = 0.1  # standard error of b, as a part of b, above which nothing is said of it
+_FRICTIONS = (1e-5, 0.01, 0.05)  # Coulomb friction that a search begins with, of the force's span
+_SEARCH_REACH = 3.0  # of a search, in logarithms
+_SUSPICIOUS = 0.1  # part by which an estimate may exceed the declared damping
+
+
+# A force that does not depend on the motion: a chirp, then silence. What a device is identified with.
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """Forces fed back over time, as a program for a session. Open loop: it can make no passive person unstable."""
+
+    signal: Array  # (ticks, m) [N]
+    T: float  # [s]
+    link: int  # [ticks]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "signal", frozen(self.signal, 2))
+
+    @property
+    def certified(self) -> bool:
+        """A force that the motion does not change closes no loop."""
+        return True
+
+    @property
+    def name(self) -> str:
+        return f"open-loop force of at most {np.abs(self.signal).max():g} N"
+
+    @property
+    def seconds(self) -> float:
+        return len(self.signal) * self.T
+
+    def controller(self) -> Controller:
+        return _Player(self)
+
+
+class _Player:
+    """Plays an excitation tick by tick, then zero."""
+
+    def __init__(self, excitation: Excitation) -> None:
+        self.T = excitation.T
+        self._signal, self._k = excitation.signal, 0
+
+    def step(self, x: Sequence[float]) -> Array:
+        k, self._k = self._k, self._k + 1
+        return self._signal[k] if k < len(self._signal) else np.zeros(len(x))
+
+
+def chirp(
+    channels: int, T: float, link: int, amplitude: float, band: tuple[float, float], seconds: float
+) -> Excitation:
+    """A cosine [N] whose frequency rises exponentially through `band` [Hz], then half as long without force.
+
+    It begins with a cosine so that a free mass does not drift away.
+    """
+    t = np.arange(round(seconds / T)) * T
+    low, high = band
+    rate = np.log(high / low) / seconds
+    wave = amplitude * np.cos(2 * np.pi * low * np.expm1(rate * t) / rate)
+    lead, tail = np.zeros(round(_LEAD / T)), np.zeros(round(seconds / 2 / T))
+    return Excitation(np.tile(np.concatenate([lead, wave, tail])[:, None], channels), T, link)
+
+
+# How much a sample of an encoder is worth to a fit: all samples of one standstill together as much as a few.
+#
+# An encoder that stands still tells its position to half a step, however often it is read: the error of every sample is
+# the same one. Least squares that takes a thousand such samples for a thousand measurements moves the last place of a
+# release to the middle of its count, at the price of friction: Coulomb and viscous are exchanged until it fits.
+
+
+def worth(counts: Array) -> Array:
+    """Weights (N,) in (0, 1] of samples (N,) [counts]: 1 while the encoder moves, WORTH/L in a standstill of L samples.
+
+    A standstill is a stretch, as long as possible from left to right, in which the counts differ by _APART at most.
+    """
+    starts, low, high = [0], counts[0], counts[0]
+    for k, n in enumerate(counts.tolist()):
+        low, high = min(low, n), max(high, n)
+        if high - low > _APART:
+            starts.append(k)
+            low = high = n
+    lengths = np.diff([*starts, len(counts)])
+    return np.repeat(np.minimum(1.0, _WORTH / lengths), lengths)
+
+
+# One axis: the displacement that a record of forces gives, for any mass, friction, transmission.
+#
+# The model is the device's: motor (m1) with viscous friction b and Coulomb friction c, transmission spring k, handle
+# (m2); the rigid one has the motor alone. Between ticks it is exact for a held force (expm); Coulomb friction is
+# c tanh(v/v0), held for an eighth of a tick.
+
+
+class _Model:
+    """p = [log m1, log b, c, log m2, log k] -> simulated displacement."""
+
+    def __init__(
+        self, x: Array, force: Array, used: _Flags, T: float, step: float, rigid: bool, substeps: int = _COARSE
+    ) -> None:
+        self.x, self.force, self.used, self.T, self.step, self.rigid = x, force, used, T, step, rigid
+        self.substeps = substeps
+        self.weight = worth(np.round(x[used] / step))
+
+    def finer(self) -> _Model:
+        """The same record, friction integrated more finely."""
+        return _Model(self.x, self.force, self.used, self.T, self.step, self.rigid, _FINE)
+
+    def matrices(self, p: Array, T: float) -> tuple[Array, Array]:
+        """The plant held for T: s+ = A s + B u with s = [positions; velocities]."""
+        m1, b = np.exp(p[0]), np.exp(p[1])
+        if self.rigid:
+            a = np.array([[0.0, 1.0, 0.0], [0.0, -b / m1, 1 / m1], [0.0, 0.0, 0.0]])
+        else:
+            m2, k = np.exp(p[3]), np.exp(p[4])
+            a = np.zeros((5, 5))
+            a[0, 2] = a[1, 3] = 1.0
+            a[2] = [-k / m1, k / m1, -b / m1, 0.0, 1 / m1]
+            a[3, :2] = [k / m2, -k / m2]
+        step = np.asarray(expm(a * T), dtype=np.float64)
+        return step[:-1, :-1], step[:-1, -1]
+
+    def simulate(self, p: Array) -> Array:
+        """Displacement (N,) [m] from rest."""
+        substeps = self.substeps if p[_COULOMB] else 1
+        A, B = self.matrices(p, self.T / substeps)
+        play = _play_rigid if self.rigid else _play_compliant
+        return np.array(play(A.tolist(), B.tolist(), float(p[_COULOMB]), self.force.tolist(), substeps))
+
+    def allowed(self) -> float:
+        """What a fit may leave unexplained [m] rms."""
+        return max(_UNEXPLAINED[0] * self.step, _UNEXPLAINED[1] * float(np.std(self.x[self.used])))
+
+    def error(self, p: Array) -> Array:
+        """Measured less simulated (used,) [m]; where the origin lies is not known."""
+        error = (self.x - self.simulate(p))[self.used]
+        error -= np.average(error, weights=self.weight)
+        return np.nan_to_num(error, nan=1e3, posinf=1e3, neginf=-1e3)
+
+    def residual(self, p: Array) -> Array:
+        """What a fit makes small: the error (used,) [m], times the root of what a sample is worth."""
+        return np.sqrt(self.weight) * self.error(p)
+
+    def jacobian(self, p: Array) -> Array:
+        """Derivatives of the displacement (used, p) by central differences."""
+        shifts = _SHIFT * np.eye(p.size)
+        columns = [(self.simulate(p + s) - self.simulate(p - s))[self.used] for s in shifts]
+        return np.stack(columns, axis=1) / (2 * _SHIFT)
+
+    def slopes(self, p: Array) -> Array:
+        """Derivatives of what is subtracted in residual() (used, p)."""
+        J = self.jacobian(p)
+        return np.sqrt(self.weight)[:, None] * (J - np.average(J, axis=0, weights=self.weight))
+
+    def rms(self, residual: Array) -> float:
+        """[m] of the error behind a residual."""
+        return float(np.sqrt(residual @ residual / self.weight.sum()))
+
+
+def _play_rigid(A: list[list[float]], B: list[float], c: float, force: list[float], substeps: int) -> list[float]:
+    """Displacements of one mass; plain floats, since a product of so few numbers is nothing but overhead to NumPy."""
+    (_, xv), (_, vv) = A
+    bx, bv = B
+    x, v, out = 0.0, 0.0, []
+    for f in force:
+        out.append(x)
+        for _ in range(substeps):
+            u = f - c * tanh(v / _SLIP)
+            x, v = x + xv * v + bx * u, vv * v + bv * u
+    return out
+
+
+def _play_compliant(A: list[list[float]], B: list[float], c: float, force: list[float], substeps: int) -> list[float]:
+    """Displacements of the motor of two masses."""
+    (a00, a01, a02, a03), (a10, a11, a12, a13), (a20, a21, a22, a23), (a30, a31, a32, a33) = A
+    b0, b1, b2, b3 = B
+    x, y, v, w, out = 0.0, 0.0, 0.0, 0.0, []
+    for f in force:
+        out.append(x)
+        for _ in range(substeps):
+            u = f - c * tanh(v / _SLIP)
+            x, y, v, w = (
+                a00 * x + a01 * y + a02 * v + a03 * w + b0 * u,
+                a10 * x + a11 * y + a12 * v + a13 * w + b1 * u,
+                a20 * x + a21 * y + a22 * v + a23 * w + b2 * u,
+                a30 * x + a31 * y + a32 * v + a33 * w + b3 * u,
+            )
+    return out
+
+
+# Where the search for a transmission begins: the modes and splits of the mass that fit the spectrum.
+#
+# A search in time stops at any mode but the right one, and two per cent from it is already another one: a mode is but a
+# few tenths of a hertz wide. The spectrum is that of the steps x[k+1] - x[k], which begin and end at rest, over that of
+# the forces, where the force had something to say.
+
+
+class _Spectrum:
+    """The measured ratio of steps to forces, and how far a model is from it."""
+
+    def __init__(self, model: _Model) -> None:
+        force, moved = np.fft.rfft(model.force), np.fft.rfft(np.diff(model.x, append=model.x[-1]))
+        loud = np.flatnonzero(np.abs(force) > 0.2 * np.abs(force).max())
+        self.model, self.z = model, np.exp(2j * np.pi * loud / len(model.force))
+        self.measured = np.log(np.abs(moved[loud] / force[loud]) + _FLOOR)
+
+    def apart(self, point: Array, every: int = 1) -> Array:
+        """Logarithms of the model's ratio less the measured one's, at every so many frequencies."""
+        A, B = self.model.matrices(point, self.model.T)
+        z = self.z[::every]
+        G = np.linalg.solve(z[:, None, None] * np.eye(len(A)) - A, np.broadcast_to(B[:, None], (z.size, len(A), 1)))
+        return np.log(np.abs((z - 1) * G[:, 0, 0]) + _FLOOR) - self.measured[::every]
+
+    def refined(self, point: Array) -> tuple[float, Array]:
+        """The nearest point by all frequencies, and how far it is; Coulomb friction stays."""
+
+        def apart(p: Array) -> Array:
+            return self.apart(np.insert(p, _COULOMB, point[_COULOMB]))
+
+        fit = least_squares(apart, np.delete(point, _COULOMB), loss="soft_l1", f_scale=_OUTLIER, max_nfev=40)
+        return float(fit.cost), np.insert(fit.x, _COULOMB, point[_COULOMB])
+
+
+def _spectral_starts(model: _Model, stiff: Array) -> list[Array]:
+    """Parameters to begin with, best first, from those of a stiff device: [log m, log b, c]."""
+    spectrum = _Spectrum(model)
+    every = max(1, spectrum.z.size // _SPECTRUM)
+    points, mass = [], float(np.exp(stiff[0]))
+    for hz, part in product(_MODES_HZ, _PARTS):
+        m1, m2 = part * mass, (1 - part) * mass
+        k = (2 * np.pi * hz) ** 2 * m1 * m2 / mass
+        point = np.array([np.log(m1), max(stiff[1], -2.0), stiff[_COULOMB], np.log(m2), np.log(k)])
+        # absolute: a few bins of a resonance may lie far apart
+        points.append((float(np.abs(spectrum.apart(point, every)).mean()), point))
+    best: dict[float, Array] = {}
+    for _, point in sorted(points, key=lambda entry: entry[0]):
+        best.setdefault(round(float(point[0]), 6), point)  # the best mode of every split
+    refined = [spectrum.refined(point) for point in list(best.values())[:_STARTS]]
+    return [point for _, point in sorted(refined, key=lambda entry: entry[0])]
+
+
+# How far the estimates scatter: by what the residuals show, and by records that might have been.
+#
+# Residuals show noise and what the model has not (the sandwich (J'J)^-1 J' R J (J'J)^-1 with Bartlett weights, Newey
+# and West 1987). They do not show where between two counts the encoder stood: in one record its error is one number
+# over a whole standstill, and no average over that record tells how it scatters. So records are made from the fitted
+# model, with parameters within their uncertainty, the encoder's origin anywhere within a step, the same rounding, and
+# white noise as strong as the residual's; each is estimated again by one Gauss-Newton step (parametric bootstrap;
+# Efron and Tibshirani 1993, section 6.5). Both variances are added: rounding is then counted twice, which errs on the
+# safe side.
+
+
+@dataclass(frozen=True, eq=False)
+class _Spread:
+    """Of the parameters p of _Model."""
+
+    covariance: Array  # (p, p)
+    bias: Array  # (p,) that the records that might have been have on average
+
+
+def _spread(model: _Model, p: Array, seed: int = 0) -> _Spread:
+    """Of the estimate p (p,) from `model`'s record."""
+    J = model.jacobian(p)
+    residual = model.error(p)
+    covariance = _sandwich(J, residual, model.weight)
+    share = model.weight / model.weight.sum()
+    noise = np.sqrt(max(0.0, float(share @ residual**2) / model.step**2 - _ROUNDING))  # [counts]
+    generator = np.random.default_rng(seed)
+    root = _root(covariance)
+    misses = np.array([_miss(model, p, root, J, noise, generator) for _ in range(_RECORDS)])
+    return _Spread(covariance + np.cov(misses.T), misses.mean(axis=0))
+
+
+def _miss(model: _Model, p: Array, root: Array, J: Array, noise: float, generator: np.random.Generator) -> Array:
+    """By how much a record that might have been is estimated wrong (p,)."""
+    other = p + np.clip(root @ generator.standard_normal(p.size), -_WIDEST, _WIDEST)
+    other[_COULOMB] = max(0.0, other[_COULOMB])
+    exact = model.simulate(other)[model.used] / model.step + generator.uniform()
+    counts = np.round(exact + noise * generator.standard_normal(exact.size))
+    weight = worth(counts)
+    error = model.step * (counts - exact)
+    root_weight = np.sqrt(weight)
+    centred = root_weight[:, None] * (J - np.average(J, axis=0, weights=weight))
+    return np.linalg.pinv(centred) @ (root_weight * (error - np.average(error, weights=weight)))
+
+
+def _root(covariance: Array) -> Array:
+    values, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def _sandwich(J: Array, residual: Array, weight: Array) -> Array:
+    centred = J - np.average(J, axis=0, weights=weight)
+    scores = centred * (weight * residual)[:, None]
+    middle = scores.T @ scores
+    for lag in range(1, min(_BANDWIDTH, len(scores) - 1)):
+        shared = scores[lag:].T @ scores[:-lag]
+        middle += (1 - lag / _BANDWIDTH) * (shared + shared.T)
+    bread = np.linalg.pinv(centred.T @ (weight[:, None] * centred))
+    return bread @ middle @ bread
+
+
+# the fit
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """One axis, with standard errors."""
+
+    mass: float  # [kg] in all
+    motor_mass: float  # [kg]
+    viscous: float  # b [N s/m]
+    coulomb: float  # c [N]
+    stiffness: float | None  # k [N/m] of the transmission, None for a rigid device
+    mode_hz: float | None  # the transmission mode, free at both ends
+    errors: dict[str, float]  # standard errors of mass, viscous, coulomb
+    delta: float  # [N s/m] 95 % lower confidence bound of b
+    rms: float  # [m] of the residual
+    steps: float  # the same in encoder steps
+
+
+def identify(x: Array, force: Array, used: _Flags, T: float, step: float, rigid: bool, mass: float = 0.25) -> Estimate:
+    """Fit one axis: displacements x (N,) [m], what the motor did (N,) [N], which samples count (N,), encoder step [m].
+
+    `mass` is where the search begins. Raises ValueError where the device did not move or no model fits.
+    """
+    if np.ptp(x[used]) < 20 * step:
+        raise ValueError(f"the axis moved by {np.ptp(x[used]) / step:.0f} encoder steps, at least 20 are needed")
+    whole = _Model(x, force, used, T, step, rigid=True)
+    stiff = _with_coulomb(whole, _without_coulomb(whole, np.array([np.log(mass), 0.0])).x)
+    if rigid:
+        fine = whole.finer()
+        return _settled(fine, _polished(fine, stiff.x))
+    model = _Model(x, force, used, T, step, rigid=False)
+    fine, ends = model.finer(), []
+    for start in _spectral_starts(model, stiff.x):
+        p = _polished(fine, _search(model, start).x)
+        ends.append((fine.rms(fine.residual(p)), p))
+        if ends[-1][0] <= fine.allowed():
+            break
+    return _settled(fine, min(ends, key=lambda end: end[0])[1])
+
+
+def _without_coulomb(model: _Model, start: Array) -> OptimizeResult:
+    """The nearest parameters within a factor of twenty of the start, which lacks c as the result does.
+
+    Coulomb friction bends the sum of squares so sharply that a search from afar with it does not arrive.
+    """
+
+    def residual(p: Array) -> Array:
+        return model.residual(np.insert(p, _COULOMB, 0.0))
+
+    bounds = (start - _SEARCH_REACH, start + _SEARCH_REACH)
+    return least_squares(residual, start, x_scale="jac", bounds=bounds, max_nfev=_EVALUATIONS[0])
+
+
+def _with_coulomb(model: _Model, near: Array) -> OptimizeResult:
+    """All parameters, from a start that lacks c: hardly any at first, then more as long as much is unexplained."""
+    fits = []
+    for part in _FRICTIONS:
+        fits.append(_search(model, np.insert(near, _COULOMB, part * np.ptp(model.force))))
+        if model.rms(fits[-1].fun) <= model.allowed():
+            break
+    return min(fits, key=lambda fit: fit.cost)
+
+
+def _search(model: _Model, start: Array) -> OptimizeResult:
+    strongest = np.ptp(model.force)
+    start = start.copy()
+    start[_COULOMB] = np.clip(start[_COULOMB], _FRICTIONS[0] * strongest, strongest / 2)
+    free = np.arange(start.size) != _COULOMB
+    bounds = (np.where(free, start - _SEARCH_REACH, 0.0), np.where(free, start + _SEARCH_REACH, strongest))
+    # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
+    options: dict[str, Any] = {"x_scale": "jac", "max_nfev": _EVALUATIONS[1], "ftol": 1e-4}
+    slopes: Any = lambda p: -model.slopes(p)  # noqa: E731 - SciPy's stub takes names only
+    return least_squares(model.residual, start, slopes, bounds=bounds, **options)
+
+
+def _polished(model: _Model, p: Array) -> Array:
+    """The nearest parameters from close by: Gauss-Newton steps as long as they help, halved where they do not.
+
+    A search that stops where its sum of squares hardly changes may be several standard errors away.
+    """
+    residual = model.residual(p)
+    for _ in range(_POLISH):
+        change = np.linalg.lstsq(model.slopes(p), residual, rcond=None)[0]
+        for part in (1.0, 0.5, 0.1):
+            other = p + part * change
+            other[_COULOMB] = max(0.0, other[_COULOMB])
+            left = model.residual(other)
+            if left @ left < residual @ residual:
+                break
+        else:
+            break
+        gain = 1 - (left @ left) / (residual @ residual)
+        p, residual = other, left
+        if gain < _ENOUGH:
+            break
+    return p
+
+
+def _settled(model: _Model, p: Array) -> Estimate:
+    step, rms, allowed = model.step, model.rms(model.residual(p)), model.allowed()
+    if rms > allowed:
+        raise ValueError(
+            f"the model leaves {rms / step:.2g} encoder steps rms unexplained, at most {allowed / step:.2g} may be "
+            "(friction of another kind, a hand at the handle, gravity, or a slipping drive?)"
+        )
+    estimate = _estimate(model, p, rms)
+    vague = estimate.errors["viscous"] / estimate.viscous
+    if vague > _VAGUE:
+        raise ValueError(
+            f"the record does not tell viscous from dry friction: {estimate.viscous:.3g} N s/m, standard error "
+            f"{100 * vague:.0f} %, at most {100 * _VAGUE:.0f} % may be; take one with more force or a longer one"
+        )
+    return estimate
+
+
+def _estimate(model: _Model, p: Array, rms: float) -> Estimate:
+    scatter = _spread(model, p)
+    covariance = scatter.covariance
+    m1, b = np.exp(p[0]), np.exp(p[1])
+    gradient = np.zeros(p.size)
+    gradient[0], mass, k, mode = m1, m1, None, None
+    if not model.rigid:
+        m2, k = np.exp(p[3]), float(np.exp(p[4]))
+        mass, gradient[3] = m1 + m2, m2
+        mode = float(np.sqrt(k * mass / (m1 * m2)) / (2 * np.pi))
+    errors = {
+        "mass": float(np.sqrt(gradient @ covariance @ gradient)),
+        "viscous": float(b * np.sqrt(covariance[1, 1])),
+        "coulomb": float(np.sqrt(covariance[2, 2])),
+    }
+    above = max(0.0, float(b * scatter.bias[1]))  # on average; a bias to the safe side is left where it is
+    delta = max(0.0, float(b) - above - _ONE_SIDED_95 * errors["viscous"])
+    return Estimate(float(mass), float(m1), float(b), float(p[2]), k, mode, errors, delta, rms, rms / model.step)
+
+
+# from a session's record
+
+
+def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[str]:
+    """Axes with far more damping than they are said to have, by INFO's guarantee and the scenario's own damping.
+
+    A hand cannot be told from a device by its motion. Of an honest device the estimate scatters about what is
+    declared, and one bound in twenty lies above it: that alone is no reason to ask.
+    """
+    found = []
+    for i, (e, said) in enumerate(zip(estimates, _declared(scenario, session), strict=False), start=1):
+        if e.viscous > (1 + _SUSPICIOUS) * said:
+            found.append(
+                f"axis {i}: {e.viscous:.4g} N s/m estimated, {said:.4g} declared (scenario, INFO): is somebody "
+                "holding it? No bound is offered; where the device really has more, declare it and take another record"
+            )
+    return found
+
+
+def _declared(scenario: Scenario, session: Session) -> list[float]:
+    """Damping of every axis [N s/m], the larger of the scenario's and INFO's."""
+    guaranteed = [1e-6 * d for d in session.info.osp_damping] if session.info else [0.0] * scenario.channels
+    return [max(device.damping, said) for device, said in zip(scenario.device, guaranteed, strict=True)]
+
+
+def capped(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[Estimate]:
+    """No bound above the declared damping: what is more may be a hand."""
+    said = _declared(scenario, session)
+    return [replace(e, delta=min(e.delta, limit)) for e, limit in zip(estimates, said, strict=False)]
+
+
+def estimate(
+    recorder: Recorder,
+    session: Session,
+    scenario: Scenario,
+    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+) -> list[Estimate]:
+    """One estimate per axis from a recorded session. Raises ValueError naming the axis that gives none."""
+    link, units = recorder.link(), session.units
+    missing = int((~link["received"]).sum())
+    if missing:  # which force acted then is not known for certain, and a wrong one makes a wrong bound
+        raise ValueError(f"{missing} of {len(recorder)} ticks came without a STATE: take another record")
+    applied = link["applied"]
+    estimates = []
+    for i, device in enumerate(scenario.device):
+        progress(i, scenario.channels, f"estimating axis {i + 1}")
+        rigid = isinstance(device, RigidDevice)
+        x, force = link["x"][:, i], applied[:, i] * units.force_step[i]
+        try:
+            estimates.append(identify(x, force, link["received"], scenario.T, units.encoder_step[i], rigid))
+        except ValueError as error:
+            raise ValueError(f"axis {i + 1}: {error}") from None
+    return estimates
+
+
+if __name__ == "__main__":
+    from cli.main import door
+
+    door("identify")

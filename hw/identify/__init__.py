@@ -1,1 +1,0 @@
-"""python -m hw.identify: how much damping does a device guarantee?"""

@@ -1,0 +1,331 @@
+"""What may be done to a device, and by which device: limits of forces and encoders, and what INFO must promise first.
+
+Pure functions, no clock, no port. Order matters: a number that is not finite is found before any clamping, because
+max(-12, min(12, nan)) is +12.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from hw.protocol import MAX_RELEASE_NS, MAX_THETA, PROTOCOL, Config, Force, Info, State, wire_bytes
+from models.device import require
+from sim.scenario import Scenario
+
+_BITS_PER_BYTE = 10  # start bit, eight data bits, stop bit
+_FEWEST_STEPS = 16  # of force up to the cap: coarser, and the certificate's linear loop is another one
+_COARSEST = 0.1  # of the largest displacement in a tick that is taken for a hand's: one count of an encoder
+_LARGEST_MARGIN_US = 30_000  # an age is read from a margin, which is an i16 in microseconds
+_HOLD, _RAMP_US = 4, 5000  # what the device does without answers: ticks held, then microseconds to zero
+
+
+class Stage(StrEnum):
+    """Where a session stands. From the last five there is no way back but a new session."""
+
+    CONNECTING = "connecting"  # HELLO sent, no INFO yet
+    CONFIGURING = "configuring"  # CONFIG sent, no ACK yet
+    MEASURING = "measuring"  # zero force: the age of every answer is collected
+    MEASURED = "measured"  # zero force: waiting for a coupling that is certified for what was measured
+    DISARMED = "disarmed"  # zero force: waiting for a person
+    ARMING = "arming"  # the gain rises
+    ARMED = "armed"
+    DISARMING = "disarming"  # the gain falls
+    FINISHED = "finished"  # ended as planned
+    REFUSED = "refused"  # this device, link or coupling may not be armed
+    STOPPED = "stopped"  # a fault
+    LOST = "lost"  # the device does not answer, or is gone
+    ESTOP = "e-stop"
+
+
+ENDED = frozenset({Stage.FINISHED, Stage.REFUSED, Stage.STOPPED, Stage.LOST, Stage.ESTOP})
+DRIVING = frozenset({Stage.ARMING, Stage.ARMED, Stage.DISARMING})
+
+
+class Fault(Exception):
+    """A reason to stop, in the words of the log."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The host's own limits; the device has the same ones in its firmware."""
+
+    cap: tuple[float, ...]  # (m,) [N] largest force
+    slew: float = 2000.0  # [N/s] fastest change of a force
+    jump: float = 3e-3  # [m] largest displacement from tick to tick: 2.5 m/s at T = 1.2 ms
+    watchdog_us: int = 6000  # [us] longest silence of a device that is streaming; see watchdog_for
+    ramp_in: float = 0.25  # [s] in which the gain rises from 0 to 1
+    ramp_out: float = 0.1  # [s] in which it falls
+    speed: float = 1.0  # [m/s] fastest motion while forces act
+    continuous: tuple[float, ...] = ()  # (m,) [N] that every motor stands for ever; none: heating is not looked at
+    thermal: float = 10.0  # [s] time constant of the motors
+
+    def __post_init__(self) -> None:
+        for i, cap in enumerate(self.cap):
+            require(f"cap[{i}]", cap, 1e-3, 12.0, "N")
+        require("slew", self.slew, 1.0, 2000.0, "N/s")
+        require("jump", self.jump, 1e-6, 3e-3, "m")
+        require("watchdog_us", self.watchdog_us, 1000, 20000, "us")
+        require("ramp_in", self.ramp_in, 0.1, 0.25, "s")
+        require("ramp_out", self.ramp_out, 0.1, 0.25, "s")
+        require("speed", self.speed, 1e-3, 2.5, "m/s")
+        require("thermal", self.thermal, 0.1, 1000.0, "s")
+        if self.continuous and len(self.continuous) != len(self.cap):
+            raise ValueError(f"continuous has {len(self.continuous)} entries, cap {len(self.cap)}")
+        for i, (most, cap) in enumerate(zip(self.continuous, self.cap, strict=False)):
+            require(f"continuous[{i}]", most, 1e-3, cap, "N")
+
+
+@dataclass(frozen=True)
+class Shaped:
+    """A force that may be sent, and what had to be done to it."""
+
+    force: tuple[float, ...]  # (m,) [N]
+    clipped: bool  # at the cap
+    slowed: bool  # at the slew limit
+
+
+def _require_finite(force: Sequence[float]) -> None:
+    """Raise Fault where a force is not a number or infinite."""
+    if not all(map(math.isfinite, force)):
+        raise Fault(f"the controller asked for {', '.join(f'{f:g}' for f in force)} N, which is no force")
+
+
+def shape(
+    asked: Sequence[float],
+    previous: Sequence[float],
+    gain: float,
+    limits: Limits,
+    T: float,
+    test: Sequence[float] | None = None,
+) -> Shaped:
+    """The force to send in place of `asked` (m,) [N], after `previous` (m,) [N], at a gain within [0, 1].
+
+    `test` (m,) [N] is added behind the gain: what an encoder is tested with.
+
+    Raises Fault where `asked` is not finite; that is looked at first, and the result is looked at again.
+    """
+    _require_finite(asked)
+    if not 0.0 <= gain <= 1.0:
+        raise Fault(f"the gain is {gain}, expected a number within [0, 1]")
+    step, clipped, slowed, force = limits.slew * T, False, False, []
+    wishes = [gain * one + more for one, more in zip(asked, test or (0.0,) * len(asked), strict=True)]
+    _require_finite(wishes)
+    for wanted, last, cap in zip(wishes, previous, limits.cap, strict=True):
+        capped = max(-cap, min(cap, wanted))
+        sent = max(last - step, min(last + step, capped))
+        clipped |= capped != wanted
+        slowed |= sent != capped
+        force.append(sent)
+    _require_finite(force)
+    return Shaped(tuple(force), clipped, slowed)
+
+
+def check_jump(x: Sequence[float], previous: Sequence[float], ticks: int, limits: Limits) -> None:
+    """Raise Fault where an encoder moved further in `ticks` ticks than a hand can: x, previous (m,) [m]."""
+    for i, (now, before) in enumerate(zip(x, previous, strict=True), start=1):
+        if not abs(now - before) <= limits.jump * ticks:
+            allowed = f"{1e3 * limits.jump * ticks:g} mm in {ticks} tick{'s' if ticks > 1 else ''}"
+            raise Fault(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
+
+
+def check_jolt(x: Sequence[float], previous: Sequence[float], before: Sequence[float], limits: Limits) -> None:
+    """Raise Fault where an encoder's speed changed within a tick by more than `limits.jump` per tick, as no mass can.
+
+    x, previous, before: (m,) [m], of three ticks in a row.
+    """
+    for i, (now, last, first) in enumerate(zip(x, previous, before, strict=True), start=1):
+        if not (change := abs(now - 2 * last + first)) <= limits.jump:
+            most = f"{1e3 * limits.jump:g} mm in a tick"
+            raise Fault(f"encoder {i} shakes: its speed changed by {1e3 * change:.3g} mm in a tick, allowed are {most}")
+
+
+def check_speed(x: Sequence[float], before: Sequence[float], seconds: float, limits: Limits) -> None:
+    """Raise Fault where an axis moved faster than allowed: x now, `before` so many `seconds` ago, (m,) [m]."""
+    for i, (now, then) in enumerate(zip(x, before, strict=True), start=1):
+        if not (speed := abs(now - then) / seconds) <= limits.speed:
+            raise Fault(f"axis {i} moves at {speed:.3g} m/s, allowed are {limits.speed:g} m/s while forces act")
+
+
+def check_range(x: Sequence[float], reach: Sequence[float]) -> None:
+    """Raise Fault where a displacement x (m,) [m] is outside of what the device can reach: +-reach (m,) [m]."""
+    for i, (now, most) in enumerate(zip(x, reach, strict=True), start=1):
+        if not abs(now) <= most:
+            raise Fault(f"encoder {i} is at {1e3 * now:.4g} mm, its range is +-{1e3 * most:.4g} mm")
+
+
+@dataclass
+class Gain:
+    """The factor in front of every force. It moves linearly in time, never jumps, and starts at 0.
+
+    Any constant gain within [0, 1] keeps a certificate: He[g F/(z-1)] > -Delta_D/T holds for g F if it does for F.
+    """
+
+    limits: Limits
+    T: float  # [s]
+    value: float = 0.0
+
+    def rise(self, ticks: int = 1) -> float:
+        """The gain `ticks` ticks later, on its way to 1."""
+        self.value = min(1.0, self.value + ticks * self.T / self.limits.ramp_in)
+        return self.value
+
+    def fall(self, ticks: int = 1) -> float:
+        """The gain `ticks` ticks later, on its way to 0."""
+        self.value = max(0.0, self.value - ticks * self.T / self.limits.ramp_out)
+        return self.value
+
+
+class Heat:
+    """The heating of every motor by the square of its force, I2t: a first-order lag that tends to the square.
+
+    At a constant force F it reaches the continuous force's square after -tau ln(1 - (F_continuous / F)^2).
+    """
+
+    def __init__(self, limits: Limits, T: float) -> None:
+        self._limits, self._T = limits, T
+        self._squares = [0.0] * len(limits.continuous)  # [N^2]
+
+    def check(self, force: Sequence[float], ticks: int) -> None:
+        """Take in the force (m,) [N] that acts for so many ticks. Raise Fault where a motor gets too hot."""
+        part = -math.expm1(-ticks * self._T / self._limits.thermal)
+        for i, most in enumerate(self._limits.continuous):
+            self._squares[i] += (force[i] ** 2 - self._squares[i]) * part
+            if self._squares[i] > most**2:
+                raise Fault(
+                    f"motor {i + 1} gets hot: {self._squares[i] ** 0.5:.3g} N rms, {most:g} N are allowed for long"
+                )
+
+
+# before anything moves: is this the device that the scenario is about, and can the line carry it?
+
+
+@dataclass(frozen=True)
+class Units:
+    """Integers of the wire to SI units and back. The wire carries what the motor does, -f."""
+
+    encoder_step: tuple[float, ...]  # (m,) [m]
+    force_step: tuple[float, ...]  # (m,) [N]
+    reach: tuple[float, ...]  # (m,) [m]
+
+    @classmethod
+    def of(cls, info: Info) -> Units:
+        encoder = tuple(1e-12 * step for step in info.encoder_step)
+        reach = tuple(step * counts for step, counts in zip(encoder, info.range, strict=True))
+        return cls(encoder, tuple(1e-6 * step for step in info.force_step), reach)
+
+    def positions(self, counts: tuple[int, ...]) -> tuple[float, ...]:
+        """Displacements (m,) [m]."""
+        return tuple(n * step for n, step in zip(counts, self.encoder_step, strict=True))
+
+    def forces(self, steps: tuple[int, ...]) -> tuple[float, ...]:
+        """Forces fed back f (m,) [N], from what the motors do."""
+        return tuple(-n * step for n, step in zip(steps, self.force_step, strict=True))
+
+    def steps(self, f: Sequence[float], cap: tuple[int, ...]) -> tuple[int, ...]:
+        """What the motors are to do for the forces fed back f (m,) [N]: whole steps, at most `cap`."""
+        return tuple(
+            max(-most, min(most, round(-force / step)))
+            for force, step, most in zip(f, self.force_step, cap, strict=True)
+        )
+
+
+def _wire_time(baud: int, axes: int) -> tuple[float, str]:
+    """Seconds for one STATE and one FORCE, and the arithmetic as text."""
+    up, down = wire_bytes(State, axes), wire_bytes(Force, axes)
+    seconds = (up + down) * _BITS_PER_BYTE / baud
+    return seconds, f"({up} + {down}) bytes x {_BITS_PER_BYTE} bits / {baud} baud = {1e6 * seconds:.0f} us"
+
+
+def objections(info: Info, scenario: Scenario, limits: Limits, baud: int | None) -> list[str]:
+    """Why this device may not run this scenario over this line; empty where nothing is wrong. baud None: no UART."""
+    if info.version != PROTOCOL:
+        return [f"the device speaks version {info.version} of the protocol, this host version {PROTOCOL}"]
+    m = scenario.channels
+    if info.axes != m:
+        return [f"the device has {info.axes} ax{'i' if info.axes == 1 else 'e'}s, the scenario {m} channels"]
+    reasons = []
+    period_ns = round(1e9 * scenario.T)
+    if info.period_ns != period_ns:
+        reasons.append(f"the device ticks every {info.period_ns} ns, the scenario's T is {period_ns} ns")
+    if baud is not None:
+        seconds, arithmetic = _wire_time(baud, m)
+        if seconds > scenario.T:
+            instead = "of a link without UART say --baud none"
+            reasons.append(
+                f"one STATE and one FORCE take {arithmetic}, more than T = {1e6 * scenario.T:g} us ({instead})"
+            )
+    for i in range(m):
+        if wrong := _impossible(i, info):
+            return [wrong]
+        damping, strongest = 1e-6 * info.osp_damping[i], 1e-6 * info.hard_limit[i] * info.force_step[i]
+        if damping < scenario.delta[i] * (1 - 1e-6):
+            reasons.append(
+                f"axis {i + 1} guarantees {damping:g} N s/m, the certificate needs delta = {scenario.delta[i]:g}"
+            )
+        reasons += _coarse(i, info, limits, scenario.T)
+        if strongest < limits.cap[i] * (1 - 1e-3):
+            reasons.append(f"axis {i + 1} can do {strongest:g} N, the force limit is {limits.cap[i]:g} N")
+    return reasons
+
+
+def _impossible(i: int, info: Info) -> str | None:
+    """What axis i says of itself that docs/protocol.md does not allow."""
+    allowed = {"encoder_step": 0xFFFFFFFF, "force_step": 0xFFFFFFFF, "hard_limit": 0x7FFF, "range": 0x7FFFFFFF}
+    for name, most in allowed.items():
+        if not 1 <= (value := getattr(info, name)[i]) <= most:
+            return f"{name.replace('_', ' ')} of axis {i + 1} is {value}, allowed are 1 to {most}"
+    return None
+
+
+def _coarse(i: int, info: Info, limits: Limits, T: float) -> list[str]:
+    """What is too coarse on axis i for limits on forces and displacements to mean anything."""
+    reasons, force, count = [], 1e-6 * info.force_step[i], 1e-12 * info.encoder_step[i]
+    finest = min(limits.cap[i] / _FEWEST_STEPS, limits.slew * T)
+    if force > finest:
+        reasons.append(f"one force step of axis {i + 1} is {force:g} N, at most {finest:g} N is allowed")
+    if count > _COARSEST * limits.jump:
+        finest = _COARSEST * limits.jump
+        reasons.append(
+            f"one encoder count of axis {i + 1} is {1e3 * count:g} mm, at most {1e3 * finest:g} mm is allowed"
+        )
+    return reasons
+
+
+def probe_delay(T: float) -> int:
+    """The theta to measure with: the longest whose margin can be told. Raises ValueError where there is none."""
+    theta = min(MAX_THETA, int(_LARGEST_MARGIN_US / (1e6 * T)))
+    if theta < 1:
+        raise ValueError(f"T is {T:g} s, a serial link is for at most {1e-6 * _LARGEST_MARGIN_US:g} s")
+    return theta
+
+
+def watchdog_for(T: float) -> int:
+    """The longest silence [us] of a device that ticks every T [s]: five ticks, and at least the 6 ms of a busy host.
+
+    Raises ValueError where that is longer than a free handle may be pushed without being asked.
+    """
+    silence = max(6000, math.ceil(round(5e6 * T, 3)))
+    if silence > MAX_RELEASE_NS // 1000:
+        most = MAX_RELEASE_NS / 5e9
+        raise ValueError(f"T is {T:g} s, a serial link is for at most {most:g} s: the host's watchdog is five ticks")
+    return silence
+
+
+def configuration(info: Info, limits: Limits, theta: int) -> Config:
+    """What the device is told: never more than the host allows itself, nor than the device can do."""
+    T_ns = info.period_ns
+    ramp = max(1, min(0xFF, math.ceil(1000 * _RAMP_US / T_ns)))
+    steps = [1e-6 * step for step in info.force_step]
+    most = [int(cap / step + 1e-9) for cap, step in zip(limits.cap, steps, strict=True)]
+    slew = [min(0xFFFF, math.ceil(limits.slew * 1e-9 * T_ns / step)) for step in steps]
+    return Config(
+        theta=theta,
+        hold=max(0, min(_HOLD, MAX_RELEASE_NS // T_ns - ramp)),
+        ramp=ramp,
+        ramp_in=min(0xFFFF, math.ceil(1e9 * limits.ramp_in / T_ns)),
+        cap=tuple(map(min, info.hard_limit, most)),
+        slew=tuple(slew),
+    )

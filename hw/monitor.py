@@ -1,0 +1,423 @@
+"""Whether link and device do what was agreed: the delay that is measured, the clock, lateness, and obedience.
+
+The certificate is for a period T and for delays up to theta, and every ramp and limit counts ticks. So the device's
+clock is compared with its tick number, and so is the host's; answers that come late or never are counted; and the force
+that the device says it applies is compared with what it was told. Docs/protocol.md leaves a conforming device no choice
+there: in ARMED it moved from its last force towards the one for this tick, within slew and growing cap; in HOLDING it
+kept the last one; in DISARMED there is none.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from hw.device import cap_after, limited
+from hw.limits import DRIVING, Fault, Limits, Stage
+from hw.protocol import NO_MARGIN, Config, Phase, State, distance
+
+_STATES_PER_ANSWER = 8  # at most: a USB frame of 1 ms may bring several FORCEs, of which one margin is told
+_MEASURED_TOLERANCE = 0.01  # of the device's clock against T, over the measurement
+_UNTOLD = 0.9  # part of STATEs without a margin above which nobody can judge the link; a USB frame may carry several
+_DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # of a clock over a block; a busy host and its buffers blur the second
+BLOCK = 200  # ticks over which a clock is compared
+_REMEMBERED = 64  # forces on their way, of which at most theta matter
+_ROUNDING = 1  # [steps] for a firmware that rounds otherwise
+PATIENCE = 5  # ticks in a row
+_CHANGE = 1.0  # [N] of force that moves any handle which is not against a stop
+_IMPULSE = 0.1  # [N s] of such a change without a motion: 100 ms of 1 N, 20 ms of 5 N
+_HEAVIEST = 2.5  # [kg] of hand and handle
+_TEST_FORCE, _TEST_SECONDS, _TEST_HALF = 1.0, 0.24, 0.03  # [N] reached after so many seconds, and half a period
+_FORGETTING = 8  # right ticks that make up for a wrong one: seldom wrong is stopped too, just later
+
+
+@dataclass(frozen=True)
+class LinkSettings:
+    """How a session judges its link, and how it arms."""
+
+    baud: int | None = None  # of a UART; None for a link without one (USB, pseudo-terminal)
+    measure: int = 800  # answers whose age is measured
+    window: int = 200  # ticks over which misses are judged
+    late: float = 0.1  # part of late answers above which the coupling is too fast for the link
+    missed: float = 0.2  # part of missing answers above which nothing is certified: mean-square stability ends there
+    test_encoders: bool = True  # by a small force at every arming
+    rereference: bool = True  # positions count from where the handles are at arming
+
+
+# the delay, timed at zero force
+
+
+@dataclass(frozen=True)
+class Ages:
+    """How old a force is when it reaches the device, counted from its sample [us], and how many never do."""
+
+    values: tuple[int, ...]
+    missing: int = 0
+
+    def quantile(self, q: float) -> int:
+        """The least age that a fraction q of all forces does not exceed. Raises Fault where so many never arrive."""
+        ordered, everything = sorted(self.values), len(self.values) + self.missing
+        place = min(everything - 1, int(q * everything))
+        if place >= len(ordered):
+            part = 100 * self.missing / everything
+            raise Fault(f"{part:.2g} % of the answers never arrived: no delay keeps {100 * q:g} % (--quantile)")
+        return ordered[place]
+
+    @property
+    def median(self) -> int:
+        """Of those that arrived [us]."""
+        return sorted(self.values)[len(self.values) // 2]
+
+
+class Measurement:
+    """Counts answers until there are `needed`, arrived or missing. Its end is certain: it counts STATEs too."""
+
+    def __init__(self, needed: int, theta: int, T: float, most_missing: float) -> None:
+        self.ages: list[int] = []
+        self._missed = 0
+        self._needed, self._theta, self._T_us, self._most_missing = needed, theta, 1e6 * T, most_missing
+        self._first: State | None = None
+        self._states = 0
+
+    def note(self, state: State, margin: int | None, missed: int) -> bool:
+        """Take in a STATE; whether that was the last one. Raises Fault where the link cannot be used."""
+        self._first = self._first or state
+        self._states += 1
+        counted = self._states - 2 * self._theta  # before, the device misses answers to ticks that nobody saw
+        if counted <= 0:
+            return False
+        self._missed += missed
+        if margin is not None:
+            self.ages.append(round(self._theta * self._T_us) - margin)
+            self._missed -= margin < 0  # it was missed, but came after all
+        everything = len(self.ages) + self.missing
+        if everything < self._needed and counted < _STATES_PER_ANSWER * self._needed:
+            return False
+        part = 1 - len(self.ages) / (everything if everything >= self._needed else counted)
+        if part > self._most_missing:
+            raise Fault(f"{100 * part:.0f} % of the answers never reached the device, {self._states} STATEs came")
+        self._check_clock(state)
+        return True
+
+    @property
+    def missing(self) -> int:
+        """Answers that did not come, not even late."""
+        return max(0, self._missed)
+
+    @property
+    def result(self) -> Ages:
+        return Ages(tuple(self.ages), self.missing)
+
+    def _check_clock(self, state: State) -> None:
+        assert self._first is not None
+        elapsed = (state.t_us - self._first.t_us) & 0xFFFFFFFF
+        ticks = distance(state.tick, self._first.tick)
+        if ticks > 0 and abs(elapsed / (ticks * self._T_us) - 1) > _MEASURED_TOLERANCE:
+            each = elapsed / ticks
+            raise Fault(f"a tick of the device lasts {each:.1f} us by its own clock, T is {self._T_us:g} us")
+
+
+# lateness
+
+
+@dataclass
+class Counters:
+    """Since the session began; the device's own counts are differences modulo 256, summed."""
+
+    states: int = 0  # STATEs that were acted upon
+    gaps: int = 0  # ticks of which no STATE came
+    duplicates: int = 0  # the same tick again
+    stale: int = 0  # an older tick than the last: late or reordered
+    unexpected: int = 0  # messages that have no place here
+    late: int = 0  # answers that reached the device after their latch
+    misses: int = 0  # ticks without an answer in time, by the device's count
+    device_errors: int = 0  # frames that the device rejected
+    clipped: int = 0  # forces at the cap
+    slowed: int = 0  # forces at the slew limit
+    unlike: int = 0  # ticks at which the device applied another force than it was sent in time
+
+
+class LinkMonitor:
+    """Order of STATEs, and over a sliding window what came late, what was missed, and what nobody told."""
+
+    def __init__(self, settings: LinkSettings, counters: Counters) -> None:
+        self.settings, self.counters = settings, counters
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the window: the delay has been configured anew."""
+        self.last: State | None = None
+        self.margin: int | None = None  # [us] of the answer that the last fresh STATE tells; None: no answer came
+        self.missed = 0  # ticks that the last fresh STATE tells of
+        self._window: deque[_Tick] = deque()
+        self._late = self._missed = self._untold = self._gaps = 0  # sums over it: adding up takes longer than a tick
+
+    def take(self, state: State) -> int:
+        """Take in a STATE: ticks since the one before, or 0 where it is no news (the same tick again, or an older)."""
+        ahead = 1 if self.last is None else distance(state.tick, self.last.tick)
+        if ahead <= 0:
+            self.counters.duplicates += ahead == 0
+            self.counters.stale += ahead < 0
+            return 0
+        self.missed = 0
+        if self.last is not None:
+            self.missed = (state.misses - self.last.misses) & 0xFF
+            self.counters.device_errors += (state.crc_errors - self.last.crc_errors) & 0xFF
+        self.margin = None if state.margin_us == NO_MARGIN else state.margin_us
+        tick = _Tick(self.margin, self.missed, ahead - 1)
+        self.counters.states += 1
+        self.counters.gaps += tick.gap
+        self.counters.misses += tick.missed
+        self.counters.late += tick.late
+        self._window.append(tick)
+        self._add(tick, 1)
+        if len(self._window) > self.settings.window:
+            self._add(self._window.popleft(), -1)
+        self.last = state
+        return ahead
+
+    def _add(self, tick: _Tick, sign: int) -> None:
+        self._late += sign * tick.late
+        self._missed += sign * tick.missed
+        self._gaps += sign * tick.gap
+        self._untold += sign * (tick.margin is None)
+
+    @property
+    def least_margin(self) -> int | None:
+        """[us] over the window; None where no answer came."""
+        return min((tick.margin for tick in self._window if tick.margin is not None), default=None)
+
+    def too_late(self) -> str | None:
+        """Whether the link has become slower than the coupling was certified for, in words.
+
+        Parts are of a whole window, however few ticks there were yet. Raises Fault where too little arrives at all.
+        """
+        window, most = self.settings.window, self.settings.missed
+        late, missed = self._late / window, min(1.0, self._missed / window)
+        if missed > most + late:
+            raise Fault(f"{100 * missed:.0f} % of the last {window} ticks had no answer in time")
+        if self._gaps / window > most:
+            part = f"{100 * self._gaps / window:.0f} % of {window} ticks"
+            raise Fault(f"no STATE came of {part}: nobody can say what the device did")
+        if self._untold / window > _UNTOLD:
+            raise Fault(
+                f"{100 * _UNTOLD:g} % of the last {window} STATEs told no margin: nobody can say how late answers are"
+            )
+        if late > self.settings.late:
+            return f"{100 * late:.0f} % of the last {window} answers were late"
+        return None
+
+
+class _Tick(NamedTuple):
+    """What one fresh STATE tells of its link."""
+
+    margin: int | None  # [us]
+    missed: int
+    gap: int  # ticks before it of which no STATE came
+
+    @property
+    def late(self) -> bool:
+        return self.margin is not None and self.margin < 0
+
+
+# the clock: two are compared with the number of the tick, the device's own and the host's, since a device that
+# computes its clock from its ticks is found by the second one only
+
+
+@dataclass
+class ClockDrift:
+    """One clock against ticks of `T_us`, in blocks, each without its longest delay: a freeze is no drift."""
+
+    whose: str
+    T_us: float
+    tolerance: float  # part of a block
+    forgiven_us: float  # longest freeze that is left out
+    _last: int | None = None
+    _ticks: int = 0
+    _behind: float = 0.0  # [us] of the clock beyond ticks * T
+    _freeze: float = 0.0  # [us] the longest single part of it
+
+    def note(self, at_us: int, ticks: int) -> None:
+        """The clock shows `at_us` (modulo 2^32), `ticks` after the call before. Raises Fault where it drifts."""
+        if self._last is not None:
+            elapsed = (at_us - self._last + 2**31) % 2**32 - 2**31
+            late = elapsed - ticks * self.T_us
+            self._behind += late
+            self._freeze = min(self.forgiven_us, max(self._freeze, late))
+            self._ticks += ticks
+            drift = self._behind - max(0.0, min(self._freeze, self._behind))
+            if abs(drift) > self.tolerance * BLOCK * self.T_us:
+                lasts = self.T_us + drift / self._ticks
+                what = f"over {self._ticks} tick{'s' if self._ticks > 1 else ''}, T is {self.T_us:g} us"
+                raise Fault(f"a tick of the device lasts {lasts:.4g} us by {self.whose} clock {what}")
+            if self._ticks >= BLOCK:
+                self._ticks, self._behind, self._freeze = 0, 0.0, 0.0
+        self._last = at_us
+
+
+class ClockMonitor:
+    """Both clocks, and the number of the tick, while forces act."""
+
+    def __init__(self, limits: Limits, T: float) -> None:
+        T_us = 1e6 * T
+        self.most = max(1, int(limits.watchdog_us / T_us))  # [ticks] that may be missing at once
+        self._device = ClockDrift("its own", T_us, _DEVICE_TOLERANCE, limits.watchdog_us)
+        self._host = ClockDrift("the host's", T_us, _HOST_TOLERANCE, limits.watchdog_us)
+
+    def check(self, state: State, ticks: int, now: int) -> None:
+        """Raise Fault where the STATE that came at `now` [us] cannot be `ticks` after the one before."""
+        if ticks > self.most:
+            raise Fault(f"the tick number leapt by {ticks}, the watchdog allows {self.most}")
+        self._device.note(state.t_us, ticks)
+        self._host.note(now, ticks)
+
+
+# obedience: the state of the device, and the force that it says it applies
+
+
+def check_state(state: State, config: Config, stage: Stage, gain: float) -> None:
+    """Raise Fault where the device is where it may not be, or has a force that nobody can have asked for."""
+    strongest = max(abs(a) - c for a, c in zip(state.applied, config.cap, strict=True))
+    if strongest > 0:
+        raise Fault(f"the device applies {state.applied} steps, the cap is {config.cap}")
+    if state.phase in (Phase.STOPPED, Phase.RAMP, Phase.SILENT):
+        raise Fault(f"the device is in {state.phase.name.lower()}, cause {state.cause.name.lower()}")
+    armed = state.phase in (Phase.ARMED, Phase.HOLDING)
+    if armed and stage not in DRIVING:
+        raise Fault("the device is armed, and nobody asked it to")
+    if not armed and (stage in (Stage.ARMED, Stage.DISARMING) or gain > 0):
+        raise Fault("the device has disarmed itself")
+    if not armed and any(state.applied):
+        raise Fault(f"the device is disarmed and applies {state.applied} steps")
+
+
+class CommandMonitor:
+    """The forces that a device was told, and whether it applies them."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._forces: dict[int, tuple[int, ...]] = {}  # by the tick that they are for
+        self._last: State | None = None
+        self._run = (0, 0)  # fewest and most forces latched since arming, where STATEs were lost
+        self._unlike = self._holding = 0
+
+    def tell(self, tick: int, steps: tuple[int, ...]) -> None:
+        """`steps` answer `tick`."""
+        self._forces[(tick + self._config.theta) & 0xFFFF] = steps
+        if len(self._forces) > _REMEMBERED:
+            self._forces.pop(next(iter(self._forces)))
+
+    def unlike(self, state: State, ticks: int) -> bool:
+        """Whether the device applies what it cannot have been told; a STATE after a gap is not judged.
+
+        Raises Fault where that goes on.
+        """
+        self._holding = self._holding + 1 if state.phase == Phase.HOLDING else 0
+        if self._holding > self._config.hold:
+            raise Fault(f"the device holds a force for {self._holding} ticks, {self._config.hold} are agreed")
+        told, last = self._forces.pop(state.tick, None), self._last
+        self._last = state
+        if last is None or state.phase == Phase.DISARMED:
+            return False
+        if last.phase != Phase.DISARMED:
+            fewest, most = self._run
+            self._run = (fewest + (state.phase == Phase.ARMED), most + ticks)
+        if ticks > 1:
+            return False
+        wrong = not self._could(state, last.applied, told)
+        self._unlike = max(0, self._unlike + (_FORGETTING if wrong else -1))
+        if self._unlike > _FORGETTING * (PATIENCE - 1):
+            what = f"told {told}" if state.phase == Phase.ARMED else f"to hold {last.applied}"
+            raise Fault(f"the device applies {state.applied} steps, it was {what}, and so for {PATIENCE} ticks")
+        return wrong
+
+    def _could(self, state: State, last: tuple[int, ...], told: tuple[int, ...] | None) -> bool:
+        if state.phase == Phase.HOLDING:
+            return state.applied == last
+        if told is None:
+            return False
+        config = self._config
+        fewest, most = self._run
+        for force, before, asked, cap, slew in zip(state.applied, last, told, config.cap, config.slew, strict=True):
+            low = high = limited(asked, before, cap_after(config, cap, most), slew)
+            if fewest < most and fewest < config.ramp_in:
+                other = limited(asked, before, cap_after(config, cap, fewest), slew)
+                low, high = min(low, other), max(high, other)
+            if not low - _ROUNDING <= force <= high + _ROUNDING:
+                return False
+        return True
+
+
+# encoders: a hand that holds still looks like a cable that is off, but no hand is as stiff as a dead encoder
+
+
+class EncoderTest:
+    """A small force on every axis, up and down by turns and growing, until its encoder has moved by more than a count.
+
+    A free handle of 0.25 kg answers an encoder of 10 um within 25 ms, at 0.1 N. Raises Fault, naming the axis, where
+    1 N, or as much as is allowed, was answered by nothing.
+    """
+
+    def __init__(self, cap: Sequence[float], T: float) -> None:
+        self._cap, self._T = cap, T
+        self._band: list[list[int]] | None = None  # least and most counts of every axis
+        self._ticks = 0
+
+    def force(self, counts: Sequence[int], ticks: int) -> tuple[float, ...] | None:
+        """Forces fed back (m,) [N], `ticks` after the call before; None once every encoder has answered."""
+        self._band = [[n, n] for n in counts] if self._band is None else self._band
+        for pair, n in zip(self._band, counts, strict=True):
+            pair[0], pair[1] = min(pair[0], n), max(pair[1], n)
+        dead = [i for i, (low, high) in enumerate(self._band) if high - low <= 1]
+        if not dead:
+            return None
+        t = self._ticks * self._T
+        if t > _TEST_SECONDS:
+            strongest = min(_TEST_FORCE, self._cap[dead[0]])
+            what = f"it moved by {self._band[dead[0]][1] - self._band[dead[0]][0]} counts at a test force of"
+            raise Fault(f"encoder of axis {dead[0] + 1} does not follow: {what} up to {strongest:g} N")
+        size = _TEST_FORCE * t / _TEST_SECONDS * (-1 if int(t / _TEST_HALF) % 2 else 1)
+        self._ticks += ticks
+        return tuple(
+            max(-cap, min(cap, size)) if i in dead else 0.0
+            for i, cap in zip(range(len(counts)), self._cap, strict=True)
+        )
+
+
+class EncoderMonitor:
+    """Whether encoders follow the force, while it acts.
+
+    The handle that a changing force does not move by more than one count is held by nothing that lives: an encoder of
+    which one channel is broken still toggles between two counts. What is compared is the force that the device says
+    it applies, with the one at the last motion; a change of more than 1 N is summed up over time. A mass M that a
+    change F turns around stays within two counts of q for 4 sqrt(q M / F): a coarse encoder gets twice as long.
+    """
+
+    def __init__(self, encoder_step: Sequence[float], force_step: Sequence[float], T: float) -> None:
+        self._encoder_step, self._force_step, self._T = encoder_step, force_step, T
+        self._band: list[list[int]] | None = None
+        self._reference = [0.0] * len(force_step)  # [N] at the last motion
+        self._impulse = [0.0] * len(force_step)  # [N s] since then
+
+    def check(self, counts: Sequence[int], applied: Sequence[int], ticks: int) -> None:
+        """Raise Fault where an encoder has not moved. `applied` (m,) [steps] acts from these `counts` (m,) on."""
+        if self._band is None:
+            self._band = [[n, n] for n in counts]
+        for i, (n, steps) in enumerate(zip(counts, applied, strict=True)):
+            force, band = steps * self._force_step[i], self._band[i]
+            if n > band[0] + 1 or n < band[1] - 1:
+                band[:] = n, n
+                self._reference[i], self._impulse[i] = force, 0.0
+                continue
+            if n > band[1]:
+                band[1] = n
+            elif n < band[0]:
+                band[0] = n
+            change = abs(force - self._reference[i])
+            if change > _CHANGE:
+                self._impulse[i] += change * ticks * self._T
+            if self._impulse[i] > max(_IMPULSE, 8.0 * (self._encoder_step[i] * _HEAVIEST * change) ** 0.5):
+                still = f"it stands still while the force changes by {change:.3g} N"
+                raise Fault(f"encoder of axis {i + 1} does not follow: {still}")

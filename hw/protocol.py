@@ -1,0 +1,377 @@
+"""What host and device say to each other: messages as tuples of integers, and the frames that carry them.
+
+A frame on the wire is payload + CRC-32, COBS-stuffed, ended by 0x00; docs/protocol.md draws every byte. A payload is a
+type byte, fixed fields, then one group of fields per axis: the number of axes follows from the length. All integers are
+little-endian; there is no float, so no NaN can travel. The longest frame has fewer than 254 bytes before stuffing, so
+COBS costs exactly one byte and the size of a frame does not depend on its content.
+"""
+
+from __future__ import annotations
+
+import operator
+from enum import IntEnum
+from itertools import chain
+from struct import Struct, error
+from typing import Any, NamedTuple
+from zlib import crc32
+
+PROTOCOL = 1
+MAX_AXES = 8
+MAX_THETA = 15
+MAX_RELEASE_NS = 20_000_000  # longest hold and ramp together: 12 N for 20 ms bring a free 0.25 kg to 1 m/s
+NO_MARGIN = -32768  # in State.margin_us: no FORCE came since the STATE before
+
+
+class Phase(IntEnum):
+    """States of the device, the low four bits of a status."""
+
+    SILENT = 0
+    DISARMED = 1
+    ARMED = 2
+    HOLDING = 3
+    RAMP = 4
+    STOPPED = 5
+    ESTOP = 6
+
+
+class Cause(IntEnum):
+    """Why the device is where it is, the high four bits of a status."""
+
+    NONE = 0
+    HOST = 1  # a STOP from the host
+    WATCHDOG = 2  # more than `hold` ticks without a force
+    COMMAND = 3  # a FORCE with a command that has no place while armed
+    DEVICE = 4  # the firmware found a fault of its own
+    ESTOP_DEVICE = 5  # the emergency stop at the device
+    ESTOP_HOST = 6  # a STOP with reason ESTOP
+
+
+#: by value: what an enumeration takes ten times as long for, and a tick asks ten times
+_PHASES, _CAUSES = {int(phase): phase for phase in Phase}, {int(cause): cause for cause in Cause}
+
+
+class Command(IntEnum):
+    """What a FORCE asks for; only RUN may carry a force other than zero."""
+
+    IDLE = 0
+    ARM = 1
+    RUN = 2
+
+
+class Refused(IntEnum):
+    """Why a CONFIG was refused."""
+
+    ACCEPTED = 0
+    RUNNING = 1
+    ESTOP = 2
+    AXES = 3
+    THETA = 4
+    RELEASE = 5  # a ramp of no ticks, or hold and ramp longer than MAX_RELEASE_NS
+    CAP = 6
+    SLEW = 7
+
+
+class Reason(IntEnum):
+    """Why the host stops. The device stops on any; ESTOP latches."""
+
+    DONE = 0
+    OPERATOR = 1
+    FAULT = 2
+    ESTOP = 3
+
+
+class Hello(NamedTuple):
+    """Host to device: who are you?"""
+
+    version: int = PROTOCOL
+
+
+class Info(NamedTuple):
+    """Device to host: what it is. Tuples have one entry per axis."""
+
+    version: int
+    firmware: str  # at most 16 ASCII characters
+    serial: int
+    period_ns: int
+    osp_damping: tuple[int, ...]  # guaranteed damping [uN s/m]
+    encoder_step: tuple[int, ...]  # [pm per count]
+    force_step: tuple[int, ...]  # [uN per step]
+    hard_limit: tuple[int, ...]  # largest force [steps]
+    range: tuple[int, ...]  # the workspace is +-range [counts]
+
+    @property
+    def axes(self) -> int:
+        return len(self.encoder_step)
+
+
+class Config(NamedTuple):
+    """Host to device: how to run. Tuples have one entry per axis."""
+
+    theta: int  # a force answers tick k and is latched at tick k + theta
+    hold: int  # ticks that the last force is held for when frames are missing
+    ramp: int  # ticks from there to zero
+    ramp_in: int  # ticks over which the cap grows from zero after arming; 0: at once
+    cap: tuple[int, ...]  # [steps]
+    slew: tuple[int, ...]  # [steps per tick]
+
+    @property
+    def axes(self) -> int:
+        return len(self.cap)
+
+
+class Ack(NamedTuple):
+    """Device to host: the CRC-32 of the CONFIG payload it answers, and why that was refused (0: accepted)."""
+
+    crc: int
+    refused: int
+
+
+class State(NamedTuple):
+    """Device to host, every tick."""
+
+    status: int  # phase and cause
+    tick: int
+    echo: int  # the source of the last FORCE that came
+    margin_us: int  # how long before its latch it came, negative: too late; NO_MARGIN: none came since the last STATE
+    crc_errors: int  # frames that the device rejected, modulo 256
+    misses: int  # ticks for which no FORCE was there in time, modulo 256
+    t_us: int  # the device's clock at this tick, modulo 2^32
+    counts: tuple[int, ...]  # encoders, sampled at this tick
+    applied: tuple[int, ...]  # the force from this tick on [steps]
+
+    @property
+    def axes(self) -> int:
+        return len(self.counts)
+
+    @property
+    def phase(self) -> Phase:
+        return _PHASES[self.status & 15]
+
+    @property
+    def cause(self) -> Cause:
+        return _CAUSES[self.status >> 4]
+
+
+class Force(NamedTuple):
+    """Host to device, one for each STATE: the force for tick `apply_at` = source + theta."""
+
+    command: int
+    apply_at: int
+    source: int
+    force: tuple[int, ...]  # [steps]
+
+    @property
+    def axes(self) -> int:
+        return len(self.force)
+
+
+class Stop(NamedTuple):
+    """Host to device: to zero force, now."""
+
+    reason: int
+
+
+Message = Hello | Info | Config | Ack | State | Force | Stop
+
+
+_U8, _U16, _U32 = (0, 0xFF), (0, 0xFFFF), (0, 0xFFFFFFFF)
+_I16, _I32 = (-0x8000, 0x7FFF), (-0x80000000, 0x7FFFFFFF)
+_TEXT = 16  # bytes of Info.firmware, ASCII, filled up with zeros
+
+
+class _Layout(NamedTuple):
+    """One kind of payload: type byte, struct codes of its fixed fields and of one axis, what each field may hold."""
+
+    code: int
+    fixed: str
+    axis: str
+    limits: tuple[tuple[int, int], ...]
+
+
+LAYOUTS: dict[type, _Layout] = {
+    Hello: _Layout(1, "B", "", (_U8,)),
+    Info: _Layout(
+        2,
+        f"B{_TEXT}sII",
+        "IIIHi",
+        (_U8, (0, _TEXT), _U32, (100_000, 100_000_000), _U32, (1, _U32[1]), (1, _U32[1]), (1, _I16[1]), (1, _I32[1])),
+    ),
+    Config: _Layout(3, "BBBH", "HH", ((1, MAX_THETA), _U8, (1, 0xFF), _U16, (1, _I16[1]), (1, _U16[1]))),
+    Ack: _Layout(4, "IB", "", (_U32, _U8)),
+    State: _Layout(5, "BHHhBBI", "ih", (_U8, _U16, _U16, _I16, _U8, _U8, _U32, _I32, _I16)),
+    Force: _Layout(6, "BHH", "h", (_U8, _U16, _U16, _I16)),
+    Stop: _Layout(7, "B", "", (_U8,)),
+}
+
+
+class _Form(NamedTuple):
+    """A layout for a given number of axes; `fixed` counts the values before the first axis, type byte included."""
+
+    kind: type
+    struct: Struct
+    fixed: int
+    columns: int
+
+
+def _form(kind: type, axes: int) -> _Form:
+    layout = LAYOUTS[kind]
+    columns = len(layout.axis)
+    return _Form(kind, Struct("<B" + layout.fixed + layout.axis * axes), 1 + len(layout.limits) - columns, columns)
+
+
+#: by kind and number of axes (0 where a message has none) to write, by type byte and length to read
+_FORMS = {
+    (kind, n): _form(kind, n) for kind in LAYOUTS for n in (range(1, MAX_AXES + 1) if LAYOUTS[kind].axis else (0,))
+}
+READ = {(LAYOUTS[kind].code, f.struct.size): f for (kind, _), f in _FORMS.items()}
+
+_OVERHEAD = 6  # CRC-32, the COBS byte, the delimiter
+_MAX_WIRE = max(f.struct.size for f in _FORMS.values()) + _OVERHEAD
+_RESIDUE = crc32(bytes(4) + crc32(bytes(4)).to_bytes(4, "little"))  # CRC-32 over anything followed by its own CRC-32
+_STATUSES = frozenset(phase | cause << 4 for phase in Phase for cause in Cause)
+_CHECKED = (Hello, Info, Config, Ack, Stop)  # seldom sent: every field looked at; State and Force leave it to struct
+
+
+def wire_bytes(kind: type, axes: int) -> int:
+    """Length of a frame, delimiter included: STATE 20 + 6N, FORCE 12 + 2N."""
+    f = _FORMS.get((kind, axes if LAYOUTS[kind].axis else 0))
+    if f is None:
+        raise ValueError(f"axes: {axes}; the protocol carries 1 to {MAX_AXES}")
+    return f.struct.size + _OVERHEAD
+
+
+def encode(message: Message) -> bytes:
+    """The frame of a message. Raises ValueError that names the field, what it held and what it may hold."""
+    if type(message) in _CHECKED:
+        _check(message)
+    payload = pack(message)
+    raw = payload + crc32(payload).to_bytes(4, "little")
+    return b"".join([_CODES[len(block)] + block for block in raw.split(b"\0")]) + b"\0"
+
+
+#: a COBS block is its length plus one, then its bytes; the zero behind it goes without saying
+_CODES = [bytes((n + 1,)) for n in range(254)]
+
+
+def pack(message: Message) -> bytes:
+    """The payload of a message."""
+    kind = type(message)
+    layout = LAYOUTS[kind]
+    values: Any = message
+    if isinstance(message, Info):
+        values = (message.version, message.firmware.encode("ascii"), *message[2:])
+    try:
+        if not layout.axis:
+            return _FORMS[kind, 0].struct.pack(layout.code, *values)
+        columns: Any = message[-len(layout.axis) :]
+        by_axis = columns[0] if len(columns) == 1 else chain.from_iterable(zip(*columns, strict=True))
+        f = _FORMS[kind, len(columns[0])]
+        return f.struct.pack(layout.code, *values[: f.fixed - 1], *by_axis)
+    except (error, KeyError, TypeError, ValueError):
+        _check(message)
+        raise
+
+
+def _check(message: Message) -> None:
+    """Raises ValueError for the first field that cannot travel."""
+    layout, name = LAYOUTS[type(message)], type(message).__name__
+    fixed = len(layout.limits) - len(layout.axis)
+    axes, values = None, tuple[Any, ...](message)
+    for index, (field, value, limits) in enumerate(zip(message._fields, values, layout.limits, strict=True)):
+        if limits == (0, _TEXT):
+            if not (isinstance(value, str) and value.isascii() and value.isprintable() and len(value) <= _TEXT):
+                raise ValueError(f"{name}.{field}: {value!r}; at most {_TEXT} printable ASCII characters")
+        elif index < fixed:
+            _check_integer(f"{name}.{field}", value, limits)
+        elif not isinstance(value, tuple):
+            raise ValueError(f"{name}.{field}: {value!r}; a tuple with one integer per axis")
+        else:
+            axes = len(value) if axes is None else axes
+            if len(value) != axes or not 1 <= axes <= MAX_AXES:
+                raise ValueError(f"{name}.{field}: {len(value)} entries; 1 to {MAX_AXES} axes, every field the same")
+            for axis, entry in enumerate(value):
+                _check_integer(f"{name}.{field}[{axis}]", entry, limits)
+
+
+def _check_integer(name: str, value: Any, limits: tuple[int, int]) -> None:
+    """Raises ValueError naming the field unless the value is an integer from limits[0] to limits[1]."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise ValueError(f"{name}: {value!r}; integers only") from None
+    if not limits[0] <= number <= limits[1]:
+        raise ValueError(f"{name}: {value}; {limits[0]} to {limits[1]}")
+
+
+def _unpack(payload: bytes) -> Message | None:
+    """The message of a payload; None where type and length fit none, a status has no name or a text is not ASCII."""
+    f = READ.get((payload[0], len(payload)))
+    if f is None or (f.kind is State and payload[1] not in _STATUSES):
+        return None
+    values = f.struct.unpack(payload)
+    if f.columns:
+        message = f.kind(*values[1 : f.fixed], *[values[i :: f.columns] for i in range(f.fixed, f.fixed + f.columns)])
+        if f.kind is Info:
+            text = values[2].rstrip(b"\0")
+            return message._replace(firmware=text.decode("ascii")) if text.isascii() else None
+        return message
+    return f.kind(*values[1:])
+
+
+def config_crc(config: Config) -> int:
+    """CRC-32 of a CONFIG's payload: what the ACK for it carries."""
+    return crc32(pack(config))
+
+
+class Decoder:
+    """Bytes in any pieces -> messages. Whatever cannot be read is counted and dropped up to the next delimiter."""
+
+    def __init__(self) -> None:
+        self.crc_errors = 0
+        self.malformed = 0  # COBS does not come out, or no message has this type and length
+        self.oversize = 0  # longer than any frame
+        self.tail = b""  # never longer than _MAX_WIRE
+        self.skipping = False  # inside an oversize frame that is already counted
+
+    @property
+    def rejected(self) -> int:
+        return self.crc_errors + self.malformed + self.oversize
+
+    def feed(self, data: bytes) -> list[Message]:
+        """The messages completed by these bytes, oldest first."""
+        *frames, tail = (self.tail + data).split(b"\0")
+        messages = []
+        for frame in frames:
+            if frame and (message := self.read(frame)) is not None:
+                messages.append(message)
+            self.skipping = False
+        if len(tail) >= _MAX_WIRE:
+            self.oversize += not self.skipping
+            self.skipping, tail = True, tail[:_MAX_WIRE]
+        self.tail = tail
+        return messages
+
+    def read(self, frame: bytes) -> Message | None:
+        """One frame without its delimiter."""
+        if len(frame) >= _MAX_WIRE:
+            self.oversize += not self.skipping
+            return None
+        raw, i, end = bytearray(frame), 0, len(frame)
+        while i < end:
+            code = raw[i]
+            raw[i] = 0
+            i += code
+        if i != end or end < _OVERHEAD:
+            self.malformed += 1
+            return None
+        if crc32(raw[1:]) != _RESIDUE:
+            self.crc_errors += 1
+            return None
+        message = _unpack(bytes(raw[1:-4]))
+        self.malformed += message is None
+        return message
+
+
+def distance(a: int, b: int) -> int:
+    """How many ticks a lies after b: -32768 to 32767, ticks counted modulo 2^16."""
+    return ((a - b + 0x8000) & 0xFFFF) - 0x8000

@@ -1,0 +1,414 @@
+"""The record of a session: its trace, its report, and the replay of the trace through the controller, bit by bit.
+
+A trace is the npz of sim.run, with what the link saw beside it, so that it can be replayed; the recipe for that (the
+limits, coupling and scenario of every arming) travels in its metadata.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from array import array
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any, BinaryIO
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from controller.coupling import Form
+from controller.lti import Array
+from hw.control import CertifiedCoupling, LinearController, Program, TraceRow, host_controller
+from hw.limits import Fault, Limits, Units, shape
+from hw.protocol import NO_MARGIN, Config
+from hw.session import Session
+from models.device import require
+from sim.files import write, write_json
+from sim.scenario import InputError, Scenario
+from sim.trace import DAMAGED, Trace, growths
+
+#: what the link adds, one entry per tick: name -> axes of the array
+_LINK = {"tick": 1, "arming": 1, "received": 1, "asked": 2, "gain": 1, "sent": 2, "margin_us": 1, "status": 1}
+_LATER = {"test": 2}  # that older traces lack
+_FLOATS, _WHOLE = ("asked", "gain", "test"), ("tick", "arming", "sent", "margin_us", "status")
+#: link array -> least and most that a session writes
+_RANGES = {"gain": (0.0, 1.0), "tick": (0, 0xFFFF), "sent": (-0x7FFF, 0x7FFF), "margin_us": (-0x8000, 0x7FFF)}
+_PERCENTILES = (50, 90, 99, 100)
+
+
+class Recorder:
+    """Collects rows in compact arrays: about 100 bytes a tick."""
+
+    def __init__(self, channels: int) -> None:
+        self.channels = channels
+        self._floats = array("d")  # x, asked, gain
+        self._whole = array("i")  # tick, arming, received, sent, applied, margin, status
+
+    def __call__(self, row: TraceRow) -> None:
+        """Take in one tick."""
+        m, state = self.channels, row.state
+        self._floats.extend((*row.x, *row.asked, row.gain, *(row.test or (0.0,) * m)))
+        if state is None:
+            self._whole.extend((row.tick, row.arming, 0, *(0,) * (2 * m), NO_MARGIN, 0))
+        else:
+            self._whole.extend((row.tick, row.arming, 1, *row.sent, *state.applied, state.margin_us, state.status))
+
+    def __len__(self) -> int:
+        return len(self._floats) // (3 * self.channels + 1)
+
+    def link(self) -> dict[str, NDArray[Any]]:
+        """Arrays by the names of _LINK, with `x` (N, m) [m] and `applied` (N, m) [steps] beside them."""
+        m, n = self.channels, len(self)
+        floats = np.array(self._floats).reshape(n, 3 * m + 1)
+        whole = np.array(self._whole).reshape(n, 2 * m + 5)
+        tick, arming, received, sent, applied, rest = np.split(whole, [1, 2, 3, 3 + m, 3 + 2 * m], axis=1)
+        return {
+            "x": floats[:, :m],
+            "asked": floats[:, m : 2 * m],
+            "gain": floats[:, 2 * m],
+            "test": floats[:, 2 * m + 1 :],
+            "tick": tick[:, 0],
+            "arming": arming[:, 0],
+            "received": received[:, 0].astype(bool),
+            "sent": sent,
+            "applied": applied,
+            "margin_us": rest[:, 0],
+            "status": rest[:, 1],
+        }
+
+
+def steady_ticks(recorder: Recorder, force_step: Sequence[float]) -> list[list[int]]:
+    """[first, stop) of each arming in which the loop was one linear loop: full gain, until a cap or the slew rate cuts.
+
+    Missed ticks are not left out. `force_step` (m,) [N].
+    """
+    link = recorder.link()
+    asked = -np.round(link["asked"] / np.array(force_step))
+    cut = link["received"] & np.any(link["sent"] != asked, axis=1)
+    stretches = []
+    for arming in np.unique(link["arming"]):
+        full = np.flatnonzero((link["arming"] == arming) & (link["gain"] == 1.0))
+        if full.size:
+            count = int(np.argmax(cut[full])) if cut[full].any() else full.size
+            stretches.append([int(full[0]), int(full[0]) + count])
+    return stretches
+
+
+def result_of(recorder: Recorder, units: Units, T: float, meta: dict[str, Any]) -> Trace:
+    """The trace in the terms of sim.run. Handles and outside forces are not measured: nan, and no column."""
+    link = recorder.link()
+    n, m = len(recorder), recorder.channels
+    last = np.maximum.accumulate(np.where(link["received"], np.arange(n), 0))  # a force is held until the next is known
+    f = -link["applied"][last] * np.array(units.force_step)
+    unknown = np.full((n, m), np.nan)
+    t = np.arange(n, dtype=float) * T
+    return Trace(t, link["x"], f, unknown, unknown, np.zeros((n, 0)), meta)
+
+
+def save_npz(path: Path, result: Trace, recorder: Recorder) -> Path:
+    """An npz that sim.trace reads, with the arrays of _LINK beside its own."""
+    recorded = recorder.link()
+    link = {f"link_{name}": recorded[name] for name in _LINK | _LATER}
+    own = {name: getattr(result, name) for name in ("t", "x", "f", "x_handle", "v_handle", "w")}
+    arrays: dict[str, Any] = {**own, **link, "meta": np.array(json.dumps(result.meta))}
+
+    def content(file: BinaryIO) -> None:
+        np.savez_compressed(file, allow_pickle=False, digest=np.array(digest(arrays)), **arrays)
+
+    return write(path, content)
+
+
+def digest(arrays: Mapping[str, Array]) -> str:
+    """SHA-256 of everything in a trace: it tells a record from one that was changed, cut or put together."""
+    whole = hashlib.sha256()
+    for name in sorted(arrays):
+        whole.update(f"{name} {arrays[name].dtype.str} {arrays[name].shape} ".encode() + arrays[name].tobytes())
+    return whole.hexdigest()
+
+
+def load(path: Path) -> tuple[Trace, dict[str, Array]]:
+    """A trace with its link arrays. Raises InputError where the file holds no session of a bridge."""
+    result = Trace.load_npz(path)
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+            link = {name: arrays[f"link_{name}"] for name in _LINK}
+            link |= {name: arrays.get(f"link_{name}", np.zeros(arrays["x"].shape)) for name in _LATER}
+    except (OSError, *DAMAGED):
+        raise InputError(f"{path}: a trace, but not of a bridge's session; hw.bridge writes one") from None
+    n, m = result.x.shape
+    for name, axes in (_LINK | _LATER).items():
+        if link[name].shape != ((n, m) if axes == 2 else (n,)):
+            raise InputError(
+                f"{path}: link_{name} has the shape {link[name].shape}, the trace {n} ticks of {m} channels"
+            )
+    if wrong := _complaint(result, link):
+        raise InputError(f"{path}: no session of hw.bridge: {wrong}")
+    if str(arrays.pop("digest", "")) != digest(arrays):
+        raise InputError(f"{path}: was changed after hw.bridge wrote it: its digest is another")
+    return result, link
+
+
+def _complaint(result: Trace, link: dict[str, Array]) -> str | None:
+    """What is wrong with a trace whose shapes are right; None where nothing is."""
+    if not isinstance(result.meta, dict):
+        return f"its metadata is a {type(result.meta).__name__}, expected an object"
+    if result.t.size == 0:
+        return "it has no ticks"
+    for name, values in {"x": result.x, "t": result.t}.items():
+        if not np.isfinite(values).all():
+            return f"{name} is not finite at tick {_first(~np.isfinite(values))}"
+    wanted: dict[str, Any] = dict.fromkeys(_FLOATS, np.float64) | {"received": np.bool_}
+    for name, values in link.items():
+        kind = values.dtype
+        if name in _WHOLE and kind.kind != "i":
+            return f"link_{name} is of type {kind}, expected whole numbers"
+        if name in wanted and kind != wanted[name]:
+            return f"link_{name} is of type {kind}, expected {np.dtype(wanted[name])}"
+        if name in _FLOATS and not np.isfinite(values).all():
+            return f"link_{name} is not finite at tick {_first(~np.isfinite(values))}"
+        low, high = _RANGES.get(name, (-np.inf, np.inf))
+        outside = (values < low) | (values > high) if name in _RANGES else np.zeros(1, bool)
+        if outside.any():
+            return f"link_{name} is outside of {low:g} to {high:g} at tick {_first(outside)}"
+    arming = link["arming"]
+    if arming[0] != 0 or not np.isin(np.diff(arming), (0, 1)).all():
+        return "link_arming does not count armings from 0 up"
+    return None
+
+
+def _first(wrong: Array) -> int:
+    """The first row of `wrong` (N,) or (N, m) with a True."""
+    return int(np.argmax(wrong.reshape(len(wrong), -1).any(axis=1)))
+
+
+class IncidentLog:
+    """A file that is true up to the last second, however the process ended: appended to, never kept in memory.
+
+    One JSON object a line: every change of the stage at once, and every second where things stand. What was written
+    survives SIGKILL, though not a power failure.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises InputError where the file cannot be written."""
+        self.path = path
+        try:
+            self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise InputError(f"cannot write {path}: {error.strerror}") from None
+        self._told = 0  # [us]
+
+    def attach(self, session: Session) -> None:
+        """From now on, follow this session."""
+        self._write({"at": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "scenario": session.scenario.name, "pid": os.getpid()})
+        session.listen = lambda event: self._write({"t_us": event.t_us, "stage": event.stage, "cause": event.cause})
+
+    def glance(self, session: Session) -> None:
+        """Where things stand, once a second."""
+        if session.now - self._told < 1_000_000:
+            return
+        self._told, drive = session.now, session.drive
+        force, x = (list(drive.force), list(drive.x or ())) if drive else ([], [])
+        standing = {"t_us": session.now, "stage": session.stage, "gain": session.gain, "x_m": x, "f_n": force}
+        self._write(standing | {"counters": asdict(session.counters)})
+
+    def _write(self, line: dict[str, Any]) -> None:
+        with suppress(OSError):  # a full disk is no reason to drop the forces
+            os.write(self._file, (json.dumps(line) + "\n").encode())
+
+    def close(self) -> None:
+        os.close(self._file)
+
+
+# the report, and the files
+
+
+def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace: float = 1.0) -> dict[str, Any]:
+    """Stage, cause and log; the coupling with its certificates; what the link did, as a report without a verdict."""
+    begin = session.log[0].t_us if session.log else 0
+    log = [{"t_s": 1e-6 * (e.t_us - begin), "stage": str(e.stage), "cause": e.cause} for e in session.log]
+    parts = session.program.part() if isinstance(session.program, CertifiedCoupling) else {}
+    empty = {"coupling": None, "certificate": None, "certificates": None, "promise": None, "theta": None}
+    loop = isinstance(session.program, CertifiedCoupling) and len(recorder) > 0
+    report = {
+        "case": case,
+        "scenario": session.scenario.name,
+        **(empty | parts),
+        "session": {"stage": str(session.stage), "cause": session.cause, "armed": len(recorder) > 0, "log": log},
+        "link": _link(session, recorder, dropped),
+        "run": {
+            "samples": len(recorder),
+            "duration_s": len(recorder) * session.scenario.T,
+            "T_s": session.scenario.T,
+            "scenario_digest": session.scenario.digest,
+            "pace": pace,  # below 1: slow motion, in which a link looks faster than it is
+            "encoder_step_m": list(session.units.encoder_step) if len(recorder) else None,
+            "steady_ticks": steady_ticks(recorder, session.units.force_step) if loop else [],
+        },
+    }
+    trace = result_of(recorder, session.units, session.scenario.T, report) if loop else None
+    return report | {"growth": [one.part() for one in growths(trace)] if trace else []}
+
+
+def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
+    measured = session.measurement
+    counters = asdict(session.counters) | {"host_errors": session.decoder.rejected, "host_dropped_bytes": dropped}
+    part: dict[str, Any] = {
+        "measured_age_us": _percentiles(np.array(measured.ages)),
+        "measured_missing": measured.missing,
+        "age_us": None,
+        "rate_hz": None,
+        "missed_percent": None,
+        "counters": counters,
+    }
+    if len(recorder) and session.config:
+        arrays = recorder.link()
+        margins = arrays["margin_us"][arrays["received"] & (arrays["margin_us"] != NO_MARGIN)]
+        part["age_us"] = _percentiles(session.config.theta * 1e6 * session.scenario.T - margins)
+        part["rate_hz"] = float(arrays["received"].mean() / session.scenario.T)
+        answered = arrays["received"].sum()
+        part["missed_percent"] = 100 * session.missed_while_driving / answered if answered else None
+    return part
+
+
+def _percentiles(values: np.ndarray) -> dict[str, float] | None:
+    return {f"p{q}": float(np.percentile(values, q)) for q in _PERCENTILES} if values.size else None
+
+
+def save(out: Path, session: Session, recorder: Recorder, report: dict[str, Any], plot: bool) -> list[Path]:
+    """The trace (where forces acted), its picture, and the report."""
+    files = []
+    if len(recorder):
+        replay = [_recipe_of(session, program, config) for program, config in session.armings]
+        result = result_of(recorder, session.units, session.scenario.T, report | {"replay": replay})
+        files += [save_npz(out / "trace.npz", result, recorder), result.save_csv(out / "trace.csv")]
+        if plot:
+            from sim.plots import plot_run
+
+            title = f"{report['scenario']}, case {report['case']}: a session that ended {session.stage}"
+            files.append(plot_run(result, out / "figure.png", title, 10.0))
+    files.append(out / "report.json")
+    write_json(files[-1], report | {"files": [str(p) for p in files]})
+    return files
+
+
+def _recipe_of(session: Session, program: Program, config: Config) -> dict[str, Any]:
+    """All that hw.replay needs of one arming."""
+    assert isinstance(program, CertifiedCoupling)
+    return {
+        "scenario": json.loads(msgspec.json.encode(program.scenario)),
+        "coupling": json.loads(msgspec.json.encode(program.chosen.coupling.form())),
+        "link_delay": program.link,
+        "limits": asdict(session.limits),
+        "force_step": list(session.units.force_step),
+        "cap": list(config.cap),
+    }
+
+
+# the replay
+
+
+class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a trace says of the controller that made it."""
+
+    scenario: Scenario
+    coupling: Form
+    link_delay: int
+    limits: Limits
+    force_step: tuple[float, ...]
+    cap: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        """Raises ValueError naming what no session can have written."""
+        m, least = self.scenario.channels, min(self.scenario.theta)
+        for name, given in (("limits.cap", self.limits.cap), ("force_step", self.force_step), ("cap", self.cap)):
+            if len(given) != m:
+                raise ValueError(f"{name} has {len(given)} entries, the scenario {m} channels")
+        for i in range(m):
+            require(f"force_step[{i}]", self.force_step[i], 1e-9, 1.0, "N")
+            require(f"cap[{i}]", self.cap[i], 1, 0x7FFF, "steps")
+        if not 1 <= self.link_delay <= least:
+            raise ValueError(f"link_delay is {self.link_delay}, allowed are 1 to {least}, the scenario's least theta")
+
+    def controller(self) -> LinearController:
+        """F as the host ran it. Raises InputError where nothing can have run."""
+        try:
+            return host_controller(self.scenario, self.coupling.build(self.scenario.T), self.link_delay)
+        except ValueError as error:
+            raise InputError(f"the trace cannot be replayed: {error}") from None
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Where the replay differs from the record."""
+
+    asked: NDArray[np.bool_]  # (N,) the controller's forces, as 64-bit floats
+    sent: NDArray[np.bool_]  # (N,) what was put on the wire, as integers
+    largest: float  # [N] between the controller's forces
+
+    @property
+    def identical(self) -> bool:
+        return not (self.asked.any() or self.sent.any())
+
+
+def recipes_of(result: Trace) -> list[_Recipe]:
+    """The recipes in a trace, one for each arming. Raises InputError where there is none."""
+    try:
+        _require_limits(result.meta.get("replay"))
+        return msgspec.convert(result.meta.get("replay"), Annotated[list[_Recipe], msgspec.Meta(min_length=1)])
+    except (msgspec.ValidationError, ValueError) as error:
+        raise InputError(f"the trace cannot be replayed: {error}") from None
+
+
+def _require_limits(raw: object) -> None:
+    """Raise ValueError where a recipe has other limits than Limits: msgspec passes over those of a dataclass."""
+    names = {field.name for field in fields(Limits)}
+    needed = names - {"speed", "continuous", "thermal"}  # which older traces lack
+    for recipe in raw if isinstance(raw, list) else []:
+        limits = recipe.get("limits") if isinstance(recipe, dict) else None
+        if isinstance(limits, dict) and not needed <= set(limits) <= names:
+            wrong = ", ".join(sorted((needed - set(limits)) | (set(limits) - names)))
+            raise ValueError(f"limits are {', '.join(sorted(names))}; missing or unknown: {wrong}")
+
+
+def replay(result: Trace, link: dict[str, Array]) -> Comparison:
+    """Feed the recorded displacements through controller, gain, limits and rounding, every arming from rest."""
+    recipes, arming = recipes_of(result), link["arming"]
+    channels = result.x.shape[1]
+    if int(arming[-1]) + 1 != len(recipes) or any(recipe.scenario.channels != channels for recipe in recipes):
+        told = f"{len(recipes)} recipes for {int(arming[-1]) + 1} armings of {channels} channels"
+        raise InputError(f"the trace cannot be replayed: it has {told}")
+    asked, sent = np.zeros_like(link["asked"]), np.zeros_like(link["sent"])
+    for i, recipe in enumerate(recipes):
+        _again(recipe, np.flatnonzero(arming == i), result, link, (asked, sent))
+    different = asked.view(np.int64) != link["asked"].view(np.int64)
+    largest = float(np.abs(asked - link["asked"]).max(initial=0.0))
+    return Comparison(different.any(axis=1), (sent != link["sent"]).any(axis=1), largest)
+
+
+def _again(
+    recipe: _Recipe, ticks: NDArray[np.intp], result: Trace, link: dict[str, Array], into: tuple[Array, Array]
+) -> None:
+    """The `ticks` of one arming: forces asked for and steps sent, written to `into`."""
+    controller, units = (
+        recipe.controller(),
+        Units((1.0,) * len(recipe.cap), recipe.force_step, (1.0,) * len(recipe.cap)),
+    )
+    force: Sequence[float] = (0.0,) * len(recipe.cap)
+    asked, sent = into
+    for k in ticks:
+        asked[k] = controller.step(result.x[k].tolist())
+        if not link["received"][k]:
+            continue
+        try:
+            gain = float(link["gain"][k])
+            test = link["test"][k].tolist()
+            force = shape(asked[k].tolist(), force, gain, recipe.limits, recipe.scenario.T, test).force
+        except Fault as fault:
+            raise InputError(f"the trace cannot be replayed: tick {k}: {fault}") from None
+        sent[k] = units.steps(force, recipe.cap)

@@ -1,0 +1,324 @@
+"""How a session's bytes travel in real time: the serial port, by pyserial, and one thread that waits for nothing else.
+
+Python holds up a loop by itself: a full garbage collection takes 40 ms with MuJoCo and cvxpy loaded. So what is loaded
+is frozen and the collector is off while forces act.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import select
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import Protocol, Self
+
+from hw.control import Program
+from hw.limits import ENDED, Fault, Stage
+from hw.monitor import Ages
+from hw.session import Operator, Session
+from sim.scenario import InputError
+
+_CHUNK = 4096  # bytes read at once; a tick brings a few dozen
+_UNUSED = 9600  # baud that a port without UART is told: it does nothing, but 1200 resets many boards
+_LONGEST_WAIT = 1e-3  # [s] between two looks at the time-outs
+_STALL_SECONDS, _STALL_MS = 2.0, 2.0  # how long stalls are measured, and from which on something is said
+_GRACE_US = 50_000  # after the end, in which a STOP that was lost is repeated
+
+
+class PortLost(OSError):
+    """The device at the other end of the port is gone."""
+
+
+class SerialPort:
+    """A port in raw mode: whole bytes in, whole bytes out, no echo, no flow control."""
+
+    def __init__(self, path: str, baud: int | None) -> None:
+        """Open `path` for ourselves alone, at `baud` where it has a UART. Raises InputError where that cannot be."""
+        try:
+            import serial
+        except ImportError:
+            raise InputError("--port needs pyserial: pip install 'haptic-loop[hw]'") from None
+        self._error = serial.SerialException
+        try:
+            self._serial = serial.Serial(path, baud or _UNUSED, timeout=0, write_timeout=0, exclusive=True)
+        except (serial.SerialException, ValueError, OSError) as error:
+            raise InputError(f"--port {path}: {error}") from None
+        with suppress(Exception):  # where the driver knows it: the latency timer of FTDI chips goes from 16 ms to 1 ms
+            self._serial.set_low_latency_mode(True)
+
+        self._fd = self._serial.fileno()
+
+    def fileno(self) -> int:
+        """For select."""
+        return self._fd
+
+    def read(self) -> bytes:
+        """What is there, once select has said that something is. Raises PortLost.
+
+        By the file descriptor, as write(): pyserial's own take 31 us of every tick.
+        """
+        try:
+            data = os.read(self._fd, _CHUNK)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise PortLost(f"the port cannot be read: {error}") from None
+        if not data:
+            raise PortLost("the port cannot be read: it was hung up")
+        return data
+
+    def write(self, data: bytes) -> int:
+        """How many of these bytes could be sent without waiting. Raises PortLost."""
+        try:
+            return os.write(self._fd, data)
+        except BlockingIOError:
+            return 0
+        except OSError as error:
+            raise PortLost(f"the port cannot be written: {error}") from None
+
+    def discard(self) -> None:
+        """Forget what has come in. Raises PortLost."""
+        try:
+            self._serial.reset_input_buffer()
+        except (self._error, OSError, TypeError) as error:
+            raise PortLost(f"the port is gone: {error}") from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(Exception):
+            self._serial.close()
+
+
+@dataclass(frozen=True)
+class Preflight:
+    """How well this machine can keep time, and what to do where it cannot."""
+
+    scheduling: str
+    memory: str
+    latency_timer: str
+    clock: str
+    worst_stall_ms: float
+
+    def line(self) -> str:
+        """One line, with what to do about each."""
+        stall = f"worst stall in {_STALL_SECONDS:g} s {self.worst_stall_ms:.1f} ms"
+        if self.worst_stall_ms > _STALL_MS:
+            stall += " (close what is busy; a real machine, no virtual one)"
+        return "pre-flight: " + "; ".join((self.scheduling, self.memory, self.latency_timer, self.clock, stall))
+
+
+def preflight(path: str) -> Preflight:
+    """Ask the system for real-time scheduling and locked memory, and measure for two seconds how late it wakes us."""
+    return Preflight(_scheduling(), _locked_memory(), _latency_timer(path), _clock_source(), 1e3 * _worst_stall())
+
+
+def _scheduling() -> str:
+    with suppress(OSError):
+        # the dashboard and other children do without
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(10))
+    policy = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+    if policy in (os.SCHED_FIFO, os.SCHED_RR):
+        return f"real-time scheduling, priority {os.sched_getparam(0).sched_priority}"
+    return "no real-time scheduling (allow it: `rtprio 20` in /etc/security/limits.conf, or start by chrt -f 10)"
+
+
+def _locked_memory() -> str:
+    current, future = 1, 2
+    if ctypes.CDLL(None).mlockall(current | future) == 0:
+        return "memory locked"
+    return "memory not locked (allow it: `memlock unlimited` in /etc/security/limits.conf)"
+
+
+def _latency_timer(path: str) -> str:
+    name = os.path.basename(os.path.realpath(path))
+    try:
+        with open(f"/sys/bus/usb-serial/devices/{name}/latency_timer") as file:
+            ms = int(file.read())
+    except (OSError, ValueError):
+        return "no latency timer"
+    return f"latency timer {ms} ms" + (f" (setserial {path} low_latency)" if ms > 1 else "")
+
+
+def _clock_source() -> str:
+    try:
+        with open("/sys/devices/system/clocksource/clocksource0/current_clocksource") as file:
+            source = file.read().strip()
+    except OSError:
+        return "clock source unknown"
+    fast = source in ("tsc", "kvm-clock", "arch_sys_counter")
+    return f"clock {source}" + ("" if fast else " (slow to read; a kernel that trusts its tsc is better)")
+
+
+def _worst_stall() -> float:
+    """By how much a sleep of a millisecond is late at worst [s]."""
+    worst, begun = 0.0, time.monotonic()
+    last = begun
+    while last < begun + _STALL_SECONDS:
+        time.sleep(1e-3)
+        now = time.monotonic()
+        worst, last = max(worst, now - last - 1e-3), now
+    return worst
+
+
+class Wire(Protocol):
+    """What a session needs of a port."""
+
+    def fileno(self) -> int: ...
+    def read(self) -> bytes: ...
+    def write(self, data: bytes) -> int: ...
+    def discard(self) -> None: ...
+
+
+class Live:
+    """Moves bytes between a port and a session until the session has ended."""
+
+    def __init__(
+        self,
+        session: Session,
+        port: Wire,
+        plan: Callable[[Ages], Sequence[Program]],
+        auto_arm: bool,
+        seconds: float,
+        keyboard: int | None = None,  # a file descriptor with single keys
+        glance: Callable[[Session], None] = lambda session: None,  # called a few times a second
+        pace: float = 1.0,  # seconds of the session per second; 1 with any real device
+        deadman: Callable[[], bool] | None = None,  # whether somebody showed up since the last call
+    ) -> None:
+        self.session, self.port, self._plan = session, port, plan
+        self._operator = Operator(auto_arm, seconds, deadman)
+        self._keyboard, self._glance, self._pace = keyboard, glance, pace
+        self.signals: list[int] = []
+        self.dropped = 0  # bytes that the port would not take at once
+        self._glanced = 0
+
+    def now(self) -> int:
+        """The session's clock [us]."""
+        return int(time.monotonic_ns() * self._pace) // 1000
+
+    def run(self) -> Session:
+        """From HELLO to the end. Whatever is raised in between, the device is stopped first."""
+        session = self.session
+        with _signals(self.signals), _no_collections():
+            try:
+                self._write(session.start(self.now()))
+                while session.stage not in ENDED:
+                    self._step()
+                    self._steer()
+                ended = self.now()
+                while session.stage != Stage.LOST and self.now() - ended < _GRACE_US:
+                    self._step()
+            except PortLost as lost:
+                session.lost(str(lost), self.now())
+            except BaseException as error:
+                self._write_at_last(session.fail(f"{type(error).__name__} in the bridge: {error}", self.now()))
+                raise
+        return session
+
+    def _step(self) -> None:
+        """Wait for bytes or for a millisecond, and answer."""
+        sources = [self.port] if self._keyboard is None else [self.port, self._keyboard]
+        ready = select.select(sources, [], [], _LONGEST_WAIT)[0]
+        if self.port in ready:
+            self._write(self.session.receive(self.port.read(), self.now()))
+        else:
+            self._write(self.session.poll(self.now()))
+        if self._keyboard in ready:
+            self._pressed()
+
+    def _steer(self) -> None:
+        """What is not an answer: couplings for the measured delay, arming and the planned end, signals."""
+        session, now = self.session, self.now()
+        if session.stage == Stage.MEASURED:
+            self._load()
+        self._write(self._operator.look(session, now))
+        if signal.SIGUSR1 in self.signals:
+            self._write(session.estop("SIGUSR1", now))
+        elif self.signals:
+            name = signal.Signals(self.signals[0]).name
+            self._write(session.stop(name, now) if len(self.signals) == 1 else session.fail(f"{name} again", now))
+        if now - self._glanced > 100_000:
+            self._glanced = now
+            self._glance(session)
+
+    def _load(self) -> None:
+        """Design while the device rests at zero force; what it says meanwhile is of no use."""
+        session = self.session
+        try:
+            with _interruptible():
+                programs = self._plan(session.measurement.result)
+        except Fault as fault:
+            self._write(session.refuse(str(fault), self.now()))
+            return
+        except KeyboardInterrupt:
+            self.signals.append(signal.SIGINT)
+            self._write(session.refuse("SIGINT during the design", self.now()))
+            return
+        if self._keyboard is not None and select.select([self._keyboard], [], [], 0)[0]:
+            self._pressed()  # of now: an `a` from before may not arm what was not there to be armed
+        gc.collect()  # the solver is loaded now
+        gc.freeze()
+        self.port.discard()
+        self._write(session.load(programs, self.now()))
+
+    def _pressed(self) -> None:
+        """Do what was typed; a terminal that is gone is a person who is gone, as SIGHUP says it."""
+        assert self._keyboard is not None
+        keys = b""
+        with suppress(OSError):
+            keys = os.read(self._keyboard, 64)
+        if not keys:
+            self._keyboard = None
+            self.signals.append(signal.SIGHUP)
+        for key in keys.decode(errors="replace"):
+            self._write(self._operator.press(key, self.session, self.now()))
+
+    def _write(self, data: bytes) -> None:
+        if data:
+            self.dropped += len(data) - self.port.write(data)
+
+    def _write_at_last(self, data: bytes) -> None:
+        with suppress(PortLost):
+            self._write(data)
+
+
+@contextmanager
+def _signals(received: list[int]) -> Iterator[None]:
+    """SIGINT, SIGTERM, SIGHUP, SIGQUIT and SIGUSR1 (emergency stop) are noted, and dealt with between two ticks."""
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1)
+    before = {number: signal.signal(number, lambda got, frame: received.append(got)) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGINT is a KeyboardInterrupt: a design may take long, and nothing moves meanwhile."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def _no_collections() -> Iterator[None]:
+    gc.collect()
+    gc.freeze()
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+        if was_on:
+            gc.enable()

@@ -1,0 +1,187 @@
+"""Speed beside error: the exponential engine, four Runge-Kutta steps and the exact engine, alternating in one run.
+
+make bench    (or: python -m pytest tests/benchmarks/test_engine_cost.py --benchmark-only -s)
+
+CPU time. What a loop is divided by are MuJoCo's own calls, on a model that moves as it does in the run: its controls
+are written before each call, and for the exponential engine, which moves the model itself, its state as well.
+"""
+
+import time
+
+import mujoco
+import numpy as np
+import pytest
+
+from controller.process import StepBuffer
+from design.result import CASE_I
+from models.device import CompliantDevice
+from models.scene import plant, variants
+from sim.crowds import crowds
+from sim.engines import (
+    EXPONENTIAL,
+    ExactBatchEngine,
+    MujocoBatchEngine,
+    discretised,
+    hold,
+    profiler_off,
+)
+from sim.run import assemble, make_engine, run, run_block
+from sim.scenario import load
+from sim.stability import exact_growth
+from sim.stepping import default_substeps, measured_hold, pace, simulated_growth
+
+pytestmark = pytest.mark.benchmark(group="engines")
+ROUNDS = 9
+SCENES = {
+    "default": load(),
+    "transmission of 1.45e6 N/m": load().replace(
+        device=(CompliantDevice(transmission_stiffness=1.45e6),) * 2, duration=5.0
+    ),
+}
+
+
+def cpu_seconds(call) -> float:
+    begin = time.process_time()
+    call()
+    return time.process_time() - begin
+
+
+def looped(assembly, engine, integrator=None, substeps=None):
+    """A run of the scenario, as sim.run makes it."""
+    return run(assembly, make_engine(assembly, engine, integrator, substeps))
+
+
+def raw(assembly, integrator, substeps, record) -> float:
+    """CPU seconds of MuJoCo's calls of that run alone."""
+    model = discretised(assembly.scene, assembly.scenario.T, integrator, substeps)
+    data, nq = mujoco.MjData(model), model.nq
+    q, v, ctrl = data.qpos, data.qvel, data.ctrl
+    inputs = list(np.concatenate([record.w, record.f], axis=1))
+    states = list(zip(record.s[:, :nq], record.s[:, nq:], strict=True))
+    with profiler_off():
+        begin = time.process_time()
+        if integrator == EXPONENTIAL:
+            forward = mujoco.mj_forward
+            for row, (position, velocity) in zip(inputs, states, strict=True):
+                ctrl[...], q[...], v[...] = row, position, velocity
+                forward(model, data)
+        else:
+            step = mujoco.mj_step
+            for row in inputs:
+                ctrl[...] = row
+                step(model, data, substeps)
+        return time.process_time() - begin
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_speed_and_error_side_by_side(benchmark, scene):
+    assembly = assemble(SCENES[scene], CASE_I)
+    substeps = default_substeps(assembly, "RK4")
+    settings = {
+        "exact": ("exact", None, None),
+        "exponential x 1": ("mujoco", EXPONENTIAL, 1),
+        f"RK4 x {substeps}": ("mujoco", "RK4", substeps),
+    }
+    records = {name: looped(assembly, *setting) for name, setting in settings.items()}
+    used, bare = {name: [] for name in settings}, {name: [] for name in settings}
+
+    def once():
+        for name, setting in settings.items():
+            used[name].append(cpu_seconds(lambda setting=setting: looped(assembly, *setting)))
+            if setting[0] == "mujoco":
+                bare[name].append(raw(assembly, *setting[1:], records[name]))
+
+    benchmark.pedantic(once, rounds=ROUNDS, iterations=1, warmup_rounds=1)
+    exact, slow = records["exact"].s[:, :2], np.array(used[f"RK4 x {substeps}"])
+    errors = {}
+    for name, (_, integrator, count) in settings.items():
+        position = np.sqrt(np.mean((records[name].s[:, :2] - exact) ** 2) / np.mean(exact**2))
+        errors[name] = simulated_growth(assembly, integrator, count) - exact_growth(assembly) if integrator else 0.0
+        ratio = f"{np.median(np.array(used[name]) / bare[name]):.2f}" if bare[name] else "-"
+        print(
+            f"\n{scene}: {name}: {1e3 * np.median(used[name]):.1f} ms for {assembly.scenario.duration:g} s, "
+            f"{np.median(slow / used[name]):.1f} x as fast as RK4 x {substeps}, loop / raw calls {ratio} "
+            f"(median of {ROUNDS}), position error {position:.1e}, growth error {errors[name]:+.1e} 1/s",
+            end="",
+        )
+    print()
+    assert abs(errors["exponential x 1"]) <= 1e-9
+    assert abs(errors[f"RK4 x {substeps}"]) <= 1e-3
+
+
+def test_what_a_force_evaluation_is_made_of(benchmark):
+    """Skipping the position stage saves a part of one call, and leaves spring forces of an old position behind."""
+    assembly = assemble(load(), CASE_I)
+    model, calls = assembly.scene.model, 20_000
+    data, position = mujoco.MjData(model), mujoco.mjtStage.mjSTAGE_POS
+    parts = {
+        "mj_forward": lambda: mujoco.mj_forward(model, data),
+        "mj_tendon and mj_forwardSkip": lambda: (
+            mujoco.mj_tendon(model, data),
+            mujoco.mj_forwardSkip(model, data, position, 1),
+        ),
+    }
+    used = {name: [] for name in parts}
+
+    def once():
+        with profiler_off():
+            for name, call in parts.items():
+                used[name].append(cpu_seconds(lambda call=call: [call() for _ in range(calls)]) / calls)
+
+    benchmark.pedantic(once, rounds=ROUNDS, iterations=1, warmup_rounds=1)
+    print("\n" + ", ".join(f"{name}: {1e6 * np.median(times):.2f} us" for name, times in used.items()))
+    data.qpos[0] = 1e-3
+    results = []
+    for call in parts.values():
+        call()
+        results.append(data.qacc.copy())
+    np.testing.assert_array_equal(*results)
+
+
+def test_many_hands(benchmark):
+    """CPU time per simulation and tick, one thread, 125 hands as in a batch of sim.validate."""
+    scenario, nsim, ticks = load(), 125, 320
+    assembly = assemble(scenario, CASE_I)
+    ((_, crowd),) = crowds(scenario.population, scenario.channels, 0, range(nsim), 1)
+    held_by = variants(scenario.device, crowd)
+    plants, limit = hold(held_by.plants(), scenario.T), assembly.process.force_limit
+    batches = {
+        "exact": ExactBatchEngine(plants, limit),
+        "exponential x 1": MujocoBatchEngine(held_by.scene, scenario.T, EXPONENTIAL, 1, nsim, 1, held_by.fields),
+        "RK4 x 4": MujocoBatchEngine(held_by.scene, scenario.T, "RK4", 4, nsim, 1, held_by.fields),
+    }
+    used, after = {name: [] for name in batches}, {}
+    start = 1e-4 * np.random.default_rng(0).normal(size=(plants.A.shape[1], nsim))
+
+    def once():
+        for name, engine in batches.items():
+            tape = StepBuffer(assembly.process, ticks, len(start), held_by.scene.outside, nsim)
+            tape.s[0] = start
+            engine.start(tape)
+            with profiler_off():
+                used[name].append(cpu_seconds(lambda engine=engine, tape=tape: run_block(tape, engine, ticks)))
+            after[name] = tape.s.copy()
+
+    benchmark.pedantic(once, rounds=ROUNDS, iterations=1, warmup_rounds=1)
+    scale = np.abs(after["exact"]).max(axis=0).max(axis=1, keepdims=True)
+    for name in batches:
+        error = (np.abs(after[name] - after["exact"]) / scale).max()
+        print(
+            f"\n{nsim} hands: {name}: {1e6 * np.median(used[name]) / nsim / ticks:.2f} us per simulation and tick, "
+            f"error {error:.1e} in {ticks} ticks",
+            end="",
+        )
+        assert error < (1e-2 if name == "RK4 x 4" else 1e-10)  # lightly damped modes at 83 Hz: phase errors add up
+    print()
+
+
+def test_how_long_a_period_may_be(benchmark):
+    """The map over 0.1 s of a plant whose fastest mode turns 497 rad in it: one step, against scipy's exponential."""
+    assembly = assemble(SCENES["transmission of 1.45e6 N/m"], CASE_I)
+    T, turns = 0.1, pace(plant(assembly.scene.model).A).mode * 0.1
+    step = benchmark.pedantic(
+        lambda: measured_hold(assembly, "mujoco", EXPONENTIAL, 1, T), rounds=3, iterations=1, warmup_rounds=1
+    )
+    error = np.abs(step.A - hold(plant(assembly.scene.model), T).A).max() / np.abs(step.A).max()
+    print(f"\none step of {T} s, {turns:.0f} rad of the fastest mode: map within {error:.1e}")
+    assert error < 1e-9

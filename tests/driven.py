@@ -1,0 +1,30 @@
+"""Many simulations closed at once from given plant states: what the laws about engines are stated on."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.process import Process, StepBuffer
+from sim.engines import Engine
+from sim.run import Outside, run_blocks
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """What every tick saw, (ticks, entries, nsim)."""
+
+    z: np.ndarray
+    s: np.ndarray
+    f: np.ndarray
+
+
+def driven(process: Process, engine: Engine, outside: Outside, ticks: int, start: np.ndarray) -> Driven:
+    """Close the loop from the plant states `start`, (2n, nsim)."""
+    kept = []
+
+    def look(buffer: StepBuffer, first: int, count: int) -> None:
+        buffer.saturate(count)
+        kept.append([rows[:count].copy() for rows in (buffer.z, buffer.s, buffer.f)])
+
+    run_blocks(process, engine, outside, ticks, start, look, 1000)
+    return Driven(*(np.concatenate(rows) for rows in zip(*kept, strict=True)))

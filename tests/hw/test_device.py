@@ -1,0 +1,358 @@
+"""The device's rules, as docs/protocol.md states them: when a force acts, what stops it, what never starts it again."""
+
+import pytest
+
+from hw.device import Device
+from hw.protocol import (
+    NO_MARGIN,
+    Ack,
+    Cause,
+    Command,
+    Config,
+    Decoder,
+    Force,
+    Hello,
+    Info,
+    Phase,
+    Reason,
+    Refused,
+    State,
+    Stop,
+    config_crc,
+    encode,
+)
+
+T = 1200  # [us]
+INFO = Info(1, "test", 7, 1_200_000, (1_370_000,) * 2, (10_000_000,) * 2, (500,) * 2, (24_000, 20_000), (8_000,) * 2)
+CONFIG = Config(1, 4, 4, 0, (24_000, 20_000), (48_000,) * 2)
+
+
+class Rig:
+    """A device with a host at its side that says only what a test tells it to."""
+
+    def __init__(self, config: Config | None = CONFIG, first_tick: int = 0) -> None:
+        self.device, self.decoder, self.now = Device(INFO), Decoder(), 0
+        for _ in range(first_tick):
+            self.tick()
+        if config:
+            self.device.receive(encode(config), self.now)
+            assert [type(m) for m in self.tick()] == [Ack, State]
+        self.config = config
+
+    def say(self, *messages, after: int = 300) -> None:
+        for message in messages:
+            self.device.receive(encode(message), self.now + after)
+
+    def answer(self, force=(0, 0), command=Command.RUN, back: int = 0, after: int = 300) -> None:
+        """The FORCE that answers the STATE of `back` ticks ago."""
+        source = (self.device.k - back) & 0xFFFF
+        self.say(Force(command, (source + self.config.theta) & 0xFFFF, source, force), after=after)
+
+    def tick(self, counts=(5, -6)) -> list:
+        self.now += T
+        self.forces, sent = self.device.tick(self.now, counts)
+        self.said = self.decoder.feed(sent)
+        if self.said and isinstance(self.said[-1], State):
+            self.state = self.said[-1]
+            assert self.state.applied == self.forces
+        return self.said
+
+    def arm(self) -> None:
+        for _ in range(self.config.theta):
+            self.answer(command=Command.ARM)
+            self.tick()
+        assert self.device.phase == Phase.ARMED
+
+    @property
+    def at(self) -> tuple[Phase, Cause]:
+        return self.device.phase, self.device.cause
+
+
+def armed(**changes) -> Rig:
+    rig = Rig(CONFIG._replace(**changes))
+    rig.arm()
+    return rig
+
+
+# ---- before it runs --------------------------------------------------------------------------------------------------
+
+
+def test_it_is_silent_until_configured_and_answers_who_it_is():
+    rig = Rig(config=None)
+    assert [rig.tick() for _ in range(5)] == [[]] * 5
+    rig.say(Hello())
+    assert rig.tick() == [INFO]
+    assert rig.tick() == []
+    rig.say(CONFIG)
+    ack, state = rig.tick()
+    assert ack == Ack(config_crc(CONFIG), Refused.ACCEPTED)
+    assert (state.phase, state.tick, state.t_us, state.counts) == (Phase.DISARMED, 8, 8 * T, (5, -6))
+
+
+@pytest.mark.parametrize(
+    ("config", "reason"),
+    [
+        (Config(1, 4, 4, 0, (1,), (1,)), Refused.AXES),
+        (CONFIG._replace(hold=4, ramp=13), Refused.RELEASE),  # 17 ticks of 1.2 ms: 20.4 ms
+        (CONFIG._replace(cap=(24_001, 1)), Refused.CAP),
+        (CONFIG._replace(cap=(1, 20_001)), Refused.CAP),
+    ],
+)
+def test_a_config_that_does_not_suit_the_device_is_refused(config, reason):
+    rig = Rig(config=None)
+    rig.say(config)
+    assert rig.tick() == [Ack(config_crc(config), reason)]
+    assert rig.device.phase == Phase.SILENT
+    rig.say(config._replace(hold=4, ramp=12, cap=(24_000, 20_000), slew=(1, 1)))
+    assert rig.tick()[0].refused == Refused.ACCEPTED
+
+
+def test_a_config_is_refused_while_the_motors_may_carry_a_force():
+    rig = armed()
+    other = CONFIG._replace(theta=3)
+    for phase in (Phase.ARMED, Phase.HOLDING, Phase.HOLDING, Phase.HOLDING, Phase.HOLDING, Phase.RAMP, Phase.RAMP):
+        assert rig.device.phase == phase
+        rig.say(other)
+        ack, _ = rig.tick()
+        assert ack == Ack(config_crc(other), Refused.RUNNING)
+    assert rig.device.config == CONFIG
+
+
+def test_who_it_is_waits_until_the_motors_rest():
+    rig = armed()
+    rig.say(Hello())
+    heard = [type(m) for _ in range(12) for m in rig.tick() if rig.device.phase != Phase.STOPPED]
+    assert set(heard) == {State}
+    assert rig.device.phase == Phase.STOPPED
+    rig = armed()
+    rig.say(Hello(), Stop(Reason.DONE))
+    heard = [[type(m) for m in rig.tick()] for _ in range(5)]
+    assert heard == [[State]] * 3 + [[Info, State], [State]]
+
+
+def test_forces_before_arming_move_nothing_and_arming_needs_its_own_command():
+    rig = Rig()
+    for _ in range(10):
+        rig.answer((9000, 9000))
+        rig.tick()
+        assert rig.forces == (0, 0)
+    assert rig.at == (Phase.DISARMED, Cause.NONE)
+    rig.answer((1, 0), command=Command.ARM)  # ARM carries no force
+    rig.tick()
+    assert (rig.device.phase, rig.state.crc_errors) == (Phase.DISARMED, 1)
+    rig.arm()
+
+
+# ---- the latch -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("theta", [1, 2, 3, 15])
+@pytest.mark.parametrize("first_tick", [0, 65_500])
+def test_a_force_acts_at_tick_k_plus_theta_exactly(theta, first_tick):
+    """A staircase: 10 k answers tick k (counted from arming); at tick k the device carries 10 (k - theta)."""
+    rig = Rig(CONFIG._replace(theta=theta), first_tick)
+    rig.arm()
+    for k in range(60):
+        rig.answer((10 * k, -10 * k))
+        rig.tick()
+        due = max(0, 10 * (k + 1 - theta))
+        assert rig.forces == (due, -due)
+        assert rig.at == (Phase.ARMED, Cause.NONE)
+
+
+def test_reordered_frames_act_in_their_order_and_the_first_of_two_counts():
+    rig = armed(theta=3)
+    for k in range(30):
+        if k % 2:  # the answers to two ticks, the later one first
+            rig.answer((10 * k, 0))
+            rig.answer((10 * (k - 1), 0), back=1)
+            rig.answer((7, 7), back=1)
+        rig.tick()
+        if k >= 4:
+            assert rig.forces == (10 * (k - 2), 0)
+
+
+def test_late_early_and_misaddressed_frames_are_not_used():
+    rig = armed()
+    k = rig.device.k
+    rig.answer((100, 100))
+    rig.tick()
+    wrong = [(k, k - 1), (k + 1, k), (k + 3, k + 2), (k + 2, k), (k + 2, k + 2), (k + 0x8002, k + 0x8001)]
+    rig.say(*[Force(Command.RUN, a, s, (900, 900)) for a, s in wrong])
+    rig.tick()
+    assert (rig.forces, rig.device.phase) == ((100, 100), Phase.HOLDING)
+    assert rig.state.misses == (rig.device.misses) & 0xFF == 2  # this one, and the tick of the CONFIG
+
+
+def test_the_margin_says_how_long_before_its_latch_a_force_came():
+    for theta, after, margin in [(1, 300, 900), (2, 300, 2100), (15, 0, 18_000), (1, 1200, 0), (1, 60_000, -32_767)]:
+        rig = Rig(CONFIG._replace(theta=theta))
+        k = rig.device.k
+        rig.answer(command=Command.IDLE, after=after)
+        rig.tick()
+        assert (rig.state.echo, rig.state.margin_us) == (k, margin)
+        rig.tick()
+        assert (rig.state.echo, rig.state.margin_us) == (k, NO_MARGIN)
+    rig = Rig()
+    rig.tick()
+    rig.answer(command=Command.IDLE, back=1, after=100)  # the tick it was for began 100 us ago
+    rig.tick()
+    assert rig.state.margin_us == -100
+    assert rig.state.misses == 3
+
+
+# ---- the ways to rest ------------------------------------------------------------------------------------------------
+
+
+def test_the_watchdog_holds_four_ticks_then_ramps_to_zero():
+    """0.25 of the force a tick at ramp = 4: 4.8 ms at T = 1.2 ms."""
+    rig = armed()
+    rig.answer((1001, -999))
+    rig.tick()
+    seen = []
+    for _ in range(10):
+        rig.tick()
+        seen.append((rig.device.phase, rig.forces))
+    assert seen[:4] == [(Phase.HOLDING, (1001, -999))] * 4
+    assert seen[4:7] == [(Phase.RAMP, (750, -749)), (Phase.RAMP, (500, -499)), (Phase.RAMP, (250, -249))]
+    assert seen[7:] == [(Phase.STOPPED, (0, 0))] * 3
+    assert rig.at == (Phase.STOPPED, Cause.WATCHDOG)
+
+
+def test_holding_keeps_the_force_as_it_is_even_on_its_way():
+    """The slew rate was still letting it rise: nothing moves without a fresh frame."""
+    rig = armed(slew=(100, 100))
+    rig.answer((1000, -1000))
+    rig.tick()
+    for _ in range(4):
+        rig.tick()
+        assert rig.forces == (100, -100)
+
+
+def test_a_frame_in_time_ends_the_holding():
+    rig = armed()
+    for _ in range(20):
+        rig.answer((500, 500))
+        rig.tick()
+        for _ in range(4):
+            rig.tick()
+            assert (rig.device.phase, rig.forces) == (Phase.HOLDING, (500, 500))
+    rig.answer((400, 400))
+    rig.tick()
+    assert (rig.device.phase, rig.forces) == (Phase.ARMED, (400, 400))
+
+
+ENDINGS = {
+    Cause.HOST: lambda rig: rig.say(Stop(Reason.DONE)),
+    Cause.DEVICE: lambda rig: rig.device.fault(),
+    Cause.COMMAND: lambda rig: rig.answer(command=Command.IDLE),
+}
+
+
+@pytest.mark.parametrize("cause", ENDINGS)
+def test_every_stop_ramps_down_keeps_its_first_cause_and_never_runs_again_by_itself(cause):
+    rig = armed()
+    rig.answer((4000, 0))
+    rig.tick()
+    ENDINGS[cause](rig)
+    ramp = []
+    for _ in range(4):
+        rig.tick()
+        ramp.append(rig.forces[0])
+        rig.answer((9000, 9000))
+        rig.device.fault()
+        rig.say(Stop(Reason.FAULT))
+    assert ramp == [3000, 2000, 1000, 0]
+    for command in [Command.RUN] * 5 + [Command.ARM] * 5:
+        rig.answer((9000, 0) if command == Command.RUN else (0, 0), command=command)
+        rig.tick()
+        assert (rig.at, rig.forces) == ((Phase.STOPPED, cause), (0, 0))
+    rig.say(CONFIG)  # two deliberate steps: a new CONFIG, then ARM
+    rig.tick()
+    assert rig.at == (Phase.DISARMED, Cause.NONE)
+    rig.arm()
+
+
+def test_a_stop_before_arming_needs_no_ramp():
+    rig = Rig()
+    rig.say(Stop(200))  # a reason nobody knows stops all the same
+    rig.tick()
+    assert rig.at == (Phase.STOPPED, Cause.HOST)
+    rig = Rig(config=None)
+    rig.say(Stop(Reason.FAULT))
+    assert rig.tick() == []
+    assert rig.device.phase == Phase.SILENT
+
+
+@pytest.mark.parametrize(("press", "cause"), [("device", Cause.ESTOP_DEVICE), ("host", Cause.ESTOP_HOST)])
+def test_an_emergency_stop_is_zero_at_once_and_stays(press, cause):
+    rig = armed()
+    rig.answer((4000, 0))
+    rig.tick()
+    rig.answer((4000, 0))
+    if press == "device":
+        rig.device.estop()
+    else:
+        rig.say(Stop(Reason.ESTOP))
+    for command in (Command.RUN, Command.ARM, Command.IDLE):
+        rig.tick()
+        assert (rig.at, rig.forces) == ((Phase.ESTOP, cause), (0, 0))
+        rig.say(CONFIG, Stop(Reason.DONE), Stop(Reason.ESTOP), Hello())
+        rig.device.fault()
+        rig.device.estop()
+        rig.answer(command=command)
+    info, ack, _ = rig.tick()
+    assert (info, ack.refused) == (INFO, Refused.ESTOP)
+    assert rig.at == (Phase.ESTOP, cause)
+
+
+def test_an_emergency_stop_before_configuration_lets_nothing_be_configured():
+    rig = Rig(config=None)
+    rig.device.estop()
+    rig.say(CONFIG)
+    assert rig.tick() == [Ack(config_crc(CONFIG), Refused.ESTOP)]
+
+
+# ---- limits ----------------------------------------------------------------------------------------------------------
+
+
+def test_cap_and_slew_hold_per_axis_whatever_is_asked():
+    rig = armed(cap=(3000, 2000), slew=(700, 2500))
+    seen = []
+    for force in [(32_767, -32_768)] * 6 + [(-32_768, 32_767)] * 6:
+        rig.answer(force)
+        rig.tick()
+        seen.append(rig.forces)
+    assert [f for f, _ in seen] == [700, 1400, 2100, 2800, 3000, 3000, 2300, 1600, 900, 200, -500, -1200]
+    assert [f for _, f in seen] == [-2000] * 6 + [500] + [2000] * 5
+
+
+def test_the_cap_grows_from_zero_after_arming():
+    rig = armed(ramp_in=5, cap=(1000, 500))
+    seen = []
+    for _ in range(7):
+        rig.answer((20_000, -20_000))
+        rig.tick()
+        seen.append(rig.forces)
+    assert seen == [(200, -100), (400, -200), (600, -300), (800, -400), (1000, -500), (1000, -500), (1000, -500)]
+
+
+def test_counters_wrap():
+    rig = Rig()
+    for _ in range(300):
+        rig.device.receive(b"\x09nonsense\0", rig.now)
+        rig.tick()
+    assert (rig.state.crc_errors, rig.state.misses) == (300 % 256, 301 % 256)
+
+
+def test_frames_for_other_devices_are_counted_and_not_obeyed():
+    rig = armed()
+    k = rig.device.k
+    rig.say(Force(Command.RUN, k + 1, k, (900,)), Force(9, k + 1, k, (0, 0)), Ack(1, 0), INFO, rig.state)
+    rig.tick()
+    assert (rig.state.crc_errors, rig.forces, rig.device.phase) == (5, (0, 0), Phase.HOLDING)
+
+
+def test_an_info_that_cannot_travel_is_no_device():
+    with pytest.raises(ValueError, match=r"Info.period_ns: 1; 100000 to 100000000"):
+        Device(INFO._replace(period_ns=1))

@@ -1,0 +1,340 @@
+"""A device that does not do what it was told, or whose ticks are not T: found; one that obeys over a bad line: not."""
+
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+
+from hw.control import certified_couplings
+from hw.device import Device
+from hw.emulator import Emulator, FaultInjection, info_of, nobody
+from hw.faults import lively
+from hw.identify import chirp
+from hw.limits import Fault, Limits, Stage
+from hw.monitor import (
+    BLOCK,
+    PATIENCE,
+    Ages,
+    ClockDrift,
+    ClockMonitor,
+    CommandMonitor,
+    LinkSettings,
+    Measurement,
+    check_state,
+)
+from hw.protocol import NO_MARGIN, Ack, Command, Config, Force, Phase, Reason, State, Stop, config_crc, encode
+from hw.recording import Recorder, outcome, result_of
+from hw.rehearsal import Rehearsal
+from hw.session import Session
+from sim.scenario import load as scenario_of
+from sim.trace import growths
+
+T_US = 1200
+CONFIG = Config(2, 4, 5, 50, (20000, 20000), (600, 600))
+
+
+def state(tick, applied=(0, 0), phase=Phase.ARMED, t_us=0):
+    return State(phase, tick & 0xFFFF, 0, 100, 0, 0, t_us & 0xFFFFFFFF, (0, 0), applied)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_device_that_obeys_is_never_found_out(seed):
+    """Random forces through the device's own machine, forces and STATEs lost: ramp, slew, cap and hold all occur."""
+    rng = np.random.default_rng(seed)
+    device, told = Device(info_of(scenario_of())), CommandMonitor(CONFIG)
+    device.k = 65000  # it wraps around
+    device.configure(CONFIG)
+    last, held = None, 0
+    for now in range(0, 2000 * T_US, T_US):
+        applied, _ = device.tick(now, (0, 0))
+        if device.phase == Phase.RAMP:
+            break
+        held += device.phase == Phase.HOLDING
+        if rng.random() < 0.1:
+            continue  # a STATE is lost, so nothing answers it
+        seen = state(device.k, applied, device.phase)
+        ticks = 1 if last is None else (seen.tick - last) & 0xFFFF
+        last = seen.tick
+        assert not told.unlike(seen, ticks)
+        steps = tuple(int(n) for n in rng.integers(-30000, 30000, 2))
+        command = Command.RUN if device.phase != Phase.DISARMED else Command.ARM
+        steps = steps if command == Command.RUN else (0, 0)
+        told.tell(seen.tick, steps)
+        if rng.random() > 0.1:
+            device.accept(Force(command, (seen.tick + 2) & 0xFFFF, seen.tick, steps), now + 100)
+    assert device.run == CONFIG.ramp_in
+    assert held > 5
+
+
+@pytest.mark.parametrize(("phase", "force"), [(Phase.ARMED, (8000, 8000)), (Phase.HOLDING, (1, 0))])
+def test_a_force_that_nobody_asked_for_is_a_fault_after_a_few_ticks(phase, force):
+    told = CommandMonitor(CONFIG)
+    told.unlike(state(0), 1)
+    for tick in range(1, PATIENCE):
+        assert told.unlike(state(tick, (force[0] * tick, force[1]), phase), 1)
+    with pytest.raises(Fault, match=r"it was told None, and so for 5 ticks|holds a force for 5 ticks, 4 are agreed"):
+        told.unlike(state(PATIENCE, (force[0] * PATIENCE, force[1]), phase), 1)
+
+
+def test_a_device_that_is_wrong_every_other_tick_is_found_out_later():
+    told = CommandMonitor(CONFIG)
+    told.unlike(state(0), 1)
+    for tick in range(1, 9):
+        told.tell(tick - CONFIG.theta, (0, 0))
+        assert told.unlike(state(tick, (300 * (tick % 2), 0)), 1) == bool(tick % 2)
+    told.tell(9 - CONFIG.theta, (0, 0))
+    with pytest.raises(Fault, match="the device applies"):
+        told.unlike(state(9, (300, 0)), 1)
+
+
+def test_a_disarmed_device_has_no_force():
+    with pytest.raises(Fault, match=r"is disarmed and applies \(1, 0\) steps"):
+        check_state(state(0, (1, 0), Phase.DISARMED), CONFIG, Stage.DISARMED, 0.0)
+    check_state(state(0, (0, 0), Phase.DISARMED), CONFIG, Stage.DISARMED, 0.0)
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return lively(scenario_of())
+
+
+@pytest.fixture(scope="module")
+def rungs(scenario):
+    return certified_couplings(scenario, "I", None, None, 1, spare=0)
+
+
+def test_a_session_stops_where_a_disarmed_device_pushes(scenario, rungs):
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60))
+    Rehearsal(session, Emulator(scenario), lambda ages: rungs, arm=False).run(0.5)
+    assert session.stage == Stage.DISARMED
+    last = session.link.last
+    assert last
+    session.receive(encode(last._replace(tick=(last.tick + 1) & 0xFFFF, applied=(30000, -30000))), session.now)
+    assert (session.stage, session.cause) == (
+        Stage.STOPPED,
+        "the device is disarmed and applies (30000, -30000) steps",
+    )
+
+
+def test_an_obedient_device_on_a_bad_line_is_left_alone(scenario, rungs):
+    faults = tuple(
+        map(FaultInjection.parse, ("up:drop=0.05@0", "down:flip=0.05@0", "reorder=0.03@0", "duplicate=0.1@0"))
+    )
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60))
+    Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults).run_until_armed(1.5)
+    assert session.stage == Stage.ARMED
+    assert session.counters.misses > 50
+    assert session.counters.unlike == 0
+
+
+def hand_driven(scenario, rungs):
+    """A session at the first STATEs after arming, and what sends it one: `lie` is what the device's clock says."""
+    session, t, k = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=50, test_encoders=False)), 0, 0
+    session.start(t)
+    session.receive(encode(info_of(scenario)), t)
+    session.receive(encode(Ack(config_crc(session.config), 0)), t)
+
+    def send(phase, ticks=1, lasts=T_US, lie=None, counts=(0, 0), margin=17_900):
+        nonlocal t, k
+        t, k = t + lasts, k + ticks
+        clock = t if lie is None else lie
+        session.receive(encode(State(phase, k & 0xFFFF, 0, margin, 0, 0, clock & 0xFFFFFFFF, counts, (0, 0))), t)
+
+    while session.stage == Stage.MEASURING:
+        send(Phase.DISARMED)
+    session.load(rungs, t)
+    session.receive(encode(Ack(config_crc(session.config), 0)), t)
+    send(Phase.DISARMED)
+    session.arm(t)
+    send(Phase.DISARMED)
+    return session, send
+
+
+def test_a_leap_of_the_tick_number_skips_neither_ramp_nor_jump(scenario, rungs):
+    session, send = hand_driven(scenario, rungs)
+    for _ in range(6):
+        send(Phase.ARMED)
+    assert 0 < session.gain < 0.03
+    assert session.drive
+    gain = session.drive.gain
+    send(Phase.ARMED, ticks=300, counts=(89_000, 0))
+    assert (session.stage, session.cause) == (Stage.STOPPED, "the tick number leapt by 300, the watchdog allows 5")
+    assert gain.value < 0.03
+    session, send = hand_driven(scenario, rungs)
+    assert session.stage == Stage.ARMING  # a leap before the first force is none of its business
+    send(Phase.ARMED, ticks=300)
+    assert session.stage == Stage.STOPPED
+
+
+def test_a_device_that_stops_telling_margins_is_stopped(scenario, rungs):
+    """It applies what it is told and counts no miss, but whether answers come in time nobody knows any more."""
+    session, send = hand_driven(scenario, rungs)
+    for _ in range(250):
+        send(Phase.ARMED)
+    assert session.stage == Stage.ARMED
+    silent = 0
+    while session.stage == Stage.ARMED and silent < 200:
+        send(Phase.ARMED, margin=NO_MARGIN)
+        silent += 1
+    assert silent == 181
+    assert session.stage == Stage.STOPPED
+    assert session.cause == "90 % of the last 200 STATEs told no margin: nobody can say how late answers are"
+
+
+def test_a_device_that_keeps_every_other_state_to_itself_is_stopped(scenario, rungs):
+    """A force is judged from one tick to the next: where a fifth of the ticks is untold, nobody can."""
+    session, send = hand_driven(scenario, rungs)
+    for _ in range(250):
+        send(Phase.ARMED)
+    told = 0
+    while session.stage == Stage.ARMED and told < 100:
+        send(Phase.ARMED, ticks=2, lasts=2 * T_US)
+        told += 1
+    assert told == 41
+    assert session.stage == Stage.STOPPED
+    assert session.cause == "no STATE came of 20 % of 200 ticks: nobody can say what the device did"
+
+
+def test_a_device_that_holds_longer_than_agreed_is_stopped(scenario, rungs):
+    session, send = hand_driven(scenario, rungs)
+    for _ in range(250):
+        send(Phase.ARMED)
+    for _ in range(session.config.hold):
+        send(Phase.HOLDING)
+    assert session.stage == Stage.ARMED
+    send(Phase.HOLDING)
+    assert (session.stage, session.cause) == (Stage.STOPPED, "the device holds a force for 5 ticks, 4 are agreed")
+
+
+def test_an_emergency_stop_is_told_until_the_device_has_latched_it(scenario, rungs):
+    session, _ = hand_driven(scenario, rungs)
+    session.estop("space bar", 0)
+    told = session.receive(encode(State(Phase.DISARMED, 900, 0, 0, 0, 0, 0, (0, 0), (0, 0))), 0)
+    assert told == encode(Stop(Reason.ESTOP))
+    assert session.receive(encode(State(Phase.ESTOP, 901, 0, 0, 0, 0, 0, (0, 0), (0, 0))), 0) == b""
+
+
+@pytest.mark.parametrize("configuring", [False, True])
+def test_a_device_that_drives_before_anybody_asked_is_told_to_stop(scenario, configuring):
+    session = Session(scenario, Limits((12.0, 12.0)))
+    session.start(0)
+    if configuring:
+        session.receive(encode(info_of(scenario)), 0)
+    driving = State(Phase.ARMED, 5, 0, 100, 0, 0, 0, (0, 0), (12_000, 0))
+    assert encode(Stop(Reason.DONE if configuring else Reason.FAULT)) in session.receive(encode(driving), 1000)
+    assert session.stage == (Stage.CONFIGURING if configuring else Stage.CONNECTING)
+    session.receive(encode(driving._replace(tick=70)), 70_000)
+    if configuring:
+        assert (session.stage, session.cause) == (Stage.STOPPED, "the device drives, and nobody asked it to")
+
+
+def test_a_clock_that_is_made_of_ticks_is_found_by_the_host(scenario, rungs):
+    """The device's clock says T, its STATEs come every 2 T: 10 % of 200 ticks are behind after 20 of them."""
+    session, send = hand_driven(scenario, rungs)
+    assert session.link.last
+    begun = session.link.last.t_us
+    for n in range(1, 60):
+        send(Phase.ARMED, lasts=2 * T_US, lie=begun + n * T_US)
+        if session.stage != Stage.ARMING:
+            break
+    assert session.stage == Stage.STOPPED
+    assert "by the host's clock" in session.cause
+    assert n <= 30
+
+
+def run_clock(ticks):
+    """A clock whose ticks last so long [us], and which wraps around."""
+    pace, t = ClockDrift("its own", T_US, 0.01, 6000), 2.0**32 - 1e5
+    for lasts in ticks:
+        pace.note(round(t) & 0xFFFFFFFF, 1)
+        t += lasts
+
+
+@pytest.mark.parametrize(("factor", "found"), [(1.005, False), (0.995, False), (1.012, True), (0.988, True)])
+def test_a_percent_of_a_block_is_told_apart(factor, found):
+    with pytest.raises(Fault, match="by its own clock") if found else nullcontext():
+        run_clock([factor * T_US] * 3 * BLOCK)
+
+
+def test_one_freeze_is_no_drift_and_many_are():
+    once = [T_US + 4000 * (n == 50) for n in range(BLOCK)]
+    run_clock(once)
+    with pytest.raises(Fault, match="by its own clock"):
+        run_clock([T_US + 4000 * (n in (50, 60)) for n in range(BLOCK)])
+    with pytest.raises(Fault, match="by its own clock"):
+        run_clock([T_US, -5000, T_US])  # a clock that goes back
+
+
+def test_gaps_within_the_watchdog_are_allowed():
+    clock = ClockMonitor(Limits((12.0,)), 1e-6 * T_US)
+    for n in (0, 5, 6, 11, 12):
+        clock.check(state(n, t_us=n * T_US), 5 if n in (5, 11) else 1, n * T_US)
+    with pytest.raises(Fault, match="leapt by 6"):
+        clock.check(state(18, t_us=18 * T_US), 6, 18 * T_US)
+
+
+@pytest.mark.parametrize("misses", [0, 1])
+def test_a_measurement_without_answers_ends(scenario, misses):
+    """Whether or not the device counts what it does not hear."""
+    session, most = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=50)), 8 * 50 + 2 * 15
+    session.start(0)
+    session.receive(encode(info_of(scenario)), 0)
+    session.receive(encode(Ack(config_crc(session.config), 0)), 0)
+    for k in range(1, most + 1):
+        silent = State(Phase.DISARMED, k, 0, NO_MARGIN, 0, k * misses & 0xFF, k * T_US, (0, 0), (0, 0))
+        session.receive(encode(silent), k * T_US)
+    assert session.stage == Stage.REFUSED
+    assert "100 % of the answers never reached the device" in session.cause
+
+
+def test_answers_that_never_arrive_count_in_the_quantile():
+    ages = Ages(tuple(range(100, 190)), missing=10)
+    assert ages.quantile(0.5) == 150
+    assert ages.quantile(0.89) == 189
+    with pytest.raises(Fault, match=r"10 % of the answers never arrived: no delay keeps 95 %"):
+        ages.quantile(0.95)
+
+
+def test_a_link_that_brings_several_forces_at_once_is_measured():
+    """A USB frame of 1 ms with T = 0.3 ms: one margin for three FORCEs, of which none is missed."""
+    measurement = Measurement(50, 15, 3e-4, 0.2)
+    for k in range(1, 1000):
+        state = State(Phase.DISARMED, k, 0, 0, 0, 0, 300 * k, (0, 0), (0, 0))
+        if measurement.note(state, 3500 if k % 3 == 0 else None, 0):
+            break
+    assert measurement.result == Ages((1000,) * 50, 0)
+
+
+def test_an_identification_closes_no_loop_that_could_grow(scenario):
+    recorder = Recorder(2)
+    session = Session(scenario, Limits((1.0, 1.0)), LinkSettings(measure=50))
+    session.record = recorder
+    tune = chirp(2, scenario.T, 1, 1.0, (3, 200), 0.5)
+    Rehearsal(session, Emulator(nobody(scenario)), lambda ages: [tune]).run_until_armed(0.6)
+    report = outcome("identify", session, recorder, 0)
+    assert len(recorder) > 400
+    assert report["growth"] == report["run"]["steady_ticks"] == []
+    assert growths(result_of(recorder, session.units, scenario.T, report)) == []
+
+
+def test_an_estop_is_repeated_where_nobody_says_that_it_was_heard(scenario):
+    """The first STOP may be lost, and the STATEs that would show it too."""
+    session = Session(scenario, Limits((12.0, 12.0)))
+    session.start(0)
+    stop = encode(Stop(Reason.ESTOP))
+    assert session.estop("pressed", 1000) == stop
+    sent = [session.poll(1000 + t) for t in range(0, 60_000, 100)]
+    assert sent.count(stop) == pytest.approx(50_000 / 1200, abs=1)
+    session.receive(encode(info_of(scenario)), 70_000)
+    assert session.poll(80_000) == b""
+
+
+def test_a_force_that_a_resting_device_applies_is_told_to_stop(scenario):
+    """Its status says disarmed, its motors do not."""
+    session = Session(scenario, Limits((12.0, 12.0)))
+    session.start(0)
+    session.receive(encode(info_of(scenario)), 0)
+    pushing = State(Phase.DISARMED, 5, 0, 100, 0, 0, 0, (0, 0), (12_000, 0))
+    assert encode(Stop(Reason.DONE)) in session.receive(encode(pushing), 1000)
+    session.receive(encode(pushing._replace(tick=70)), 70_000)
+    assert session.stage == Stage.STOPPED

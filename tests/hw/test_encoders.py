@@ -1,0 +1,197 @@
+"""Encoders that do not follow: found on every axis, at arming and while forces act; a hand that holds still: not."""
+
+from pathlib import Path
+from runpy import run_path
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from hw.control import certified_couplings
+from hw.emulator import Emulator, FaultInjection, nobody
+from hw.faults import lively
+from hw.limits import Fault, Limits, Stage
+from hw.monitor import EncoderMonitor, EncoderTest, LinkSettings
+from hw.rehearsal import Rehearsal
+from hw.session import Session
+from sim.scenario import InputError
+from sim.scenario import load as scenario_of
+
+T = 1.2e-3
+STEP = 4e-4  # [N]
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return lively(scenario_of())
+
+
+@pytest.fixture(scope="module")
+def rungs(scenario):
+    return certified_couplings(scenario, "I", None, None, 1, spare=0)
+
+
+def session_with(scenario, rungs, *faults, seconds=1.0, place=None, encoder_step=None, **settings):
+    if encoder_step:
+        devices = tuple(replace(d, encoder_step=encoder_step) for d in scenario.device)
+        scenario = scenario.replace(device=devices)
+    faults = tuple(map(FaultInjection.parse, faults))
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60, **settings))
+    emulator = Emulator(scenario, faults)
+    if place is not None:  # where the handles are before anything begins
+        emulator.plant.s[: emulator.plant.scene.model.nq] = place
+    rehearsal = Rehearsal(session, emulator, lambda ages: rungs, faults)
+    rehearsal.run_until_armed(seconds)
+    return session, rehearsal
+
+
+# at arming
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+@pytest.mark.parametrize("kind", ["freeze", "toggle"])
+def test_a_dead_encoder_is_found_at_arming(scenario, rungs, kind, axis):
+    """Before the gain has risen at all: nobody has felt more than the test force."""
+    session, rehearsal = session_with(scenario, rungs, f"axis{axis}:{kind}")
+    assert session.stage == Stage.STOPPED
+    assert session.cause.startswith(f"encoder of axis {axis} does not follow: it moved by ")
+    assert max(np.abs(m.applied).max() for m in rehearsal.moments) <= 1.0
+    assert Stage.ARMED not in [event.stage for event in session.log]
+
+
+def test_both_dead_encoders_are_found_at_arming(scenario, rungs):
+    assert "axis 1 does not follow" in session_with(scenario, rungs, "freeze", "axis2:freeze")[0].cause
+
+
+@pytest.mark.parametrize(("step", "most"), [(1e-6, 0.04), (1e-5, 0.1), (1e-4, 0.4)])
+@pytest.mark.parametrize("held", [True, False])
+def test_live_encoders_answer_a_force_that_one_hardly_feels(scenario, rungs, step, most, held):
+    """Newtons until encoders of 1 to 100 um have answered, held by the scenario's hands and free."""
+    still = scenario if held else nobody(scenario)
+    forces = []
+    session = Session(still, Limits((12.0, 12.0)), LinkSettings(measure=60))
+    devices = tuple(replace(d, encoder_step=step) for d in still.device)
+    session.record = lambda row: forces.append(row.test or (0.0, 0.0))
+    Rehearsal(session, Emulator(still.replace(device=devices)), lambda ages: rungs).run_until_armed(0.5)
+    assert session.stage == Stage.ARMED
+    assert 0 < np.abs(forces).max() <= most
+
+
+@pytest.mark.parametrize("cap", [0.05, 12.0])
+def test_the_test_force_alternates_grows_and_stays_within_the_cap(cap):
+    test, forces = EncoderTest((cap, cap), T), []
+    told = f"axis 2 does not follow: it moved by 1 counts at a test force of up to {min(1, cap):g} N"
+    ticks = iter(range(1000))
+
+    def play():
+        for k in ticks:
+            forces.append(test.force((k, k % 2), 1))
+
+    with pytest.raises(Fault, match=told):
+        play()
+    moved, still = np.array(forces[2:]).T
+    assert not moved.any()
+    assert np.abs(still).max() == pytest.approx(min(1.0, cap), rel=0.01)
+    assert still.max() > 0 > still.min()
+    assert abs(still.sum()) < 0.5 * np.abs(still).sum()  # a free handle is not pushed away
+
+
+# while forces act
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+@pytest.mark.parametrize("kind", ["freeze", "toggle"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_dead_encoder_is_found_while_forces_act(scenario, rungs, kind, axis, sign):
+    """People who begin in either direction; the axis with the dead encoder is named, within 0.5 s."""
+    turned = tuple(
+        replace(h, voluntary=replace(h.voluntary, phase=h.voluntary.phase + np.pi * (sign < 0))) for h in scenario.human
+    )
+    session, _ = session_with(scenario.replace(human=turned), rungs, f"axis{axis}:{kind}@0.45", seconds=1.2)
+    assert session.stage == Stage.STOPPED
+    assert session.cause.startswith(f"encoder of axis {axis} does not follow: it stands still")
+    assert 1e-6 * (session.log[-1].t_us - session.log[-2].t_us) < 0.7
+
+
+@pytest.mark.parametrize("axis", [1, 2])
+@pytest.mark.parametrize("most", [4.0, -4.0])
+def test_a_saturated_encoder_is_found(scenario, rungs, axis, most):
+    session, _ = session_with(scenario, rungs, f"axis{axis}:saturate={most}@0.3", seconds=2.0)
+    assert session.stage == Stage.STOPPED
+    assert session.cause.startswith((f"encoder of axis {axis} does not follow", f"encoder {axis} jumped"))
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize(("newton", "after"), [(1.05, 0.1), (5.0, 0.02), (0.95, None)])
+def test_the_impulse_decides(axis, sign, newton, after):
+    """1 N for 100 ms, 5 N for 20 ms: an impulse of 0.1 N s, since the last motion; less than 1 N never."""
+    monitor, applied = EncoderMonitor((1e-6, 1e-6), (STEP, STEP), T), [0, 0]
+    monitor.check((0, 0), applied, 1)
+    applied[axis] = sign * round(newton / STEP)
+
+    def stand_still(ticks):
+        for k in range(1, ticks + 1):  # the other axis moves
+            monitor.check((2 * k * (axis == 1), 2 * k * (axis == 0)), applied, 1)
+
+    if after is None:
+        return stand_still(1000)
+    stand_still(round(0.9 * after / T))
+    with pytest.raises(Fault, match=f"axis {axis + 1} does not follow"):
+        stand_still(round(0.2 * after / T) + 1)
+    return None
+
+
+def test_a_coarse_encoder_gets_the_time_that_a_heavy_hand_needs_to_turn():
+    """8 sqrt(q M F) with 0.1 mm, 2.5 kg and 5 N is 0.283 N s, 57 ms: 48 ticks."""
+    monitor = EncoderMonitor((1e-4,), (STEP,), T)
+    monitor.check((0,), (0,), 1)
+
+    def stand_still(ticks):
+        for _ in range(ticks):
+            monitor.check((0,), (12_500,), 1)
+
+    stand_still(47)
+    with pytest.raises(Fault, match="axis 1 does not follow"):
+        stand_still(1)
+
+
+def test_a_motion_of_two_counts_begins_anew():
+    monitor = EncoderMonitor((1e-6,), (STEP,), T)
+    for k in range(2000):
+        monitor.check((2 * (k // 15),), (2500 * (k % 2),), 1)  # 1 N up and down, two counts every 18 ms
+
+
+def test_no_still_hold_is_stopped():
+    """Some of the 10,000 holds of tests/benchmarks/still_holds.py, which runs them all."""
+    still_holds = run_path(str(Path(__file__).parent.parent / "benchmarks/still_holds.py"))["still_holds"]
+    assert still_holds(300, seed=1)[0] == 0
+
+
+# positions count from where the handles are
+
+
+@pytest.mark.parametrize("place", [0.03, -0.03])
+def test_handles_off_centre_are_left_in_peace(scenario, rungs, place):
+    """Both free at 30 mm, of either sign: counted from there no force acts; counted from the middle newtons do."""
+    still = nobody(scenario)
+    session, rehearsal = session_with(still, rungs, place=place, seconds=0.5)
+    assert session.stage == Stage.ARMED
+    assert max(np.abs(m.applied).max() for m in rehearsal.moments) < 0.5
+    told = [event.cause for event in session.log if event.cause.startswith("positions count from")]
+    assert told == [f"positions count from where the handles are: {1e3 * place:+.4g}, {1e3 * place:+.4g} mm"]
+    away, rehearsal = session_with(still, rungs, place=place, seconds=0.5, rereference=False)
+    assert max(np.abs(m.applied).max() for m in rehearsal.moments) > 3
+    assert not any("positions count" in event.cause for event in away.log)
+
+
+def test_the_range_counts_from_the_middle_all_the_same(scenario, rungs):
+    session, _ = session_with(nobody(scenario), rungs, "axis2:jump=99.5", "axis1:jump=-101", seconds=0.2)
+    assert "encoder 1 is at -101 mm, its range is" in session.cause
+
+
+def test_a_fault_of_an_axis_that_is_not_there_is_refused(scenario):
+    with pytest.raises(ValueError, match="is for axis3, the scenario has 2 channels"):
+        Emulator(scenario, (FaultInjection.parse("axis3:freeze"),))
+    with pytest.raises(InputError, match="does not happen to one axis"):
+        FaultInjection.parse("axis1:drop=0.5")

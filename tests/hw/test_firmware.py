@@ -1,0 +1,629 @@
+"""hw/firmware against hw/device.py, byte for byte, and the example sketch on a board that is only memory."""
+
+import ctypes
+import os
+import random
+import re
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+from zlib import crc32
+
+import pytest
+
+from hw.device import Device
+from hw.protocol import (
+    LAYOUTS,
+    READ,
+    Ack,
+    Cause,
+    Command,
+    Config,
+    Decoder,
+    Force,
+    Hello,
+    Info,
+    Phase,
+    Reason,
+    Refused,
+    State,
+    Stop,
+    encode,
+    pack,
+)
+
+ROOT = Path(__file__).parent.parent.parent
+HEADER, HARNESS = ROOT / "hw/firmware", ROOT / "tests/firmware"
+STRICT = ["-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-pedantic", "-Werror"]
+GCC, GXX = shutil.which("gcc"), shutil.which("g++")
+needs_gcc = pytest.mark.skipif(GCC is None, reason="gcc is not installed: haptic_link.h is not compiled here")
+needs_gxx = pytest.mark.skipif(GXX is None, reason="g++ is not installed: example.ino is not compiled here")
+
+SERIAL, MAX_OUT = 77, 1024
+
+
+def build(*arguments: str | Path) -> None:
+    done = subprocess.run([str(a) for a in arguments], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    path = tmp_path_factory.mktemp("firmware") / "harness.so"
+    build(GCC, "-std=c99", "-O2", *STRICT, "-fPIC", "-shared", f"-I{HEADER}", HARNESS / "harness.c", "-o", path)
+    lib = ctypes.CDLL(str(path))
+    lib.harness_size.restype = lib.harness_tick.restype = ctypes.c_size_t
+    lib.harness_receive.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_size_t, ctypes.c_uint32]
+    return lib
+
+
+def info(axes: int, period_ns: int = 1_200_000) -> Info:
+    limits = tuple(24000 - 1000 * a for a in range(axes))
+    return Info(
+        1,
+        "harness",
+        SERIAL,
+        period_ns,
+        (1_370_000,) * axes,
+        (10_000_000,) * axes,
+        (500,) * axes,
+        limits,
+        (8000,) * axes,
+    )
+
+
+class Firmware:
+    """The C side with the interface of hw.device.Device."""
+
+    def __init__(self, library, about: Info) -> None:
+        self.lib, self.axes = library, about.axes
+        self.memory = ctypes.create_string_buffer(library.harness_size())
+        self.counts, self.force = (ctypes.c_int32 * about.axes)(), (ctypes.c_int16 * about.axes)()
+        self.out = ctypes.create_string_buffer(MAX_OUT)
+        columns = zip(
+            about.osp_damping, about.encoder_step, about.force_step, about.hard_limit, about.range, strict=True
+        )
+        values = (ctypes.c_uint32 * (5 * about.axes))(*[v for axis in columns for v in axis])
+        name = about.firmware.encode()
+        self.good = library.harness_init(self.memory, name, about.serial, about.period_ns, about.axes, values)
+
+    def tick(self, now, counts):
+        self.counts[:] = counts
+        n = self.lib.harness_tick(self.memory, now, self.counts, self.force, self.out)
+        return tuple(self.force), self.out.raw[:n]
+
+    def receive(self, data, now):
+        self.lib.harness_receive(self.memory, data, len(data), now)
+
+    def estop(self):
+        self.lib.harness_estop(self.memory)
+
+    def fault(self):
+        self.lib.harness_fault(self.memory)
+
+
+class Traffic:
+    """A host with lapses and a line with faults: what is done to a device between two of its ticks, from a seed."""
+
+    def __init__(self, seed: int, device: Device) -> None:
+        self.rng, self.device = random.Random(seed), device
+        self.theta = self.rng.choice((1, 1, 2, 3, 15))
+        self.loss, self.trouble = self.rng.choice((0.0, 0.05, 0.5)), self.rng.choice((0.0, 0.02, 0.2))
+        self.recent: list[bytes] = []
+
+    def config(self) -> Config:
+        axes, rng = self.device.info.axes, self.rng
+        cap = tuple(rng.randint(1, limit) for limit in self.device.info.hard_limit)
+        slew = tuple(rng.choice((1, 500, 4800, 65535)) for _ in range(axes))
+        return Config(self.theta, rng.randint(0, 4), rng.randint(1, 6), rng.choice((0, 0, 3, 100)), cap, slew)
+
+    def force(self) -> Force:
+        """What a good host would say now."""
+        d, rng = self.device, self.rng
+        source = d.k
+        command, force = rng.choice((Command.IDLE, Command.ARM)), (0,) * d.info.axes
+        if d.phase != Phase.DISARMED and rng.random() < 0.95:
+            command, force = Command.RUN, struct.unpack(f"<{d.info.axes}h", rng.randbytes(2 * d.info.axes))
+        return Force(command, shifted(source, d.config.theta if d.config else self.theta), source, force)
+
+    def oddity(self) -> bytes:
+        """A well-formed message that is wrong here and now, or a wrong frame."""
+        rng, d, good = self.rng, self.device, self.force()
+        axes, (code, size) = rng.randint(1, 8), rng.choice(list(READ))
+        late = rng.choice((-1, -2, 1, 2, 300, 0x8000, rng.randint(0, 0xFFFF)))
+        choices = [
+            lambda: encode(self.config()),
+            lambda: framed(self.config()._replace(theta=rng.choice((0, 16, 255)))),
+            lambda: framed(self.config()._replace(ramp=rng.choice((0, 200)))),
+            lambda: framed(self.config()._replace(cap=(rng.choice((0, 65535)),) * d.info.axes)),
+            lambda: encode(self.config()._replace(cap=tuple(c + rng.randint(0, 1) for c in d.info.hard_limit))),
+            lambda: framed(self.config()._replace(slew=(0,) * d.info.axes)),
+            lambda: encode(Config(1, 4, 4, 0, (100,) * axes, (100,) * axes)),
+            lambda: encode(Hello(rng.randint(0, 255))),
+            lambda: encode(good._replace(apply_at=shifted(good.apply_at, late), source=shifted(good.source, late))),
+            lambda: encode(good._replace(apply_at=shifted(good.apply_at, late))),
+            lambda: encode(
+                good._replace(command=rng.choice((0, 1, 2, 3, 255)), force=(rng.randint(-9, 9),) * d.info.axes)
+            ),
+            lambda: encode(good._replace(force=(0,) * axes)),
+            lambda: encode(good) + encode(good._replace(force=(0,) * d.info.axes)),
+            lambda: encode(State(rng.choice((1, 0x22, 0x77)), 1, 1, 1, 1, 1, 1, (1,) * axes, (1,) * axes)),
+            lambda: encode(Ack(rng.getrandbits(32), 0)),
+            lambda: d.info_frame,
+            lambda: enclosed(bytes([code]) + rng.randbytes(size - rng.choice((0, 1, 1, 1, 2)))),
+            lambda: enclosed(bytes([LAYOUTS[Config].code]) + rng.randbytes(5 + 4 * rng.randint(8, 10))),
+            lambda: rng.randbytes(rng.randint(1, 400)),
+            lambda: rng.randbytes(rng.choice((174, 175, 176, 177, 600))).replace(b"\0", b"\1"),
+            lambda: bytes(rng.randint(0, 3)),
+            lambda: mutated(rng, encode(good)),
+            lambda: mutated(rng, encode(self.config())),
+        ]
+        return rng.choice(choices)()
+
+    def between_ticks(self, now: int) -> list[tuple]:
+        """Operations ("R", now, bytes), ("E",), ("F",)."""
+        rng, d, ops, data = self.rng, self.device, [], b""
+        if d.phase in (Phase.SILENT, Phase.STOPPED, Phase.ESTOP) and rng.random() < 0.3:
+            data += encode(self.config())
+        if rng.random() >= self.loss:
+            data += encode(self.force())
+        if rng.random() < self.trouble:
+            data += self.oddity() if rng.random() < 0.9 else encode(Stop(rng.choice((0, 1, 2, 77))))
+        if rng.random() < (0.2 if d.phase == Phase.ESTOP else self.trouble / 10):
+            ops.append(rng.choice([("E",), ("F",), ("F",), ("F",), ("R", now, encode(Stop(Reason.ESTOP)))]))
+        cut = rng.randint(0, len(data))
+        return [("R", now + rng.randint(0, 300), data[:cut]), *ops, ("R", now + rng.randint(300, 3000), data[cut:])]
+
+
+def shifted(tick: int, by: int) -> int:
+    return (tick + by) & 0xFFFF
+
+
+def framed(message) -> bytes:
+    """encode() without its checks."""
+    return enclosed(pack(message))
+
+
+def enclosed(payload: bytes) -> bytes:
+    """A frame around any payload."""
+    blocks = (payload + struct.pack("<I", crc32(payload))).split(b"\0")
+    return b"".join(bytes([len(block) + 1]) + block for block in blocks) + b"\0"
+
+
+def mutated(rng: random.Random, frame: bytes) -> bytes:
+    data = bytearray(frame)
+    for _ in range(rng.randint(1, 3)):
+        at = rng.randrange(len(data) or 1)
+        match rng.randrange(4):
+            case 0 if data:
+                data[at] ^= 1 << rng.randrange(8)
+            case 1:
+                del data[at : at + rng.randint(1, 3)]
+            case 2:
+                data[at:at] = rng.randbytes(rng.randint(1, 3))
+            case _:
+                data = data[: at + 1]
+    return bytes(data)
+
+
+def episode(seed: int, ticks: int, silent: int = 0) -> tuple[Info, list[tuple], list[tuple], set]:
+    """Plays traffic to the Python device: its info, the operations, its answers to ("T", now, counts), its states."""
+    rng = random.Random(seed)
+    about = info(rng.randint(1, 8), rng.choice((100_000, 333_333, 1_200_000, 1_200_000, 2_000_001)))
+    device, now, period = Device(about), rng.choice((0, 2**32 - 50_000)), about.period_ns // 1000
+    traffic, script, answers, seen, latched = Traffic(seed, device), [], [], set(), 0
+    for number in range(silent + ticks):
+        ops = traffic.between_ticks(now) if number >= silent else []
+        now = (now + period) & 0xFFFFFFFF
+        counts = struct.unpack(f"<{about.axes}i", rng.randbytes(4 * about.axes)) if ops else (0,) * about.axes
+        for op in ops:
+            play(device, op)
+        answers.append(device.tick(now, counts))
+        script += [*ops, ("T", now, counts)]
+        seen.add((device.phase, device.cause))
+        latched += device.phase == Phase.ESTOP
+        if latched > 50:  # nothing can happen any more
+            break
+    return about, script, answers, seen
+
+
+def play(device, op: tuple):
+    match op:
+        case ("R", now, data):
+            device.receive(data, now & 0xFFFFFFFF)
+        case ("T", now, counts):
+            return device.tick(now, counts)
+        case ("E",):
+            device.estop()
+        case ("F",):
+            device.fault()
+    return None
+
+
+def described(answer) -> str:
+    return f"{answer[0]} {Decoder().feed(answer[1])} {answer[1].hex(' ')}"
+
+
+EPISODES = [(seed, 400, 0) for seed in range(int(os.environ.get("HAPTIC_FUZZ_EPISODES", "50")))]
+EPISODES.append((1_000_000, 1500, 64_800))  # crosses tick 65535
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    return [episode(*e) for e in EPISODES]
+
+
+def test_the_traffic_visits_every_state_cause_and_refusal(episodes):
+    """Otherwise the comparison below would not mean what it says."""
+    phases, causes = zip(*set().union(*(seen for *_, seen in episodes)), strict=True)
+    assert set(phases) == set(Phase)
+    assert set(causes) == set(Cause)
+    answers = [a for _, _, answered, _ in episodes for a in answered]
+    messages = [m for _, sent in answers for m in Decoder().feed(sent)]
+    assert {m.refused for m in messages if isinstance(m, Ack)} == set(Refused)
+    states = [m for m in messages if isinstance(m, State)]
+    assert any(m.margin_us > 0 for m in states)
+    assert any(-0x7FFF < m.margin_us < 0 for m in states)
+    last = [m for _, sent in episodes[-1][2] for m in Decoder().feed(sent) if isinstance(m, State)]
+    ticks = [m.tick for m in last if m.phase == Phase.ARMED]
+    assert max(ticks) == 0xFFFF
+    assert min(ticks) < 10
+    assert max(m.crc_errors for m in states) > 20
+    assert any(isinstance(m, Info) for m in messages)
+    assert sum(any(forces) for forces, _ in answers) > 2000
+
+
+@needs_gcc
+def test_the_c_side_equals_the_python_side_byte_for_byte(library, episodes):
+    compared = 0
+    for (seed, *_), (about, script, answers, _) in zip(EPISODES, episodes, strict=True):
+        firmware, expected = Firmware(library, about), iter(answers)
+        for op in script:
+            answer = play(firmware, op)
+            if op[0] == "T":
+                want = next(expected)
+                assert answer == want, f"seed {seed}, tick {compared}: {described(answer)} for {described(want)}"
+                compared += len(want[1]) > 0
+    assert compared > 12_000
+
+
+@needs_gcc
+def test_no_sanitizer_complains(tmp_path, episodes):
+    """The same traffic, with the same answers, through an executable with AddressSanitizer and UBSan."""
+    program = tmp_path / "harness"
+    sanitize = ["-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-DHARNESS_MAIN"]
+    try:
+        build(GCC, "-std=c99", *STRICT, *sanitize, f"-I{HEADER}", HARNESS / "harness.c", "-o", program)
+    except AssertionError as failed:
+        if "cannot find" in str(failed):
+            pytest.skip("this gcc comes without libasan or libubsan")
+        raise
+    for about, script, answers, _ in episodes:
+        done = subprocess.run([program], input=written(about, script), capture_output=True)
+        assert done.returncode == 0, done.stderr.decode()
+        force = struct.Struct(f"<{about.axes}h")
+        assert done.stdout == b"".join(struct.pack("<H", len(out)) + out + force.pack(*f) for f, out in answers)
+
+
+def written(about: Info, script: list[tuple]) -> bytes:
+    """A script as the harness reads it from standard input."""
+    columns = zip(about.osp_damping, about.encoder_step, about.force_step, about.hard_limit, about.range, strict=True)
+    out = [struct.pack("<III", about.serial, about.period_ns, about.axes)]
+    out += [struct.pack("<5I", *axis) for axis in columns]
+    for op in script:
+        out.append(struct.pack("<I", ord(op[0])))
+        if op[0] == "R":
+            out.append(struct.pack("<II", op[1] & 0xFFFFFFFF, len(op[2])) + op[2])
+        elif op[0] == "T":
+            out.append(struct.pack(f"<I{about.axes}i", op[1], *op[2]))
+    return b"".join(out)
+
+
+@needs_gcc
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"period_ns": 99_999},
+        {"period_ns": 100_000_001},
+        {"encoder_step": (0, 1)},
+        {"force_step": (1, 0)},
+        {"hard_limit": (0, 1)},
+        {"hard_limit": (32768, 1)},
+        {"range": (1, 0)},
+    ],
+    ids=str,
+)
+def test_a_firmware_with_impossible_numbers_never_runs(library, wrong):
+    firmware = Firmware(library, info(2)._replace(**wrong))
+    assert not firmware.good
+    firmware.receive(encode(Config(1, 4, 4, 0, (100, 100), (100, 100))), 0)
+    forces, sent = firmware.tick(0, (0, 0))
+    (ack,) = Decoder().feed(sent)
+    assert isinstance(ack, Ack)
+    assert ack.refused == Refused.ESTOP
+    assert forces == (0, 0)
+    assert Firmware(library, info(2)).good
+
+
+@needs_gcc
+def test_the_headers_need_no_library_no_float_and_no_heap(tmp_path):
+    """Only C99 headers that every compiler has; an object file's undefined symbols say what it calls."""
+    text = (HEADER / "haptic_frame.h").read_text() + (HEADER / "haptic_link.h").read_text()
+    assert sorted(line for line in text.splitlines() if line.startswith("#include")) == [
+        '#include "haptic_frame.h"',
+        "#include <stdbool.h>",
+        "#include <stddef.h>",
+        "#include <stdint.h>",
+        "#include <string.h>",
+    ]
+    flags = ["-std=c99", "-O0", "-fno-stack-protector", "-fno-pie", f"-I{HEADER}"]
+    build(GCC, *flags, "-c", HARNESS / "harness.c", "-o", tmp_path / "harness.o")
+    symbols = subprocess.run(["nm", "-u", tmp_path / "harness.o"], capture_output=True, text=True, check=True).stdout
+    needed = {line.split()[-1].removeprefix("_") for line in symbols.splitlines()}
+    assert needed == {"memcpy", "memset", "strncpy"}  # strncpy: the harness itself
+    assert not re.search(r"\b(float|double)\b", text.split("#include", 1)[1])
+
+
+SKETCH_PINS = {"encoder A": 2, "encoder B": 3, "pwm": (9, 10), "direction": (7, 8), "enable": 6, "stop": 11}
+
+
+class Sketch:
+    """example.ino on the stub board, looped every 50 us."""
+
+    def __init__(self, path: Path) -> None:
+        self.lib = ctypes.CDLL(str(path))
+        self.lib.stub_sent.restype = ctypes.c_size_t
+        self.now, self.decoder = 0, Decoder()
+        self.lib.stub_setup()
+
+    def feed(self, message) -> None:
+        data = encode(message)
+        self.lib.stub_feed(data, ctypes.c_size_t(len(data)))
+
+    def run(self, us: int) -> list:
+        """The messages of the next `us` microseconds."""
+        for _ in range(us // 50):
+            self.now += 50
+            self.lib.stub_loop(ctypes.c_ulong(self.now))
+        out = ctypes.create_string_buffer(65536)
+        n = self.lib.stub_sent(out, ctypes.c_size_t(65536))
+        return self.decoder.feed(out.raw[:n])
+
+    def pin(self, pin: int) -> int:
+        return self.lib.stub_pin(pin)
+
+
+@pytest.fixture(scope="module")
+def compiled_sketch(tmp_path_factory):
+    path = tmp_path_factory.mktemp("sketch") / "sketch.so"
+    sources = [HEADER / "example.ino", HARNESS / "stub.cpp"]
+    build(
+        GXX, "-std=c++11", *STRICT, "-fPIC", "-shared", f"-I{HARNESS}", f"-I{HEADER}", "-x", "c++", *sources, "-o", path
+    )
+    return path
+
+
+@pytest.fixture
+def sketch(compiled_sketch, tmp_path):
+    """A board just switched on: a library under a new name has memory of its own."""
+    return Sketch(Path(shutil.copy(compiled_sketch, tmp_path)))
+
+
+@needs_gxx
+def test_the_example_sketch_arms_follows_and_stops(sketch):
+    assert sketch.run(12_000) == []  # silent until configured
+    sketch.feed(Hello())
+    (about,) = sketch.run(1200)
+    assert (about.axes, about.period_ns, about.firmware) == (2, 1_200_000, "example 1")
+    assert sketch.lib.stub_resolution() == 12  # a step of force is a step of the PWM
+    assert about.hard_limit == (4095, 4095)
+    strongest = [n * step / 1e6 for n, step in zip(about.hard_limit, about.force_step, strict=True)]
+    assert strongest == pytest.approx([12.0] * 2, rel=1e-3)  # which the host allows it to be short of
+    sketch.feed(Config(1, 4, 4, 0, (4095, 4095), (4095, 4095)))
+    ack, state = sketch.run(1200)
+    assert ack.refused == Refused.ACCEPTED
+    for command, force in [(Command.ARM, (0, 0)), *[(Command.RUN, (2048, -4095))] * 3]:
+        sketch.feed(Force(command, (state.tick + 1) & 0xFFFF, state.tick, force))
+        (state,) = sketch.run(1200)
+    assert (state.phase, state.applied) == (Phase.ARMED, (2048, -4095))
+    assert [sketch.pin(p) for p in SKETCH_PINS["pwm"]] == [2048, 4095]
+    assert [sketch.pin(p) for p in SKETCH_PINS["direction"]] == [0, 1]
+    assert sketch.pin(SKETCH_PINS["enable"]) == 1
+    *_, state = sketch.run(12_000)  # no host: the watchdog
+    assert (state.phase, state.cause, state.applied) == (Phase.STOPPED, Cause.WATCHDOG, (0, 0))
+    assert sketch.pin(SKETCH_PINS["enable"]) == 0
+
+
+@needs_gxx
+def test_the_example_sketch_counts_edges_and_obeys_its_button(sketch):
+    sketch.feed(Config(1, 4, 4, 0, (4095, 4095), (4095, 4095)))
+    sketch.run(1200)
+    for level_b, level_a in [(0, 1), (1, 0), (0, 1), (1, 0), (1, 1)]:  # A after B: falling counts, the last one back
+        sketch.lib.stub_set_pin(SKETCH_PINS["encoder B"], level_b)
+        sketch.lib.stub_set_pin(SKETCH_PINS["encoder A"], level_a)
+    (state,) = sketch.run(1200)
+    assert state.counts == (-3, 0)
+    sketch.lib.stub_set_pin(SKETCH_PINS["stop"], 1)
+    (state,) = sketch.run(1200)
+    assert (state.phase, state.cause) == (Phase.ESTOP, Cause.ESTOP_DEVICE)
+    sketch.lib.stub_set_pin(SKETCH_PINS["stop"], 0)
+    (state,) = sketch.run(1200)
+    assert state.phase == Phase.ESTOP
+
+
+@needs_gxx
+def test_the_example_sketch_does_not_wait_for_a_host_that_reads_nothing_nor_catch_up(sketch):
+    sketch.feed(Config(1, 4, 4, 0, (4095, 4095), (4095, 4095)))
+    sketch.run(1200)
+    sketch.lib.stub_room(0)
+    assert sketch.run(12_000) == []
+    sketch.lib.stub_room(1000)
+    assert [state.tick for state in sketch.run(1200)] == [11, 12]  # the newest that waited, and the next one
+    sketch.now += 100_000  # the board was held up for 83 periods
+    (state,) = sketch.run(1200)
+    assert (state.tick, state.phase, state.cause) == (13, Phase.STOPPED, Cause.DEVICE)
+
+
+@needs_gxx
+@pytest.mark.parametrize("room", [1, 31, 63])
+def test_a_board_with_a_small_write_buffer_sends_whole_frames(sketch, room):
+    """A pass of the loop every 50 us: 24 pieces in a period. What has no time to leave is dropped whole."""
+    sketch.lib.stub_room(room)
+    sketch.feed(Hello(7))
+    (about,) = [m for m in sketch.run(10_000) if isinstance(m, Info)]
+    assert about.axes == 2
+    sketch.feed(Config(1, 4, 4, 0, (4095, 4095), (4095, 4095)))
+    sketch.run(4_000)
+    ticks = [m.tick for m in sketch.run(12_000)]
+    assert len(ticks) == 10 if room > 1 else 4 <= len(ticks) < 10
+    assert ticks == sorted(set(ticks))
+
+
+@needs_gxx
+def test_the_boards_watchdog_is_fed_by_ticks_and_nothing_else(sketch):
+    """Ticks feed it; a loop that turns on a clock that stands still, or one that hangs, does not."""
+    sketch.run(100_000)
+    assert not sketch.lib.stub_bites()
+    text = (HEADER / "example.ino").read_text()
+    loop = text[text.index("void loop()") :]
+    assert text.count("watchdogFeed();") == loop.count("watchdogFeed();") == 1
+    assert loop.index("not due yet") < loop.index("watchdogFeed();") > loop.index("writeForces(force);")
+
+
+# the rules of docs/protocol.md that no frame shows, on both sides
+
+
+@pytest.fixture(params=["python", pytest.param("c", marks=needs_gcc)])
+def device(request):
+    """Two axes of either side, ticked by hand, with what it last said."""
+    make = Device if request.param == "python" else lambda about: Firmware(request.getfixturevalue("library"), about)
+    return Hand(make(info(2)))
+
+
+class Hand:
+    def __init__(self, device) -> None:
+        self.device, self.now, self.k = device, 0, 0
+
+    def tell(self, *messages, after=100) -> None:
+        self.device.receive(b"".join(framed(m) for m in messages), self.now + after)
+
+    def tick(self, ticks=1) -> list:
+        said = []
+        for _ in range(ticks):
+            self.now, self.k = self.now + 1200, self.k + 1
+            self.force, out = self.device.tick(self.now, (0, 0))
+            said = Decoder().feed(out)
+        return said
+
+    def state(self, ticks=1):
+        return next(m for m in self.tick(ticks) if isinstance(m, State))
+
+    def armed(self, theta=2, hold=4, ramp=5, force=(1000, -1000)):
+        self.tell(Config(theta, hold, ramp, 0, (20000, 20000), (20000, 20000)))
+        self.tick()
+        for command, steps in [(Command.ARM, (0, 0))] + [(Command.RUN, force)] * (theta + 2):
+            self.answer(command, steps, theta)
+            self.tick()
+        return self
+
+    def answer(self, command, steps, theta):
+        self.tell(Force(command, shifted(self.k, theta), self.k, steps))
+
+
+@pytest.mark.parametrize(("theta", "hold", "ramp"), [(1, 4, 5), (2, 4, 5), (3, 0, 1), (15, 2, 8)])
+def test_after_the_hosts_death_zero_comes_after_theta_hold_and_ramp(device, theta, hold, ramp):
+    device.armed(theta, hold, ramp)
+    device.answer(Command.RUN, (1000, -1000), theta)  # the last one
+    forces = []
+    for _ in range(theta + hold + ramp + 1):
+        device.tick()
+        forces.append(device.force)
+    assert forces[-3 if ramp > 1 else -4] != (0, 0)
+    assert (
+        forces.index((0, 0)) == theta + hold + ramp - 1
+    )  # the tick (theta + hold + ramp) T after the last STATE answered
+    assert forces[theta + hold - 1] == (1000, -1000)
+
+
+def test_a_ramp_is_the_same_at_zero_force(device):
+    """RAMP at zero force lasts as long as any other, and refuses a CONFIG as any other."""
+    device.armed(theta=1, ramp=5, force=(0, 0))
+    device.tell(Stop(0))
+    phases = []
+    for _ in range(5):
+        device.tell(Config(1, 4, 5, 0, (1, 1), (1, 1)))
+        said = device.tick()
+        phases.append(next(m.phase for m in said if isinstance(m, State)))
+        assert device.force == (0, 0)
+    assert phases == [Phase.RAMP] * 4 + [Phase.STOPPED]
+
+
+def test_an_emergency_stop_takes_the_place_of_an_earlier_cause(device):
+    device.armed()
+    device.tell(Stop(0))
+    device.device.fault()
+    assert device.state().cause == Cause.HOST  # the first one stays
+    device.tell(Stop(Reason.ESTOP))
+    state = device.state()
+    assert (state.phase, state.cause) == (Phase.ESTOP, Cause.ESTOP_HOST)
+    device.device.estop()
+    assert device.state().cause == Cause.ESTOP_HOST  # of emergency stops the first stays, too
+
+
+def test_what_late_double_and_wrong_theta_forces_leave_behind(device):
+    """Late: echo and a margin below zero, no force. Double and wrong theta: nothing at all. None counts as an error."""
+    device.armed(theta=2)
+    before = device.state()
+    k = device.k
+    device.tell(Force(2, shifted(k, -1), shifted(k, -3), (7, 7)))
+    state = device.state()
+    assert (state.echo, state.applied) == (shifted(k, -3), before.applied)
+    assert state.margin_us < 0
+    device.armed(theta=2)
+    k = device.k
+    device.tell(Force(2, shifted(k, 2), k, (500, 0)))
+    device.tell(Force(2, shifted(k, 2), k, (600, 0)), after=200)
+    device.tell(Force(2, shifted(k, 1), k, (700, 0)), after=300)
+    state = device.state()
+    assert (state.echo, state.margin_us) == (k, 2300)  # of the first one
+    assert device.state().applied == (500, 0)
+    assert state.crc_errors == before.crc_errors
+
+
+def test_a_force_before_config_is_dropped_silently(device):
+    device.tell(Force(2, 3, 2, (5, 5)))
+    assert device.tick() == []
+    device.tell(Config(1, 4, 5, 0, (9, 9), (9, 9)))
+    state = device.state()
+    assert (state.crc_errors, state.margin_us, state.phase) == (0, -32768, Phase.DISARMED)
+
+
+def test_a_hello_of_another_version_is_answered(device):
+    """It is for the host to refuse; so it can say why."""
+    device.tell(Hello(9))
+    (about,) = device.tick()
+    assert (type(about), about.version) == (Info, 1)
+
+
+def test_a_config_leaves_the_counters_and_forgets_the_forces(device):
+    device.armed(theta=2)
+    device.device.receive(b"\x05nonsense\0", device.now)
+    device.tell(Force(2, shifted(device.k, 2), device.k, (500, 0)), Stop(0))
+    before = device.state(8)
+    assert before.misses > 0
+    assert before.crc_errors == 1
+    device.tell(Config(3, 4, 5, 0, (9, 9), (9, 9)))
+    state = device.state()
+    assert (state.crc_errors, state.tick) == (1, before.tick + 1)
+    assert state.misses == before.misses + 1  # disarmed, this tick had no force
+    assert (state.echo, state.margin_us, state.applied) == (0, -32768, (0, 0))
+
+
+def test_a_line_of_text_before_a_frame_costs_that_frame_at_most(device):
+    """Boot messages, and the noise of another baud rate, up to the next delimiter."""
+    device.device.receive(b"Booting v1.2 ...\r\n", 0)
+    device.tell(Hello())
+    assert device.tick() == []
+    device.tell(Hello())
+    assert [type(m) for m in device.tick()] == [Info]

@@ -1,0 +1,201 @@
+"""Identification on the emulated device, in virtual time: known parameters come back, and a bound is a lower bound."""
+
+from types import SimpleNamespace
+
+import msgspec
+import numpy as np
+import pytest
+
+from cli.identify import main as identify_command
+from hw.emulator import Emulator, FaultInjection, nobody
+from hw.identify import capped, chirp, estimate, held, identify, worth
+from hw.limits import Limits, Stage
+from hw.monitor import LinkSettings
+from hw.recording import Recorder
+from hw.rehearsal import Rehearsal
+from hw.session import Session
+from models.device import RigidDevice
+from sim.scenario import InputError, load
+from sim.trace import Trace
+
+STEP = 5e-6  # [m] a coarse encoder: half of an Omega's 0.01 mm
+
+
+def record_of(scenario, *faults):
+    """A chirp of 1 N and a release, recorded through the whole link."""
+    recorder = Recorder(scenario.channels)
+    session = Session(
+        scenario.replace(delta=(1e-6,) * scenario.channels), Limits((1.0, 1.0)), LinkSettings(measure=100)
+    )
+    session.record = recorder
+    excitation = chirp(scenario.channels, scenario.T, 1, 1.0, (3.0, 200.0), 1.5)
+    faults = tuple(map(FaultInjection.parse, faults))
+    rehearsal = Rehearsal(session, Emulator(nobody(scenario)), lambda ages: [excitation], faults)
+    rehearsal.run_until_armed(excitation.seconds + 0.1)
+    assert session.stage == Stage.ARMED
+    assert np.abs(recorder.link()["sent"]).max() <= 2500  # the chirp's own amplitude is the cap: 1 N in 0.4 mN
+    return recorder, session
+
+
+def test_known_parameters_come_back():
+    """A compliant and a rigid device, neither of them the ones the search begins with.
+
+    Estimates to 0.2 %: the rounded encoder leaves standard errors of a few hundredths of a per cent, and the last part
+    of the release is cut off.
+    """
+    scenario = load()
+    compliant = msgspec.structs.replace(
+        scenario.device[0],
+        damping=0.8,
+        motor_mass=0.08,
+        handle_mass=0.3,
+        transmission_stiffness=9000.0,
+        encoder_step=STEP,
+    )
+    scenario = scenario.replace(device=(compliant, RigidDevice(mass=0.16, damping=2.0, encoder_step=STEP)))
+    recorder, session = record_of(scenario)
+    first, second = estimate(recorder, session, scenario)
+    assert first.mass == pytest.approx(0.38, rel=2e-3)
+    assert first.motor_mass == pytest.approx(0.08, rel=2e-3)
+    assert first.viscous == pytest.approx(0.8, rel=2e-3)
+    assert first.stiffness == pytest.approx(9000.0, rel=2e-3)
+    reduced = 0.08 * 0.3 / 0.38
+    assert first.mode_hz == pytest.approx(np.sqrt(9000.0 / reduced) / (2 * np.pi), rel=2e-3)
+    assert second.mass == pytest.approx(0.16, rel=2e-3)
+    assert second.viscous == pytest.approx(2.0, rel=2e-3)
+    assert (second.stiffness, second.mode_hz) == (None, None)
+    for found, true in ((first, 0.8), (second, 2.0)):
+        assert found.coulomb == pytest.approx(0.0, abs=1e-3)  # [N], of a chirp of 1 N
+        assert 0.99 * true < found.delta <= true
+        assert found.steps < 0.5  # rounding alone leaves 1/sqrt(12) = 0.29
+
+
+def played(force, T, mass, b, c, substeps=64):
+    """One mass with dry friction, by semi-implicit Euler in small steps: nothing of the fit's own integration."""
+    x, v, out, h = 0.0, 0.0, [], T / substeps
+    for f in force:
+        out.append(x)
+        for _ in range(substeps):
+            v += h * (f - b * v - c * np.tanh(v / 0.002)) / mass
+            x += h * v
+    return np.array(out)
+
+
+def test_dry_friction_is_told_from_viscous():
+    """Bounds of the estimate: 10 % of c and 2 % of b, since the record has few cycles in which dry friction rules."""
+    T = 1.2e-3
+    force = chirp(1, T, 1, 1.0, (3.0, 60.0), 1.5).signal[:, 0]
+    x = np.round(played(force, T, 0.25, 1.37, 0.1) / STEP) * STEP
+    found = identify(x, force, np.ones(x.size, dtype=bool), T, STEP, rigid=True)
+    assert found.coulomb == pytest.approx(0.1, rel=0.1)
+    assert found.viscous == pytest.approx(1.37, rel=0.02)
+    assert found.delta < found.viscous
+
+
+def test_a_record_that_the_model_does_not_explain_gives_no_bound():
+    """A spring to ground, which a hand at the handle is."""
+    T = 1.2e-3
+    force = chirp(1, T, 1, 1.0, (3.0, 60.0), 1.0).signal[:, 0]
+    x, s = np.zeros(force.size), np.zeros(2)
+    for k, f in enumerate(force):
+        x[k] = s[0]
+        for _ in range(32):
+            s[1] += T / 32 * (f - 1.37 * s[1] - 300.0 * s[0]) / 0.25
+            s[0] += T / 32 * s[1]
+    with pytest.raises(ValueError, match=r"encoder steps rms unexplained"):
+        identify(x, force, np.ones(x.size, dtype=bool), T, STEP, rigid=True)
+
+
+def test_an_axis_that_does_not_move_gives_nothing():
+    with pytest.raises(ValueError, match="moved by 0 encoder steps"):
+        identify(np.zeros(100), np.ones(100), np.ones(100, dtype=bool), 1e-3, STEP, rigid=True)
+
+
+def test_a_record_with_gaps_gives_no_bound():
+    scenario = load()
+    recorder, session = record_of(scenario, "up:drop=0.01@0.4")
+    with pytest.raises(ValueError, match="ticks came without a STATE"):
+        estimate(recorder, session, scenario)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--band", "200,3"], "--band is 200,3"),
+        (["--band", "3,1000"], "within 0.5 to 333 Hz"),
+        (["--force", "20"], "--force is 20, allowed are 0.05 to 6"),
+        (["--coulomb", "-1"], "--coulomb is -1"),
+    ],
+)
+def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as error:
+        identify_command(["--emulate", *options])
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize(("viscous", "suspicious"), [(1.37, False), (1.49, False), (1.52, True)])
+def test_more_damping_than_declared_asks_who_holds_it(viscous, suspicious):
+    """A hand that damps looks like the device: only the declared 1.37 N s/m can say so, with 10 % allowed."""
+    scenario = load()
+    session = Session(scenario, Limits((1.0, 1.0)), LinkSettings())
+    estimate = SimpleNamespace(viscous=viscous, delta=1.36)
+    warnings = held([estimate], scenario, session)
+    assert len(warnings) == suspicious
+    if suspicious:
+        assert "is somebody holding it?" in warnings[0]
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    """A rigid device with the encoder of example.ino, a standstill after the release and little friction."""
+    T, step = 1.2e-3, 1e-5
+    force = chirp(1, T, 1, 1.0, (3.0, 200.0), 2.5).signal[:, 0]
+    return T, step, force, played(force, T, 0.3, 0.5, 0.02)
+
+
+def test_bounds_hold_wherever_the_encoder_stands(coarse):
+    """Five origins within a step. All bounds must be below the truth: with the standstill as 1000 samples, half were
+    above. Nor may they be far below, or they would be of no use: three standard errors of 0.5 %, as measured.
+    """
+    T, step, force, exact = coarse
+    for origin in np.arange(0.1, 1.0, 0.2):
+        x = step * np.round(exact / step + origin)
+        found = identify(x, force, np.ones(x.size, dtype=bool), T, step, rigid=True)
+        assert 0.97 * 0.5 < found.delta <= 0.5
+        assert abs(found.viscous - 0.5) < 3 * found.errors["viscous"]
+
+
+def test_a_standstill_counts_as_few_samples():
+    counts = np.array([0] * 100 + [0, 1] * 50 + [3, 5, 7])
+    weight = worth(counts)
+    assert weight[:200].sum() == pytest.approx(5)  # noise of one count is a standstill too
+    assert weight[200:] == pytest.approx(1)
+
+
+def test_a_bound_never_exceeds_what_is_declared(coarse):
+    T, step, force, exact = coarse
+    x = step * np.round(exact / step)
+    found = identify(x, force, np.ones(x.size, dtype=bool), T, step, rigid=True)
+    scenario = load("omega-pair-rigid")
+    little = msgspec.structs.replace(scenario.device[0], damping=0.48, delta=None)
+    scenario = scenario.replace(device=(little, little), delta=(0.48, 0.48))
+    session = Session(scenario, Limits((1.0, 1.0)), LinkSettings())
+    assert held([found], scenario, session) == []  # 4 % more than declared is not yet a hand
+    assert found.delta > 0.48
+    assert [e.delta for e in capped([found], scenario, session)] == [0.48]
+
+
+def test_a_record_that_cannot_tell_the_frictions_apart_gives_no_bound():
+    """A short record of small motions, a few encoder steps long."""
+    T, step = 1.2e-3, 5e-5
+    force = chirp(1, T, 1, 1.0, (8.0, 60.0), 0.5).signal[:, 0]
+    x = step * np.round(played(force, T, 0.5, 0.3, 0.05) / step + 0.3)
+    with pytest.raises(ValueError, match="does not tell viscous from dry friction"):
+        identify(x, force, np.ones(x.size, dtype=bool), T, step, rigid=True)
+
+
+def test_a_trace_whose_forces_have_another_shape_is_refused():
+    two, one = np.zeros((3, 2)), np.zeros((3, 1))
+    with pytest.raises(ValueError, match="f has 1 channels, x has 2"):
+        Trace(np.arange(3.0), x=two, f=one, x_handle=two, v_handle=two, w=two, meta={})

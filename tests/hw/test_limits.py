@@ -1,0 +1,340 @@
+"""What the host never does: limits, finite numbers, jumps, gains; and the arithmetic of the line."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hw.limits import (
+    DRIVING,
+    ENDED,
+    Fault,
+    Gain,
+    Heat,
+    Limits,
+    Stage,
+    Units,
+    _wire_time,
+    check_jolt,
+    check_jump,
+    check_range,
+    check_speed,
+    configuration,
+    objections,
+    probe_delay,
+    shape,
+    watchdog_for,
+)
+from hw.monitor import CommandMonitor, check_state
+from hw.protocol import MAX_RELEASE_NS, Config, Force, Info, Phase, State, encode
+from sim.scenario import load
+
+LIMITS = Limits((12.0, 6.0))
+T = 1.2e-3
+numbers = st.floats(allow_nan=True, allow_infinity=True)
+INFO = Info(1, "test", 7, 1_200_000, (1_370_000,) * 2, (10**6,) * 2, (400,) * 2, (30000,) * 2, (10**5,) * 2)
+
+
+@given(st.tuples(numbers, numbers), st.tuples(numbers, numbers), st.floats(0, 1))
+def test_no_force_leaves_that_is_not_finite_and_within_the_cap(asked, previous, gain):
+    """Python's max and min let nan through as the cap: shape never does, whatever comes."""
+    before = tuple(
+        max(-cap, min(cap, p)) if math.isfinite(p) else 0.0 for p, cap in zip(previous, LIMITS.cap, strict=True)
+    )
+    if not all(map(math.isfinite, asked)):
+        with pytest.raises(Fault, match="which is no force"):
+            shape(asked, before, gain, LIMITS, T)
+        return
+    shaped = shape(asked, before, gain, LIMITS, T)
+    for force, last, cap in zip(shaped.force, before, LIMITS.cap, strict=True):
+        assert abs(force) <= cap
+        assert abs(force - last) <= LIMITS.slew * T * (1 + 1e-12)  # one rounding of last +- step
+
+
+def test_the_trap_that_the_order_of_checks_avoids():
+    assert max(-12.0, min(12.0, math.nan)) == 12.0
+    with pytest.raises(Fault, match="asked for nan, 0 N, which is no force"):
+        shape((math.nan, 0.0), (0.0, 0.0), 0.0, LIMITS, T)
+
+
+def test_a_force_within_the_limits_is_left_alone():
+    shaped = shape((1.0, -2.0), (0.5, -1.0), 1.0, LIMITS, T)
+    assert shaped.force == (1.0, -2.0)
+    assert (shaped.clipped, shaped.slowed) == (False, False)
+
+
+@pytest.mark.parametrize("gain", [math.nan, -0.01, 1.01])
+def test_an_impossible_gain_is_a_fault(gain):
+    with pytest.raises(Fault, match="the gain is"):
+        shape((1.0, 1.0), (0.0, 0.0), gain, LIMITS, T)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("slew", 2001.0),
+        ("jump", 4e-3),
+        ("watchdog_us", 50_000),
+        ("ramp_in", 0.01),
+        ("ramp_out", 1.0),
+        ("slew", math.nan),
+    ],
+)
+def test_limits_cannot_be_loosened(field, value):
+    with pytest.raises(ValueError, match=field):
+        Limits((12.0,), **{field: value})
+
+
+def test_no_cap_above_twelve_newtons():
+    with pytest.raises(ValueError, match=r"cap\[1\] is 13"):
+        Limits((12.0, 13.0))
+
+
+@pytest.mark.parametrize(("moved", "ticks", "fault"), [(2.9e-3, 1, False), (3.1e-3, 1, True), (5.9e-3, 2, False)])
+def test_jumps_are_measured_per_tick(moved, ticks, fault):
+    if fault:
+        with pytest.raises(Fault, match=r"encoder 2 jumped by 3\.1 mm, allowed are 3 mm in 1 tick"):
+            check_jump((0.0, moved), (0.0, 0.0), ticks, LIMITS)
+    else:
+        check_jump((0.0, moved), (0.0, 0.0), ticks, LIMITS)
+
+
+@pytest.mark.parametrize("x", [math.nan, math.inf])
+def test_a_displacement_that_is_no_number_never_passes(x):
+    with pytest.raises(Fault):
+        check_jump((x,), (0.0,), 1, LIMITS)
+    with pytest.raises(Fault):
+        check_range((x,), (0.1,))
+
+
+def test_the_gain_takes_its_time():
+    gain = Gain(LIMITS, T)
+    ticks = 0
+    while gain.value < 1:
+        gain.rise()
+        ticks += 1
+    assert ticks == math.ceil(LIMITS.ramp_in / T)
+    while gain.value > 0:
+        gain.fall()
+        ticks -= 1
+    assert ticks == math.ceil(LIMITS.ramp_in / T) - math.ceil(LIMITS.ramp_out / T)
+
+
+def test_no_stage_is_both_an_end_and_driving():
+    assert not ENDED & DRIVING
+    assert Stage.DISARMED not in ENDED | DRIVING
+
+
+@pytest.mark.parametrize(
+    ("baud", "microseconds"), [(921_600, 520.8), (2_000_000, 240.0), (115_200, 4166.7)]
+)  # section 14's figures
+def test_wire_time_is_what_the_frames_take(baud, microseconds):
+    seconds, text = _wire_time(baud, 2)
+    assert 1e6 * seconds == pytest.approx(microseconds, abs=0.1)
+    state = State(0, 0, 0, 0, 0, 0, 0, (0, 0), (0, 0))
+    bits = 10 * (len(encode(state)) + len(encode(Force(0, 0, 0, (0, 0)))))  # what really goes over the wire
+    assert seconds == bits / baud
+    assert f"{microseconds:.0f} us" in text
+
+
+def test_115200_baud_is_refused_with_the_arithmetic():
+    reasons = objections(INFO, load(), Limits((12.0, 12.0)), 115_200)
+    assert reasons == [
+        "one STATE and one FORCE take (32 + 16) bytes x 10 bits / 115200 baud = 4167 us, more than T = 1200 us "
+        "(of a link without UART say --baud none)"
+    ]
+
+
+def test_a_fitting_device_meets_no_objection():
+    assert objections(INFO, load(), Limits((12.0, 12.0)), 921_600) == []
+
+
+def test_every_objection_is_named():
+    poor = INFO._replace(period_ns=10**6, osp_damping=(1_370_000, 10**6), hard_limit=(15000, 30000))
+    reasons = objections(poor, load(), Limits((12.0, 12.0)), 115_200)
+    assert len(reasons) == 4
+    for reason, word in zip(reasons, ("1000000 ns", "baud", "axis 1 can do 6 N", "axis 2 guarantees 1"), strict=True):
+        assert word in reason
+
+
+@given(st.integers(100_000, 20_000_000))
+def test_the_configuration_never_exceeds_the_protocol(period_ns):
+    config = configuration(INFO._replace(period_ns=period_ns), LIMITS, 1)
+    encode(config)  # raises where a field cannot travel
+    assert config.cap == (30000, 15000)  # 12 N and 6 N in steps of 0.4 mN
+    assert (config.hold + config.ramp) * period_ns <= MAX_RELEASE_NS
+
+
+def test_the_wire_carries_what_the_motor_does():
+    """The device gets -f, in whole steps, and never more than the cap."""
+    units = Units.of(INFO)
+    assert units.steps((1.0, -2.0), (30000, 30000)) == (-2500, 5000)
+    assert units.steps((100.0, -100.0), (30000, 15000)) == (-30000, 15000)
+    assert units.forces((-2500, 5000)) == pytest.approx((1.0, -2.0))
+    assert units.positions((1000, -1)) == pytest.approx((1e-3, -1e-6))
+    assert units.reach == pytest.approx((0.1, 0.1))
+
+
+def test_the_probe_is_the_longest_delay_whose_margin_can_be_told():
+    assert probe_delay(1.2e-3) == 15
+    assert probe_delay(5e-3) == 6
+    with pytest.raises(ValueError, match=r"T is 0\.05 s"):
+        probe_delay(0.05)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"encoder_step": (0, 1_000_000)}, "encoder step of axis 1 is 0, allowed are 1 to 4294967295"),
+        ({"force_step": (400, 0)}, "force step of axis 2 is 0"),
+        ({"hard_limit": (65535, 30000)}, "hard limit of axis 1 is 65535, allowed are 1 to 32767"),
+        ({"range": (-100, 100_000)}, "range of axis 1 is -100"),
+        ({"force_step": (11_999_999, 400)}, "one force step of axis 1 is 12 N, at most 0.75 N is allowed"),
+        (
+            {"encoder_step": (1_000_000, 400_000_000)},
+            "one encoder count of axis 2 is 0.4 mm, at most 0.3 mm",
+        ),
+    ],
+)
+def test_a_device_too_coarse_or_impossible_is_refused(change, reason):
+    assert any(reason in one for one in objections(INFO._replace(**change), load(), Limits((12.0, 12.0)), None))
+
+
+def test_a_force_step_is_never_more_than_the_slew_limit():
+    """Else one step, the least that can be sent, would be the jump that the limit is there against."""
+    slow = Limits((12.0, 12.0), slew=100.0)  # 0.12 N in a tick
+    assert objections(INFO._replace(force_step=(100_000, 100_000), hard_limit=(120, 120)), load(), slow, None) == []
+    (reason,) = objections(INFO._replace(force_step=(130_000, 100_000), hard_limit=(120, 120)), load(), slow, None)
+    assert "0.13 N, at most 0.12 N" in reason
+
+
+def test_an_encoder_that_shakes_is_found_though_no_step_is_too_large():
+    limits = Limits((12.0,))
+    check_jolt((2e-3,), (0.0,), (0.0,), limits)  # a jump that the other check allows, too
+    check_jolt((4e-3,), (2e-3,), (0.0,), limits)  # at constant speed
+    with pytest.raises(Fault, match=r"encoder 1 shakes: its speed changed by 5\.8 mm in a tick, allowed are 3 mm"):
+        check_jolt((2.9e-3,), (0.0,), (2.9e-3,), limits)
+    with pytest.raises(Fault, match="shakes"):
+        check_jolt((float("nan"),), (0.0,), (0.0,), limits)
+
+
+# every check, on every channel and for both signs
+
+
+MIRRORED = [(channel, sign) for channel in (0, 1) for sign in (1, -1)]
+
+
+def on(channel, value, rest=0.0):
+    return tuple(value if i == channel else rest for i in (0, 1))
+
+
+@pytest.mark.parametrize(("channel", "sign"), MIRRORED)
+def test_every_motion_check_is_for_both_channels_and_signs(channel, sign):
+    for name, inside, outside, check in (
+        (f"encoder {channel + 1} jumped by", 2.9e-3, 3.1e-3, lambda x: check_jump(x, (0.0, 0.0), 1, LIMITS)),
+        (f"encoder {channel + 1} shakes", 2.9e-3, 3.1e-3, lambda x: check_jolt(x, (0.0, 0.0), (0.0, 0.0), LIMITS)),
+        (f"encoder {channel + 1} shakes", 1.4e-3, 1.6e-3, lambda x: check_jolt((0.0, 0.0), x, (0.0, 0.0), LIMITS)),
+        (f"encoder {channel + 1} shakes", 2.9e-3, 3.1e-3, lambda x: check_jolt((0.0, 0.0), (0.0, 0.0), x, LIMITS)),
+        (f"encoder {channel + 1} is at", 0.099, 0.101, lambda x: check_range(x, (0.1, 0.1))),
+        (f"axis {channel + 1} moves at", 9.9e-3, 10.1e-3, lambda x: check_speed(x, (0.0, 0.0), 0.01, LIMITS)),
+        (f"axis {channel + 1} moves at", 9.9e-3, 10.1e-3, lambda x: check_speed((0.0, 0.0), x, 0.01, LIMITS)),
+    ):
+        check(on(channel, sign * inside))
+        with pytest.raises(Fault, match=name):
+            check(on(channel, sign * outside))
+
+
+@pytest.mark.parametrize(("channel", "sign"), MIRRORED)
+def test_the_cap_and_the_slew_limit_are_for_both_channels_and_signs(channel, sign):
+    cap, step = LIMITS.cap[channel], LIMITS.slew * T
+    for asked, last, sent, clipped, slowed in (
+        (cap - 0.1, cap - 0.2, cap - 0.1, False, False),
+        (cap + 0.1, cap - 0.2, cap, True, False),
+        (3.0, 0.0, step, False, True),
+        (-3.0, 0.0, -step, False, True),
+        (cap + 0.1, 0.0, step, True, True),
+    ):
+        shaped = shape(on(channel, sign * asked), on(channel, sign * last), 1.0, LIMITS, T)
+        assert shaped.force == on(channel, sign * sent)
+        assert (shaped.clipped, shaped.slowed) == (clipped, slowed)
+    half = shape(on(channel, sign * 2.0), (0.0, 0.0), 0.5, LIMITS, T, on(channel, sign * 0.25))
+    assert half.force == on(channel, sign * 1.25)  # the gain is for the controller, not for the test of an encoder
+
+
+@pytest.mark.parametrize("channel", [0, 1])
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_force_that_is_none_is_found_on_both_channels(channel, value):
+    with pytest.raises(Fault, match="which is no force"):
+        shape(on(channel, value), (0.0, 0.0), 0.0, LIMITS, T)
+    with pytest.raises(Fault, match="which is no force"):
+        shape((0.0, 0.0), (0.0, 0.0), 0.0, LIMITS, T, on(channel, math.nan))
+
+
+@pytest.mark.parametrize(("channel", "sign"), MIRRORED)
+def test_a_motor_gets_hot_by_the_square_of_its_force(channel, sign):
+    """At twice what it stands for long, after tau ln(4/3); at 0.99 of it, never. Cold again after a while."""
+    limits = Limits((12.0, 12.0), continuous=(2.0, 2.0), thermal=5.0)
+    heat, ticks = Heat(limits, T), 0
+    for _ in range(20_000):
+        heat.check(on(channel, sign * 1.98), 1)
+
+    def push(heat):
+        nonlocal ticks
+        for _ in range(20_000):
+            heat.check(on(channel, sign * 4.0), 1)
+            ticks += 1
+
+    with pytest.raises(Fault, match=rf"motor {channel + 1} gets hot: 2 N rms, 2 N are allowed for long"):
+        push(Heat(limits, T))
+    assert ticks * T == pytest.approx(5.0 * math.log(4 / 3), abs=2 * T)
+    at_once = Heat(limits, T)
+    at_once.check(on(channel, sign * 3.0), 500)  # ticks that were missed count too
+    one_by_one = Heat(limits, T)
+    for _ in range(500):
+        one_by_one.check(on(channel, sign * 3.0), 1)
+    assert at_once._squares == pytest.approx(one_by_one._squares, rel=1e-9)
+
+
+@pytest.mark.parametrize(("channel", "sign"), MIRRORED)
+def test_what_the_device_says_is_checked_on_both_channels_and_signs(channel, sign):
+    config = Config(1, 4, 5, 0, (20000, 15000), (600, 600))
+
+    def said(tick, steps, phase=Phase.ARMED):
+        return State(phase, tick, 0, 100, 0, 0, 0, (0, 0), on(channel, sign * steps, 0))
+
+    cap = config.cap[channel]
+    check_state(said(0, cap), config, Stage.ARMED, 1.0)
+    with pytest.raises(Fault, match=r"the device applies .* the cap is"):
+        check_state(said(0, cap + 1), config, Stage.ARMED, 1.0)
+    with pytest.raises(Fault, match="is disarmed and applies"):
+        check_state(said(0, 1, Phase.DISARMED), config, Stage.DISARMED, 0.0)
+    for told, applied, wrong in ((500, 500, False), (500, 501, False), (500, 502, True), (500, 498, True)):
+        monitor = CommandMonitor(config)
+        monitor.unlike(said(0, 0), 1)
+        monitor.tell(0, on(channel, sign * told, 0))
+        assert monitor.unlike(said(1, applied), 1) == wrong
+    holding = CommandMonitor(config)
+    holding.unlike(said(0, 300), 1)
+    assert holding.unlike(said(1, 299, Phase.HOLDING), 1)
+    assert not holding.unlike(said(2, 299, Phase.HOLDING), 1)
+
+
+@pytest.mark.parametrize(("T", "watchdog"), [(3e-4, 6000), (1.2e-3, 6000), (3e-3, 15_000), (4e-3, 20_000)])
+def test_the_watchdog_is_five_ticks_and_no_less_than_a_busy_host_needs(T, watchdog):
+    assert watchdog_for(T) == watchdog
+
+
+def test_a_period_whose_five_ticks_are_too_long_is_refused():
+    with pytest.raises(ValueError, match=r"at most 0\.004 s"):
+        watchdog_for(4.1e-3)
+
+
+def test_a_force_step_is_judged_by_what_the_output_can_really_do():
+    """Eight bits of PWM for 12 N: fine for a cap of 2 N, too coarse for one of 0.5 N; twelve bits are not."""
+    eight = INFO._replace(force_step=(47_059,) * 2, hard_limit=(255,) * 2)
+    twelve = INFO._replace(force_step=(2930,) * 2, hard_limit=(4095,) * 2)
+    assert objections(eight, load(), Limits((2.0, 2.0)), None) == []
+    coarse = objections(eight, load(), Limits((0.5, 0.5)), None)
+    assert coarse[0] == "one force step of axis 1 is 0.047059 N, at most 0.03125 N is allowed"
+    assert objections(twelve, load(), Limits((0.5, 0.5)), None) == []

@@ -1,0 +1,383 @@
+"""The bridge in real time, through pyserial and a pseudo-terminal, with the emulator in its own process.
+
+Nothing here judges timing: on a busy machine a session may end because the link was too slow, which is an end like
+any other, and is tried again. What must hold on every machine: a named end with its cause, no armed device left, a
+true trace; and of several attempts, in slower and slower motion, one is armed.
+"""
+
+import fcntl
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import termios
+import time
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from cli import bridge, identify, replay
+from cli import emulator as emulator_command
+from cli.options import Parser
+from cli.session_cli import add_link_options, check_link
+from controller.delay import Jitter
+from hw.control import certified_coupling, certified_couplings
+from hw.limits import ENDED, Limits, Stage
+from hw.monitor import LinkSettings
+from hw.session import Session
+from hw.transport import Live, SerialPort
+from sim.scenario import InputError
+from sim.scenario import load as scenario_of
+
+pytest.importorskip("serial", reason="pyserial is not installed (extra hw)")
+ROOT = Path(__file__).parent.parent.parent
+PACE = 0.2  # seconds of a session per second: the patience of a session (1 s of silence) is 5 s of the machine
+PACES = (0.3, 0.2, 0.1, 0.1, 0.05, 0.05, 0.05)  # of attempts
+AT_REST = ("silent", "disarmed", "stopped", "estop", "ramp")
+
+
+class EmulatorProcess:
+    """hw.emulator as a stranger starts it."""
+
+    def __init__(self, *options):
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "hw.emulator", "--duration=300", *options],
+            env=os.environ | {"PYTHONPATH": str(ROOT)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert select.select([self.process.stdout], [], [], 120)[0]
+        self.path = self.process.stdout.readline().strip()
+
+    def end(self, patience=0.0):
+        """What it says of its device at the end, which comes by itself where the cable was pulled."""
+        with suppress(subprocess.TimeoutExpired):
+            self.process.wait(patience)
+        self.process.terminate()
+        said = self.process.communicate()[1]
+        return json.loads(said.splitlines()[-1])
+
+
+@pytest.fixture(scope="module")
+def emulator():
+    """One device for several sessions, one after the other."""
+    emulator = EmulatorProcess(f"--pace={PACE}")
+    yield emulator
+    assert emulator.end()["phase"] in AT_REST
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return scenario_of()
+
+
+@pytest.fixture(scope="module")
+def rungs(scenario):
+    return certified_couplings(scenario, "I", None, None, 1, spare=0)
+
+
+def run(emulator, scenario, plan, glance=lambda session: None, pace=PACE):
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=150))
+    with SerialPort(emulator.path, 921_600) as port:
+        live = Live(session, port, plan, True, seconds=60.0, glance=glance, pace=pace)
+        live.run()
+    return session, live
+
+
+def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
+    """What docs/hardware.md begins with: a session, a report, a trace that replays bit by bit."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    for pace in PACES:
+        options = ["--emulate", "--case", "I", "--duration", "0.1", "--measure", "60", "--pace", str(pace)]
+        code = bridge.main([*options, "--json", "-"])
+        report = json.loads(capsys.readouterr().out)
+        stage = report["session"]["stage"]
+        assert Stage(stage) in ENDED
+        assert report["session"]["cause"]
+        assert code == (0 if stage == "finished" else 1)
+        if report["session"]["armed"]:
+            break
+    else:
+        pytest.fail(f"never armed, at last {stage}: {report['session']['cause']}")
+    assert report["certificate"]["certified"]
+    assert replay.main(["out/bridge-I/trace.npz"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "stage"), [("SIGINT", Stage.FINISHED), ("SIGTERM", Stage.FINISHED), ("SIGUSR1", Stage.ESTOP)]
+)
+def test_a_signal_while_forces_act(scenario, name, stage):
+    """At slow pace: SIGINT and SIGTERM end in a ramp of 100 ms, SIGUSR1 in an emergency stop, at once and latched."""
+
+    def glance(session):
+        if session.stage == Stage.ARMED and not sent:
+            sent.append(name)
+            signal.raise_signal(getattr(signal, name))
+
+    for pace in PACES:
+        emulator, sent = EmulatorProcess(f"--pace={pace}"), []
+        session, _ = run(
+            emulator, scenario, lambda ages: [certified_coupling(scenario, "I", None, None, 2)], glance, pace
+        )
+        ended = emulator.end()
+        assert ended["phase"] in AT_REST
+        stages = [event.stage for event in session.log]
+        if sent and session.stage == stage:  # else the machine was too busy, before or after the signal
+            break
+    else:
+        pytest.fail(f"never armed and stopped by {name}, at last {session.stage}: {session.cause}")
+    assert session.cause == name
+    if stage == Stage.ESTOP:
+        assert stages[-2:] == [Stage.ARMED, Stage.ESTOP]
+        assert ended["phase"] == "estop"
+        return
+    assert stages[-3:] == [Stage.ARMED, Stage.DISARMING, Stage.FINISHED]
+    at = {event.stage: event.t_us for event in session.log}
+    assert 1e-6 * (at[Stage.FINISHED] - at[Stage.DISARMING]) > 0.09  # of the session's clock
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGQUIT"])
+def test_a_signal_ends_a_session_at_zero_force(emulator, scenario, rungs, name):
+    def glance(session):
+        if session.stage == Stage.MEASURING and not sent:
+            sent.append(name)
+            signal.raise_signal(getattr(signal, name))
+
+    sent = []
+    session, live = run(emulator, scenario, lambda ages: rungs, glance=glance)
+    assert (session.stage, session.cause) == (Stage.FINISHED, name)
+    assert live.signals == [getattr(signal, name)]
+
+
+class BridgeOnTerminal:
+    """hw.bridge with a terminal of its own, measuring for as long as the machine likes: nothing is armed."""
+
+    def __init__(self, out):
+        self.master, self.slave = os.openpty()
+        self.before = termios.tcgetattr(self.slave)
+        options = ["--emulate", "--case=I", "--pace=0.05", "--measure=100000", "--no-plot", f"--out={out}"]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "hw.bridge", *options],
+            env=os.environ | {"PYTHONPATH": str(ROOT), "TERM": "xterm"},
+            stdin=self.slave,
+            stdout=self.slave,
+            stderr=self.slave,
+            start_new_session=True,
+            preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),
+        )
+
+    @property
+    def settings(self):
+        return termios.tcgetattr(self.slave)
+
+    def read_until(self, word, patience=120.0):
+        """What it shows, until it shows `word` or is gone."""
+        shown, end = b"", time.monotonic() + patience
+        while word not in shown and time.monotonic() < end:
+            if select.select([self.master], [], [], 0.05)[0]:
+                shown += os.read(self.master, 65536)
+            elif self.process.poll() is not None:
+                break
+        return shown
+
+    def close(self):
+        self.process.kill()
+        self.process.wait()
+        os.close(self.master)
+        os.close(self.slave)
+
+
+def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
+    """With the dashboard drawing and single keys read; SIGQUIT by its key. All at once, since they mostly wait."""
+    bridges = {name: BridgeOnTerminal(tmp_path / name) for name in ("SIGQUIT", "SIGTERM", "SIGHUP")}
+    try:
+        for bridge_on in bridges.values():
+            assert b"measuring" in bridge_on.read_until(b"measuring")
+            assert not bridge_on.settings[3] & (termios.ICANON | termios.ECHO)
+        os.write(bridges["SIGQUIT"].master, b"\x1c")
+        for name in ("SIGTERM", "SIGHUP"):
+            os.kill(bridges[name].process.pid, getattr(signal, name))
+        for name, bridge_on in bridges.items():
+            shown = bridge_on.read_until(b"files: ")
+            assert bridge_on.process.wait(60) == 130
+            assert name.encode() in shown
+            assert bridge_on.settings == bridge_on.before
+            assert shown.rfind(b"\x1b[?25h") > shown.rfind(b"\x1b[?25l")  # the cursor is shown again
+    finally:
+        for bridge_on in bridges.values():
+            bridge_on.close()
+
+
+class Designing:
+    """A session that waits for a coupling, and a port that swallows everything."""
+
+    stage, measurement = Stage.MEASURED, SimpleNamespace(result=None)
+
+    def load(self, rungs, now):
+        self.stage = Stage.DISARMED if self.stage == Stage.MEASURED else self.stage
+        return b""
+
+    def arm(self, now):
+        raise AssertionError("armed by a key from before there was anything to arm")
+
+    def stop(self, cause, now):
+        self.stage = Stage.FINISHED
+        return b""
+
+    def fileno(self):
+        return self.idle
+
+    def discard(self):
+        pass
+
+
+@pytest.mark.parametrize(("typed", "stage"), [(b"a", Stage.DISARMED), (b"aq", Stage.FINISHED)])
+def test_a_key_typed_during_the_design_does_not_arm(typed, stage):
+    """It waits in the terminal's buffer until the session is disarmed: it is read before; other keys still count."""
+    keyboard, person = os.pipe()
+    session = Designing()
+    session.idle, other = os.pipe()
+
+    def plan(ages):
+        os.write(person, typed)
+        return []
+
+    live = Live(session, session, plan, False, 1.0, keyboard)
+    live._load()
+    assert select.select([keyboard], [], [], 0)[0] == []
+    assert session.stage == stage
+    os.close(person)
+    live._pressed()  # the terminal is gone
+    assert live.signals == [signal.SIGHUP]
+    for end in (keyboard, session.idle, other):
+        os.close(end)
+
+
+def test_ctrl_c_does_not_wait_for_the_end_of_a_design(emulator, scenario):
+    def plan(ages):
+        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(1000):
+            time.sleep(0.01)
+        raise AssertionError("the design went on")
+
+    session, live = run(emulator, scenario, plan)
+    assert (session.stage, session.cause) == (Stage.REFUSED, "SIGINT during the design")
+    assert live.signals == [signal.SIGINT]
+
+
+def test_an_exception_stops_the_device_first(emulator, scenario):
+    def plan(ages):
+        raise ZeroDivisionError("a mistake of ours")
+
+    with pytest.raises(ZeroDivisionError):
+        run(emulator, scenario, plan)
+
+
+def test_an_emulator_ends_with_the_bridge_that_started_it():
+    """However that ended: here by SIGKILL, which nobody can catch. An orphan would keep its terminal for minutes."""
+    code = (
+        "import time; from hw.emulator import spawned\n"
+        "with spawned(['--case=I', '--pace=0.2', '--duration=660']) as path: print(path, flush=True); time.sleep(600)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    bridge_like = subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+    path = bridge_like.stdout.readline().strip()
+    assert Path(path).exists()
+    bridge_like.kill()
+    bridge_like.communicate()
+    end = time.monotonic() + 60
+    while Path(path).exists() and time.monotonic() < end:
+        time.sleep(0.02)
+    assert not Path(path).exists()
+
+
+def test_a_coupling_that_is_not_certified_is_not_armed(emulator, scenario):
+    def plan(ages):
+        return [certified_coupling(scenario, "I", "published", None, 1)]
+
+    session, _ = run(emulator, scenario, plan)
+    assert session.stage == Stage.REFUSED
+    assert "not certified" in session.cause
+
+
+def test_a_pulled_cable_is_a_lost_session(scenario, rungs):
+    emulator = EmulatorProcess("--fault=unplug@0.05", f"--pace={PACE}")
+    session, _ = run(emulator, scenario, lambda ages: rungs)
+    assert session.stage in (Stage.LOST, Stage.STOPPED)
+    assert session.cause
+    assert emulator.end(patience=120.0)["phase"] in AT_REST
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ([], "either --port PATH or --emulate"),
+        (["--emulate", "--port", "x"], "either --port PATH or --emulate"),
+        (["--port", "/dev/null", "--fault", "drop"], "--fault is for --emulate"),
+        (["--port", "/nowhere", "--arm"], "--port /nowhere"),
+        (["--emulate", "--case", "none"], "no coupling"),
+        (["--emulate", "--baud", "5"], "--baud is 5, allowed are"),
+        (["--emulate", "--baud", "no"], "--baud is 'no', expected a whole number"),
+        (["--emulate", "--quantile", "2"], "--quantile is 2"),
+        (["--emulate", "--guard", "nan"], "--guard is nan"),
+        (["--emulate", "--measure", "1"], "--measure is 1"),
+        (["--emulate", "--duration", "0"], "--duration is 0"),
+        (["--emulate", "--pace", "2"], "--pace is 2, allowed are 0.01 to 1"),
+        (["--emulate", "--T", "0.05"], "T is 0.05 s"),
+        (["--emulate", "--T", "0.006"], "at most 0.004 s: the host's watchdog is five ticks"),
+        (["--emulate", "--fault", "nonsense"], "the emulator did not start: --fault is 'nonsense'"),
+    ],
+)
+def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    with pytest.raises(InputError) as error:
+        bridge.main(options)
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("options", "baud"),
+    [
+        (["--emulate"], None),
+        (["--emulate", "--baud", "115200"], 115_200),
+        (["--port", "/dev/ttyACM0", "--arm"], 921_600),  # may be an Uno, with a UART behind its USB chip
+        (["--port", "/dev/ttyACM0", "--arm", "--baud", "none"], None),
+        (["--port", "/dev/ttyUSB0", "--arm", "--baud", "2000000"], 2_000_000),
+    ],
+)
+def test_only_a_uart_has_a_baud_rate(options, baud):
+    parser = Parser("x", "", "")
+    add_link_options(parser)
+    assert check_link(parser.parse_args(options)).baud == baud
+
+
+def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
+    """By its own name, or by a link as socat makes them; the port opens all the same."""
+    master, slave = os.openpty()
+    link = tmp_path / "haptic"
+    link.symlink_to(os.ttyname(slave))
+    parser = Parser("x", "", "")
+    add_link_options(parser)
+    for path in (os.ttyname(slave), str(link)):
+        settings = check_link(parser.parse_args(["--port", path, "--arm"]))
+        assert settings.baud is None
+        with SerialPort(path, settings.baud) as port:
+            assert port.write(b"\x01") == 1
+            assert os.read(master, 1) == b"\x01"
+    os.close(master)
+    os.close(slave)
+
+
+@pytest.mark.parametrize("module", [bridge, emulator_command, identify])
+def test_delays_that_vary_in_the_scenario_are_refused_by_name(module, scenario, tmp_path, monkeypatch):
+    """The link has the delays that it has; a table that nothing reads would promise something else."""
+    monkeypatch.setattr(module, "scenario_from", lambda args: scenario.replace(jitter=Jitter((1, 1), (2, 2))))
+    with pytest.raises(InputError, match=r"jitter: hw\.\w+ takes the delays that its link has"):
+        module.main([] if module is emulator_command else ["--emulate", "--out", str(tmp_path)])

@@ -1,0 +1,92 @@
+"""Who arms a session, and when: the live rule, in virtual time."""
+
+import pytest
+
+from hw.control import certified_couplings
+from hw.emulator import Emulator, FaultInjection
+from hw.faults import lively
+from hw.limits import Limits, Stage
+from hw.monitor import LinkSettings
+from hw.rehearsal import Rehearsal
+from hw.session import Operator, Session
+from sim.scenario import load as scenario_of
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return lively(scenario_of())
+
+
+@pytest.fixture(scope="module")
+def rungs(scenario):
+    """Couplings for links of one and two ticks."""
+    return certified_couplings(scenario, "I", None, None, 1, spare=1)
+
+
+def rehearsal_of(scenario, rungs, operator, *faults):
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=100))
+    faults = tuple(map(FaultInjection.parse, faults))
+    return Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, operator=operator)
+
+
+def stages(session):
+    """Those that were entered; a remark in the log is none."""
+    return [event.stage for event in session.log if not event.cause.startswith("positions count from")]
+
+
+@pytest.mark.parametrize("start", [0, 0.05, 0.2, 0.2496, 0.26, 0.5])
+def test_a_session_arms_by_itself_once(scenario, rungs, start):
+    """Whenever the answers get late, in ramp-in or after: that is the end where nobody arms the softer coupling."""
+    rehearsal = rehearsal_of(scenario, rungs, Operator(True, 5.0), f"down:jitter=0.0008@{start}")
+    session = rehearsal.run_until_armed(2.0)
+    assert session.stage == Stage.REFUSED
+    assert "nobody to arm the softer coupling" in session.cause
+    assert stages(session).count(Stage.ARMING) == 1
+
+
+def test_late_answers_in_ramp_in_never_reach_full_gain(scenario, rungs):
+    """A tenth of 200 ticks is late long before the 209 ticks of the ramp are over."""
+    session = rehearsal_of(scenario, rungs, Operator(True, 5.0), "down:jitter=0.0008@0").run_until_armed(2.0)
+    assert Stage.DISARMING in stages(session)
+    assert Stage.ARMED not in stages(session)
+
+
+def test_the_time_is_over_after_full_gain_whatever_key_is_pressed(scenario, rungs):
+    operator = Operator(True, 0.3)
+    rehearsal = rehearsal_of(scenario, rungs, operator)
+    session = rehearsal.run_until_armed(0.4)
+    assert session.stage == Stage.ARMED
+    assert operator.press("a", session, session.now) == b""
+    rehearsal.run_until_armed(1.0)
+    assert (session.stage, session.cause) == (Stage.FINISHED, "the time is over")
+    at = {event.stage: event.t_us for event in session.log}
+    assert at[Stage.DISARMING] - at[Stage.ARMED] == pytest.approx(300_000, abs=2400)  # looked at once a tick
+
+
+def test_a_key_arms_a_disarmed_session_only(scenario, rungs):
+    """In a ramp-out it must not arm what comes after it."""
+    operator = Operator(False, 5.0)
+    rehearsal = rehearsal_of(scenario, rungs, operator, "down:jitter=0.0008@0.3")
+    session = rehearsal.run(0.5)
+    assert session.stage == Stage.DISARMED
+    assert operator.press("a", session, session.now) == b""
+    rehearsal.run_until_armed(0.3)
+    assert session.stage == Stage.ARMED
+    begun = session.now
+    while session.stage != Stage.DISARMING:
+        rehearsal.run(1e-6 * session.now + 0.01)
+    operator.press("a", session, session.now)
+    rehearsal.run(1e-6 * begun + 1.5)
+    assert session.stage == Stage.DISARMED
+    assert stages(session).count(Stage.ARMING) == 1
+    operator.press("a", session, session.now)
+    rehearsal.run(1e-6 * session.now + 0.4)
+    assert stages(session).count(Stage.ARMING) == 2
+
+
+@pytest.mark.parametrize("key", ["x", "\n", "A"])
+def test_other_keys_do_nothing(scenario, rungs, key):
+    rehearsal = rehearsal_of(scenario, rungs, Operator(False, 1.0))
+    session = rehearsal.run(0.5)
+    assert Operator(False, 1.0).press(key, session, session.now) == b""
+    assert session.stage == Stage.DISARMED

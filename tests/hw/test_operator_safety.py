@@ -1,0 +1,252 @@
+"""Who has to be there, what outlives a killed process, and what the bridge asks of the machine."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace as changed
+from pathlib import Path
+
+import pytest
+
+from cli import bridge, identify, replay
+from cli.bridge import _parser
+from cli.session_cli import limits_from, touched
+from hw.control import certified_couplings
+from hw.emulator import Emulator
+from hw.faults import lively
+from hw.limits import Limits, Stage
+from hw.monitor import LinkSettings
+from hw.recording import IncidentLog
+from hw.rehearsal import Rehearsal
+from hw.session import Operator, Session, session_for
+from hw.transport import Preflight, preflight
+from sim.scenario import InputError
+from sim.scenario import load as scenario_of
+
+ROOT = Path(__file__).parent.parent.parent
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return lively(scenario_of())
+
+
+@pytest.fixture(scope="module")
+def rungs(scenario):
+    return certified_couplings(scenario, "I", None, None, 1, spare=0)
+
+
+def rehearsal_of(scenario, rungs, operator):
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60))
+    return Rehearsal(session, Emulator(scenario), lambda ages: rungs, operator=operator)
+
+
+# the deadman
+
+
+@pytest.mark.parametrize("until", [0.0, 0.4, 0.9])
+def test_a_deadman_that_is_let_go_ramps_the_forces_out(scenario, rungs, until):
+    """A second after somebody showed up last, by the planned ramp of 100 ms."""
+    shown = []
+
+    def there():
+        since = rehearsal.emulator.since_armed(rehearsal.session.now)
+        if since is not None and since < until:
+            shown.append(rehearsal.session.now)
+            return True
+        return since is None
+
+    rehearsal = rehearsal_of(scenario, rungs, Operator(True, 10.0, there))
+    session = rehearsal.run_until_armed(3.0)
+    assert (session.stage, session.cause) == (Stage.FINISHED, "the deadman was let go for 1 s")
+    at = {event.stage: event.t_us for event in session.log}
+    last = shown[-1] if shown else at[Stage.ARMING]
+    assert 1e-6 * (at[Stage.DISARMING] - last) == pytest.approx(1.0, abs=0.01)
+    assert 1e-6 * (at[Stage.FINISHED] - at[Stage.DISARMING]) == pytest.approx(0.1, abs=0.005)
+
+
+def test_a_deadman_that_is_held_lets_the_session_go_on(scenario, rungs):
+    session = rehearsal_of(scenario, rungs, Operator(True, 1.5, lambda: True)).run_until_armed(3.0)
+    assert (session.stage, session.cause) == (Stage.FINISHED, "the time is over")
+
+
+def test_any_key_is_somebody(scenario, rungs):
+    operator = Operator(True, 10.0, lambda: False)
+    rehearsal = rehearsal_of(scenario, rungs, operator)
+    for _ in range(5):
+        session = rehearsal.run_until_armed(0.0) if rehearsal.armed_us is None else rehearsal.session
+        rehearsal.run(1e-6 * session.now + 0.7)
+        assert operator.press("x", session, session.now) == b""
+    assert session.stage == Stage.ARMED
+
+
+def test_a_file_that_is_touched(tmp_path):
+    path = tmp_path / "here"
+    look = touched(str(path))
+    assert not look()
+    path.touch()
+    assert look()
+    assert not look()
+    os.utime(path, ns=(1, 1))
+    assert look()
+    path.unlink()
+    assert not look()
+
+
+# options
+
+
+def test_a_first_session_is_gentle(scenario):
+    args = _parser().parse_args(["--emulate"])
+    limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits
+    assert limits.cap == (2.0, 2.0)
+    assert limits.speed == 1.0
+    args = _parser().parse_args(["--emulate", "--force-cap", "12", "--max-speed", "0.5", "--continuous-force", "3"])
+    limits = session_for(scenario, LinkSettings(), **limits_from(args, scenario)).limits
+    assert (limits.cap, limits.speed, limits.continuous) == ((12.0, 12.0), 0.5, (3.0, 3.0))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--force-cap", "13"], "--force-cap is 13, allowed are 0.05 to 12"),
+        (["--max-speed", "0"], "--max-speed is 0, allowed are 0.001 to 2.5"),
+        (["--continuous-force", "1,2,3"], "--continuous-force has 3 entries"),
+        (["--continuous-force", "5"], "continuous[0] is 5"),
+        (["--thermal-time", "nan"], "--thermal-time is nan"),
+        (["--deadman", "key"], "--deadman key needs a terminal"),
+    ],
+)
+def test_impossible_limits_are_refused(scenario, options, words):
+    args = _parser().parse_args(["--emulate", *options])
+    with pytest.raises(InputError) as error:
+        session_for(scenario, LinkSettings(), **limits_from(args, scenario))
+    assert words in str(error.value)
+
+
+# what outlives the process
+
+
+def test_the_incident_log_survives_sigkill(tmp_path):
+    """A session in a process of its own, killed while forces act: every stage up to then is on the disk."""
+    code = (
+        "import time; from pathlib import Path\n"
+        "from hw.recording import IncidentLog; from hw.limits import Limits; from hw.session import Session\n"
+        "from sim.scenario import load\n"
+        f"session, log = Session(load(), Limits((2.0, 2.0))), IncidentLog(Path({str(tmp_path / 'log')!r}))\n"
+        "log.attach(session); session.start(0); session.now = 1_500_000; log.glance(session)\n"
+        "print('written', flush=True); time.sleep(600)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "written\n"
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    lines = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
+    assert lines[0]["scenario"] == "omega-pair"
+    assert lines[1] == {"t_us": 0, "stage": "connecting", "cause": "HELLO"}
+    assert lines[2]["t_us"] == 1_500_000
+    assert lines[2]["counters"]["states"] == 0
+
+
+def test_the_incident_log_tells_every_stage_and_every_second(scenario, rungs, tmp_path):
+    log = IncidentLog(tmp_path / "log")
+    rehearsal = rehearsal_of(scenario, rungs, Operator(True, 2.0))
+    log.attach(rehearsal.session)
+    steer = rehearsal.operator.look
+    rehearsal.operator.look = lambda session, now: (log.glance(session), steer(session, now))[1]
+    session = rehearsal.run_until_armed(3.0)
+    log.close()
+    lines = [json.loads(line) for line in (tmp_path / "log").read_text().splitlines()]
+    assert [line["stage"] for line in lines if "cause" in line] == [str(event.stage) for event in session.log]
+    standing = [line for line in lines if "gain" in line]
+    assert len(standing) >= 2
+    assert 2 in [len(line["x_m"]) for line in standing]
+    again = IncidentLog(tmp_path / "log")  # appended to, never begun anew
+    again.attach(Session(scenario, Limits((2.0, 2.0))))
+    assert len((tmp_path / "log").read_text().splitlines()) == len(lines) + 1
+    with pytest.raises(InputError, match="cannot write"):
+        IncidentLog(tmp_path)
+
+
+# the machine
+
+
+def test_the_preflight_says_what_the_machine_can_do():
+    """In a child, since real-time scheduling and locked memory stay with a process."""
+    code = "from hw.transport import preflight; print(preflight('/dev/null').line())"
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    begun = time.monotonic()
+    line = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True).stdout
+    assert time.monotonic() - begun > 2.0
+    for words in ("pre-flight: ", "real-time scheduling", "memory ", "latency timer", "clock ", "worst stall in 2 s"):
+        assert words in line
+    assert line.count("\n") == 1
+
+
+def test_a_busy_machine_is_told_what_to_do():
+    good = Preflight("s", "m", "l", "c", 0.5)
+    assert "close what is busy" not in good.line()
+    assert "close what is busy" in changed(good, worst_stall_ms=5.0).line()
+    assert preflight.__doc__
+
+
+# the whole command in virtual time
+
+
+@pytest.fixture(scope="module")
+def rehearsed(tmp_path_factory):
+    """Twice the same: report and trace."""
+    found = []
+    for name in ("one", "two"):
+        out = tmp_path_factory.mktemp(name)
+        assert bridge.main(["--rehearse", "--duration", "0.5", "--out", str(out), "--json", str(out / "r.json")]) == 0
+        found.append((json.loads((out / "r.json").read_text()), (out / "trace.csv").read_text(), out))
+    return found
+
+
+def test_a_rehearsal_has_the_stages_and_files_of_a_session(rehearsed):
+    report, _, out = rehearsed[0]
+    stages = ["connecting", "configuring", "measuring", "measured", "configuring", "disarmed", "arming", "armed"]
+    assert [event["stage"] for event in report["session"]["log"]] == [*stages, "disarming", "finished"]
+    assert {path.name for path in out.iterdir()} >= {
+        "trace.npz",
+        "trace.csv",
+        "figure.png",
+        "report.json",
+        "incidents.jsonl",
+    }
+    assert report["link"]["missed_percent"] == 0
+    assert replay.main([str(out / "trace.npz")]) == 0
+
+
+def test_a_rehearsal_is_the_same_every_time(rehearsed):
+    (first, trace, _), (second, again, _) = rehearsed
+    assert trace == again
+    assert {k: v for k, v in first.items() if k != "files"} == {k: v for k, v in second.items() if k != "files"}
+
+
+def test_a_rehearsal_shows_the_faults_that_are_ordered(tmp_path, capsys):
+    assert bridge.main(["--rehearse", "--duration", "1", "--fault", "axis2:jump=-5@0.5", "--out", str(tmp_path)]) == 1
+    assert "encoder 2 jumped by" in capsys.readouterr().out
+
+
+def test_a_device_is_identified_in_virtual_time(tmp_path):
+    """The emulated device's own 1.37 N s/m, with dry friction beside it."""
+    out = ["--out", str(tmp_path), "--json", str(tmp_path / "r.json")]
+    assert identify.main(["--rehearse", "--coulomb", "0.02", "--seconds", "1.5", *out]) == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert [1.36 < axis["delta"] <= 1.37 for axis in report["axes"]] == [True, True]
+    assert [axis["coulomb"] for axis in report["axes"]] == pytest.approx([0.02] * 2, rel=0.01)
+
+
+def test_unreadable_frames_ask_about_the_baud_rate(scenario):
+    session = Session(scenario, Limits((2.0, 2.0)))
+    session.start(0)
+    for now in range(0, 2_000_000, 5000):
+        session.receive(b"\x81\x92noise\x00", now)
+    session.poll(2_100_000)
+    assert session.cause == "no answer to HELLO within 2.1 s; 400 unreadable frames: wrong baud rate?"

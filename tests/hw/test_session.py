@@ -1,0 +1,641 @@
+"""Whole sessions in virtual time: every fault, the exact engine's run, the delay into the design, traces, replays."""
+
+import json
+import re
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from cli import bridge
+from cli import replay as replay_command
+from cli import trace as trace_command
+from design.certificate import Stored, assess
+from design.certificate import save as save_coupling
+from hw.control import CertifiedCoupling, LinearController, certified_coupling, certified_couplings, fill, link_delay
+from hw.emulator import Emulator, FaultInjection
+from hw.faults import CASES, Case, at, lively, person, rehearse_case
+from hw.limits import Fault, Limits, Stage, Units
+from hw.monitor import Ages, LinkSettings
+from hw.protocol import Command, Decoder, Force, Phase, State, Stop, encode
+from hw.recording import Recorder, digest, load, outcome, recipes_of, replay, result_of, save, save_npz, steady_ticks
+from hw.rehearsal import Rehearsal
+from hw.session import Session
+from models.scene import plant
+from sim.couplings import choose
+from sim.engines import hold
+from sim.run import assemble, outside_forces, run
+from sim.scenario import InputError
+from sim.scenario import load as scenario_of
+from sim.stability import close, dominant_mode
+from sim.trace import Trace
+
+FAST = LinkSettings(measure=100)
+AT_REST = LinkSettings(measure=100, test_encoders=False)  # nothing moves the handles before the person does
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return scenario_of()
+
+
+@pytest.fixture(scope="module")
+def rungs(scenario):
+    """Couplings for links of one and two ticks."""
+    return certified_couplings(scenario, "I", None, None, 1, spare=1)
+
+
+def session_with(scenario, settings=FAST):
+    return Session(scenario, Limits(tuple(d.force_limit for d in scenario.device)), settings)
+
+
+def rehearsal_of(scenario, rungs, *faults, recorder=None, settings=FAST, **options):
+    faults = tuple(map(FaultInjection.parse, faults))
+    session = session_with(scenario, settings)
+    if recorder is not None:
+        session.record = recorder
+    return Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, **options)
+
+
+# faults
+
+
+def test_a_session_whose_device_is_deaf_to_stop_has_not_finished(scenario, rungs):
+    """Nothing at this end of the line can take the force away; it can be said, and the exit code not be 0."""
+    planned = rehearse_case(
+        Case("planned", Stage.FINISHED, faults=at("stuck"), action=person("stop")), scenario, rungs
+    )[0]
+    session = planned.session
+    assert session.stage == Stage.STOPPED
+    assert session.cause.endswith("cut its power")
+    assert [event.stage for event in session.log[-2:]] == [Stage.FINISHED, Stage.STOPPED]
+    fault = rehearse_case(Case("fault", Stage.STOPPED, faults=at("stuck jump=5")), scenario, rungs)[0].session
+    assert fault.stage == Stage.STOPPED
+    assert [event.cause[:7] for event in fault.log[-2:]] == ["encoder", "told to"]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_every_fault_ends_where_it_must(case, scenario, rungs):
+    """Stage, cause, time to zero force, counters, no force above the cap, no second arming: hw.faults says which."""
+    assert rehearse_case(case, lively(scenario), rungs)[1].wrong == ()
+
+
+def test_there_are_enough_faults():
+    assert len(CASES) >= 30
+    assert len({case.name for case in CASES}) == len(CASES)
+
+
+def test_faults_that_do_not_stop_leave_the_forces_alone(scenario, rungs):
+    """A frame that comes twice, on either side, changes no force."""
+    plain = rehearsal_of(lively(scenario), rungs)
+    twice = rehearsal_of(lively(scenario), rungs, "duplicate=0.5@0.3")
+    for rehearsal in (plain, twice):
+        rehearsal.run_until_armed(0.8)
+    assert twice.session.counters.duplicates > 50
+    np.testing.assert_array_equal([m.applied for m in plain.moments], [m.applied for m in twice.moments])
+
+
+def test_a_device_that_repeats_itself_is_lost_while_its_bytes_keep_coming(scenario, rungs):
+    """Time-outs are looked at between bytes: the same STATE for ever is no life."""
+    rehearsal = rehearsal_of(scenario, rungs)
+    session = rehearsal.run_until_armed(0.5)
+    assert session.stage == Stage.ARMED
+    assert session.link.last
+    again, now = encode(session.link.last), session.now
+    for _ in range(100):
+        now += 100
+        session.receive(again, now)
+    assert session.stage == Stage.LOST
+    assert session.log[-1].t_us - session.heard <= session.limits.watchdog_us + 100
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        ({"applied": (30001, 0)}, "the device applies"),
+        ({"status": Phase.DISARMED}, "has disarmed itself"),
+        ({"status": Phase.SILENT}, "is in silent"),
+    ],
+)
+def test_a_device_that_does_something_else_is_stopped(scenario, rungs, change, cause):
+    session = rehearsal_of(scenario, rungs).run_until_armed(0.5)
+    last = session.link.last
+    assert last
+    (said,) = Decoder().feed(
+        session.receive(encode(last._replace(tick=(last.tick + 1) & 0xFFFF, **change)), session.now)
+    )
+    assert isinstance(said, Stop)
+    assert session.stage == Stage.STOPPED
+    assert cause in session.cause
+
+
+def test_a_device_that_arms_by_itself_is_stopped(scenario, rungs):
+    rehearsal = rehearsal_of(scenario, rungs, arm=False)
+    session = rehearsal.run(1.0)
+    assert session.stage == Stage.DISARMED
+    last = session.link.last
+    assert last
+    session.receive(encode(last._replace(tick=(last.tick + 1) & 0xFFFF, status=Phase.ARMED)), session.now)
+    assert (session.stage, session.cause) == (Stage.STOPPED, "the device is armed, and nobody asked it to")
+
+
+def test_without_arming_no_force_is_ever_asked_for(scenario, rungs):
+    rehearsal = rehearsal_of(lively(scenario), rungs, arm=False)
+    rehearsal.emulator.plant.begin()  # the person moves all the same
+    sent = []
+    receive = rehearsal.emulator.receive
+    rehearsal.emulator.receive = lambda data, now: (sent.append(data), receive(data, now))
+    session = rehearsal.run(1.5)
+    forces = [m for m in Decoder().feed(b"".join(sent)) if isinstance(m, Force)]
+    assert session.stage == Stage.DISARMED
+    assert len(forces) > 1000
+    assert all(m.command == Command.IDLE and not any(m.force) for m in forces)
+
+
+def test_a_stop_that_is_lost_is_said_again(scenario, rungs):
+    session = rehearsal_of(scenario, rungs).run_until_armed(0.5)
+    last = session.link.last
+    assert last
+    session.fail("a test", session.now)
+    for ahead in (1, 2):
+        answer = session.receive(encode(last._replace(tick=(last.tick + ahead) & 0xFFFF)), session.now)
+        assert [type(m) for m in Decoder().feed(answer)] == [Stop]
+
+
+def test_random_bytes_move_nothing(scenario):
+    """A megabyte of noise, and real frames with one byte changed: no crash, no stage but waiting, no FORCE."""
+    rng = np.random.default_rng(5)
+    session = session_with(scenario)
+    session.start(0)
+    state = encode(State(Phase.ARMED, 1, 0, 0, 0, 0, 0, (5, 5), (0, 0)))
+    said = b""
+    for now in range(250):
+        said += session.receive(rng.bytes(4000), now)
+        broken = bytearray(state)
+        broken[int(rng.integers(len(state)))] ^= int(rng.integers(1, 256))
+        said += session.receive(bytes(broken), now)
+    assert session.stage == Stage.CONNECTING
+    assert said == b""
+
+
+# the exact engine
+
+
+def test_bridge_and_emulator_reproduce_the_exact_run(scenario, rungs):
+    """Both devices over the whole link against sim's exact engine with ideal encoders and forces.
+
+    Tolerances: positions to one encoder step (rounding is half of one; what rounded forces add stays below the other
+    half), forces to K of one encoder step, B of half a step per tick twice over, and one force step.
+    """
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(scenario, rungs, recorder=recorder, settings=AT_REST)
+    rehearsal.run_until_armed(2.5)
+    emulator = rehearsal.emulator
+    link, begun = recorder.link(), emulator.begun_at
+    first = int(np.argmax(link["tick"] == begun))
+    assert link["received"].all()
+    assert (link["gain"][first:] == 1.0).all()
+    n = len(recorder) - first
+    exact = run(assemble(scenario, rungs[0].chosen.coupling), "exact", ticks=n)
+    step, coupling = 1e-6, rungs[0].chosen.coupling
+    assert n > 1800
+    assert np.abs(exact.s[:, :2]).max() > 5e-3  # the people do move
+    assert np.abs(link["x"][first:] - exact.s[:, :2]).max() < step
+    forces = -link["applied"][first:] * 4e-4
+    bound = max(coupling.K) * step + max(coupling.B) * step / scenario.T + 4e-4
+    assert np.abs(forces - exact.f).max() < bound
+
+
+def test_the_same_to_the_last_bit_but_for_rounded_forces(scenario, rungs):
+    """An independent loop: held plant by expm, encoders rounded, F of the whole delay, forces rounded to steps."""
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(scenario, rungs, recorder=recorder, settings=AT_REST)
+    rehearsal.run_until_armed(1.5)
+    link = recorder.link()
+    first = int(np.argmax(link["tick"] == rehearsal.emulator.begun_at))
+    assembly = assemble(scenario, rungs[0].chosen.coupling)
+    held = hold(plant(assembly.scene.model), scenario.T)
+    n = len(recorder) - first
+    w, law = outside_forces(scenario, assembly.scene, 0, n), LinearController(assembly.F)
+    s, counts, applied = np.zeros(held.A.shape[0]), [], []
+    for k in range(n):
+        x = np.round(s[:2] / 1e-6)
+        f = np.round(law.step(x * 1e-6) / 4e-4)
+        s = held.A @ s + held.B @ np.concatenate([w[k], f * 4e-4])
+        counts.append(x)
+        applied.append(-f)
+    # a rounding of a force may fall the other way where the sums are associated otherwise: none did in this run
+    np.testing.assert_array_equal(applied, link["applied"][first:])
+    np.testing.assert_allclose(np.array(counts) * 1e-6, link["x"][first:], rtol=0, atol=1e-15)
+
+
+# delay into design
+
+
+@pytest.mark.parametrize(
+    ("ages", "expected"),
+    [([130] * 100, 1), ([1150] * 100, 2), ([130] * 995 + [9000] * 5, 1), ([130] * 900 + [2000] * 100, 2)],
+)
+def test_theta_is_a_quantile_with_a_guard_not_the_maximum(ages, expected):
+    assert link_delay(Ages(tuple(ages)), 1200.0, 0.99, 100.0) == expected
+
+
+def test_softer_couplings_are_softer_and_certified(scenario, rungs):
+    fast, soft = rungs
+    assert (fast.scenario.theta, soft.scenario.theta) == ((1, 2), (2, 2))
+    assert (fast.link, soft.link) == (1, 2)
+    assert fast.certified
+    assert soft.certified
+    assert max(soft.chosen.coupling.K) < max(fast.chosen.coupling.K)
+
+
+def test_the_host_and_the_link_share_the_delay(scenario, rungs):
+    """What the host runs, delayed by the link, is the F that was certified."""
+    z = np.exp(1j * np.linspace(0.01, 3, 50))
+    F = assemble(rungs[0].scenario, rungs[0].chosen.coupling).F
+    on_host = rungs[0].controller().F.at(z) * z[:, None, None] ** -rungs[0].link
+    np.testing.assert_allclose(on_host, F.at(z), rtol=1e-9, atol=1e-9)  # two orders of the same sums
+
+
+def test_nothing_uncertified_is_loaded(scenario, rungs):
+    with pytest.raises(Fault, match=r"published is not certified for theta = \[1, 2\]: theorem4 needs 7.629"):
+        certified_coupling(scenario, "I", "published", None, 1)
+    with pytest.raises(Fault, match="at most theta = 15"):
+        certified_coupling(scenario, "I", None, None, 16)
+    session = session_with(scenario)
+    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: ())
+    rehearsal.run_until_armed(0.1)
+    assert (session.stage, session.cause) == (Stage.REFUSED, "the coupling is not certified")
+
+
+def test_a_softer_coupling_takes_over_once_a_person_arms_it(scenario, rungs):
+    """10 % late answers: ramp-out, the coupling for one tick more, disarmed; only arm() brings the forces back."""
+    faults = (FaultInjection.parse("down:jitter=0.0007@0.45"),)
+    rehearsal = Rehearsal(session_with(lively(scenario)), Emulator(lively(scenario)), lambda ages: rungs, faults)
+    session = rehearsal.run_until_armed(1.2)
+    assert session.stage == Stage.DISARMED
+    assert session.program is rungs[1]
+    rehearsal.run(3.0)
+    assert session.stage == Stage.DISARMED
+    assert not any(np.any(m.applied) for m in rehearsal.moments[-800:])
+    session.arm(session.now)
+    rehearsal.run(4.0)
+    assert session.stage == Stage.ARMED
+    assert session.config
+    assert session.config.theta == 2
+    assert any(np.any(m.applied) for m in rehearsal.moments[-100:])
+
+
+@pytest.fixture(scope="module")
+def optimal_rungs(scenario):
+    return certified_couplings(scenario, "I", "optimal", None, 1, spare=1)
+
+
+def test_an_optimal_coupling_has_a_spring_damper_in_reserve(optimal_rungs, capsys):
+    """With one tick more no optimal coupling of the default basis is certified; by Theorem 4 a spring-damper is."""
+    fast, soft = optimal_rungs
+    assert (fast.chosen.kind, soft.chosen.kind) == ("optimal", "spring-damper")
+    assert (fast.link, soft.link) == (1, 2)
+    assert fast.requirements["closed-loop"].certified
+    assert soft.requirements["theorem4"].certified
+    assert soft.scenario.theta == (2, 2)
+    bridge.print_certificate(Ages((130,) * 100), 1, optimal_rungs, Console(width=160))
+    table = capsys.readouterr().out
+    assert re.search(r"│ optimal, theta = 1, 2 .*\(closed-loop, rational\).*this environment", table)
+    assert re.search(r"│ spring-damper, theta = 2, 2 .*\(theorem4, rational\).*any passive environment", table)
+    assert "no reserve" not in table
+
+
+def test_a_coupling_from_a_file_has_one_too(scenario, optimal_rungs, tmp_path):
+    path = tmp_path / "stiff.json"
+    save_coupling(Stored(scenario.loop("I"), optimal_rungs[0].chosen.coupling.form()), path)
+    rungs = certified_couplings(scenario, "I", str(path), None, 1)
+    assert [r.chosen.kind for r in rungs] == ["stiff.json", "spring-damper", "spring-damper"]
+    assert [r.link for r in rungs] == [1, 2, 3]
+    assert all(r.certified for r in rungs)
+    with pytest.raises(Fault, match=r"the coupling stiff\.json is not certified for theta = \[2, 2\]"):
+        certified_couplings(scenario, "I", str(path), None, 2)  # the one asked for is armed first, or none
+
+
+def test_the_spring_damper_follows_the_optimal_coupling(scenario, optimal_rungs, tmp_path):
+    """Late answers, a ramp to zero, the reserve armed by a person; and the trace of both replays bit by bit."""
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(lively(scenario), optimal_rungs, "down:jitter=0.0007@0.45", recorder=recorder)
+    session = rehearsal.run_until_armed(1.2)
+    assert (session.stage, session.program) == (Stage.DISARMED, optimal_rungs[1])
+    session.arm(session.now)
+    rehearsal.run(1e-6 * session.now + 0.8)
+    assert session.stage == Stage.ARMED
+    session.stop("enough", session.now)
+    rehearsal.run(1e-6 * session.now + 0.2)
+    files = save(tmp_path, session, recorder, outcome("I", session, recorder, 0), False)
+    result, link = load(files[0])
+    assert [recipe.link_delay for recipe in recipes_of(result)] == [1, 2]
+    assert replay(result, link).identical
+    assert np.abs(link["sent"][link["arming"] == 1]).max() > 100
+
+
+# traces
+
+
+def test_missing_samples_are_filled_by_a_straight_line():
+    assert fill((0.0, 3.0), (3.0, 0.0), 3) == [(1.0, 2.0), (2.0, 1.0), (3.0, 0.0)]
+    assert fill((0.0,), (1.0,), 1) == [(1.0,)]
+
+
+@pytest.fixture(scope="module")
+def trace(scenario, rungs, tmp_path_factory):
+    """A session over a line that loses STATEs, as files."""
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(lively(scenario), rungs, "up:drop=0.05@0.3", recorder=recorder)
+    session = rehearsal.run_until_armed(1.0)
+    session.stop("enough", session.now)
+    rehearsal.run(2.5)
+    report = outcome("I", session, recorder, 0)
+    out = tmp_path_factory.mktemp("trace")
+    return save(out, session, recorder, report | {"files": []}, plot=True), recorder
+
+
+def test_a_trace_is_one_of_sim_run(trace):
+    files, recorder = trace
+    result = Trace.load_npz(files[0])
+    assert result.t.size == len(recorder)
+    np.testing.assert_array_equal(np.diff(recorder.link()["tick"]) & 0xFFFF, 1)  # a row for every tick
+    assert np.isfinite(result.f).all()
+    assert {path.name for path in files} == {"trace.npz", "trace.csv", "figure.png", "report.json"}
+
+
+def test_a_replay_is_identical_bit_by_bit(trace):
+    result, link = load(trace[0][0])
+    assert 10 < (~link["received"]).sum() < 200
+    compared = replay(result, link)
+    assert compared.identical
+    assert np.abs(link["sent"]).max() > 1000
+
+
+def test_a_session_armed_twice_is_replayed_with_both_couplings(scenario, rungs, tmp_path):
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(lively(scenario), rungs, "down:jitter=0.0007@0.45", recorder=recorder)
+    session = rehearsal.run_until_armed(1.2)
+    assert session.stage == Stage.DISARMED
+    session.arm(session.now)
+    rehearsal.run(1e-6 * session.now + 0.8)
+    session.stop("enough", session.now)
+    rehearsal.run(1e-6 * session.now + 0.2)
+    files = save(tmp_path, session, recorder, outcome("I", session, recorder, 0), False)
+    result, link = load(files[0])
+    assert [recipe.link_delay for recipe in recipes_of(result)] == [1, 2]
+    assert np.bincount(link["arming"]).min() > 300
+    assert replay(result, link).identical
+    assert np.abs(link["sent"][link["arming"] == 1]).max() > 100
+
+
+def test_a_replay_finds_one_changed_bit(trace):
+    result, link = load(trace[0][0])
+    changed = link["asked"].copy()
+    changed.view(np.int64)[100, 1] ^= 1
+    compared = replay(result, link | {"asked": changed})
+    assert np.flatnonzero(compared.asked).tolist() == [100]
+    assert not compared.sent.any()
+    x = result.x.copy()
+    x[200, 0] += 1e-6
+    moved = Trace(result.t, x, result.f, result.x_handle, result.v_handle, result.w, result.meta)
+    assert np.flatnonzero(replay(moved, link).asked)[0] == 200
+
+
+def test_the_replay_command(trace, capsys):
+    path = trace[0][0]
+    assert replay_command.main([str(path), "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["identical"] is True
+    with pytest.raises(InputError, match="No such file"):
+        replay_command.main(["nowhere.npz"])
+
+
+def test_a_trace_of_sim_run_is_no_session(scenario, rungs, tmp_path):
+    assembly = assemble(scenario, rungs[0].chosen.coupling)
+    path = run(assembly, "exact", ticks=10).save_npz(tmp_path / "trace.npz")
+    with pytest.raises(InputError, match="not of a bridge's session"):
+        load(path)
+
+
+def test_a_trace_whose_recipe_is_broken_is_bad_input(trace, tmp_path):
+    result, _ = load(trace[0][0])
+    broken = Trace(
+        result.t, result.x, result.f, result.x_handle, result.v_handle, result.w, result.meta | {"replay": {}}
+    )
+    path = save_npz(tmp_path / "trace.npz", broken, trace[1])
+    with pytest.raises(InputError, match="cannot be replayed"):
+        replay(*load(path))
+
+
+def _spoil(path, to, **changes):
+    with np.load(path) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    changed = arrays | {name: change(arrays) for name, change in changes.items()}
+    changed.pop("digest")
+    np.savez_compressed(to, digest=np.array(digest(changed)), **changed)
+    return to
+
+
+def _nan(name):
+    def change(arrays):
+        values = arrays[name].copy()
+        values[7] = np.nan
+        return values
+
+    return change
+
+
+def _meta(**changes):
+    def change(arrays):
+        meta = json.loads(str(arrays["meta"]))
+        (recipe,) = meta["replay"]
+        limits = recipe["limits"] | changes.get("limits_more", {})
+        rest = {name: value for name, value in changes.items() if name != "limits_more"}
+        return np.array(json.dumps(meta | {"replay": [recipe | {"limits": limits} | rest]}))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"x": _nan("x")}, "x is not finite at tick 7"),
+        ({"link_gain": _nan("link_gain")}, "link_gain is not finite at tick 7"),
+        ({"link_asked": _nan("link_asked")}, "link_asked is not finite at tick 7"),
+        ({"link_gain": lambda a: a["link_gain"] * 5}, "link_gain is outside of 0 to 1"),
+        ({"link_gain": lambda a: a["link_gain"].astype(str)}, "link_gain is of type <U32"),
+        ({"link_asked": lambda a: a["link_asked"].astype(np.float32)}, "link_asked is of type float32"),
+        ({"link_received": lambda a: a["link_received"] * np.nan}, "link_received is of type float64"),
+        ({"link_sent": lambda a: a["link_sent"] * 1.0}, "link_sent is of type float64"),
+        ({"meta": lambda a: np.array("[1]")}, "metadata is a list"),
+        ({"link_arming": lambda a: a["link_arming"] + 1}, "link_arming does not count"),
+        ({"link_arming": lambda a: (a["link_tick"] == a["link_tick"][-1]).astype(int)}, "1 recipes for 2 armings"),
+        ({"meta": _meta(force_step=[0.0, 0.0])}, r"force_step\[0\] is 0"),
+        ({"meta": _meta(force_step=[4e-4])}, "force_step has 1 entries"),
+        ({"meta": _meta(cap=[30000])}, "cap has 1 entries"),
+        ({"meta": _meta(limits={})}, "missing or unknown: cap"),
+        ({"meta": _meta(limits_more={"sleew": 1.0})}, "missing or unknown: sleew"),
+        ({"meta": _meta(limits="none")}, "Expected `object`, got `str`"),
+        ({"meta": _meta(limits_more={"cap": [100.0, 100.0]})}, r"cap\[0\] is 100"),
+        ({"meta": _meta(limits_more={"slew": "fast"})}, "Expected `float`, got `str`"),
+        ({"meta": _meta(link_delay=9)}, "link_delay is 9, allowed are 1 to 1"),
+        ({"meta": _meta(link_delay=-(10**7))}, "link_delay is -10000000"),
+    ],
+)
+def test_a_spoiled_trace_is_one_line(trace, tmp_path, changes, words):
+    path = _spoil(trace[0][0], tmp_path / "trace.npz", **changes)
+    with pytest.raises(InputError, match=words) as error:
+        replay_command.main([str(path)])
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["t", "f", "link_tick", "link_margin_us", "link_status", "link_sent", "meta", "digest"]
+)
+def test_a_trace_changed_by_hand_is_refused(trace, tmp_path, name):
+    """Also where no force of the replay would show it; so is one that is cut off."""
+    with np.load(trace[0][0]) as archive:
+        arrays = {key: archive[key] for key in archive.files}
+    other = {"meta": np.array(str(arrays["meta"]).replace("true", "false", 1)), "digest": np.array("")}
+    changed = arrays | {name: other[name] if name in other else arrays[name][::-1]}
+    cut = {key: values[:-5] if values.ndim else values for key, values in arrays.items()}
+    for spoiled in (changed, cut):
+        np.savez_compressed(tmp_path / "trace.npz", **spoiled)
+        with pytest.raises(InputError, match="was changed after"):
+            replay_command.main([str(tmp_path / "trace.npz")])
+
+
+def test_an_empty_or_a_damaged_trace_is_one_line(trace, tmp_path):
+    with np.load(trace[0][0]) as archive:
+        empty = {name: archive[name][:0] if archive[name].ndim else archive[name] for name in archive.files}
+    np.savez_compressed(tmp_path / "empty.npz", **empty)
+    with pytest.raises(InputError, match="has no ticks"):
+        replay_command.main([str(tmp_path / "empty.npz")])
+    whole = bytearray(trace[0][0].read_bytes())
+    for place in range(200, len(whole), len(whole) // 40):
+        damaged = whole.copy()
+        damaged[place] ^= 0x55
+        (tmp_path / "damaged.npz").write_bytes(damaged)
+        with suppress(InputError):  # a byte of the archive's own padding or of a name may not matter
+            replay_command.main([str(tmp_path / "damaged.npz")])
+
+
+@pytest.mark.parametrize(("cap", "slew"), [(0.3, 2000.0), (12.0, 10.0)])
+def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
+    """Growth is told before the first force that the cap or the slew rate changed, as the counters saw it.
+
+    To two ticks: a force that is cut by less than a step is the same force.
+    """
+    recorder = Recorder(2)
+    session = Session(scenario, Limits((cap, cap), slew), FAST)
+    cuts = []
+
+    def record(row):
+        recorder(row)
+        cuts.append(session.counters.clipped + session.counters.slowed)
+
+    session.record = record
+    Rehearsal(session, Emulator(lively(scenario)), lambda ages: rungs).run_until_armed(1.2)
+    ((first, stop),) = steady_ticks(recorder, session.units.force_step)
+    assert (recorder.link()["gain"][first:] == 1.0).all()
+    full = np.diff(cuts, prepend=0)[first:]
+    assert 0 <= stop - first - int(np.argmax(full > 0)) <= 2
+    assert stop - first > 20
+
+
+class Dared(CertifiedCoupling):
+    """A coupling that passes for certified: what a certificate keeps out has to be seen once."""
+
+    certified = True
+
+
+@pytest.mark.parametrize(("name", "settles"), [("none", False), (None, True)])
+def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, settles):
+    """From the file alone: the exact engine's eigenvalue without coupling, to 2e-3 1/s (a rounded force is no linear
+    one), and with the certified one nothing that oscillates. On the ticks of full gain, before the cap is met.
+    """
+    made = certified_coupling(scenario, "I", None, None, 1) if settles else None
+    if made is None:
+        chosen = choose(scenario, "I", name, None)
+        made = Dared(1, scenario, "I", chosen, assess(scenario.loop("I"), chosen.coupling))
+    recorder = Recorder(2)
+    rehearsal = rehearsal_of(scenario, [made], recorder=recorder)
+    session = rehearsal.run_until_armed(2.0 if settles else 7.0)
+    session.stop("enough", session.now)
+    rehearsal.run(1e-6 * session.now + 0.2)
+    report = outcome("I", session, recorder, 0)
+    ((first, stop),) = report["run"]["steady_ticks"]
+    gain = recorder.link()["gain"]
+    assert (gain[first:stop] == 1.0).all()
+    assert gain[first - 1] < 1.0
+    path = save(tmp_path, session, recorder, report, False)[0]
+    assert trace_command.main([str(path), "--json", "-"]) == 0
+    (part,) = json.loads(capsys.readouterr().out)["growth"]
+    assert [part] == report["growth"]
+    if settles:
+        assert part["reason"].startswith("nothing oscillates")
+        return
+    assembly = assemble(scenario, made.chosen.coupling)
+    exact = dominant_mode(close(assembly.plant, assembly.F))
+    assert part["growth_rate_per_s"] == pytest.approx(exact.growth, abs=2e-3)
+    assert part["frequency_hz"] == pytest.approx(exact.frequency_hz, abs=1.0)
+    assert part["trend"] == "grows"
+    bridge.print_session(report | {"files": []}, Console(width=200))
+    assert re.search(r"growth at full gain, arming 1, ticks \d+ to \d+ .*: \+1.48", capsys.readouterr().out)
+
+
+def test_the_report_is_json_and_names_its_end(trace):
+    report = json.loads(trace[0][-1].read_text())
+    assert report["session"]["stage"] == "finished"
+    assert [e["stage"] for e in report["session"]["log"]][-2:] == ["disarming", "finished"]
+    assert report["link"]["counters"]["gaps"] > 10
+    assert report["link"]["age_us"]["p50"] == pytest.approx(130, abs=1)  # what the rehearsal's line takes
+    assert report["certificate"]["certified"]
+
+
+def test_results_of_nothing():
+    recorder = Recorder(2)
+    assert recorder.link()["x"].shape == (0, 2)
+
+
+# faults to order
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("drop=0.1", FaultInjection("drop", 0.1)),
+        ("up:flip=0.02@1+2", FaultInjection("flip", 0.02, "up", 1.0, 2.0)),
+        ("unplug@1", FaultInjection("unplug", 0.0, "both", 1.0)),
+    ],
+)
+def test_faults_are_read(text, expected):
+    assert FaultInjection.parse(text) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("dorp=0.1", "KIND one of flip, drop"),
+        ("drop=2", "allowed are 0 to 1"),
+        ("drop=x", "could not convert"),
+        ("up:unplug", "happens to the device"),
+        ("drop=nan", "allowed are 0 to 1"),
+        ("drop@-1", "START"),
+    ],
+)
+def test_a_wrong_fault_is_one_line(text, words):
+    with pytest.raises(InputError, match=words) as error:
+        FaultInjection.parse(text)
+    assert "\n" not in str(error.value)
+
+
+def test_result_of_holds_the_last_known_force(trace):
+    """Where no STATE came, the trace shows the force that was known last."""
+    _, recorder = trace
+    link = recorder.link()
+    result = result_of(recorder, Units((1e-6,) * 2, (4e-4,) * 2, (0.1,) * 2), 1.2e-3, {})
+    k = int(np.flatnonzero(~link["received"])[0])
+    np.testing.assert_array_equal(result.f[k], result.f[k - 1])

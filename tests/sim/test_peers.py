@@ -1,0 +1,55 @@
+"""Other people's tools simulate the same loop: what the comparison of costs rests on. Skipped where not installed."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from design.result import CASE_I
+from sim.run import assemble, outside_forces
+from sim.scenario import load
+
+_path = Path(__file__).parents[1] / "benchmarks/peers.py"
+_spec = importlib.util.spec_from_file_location("peers", _path)
+assert _spec
+assert _spec.loader
+peers = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(peers)
+
+#: relative rms error of positions and forces that each may have in a run that is all transient, and what it needs
+ALLOWED = {
+    "exponential x 1": (1e-11, None),
+    "RK4 x 4": (1e-5, None),
+    "Drake, RK3 x 4": (1e-3, "pydrake"),
+    "Drake, discrete x 12": (1e-2, "pydrake"),
+    "python-control, nonlinear": (1e-11, "control"),
+    "scipy dlsim, no limits": (1e-11, None),
+    "a plain NumPy loop": (1e-11, None),
+}
+
+
+@pytest.fixture(scope="module")
+def loop():
+    assembly = assemble(load().replace(duration=0.3), CASE_I)
+    w = outside_forces(assembly.scenario, assembly.scene, 0, assembly.scenario.samples)
+    w[5:30, assembly.scene.tapped[0]] += 1.0
+    return assembly, w, peers.PEERS["exact"](assembly, w)
+
+
+def test_every_peer_is_looked_at():
+    assert set(ALLOWED) | {"exact"} == set(peers.PEERS)
+
+
+@pytest.mark.filterwarnings("default")  # of the tools themselves
+@pytest.mark.parametrize("name", ALLOWED)
+def test_it_is_the_same_loop(loop, name):
+    allowed, needed = ALLOWED[name]
+    if needed:
+        pytest.importorskip(needed)
+    assembly, w, (z, s, f) = loop
+    others_z, others_s, others_f = peers.PEERS[name](assembly, w)
+    assert (others_z.shape, others_s.shape, others_f.shape) == (z.shape, s.shape, f.shape)
+    m = f.shape[1]
+    for own, exact in ((others_s[:, :m], s[:, :m]), (others_f, f)):
+        assert np.sqrt(np.mean((own - exact) ** 2) / np.mean(exact**2)) <= allowed
