@@ -64,8 +64,7 @@ def test_help_and_completion_show_what_is_for_scripts(package):
 def test_the_options_are_those_that_the_designs_take():
     """One table, the types of the arguments, and the designs' own signatures say the same."""
     from design import fixed_order as ccl
-    from design import spring_damper
-    from design import optimal
+    from design import optimal, spring_damper
     from design.designs import RETIRED
 
     assert set(OPTIONS) == set(KINDS)
