@@ -39,6 +39,7 @@ FEWEST = 16
 DEGREE = 3  # of the splines that h is made of
 GAP = 0.02  # of the bound, relatively, that the barrier leaves
 SWEEPS = 6
+QUADRATURE = 3e-6  # of the mean square: what the sums over transform and band may differ from their integrals
 LARGEST_CHARGE = 0.003  # of the bound, for what D lacks between the frequencies where it is imposed
 STEEPER = 4.0
 
@@ -60,7 +61,7 @@ def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None 
     started = time.perf_counter()
     dual = _Dual.of(loop, band_hz, knots or KNOTS.get(loop.channels, FEWEST))
     square = dual.best()
-    return Bound(float(np.sqrt(max(square, 0.0))), time.perf_counter() - started)
+    return Bound(float(np.sqrt(max(square - QUADRATURE, 0.0))), time.perf_counter() - started)
 
 
 @dataclass(frozen=True, eq=False)

@@ -118,6 +118,11 @@ def test_the_bound_is_below_what_is_reached_and_close_to_it(name):
     assert best(name).figures.rms_mismatch_db - limit.rms_db < 4.0
 
 
+def test_there_is_no_bound_where_nothing_is_lost():
+    """The environment of this loop is safe itself and its mismatch zero; so must the bound be."""
+    assert bound(loop_of("o02"), knots=30).rms == 0
+
+
 def test_where_the_environment_is_safe_itself_nothing_is_put_before_it():
     found = best("o02")
     assert isinstance(found.coupling, NoCoupling)
