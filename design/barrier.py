@@ -162,7 +162,7 @@ def _directions(block: Block, x: Array) -> tuple[Array, Array]:
 
 def _inverse_root(S: Complex) -> Complex:
     """W with W S W* = I."""
-    return np.linalg.inv(np.linalg.cholesky(S))
+    return np.linalg.inv(np.linalg.cholesky(S)).astype(np.complex128, copy=False)
 
 
 def _definite(S: Complex) -> bool:

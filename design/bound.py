@@ -28,7 +28,7 @@ from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Complex, Lti
 from design.barrier import Block, Program, centre, towards
-from design.frequency import frequencies, on_circle
+from design.frequency import frequencies, hermitian, on_circle
 from design.transparency import BAND_HZ, decibels
 
 Indices = NDArray[np.intp]  # of points of the transform
@@ -135,7 +135,9 @@ class _Dual:
         real[:, inside] = (
             hats(w[inside]) * np.pi / (span * w[inside] * e)
         )  # H = weight |E| h, weight = pi/(span w |E|^2)
-        parts = np.concatenate([_causal(real.astype(complex)), _causal(1j * real)]) * (2 / loop.T)
+        parts = np.concatenate([_causal(real.astype(complex)), _causal((1j * real).astype(np.complex128))]) * (
+            2 / loop.T
+        )
         root = np.sqrt(np.asarray(loop.delta))
         return cls(m, A, b, c, parts, forbidden, root)
 
@@ -162,8 +164,7 @@ class _Dual:
         for i, weights in self.forbidden:
             slope[:, at, i] = z[:, None] ** -np.arange(len(weights)) @ weights
             at += 1
-        slope = (slope + np.conj(np.swapaxes(slope, 2, 3))) / 2
-        return Block(np.zeros((points.size, m, m), dtype=complex), slope)
+        return Block(np.zeros((points.size, m, m), dtype=np.complex128), hermitian(slope))
 
     def start(self) -> Array:
         """h = 0 and C_0 = I/delta: D = I."""

@@ -161,7 +161,8 @@ def switching(loop: Loop, span: DelayRange, margin: float = MARGIN) -> Constrain
     def block(G: Sampled, own: Array) -> Sampled:
         alpha = np.zeros(scale.size)
         alpha[moves] = own * scale[moves]
-        return switching_block(G, span.lo, span.hi, (1 - margin) * np.asarray(loop.delta), alpha)[0]
+        usable = [(1 - margin) * d for d in loop.delta]
+        return switching_block(G, span.lo, span.hi, usable, alpha.tolist())[0]
 
     unit = 1 / np.sqrt(np.concatenate([scale, scale[moves]]))
     return Constraint("switching delays", block, unit, start=(0.5,) * moves.size, cost=(0.0,) * moves.size)
