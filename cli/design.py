@@ -363,7 +363,7 @@ def _best_rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         return []
     limit, there = outcome["bound"], outcome["robustness"]
     words = limit.get("reason") or f"no linear coupling can be better than {limit['rms_mismatch_db']:.2f} dB rms"
-    need = render.optional(there["required_over_available"], "{:.2f}", "infinite")
+    need = render.optional(there["required_over_available"], "{:.3f}", "infinite")
     climbed = ", ".join(f"{rung['mismatch_db']:.2f}" for rung in outcome["ladder"])
     return [
         ("bound", words),

@@ -1,5 +1,6 @@
 """The optimal coupling: its laws, its proofs, closed forms, and other programs that solve the same problem."""
 
+import json
 from dataclasses import replace
 from fractions import Fraction
 from functools import cache
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
+from cli.design import main
 from controller.coupling import ForceFilter, NoCoupling, basis
 from controller.environment import Network, Spring
 from controller.loop import DelayRange, Loop
@@ -381,3 +383,17 @@ def test_options_of_old_have_no_effect_and_say_so():
     loop, same = loop_of("o02"), {"functions": 16, "filter": "mixed", "margin": 0.01}
     with pytest.warns(DeprecationWarning, match="without effect: functions, filter, margin"):
         assert isinstance(design_coupling(loop, "optimal", **same).coupling, NoCoupling)
+
+
+def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
+    scenario, report = next(LOOPS.glob("n3*.toml")), tmp_path / "r.json"
+    options = ["--best", "--scenario", str(scenario), "--margin", "0.01", "--out", str(tmp_path / "c.json")]
+    assert main([*options, "--json", str(report)]) == 0
+    found, text = json.loads(report.read_text()), " ".join(capsys.readouterr().out.split())
+    assert found["bound"]["rms_mismatch_db"] < found["transparency"]["rms_mismatch_db"]
+    assert found["rendered_stiffness"] > 0.5
+    assert found["robustness"]["required_over_available"] > 1
+    assert found["ladder"][-1]["mismatch_db"] <= found["ladder"][0]["mismatch_db"]
+    assert "no linear coupling can be better than" in text
+    assert "without effect: --margin" in text
+    assert verify(load_file(tmp_path / "c.json")).proved
