@@ -18,14 +18,14 @@ import numpy as np
 from rich.table import Table
 
 from cli import options, render
-from cli.design import add_optimal_options
+from cli.design import RETIRED_WITH_VALUE, add_optimal_options, optimal_options
 from controller.environment import environment
 from controller.loop import Loop
 from controller.lti import Array
 from design import compare
 from design.certificate import CONDITIONS, certificate_part, finite
 from design.compare import AXES, FEEL_HZ, LADDERS, Judged, Limit, Perceived, Setting, optimum, settings
-from design.optimal import Wish
+from design.optimal import Options
 from design.result import CONDITION_NAMES, DesignFailed
 from design.transparency import transparency
 from sim import report
@@ -75,8 +75,8 @@ def _parser() -> options.Parser:
     beside = "spring-dampers drawn: none, any-environment, this-environment or both (default both)"
     curve.add_argument("--beside", type=_beside, default=CONDITIONS, metavar="NAME", help=beside)
     optimal = parser.add_argument_group("the optimal coupling of --over")
-    add_optimal_options(optimal, 10, "mixed")
-    optimal.add_argument("--diagonal", action="store_true", help="Q of separate channels (default: full)")
+    add_optimal_options(optimal)
+    optimal.add_argument("--diagonal", action="store_true", help=argparse.SUPPRESS)
     options.add_output_options(parser, picture=True)
     return parser
 
@@ -90,8 +90,8 @@ MODES = {
     "coupling": ("",),
     "condition": ("",),
     "no_plot": ("", "--over", "--baselines"),
-    **dict.fromkeys(("points", "keep", "beside", "functions", "filter"), ("--over",)),
-    **dict.fromkeys(("objective", "high_gain", "margin", "diagonal"), ("--over",)),
+    **dict.fromkeys(("points", "keep", "beside", "objective", "band_hz", "high_gain", "seconds"), ("--over",)),
+    **dict.fromkeys((*RETIRED_WITH_VALUE, "diagonal"), ("--over",)),
 }
 
 
@@ -114,7 +114,7 @@ def _check_mode(args: argparse.Namespace, parser: options.Parser) -> None:
                 if mode
                 else "for --over"
             )
-            raise InputError(f"--{name.replace('_', '-')} is {takes}")
+            raise InputError(f"--{name.removesuffix('_hz').replace('_', '-')} is {takes}")
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -297,7 +297,6 @@ def _ladder(args: argparse.Namespace, scenario: Scenario) -> int:
         cells = [_rung(row) for row in outcome["rows"] if row["case"] == case]
         shown.append(render.grid(f"the ladder · {scenario.name}, case {case}", heads, cells, left=(0, 4)))
     lines = [f"{row['design']}, case {row['case']}: {row['reason']}" for row in outcome["rows"] if row["reason"]]
-    lines += ["no HF limit: without |F| <= 1.5 |E| above 100 Hz, which the default design keeps."]
     render.publish(args, outcome, shown, [*lines, f"{outcome['wall_s']:.1f} s"], out)
     return options.INTERRUPTED if interrupted else options.DONE
 
@@ -306,8 +305,8 @@ def _rung(row: dict[str, Any]) -> tuple[str, ...]:
     need = "inf" if row["required_damping"] is None else f"{max(row['required_damping']):.4f}"
     need += "" if row["certified"] else " (no)"
     errors = [render.optional(row[f"{which}_mismatch_db"], "{:.2f}", "exact") for which in ("relative", "rms")]
-    if row["reason"] and row["required_damping"] is None:
-        need, errors = "-", ["-", "-"]
+    if row["required_damping"] is None:
+        need, errors = ("-", ["-", "-"]) if row["reason"] else ("-", ["-", errors[1]])
     return row["design"], need, *errors, row["proof"] or "-", f"{row['wall_s']:.2f}"
 
 
@@ -384,7 +383,7 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
     lines = [f"beside the optimum: the designed spring-damper by {names}"] if names else []
     lines += [f"{name} {row['value']:.4g}: {row['reason']}" for name, row in points if row["reason"]]
     tables = [_limit_table(outcome, name, args.beside) for name in outcome["sweeps"]]
-    lines += [*outcome["gains"], f"{outcome['wall_s']:.1f} s"]
+    lines += [*outcome["gains"], *optimal_options(args)[1], f"{outcome['wall_s']:.1f} s"]
     render.publish(args, outcome, tables, lines, out, files)
     if interrupted:
         return options.INTERRUPTED
@@ -392,15 +391,14 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
     return options.DONE if found else options.DOES_NOT_HOLD
 
 
-def _wish(args: argparse.Namespace) -> Wish:
-    high_gain = None if args.high_gain == "none" else args.high_gain
+def _wish(args: argparse.Namespace) -> Options:
     try:
-        return Wish(args.functions, args.filter, args.diagonal, args.objective, high_gain, args.margin)
+        return Options(**optimal_options(args)[0])
     except ValueError as error:
         raise InputError(options.as_option(error, args)) from None
 
 
-def _plan(args: argparse.Namespace, loop: Loop, wish: Wish) -> dict[str, list[Setting]]:
+def _plan(args: argparse.Namespace, loop: Loop, wish: Options) -> dict[str, list[Setting]]:
     """The settings of every sweep that is asked for. Raises InputError."""
     plan = {}
     for part in args.over.split(","):

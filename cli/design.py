@@ -7,11 +7,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from rich.table import Table
 
 from cli import options, render
 from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY
+from design.bound import bound
 from design.certificate import (
     ANY,
     HERE,
@@ -19,6 +21,8 @@ from design.certificate import (
     NotProved,
     Stored,
     assess,
+    digest,
+    finite,
     lag,
     promise_of,
     prove,
@@ -28,12 +32,12 @@ from design.certificate import (
     switching_requirement,
 )
 from design.conditions import BETA
-from design.designs import KINDS, compare_methods, design_by_kind, usual_condition
-from design.optimal import FILTERS, OBJECTIVES
+from design.designs import KINDS, NO_LONGER, compare_methods, design_by_kind, usual_condition
+from design.optimal import OBJECTIVES, Optimal, box_around, robustness
 from design.ranges import SAMPLES, SetCheck, check_set, cost_part, price, set_part, set_rows
 from design.result import CONDITION_NAMES, METHODS, Design, DesignFailed, listed
 from design.spring_damper import STIFFEST
-from design.transparency import transparency
+from design.transparency import BAND_HZ, transparency
 from sim import report
 from sim.files import out_file
 from sim.scenario import InputError
@@ -48,9 +52,11 @@ def main(argv: list[str]) -> int:
     out = out_file(args.out, f"out/design-{args.case}.json", "the file of the coupling")
     loop = _loop(args)
     design = _design(args, loop)
-    requirements = assess(loop, design.coupling, design.phi)
+    best = design if isinstance(design, Optimal) else None
+    held = best and best.certificate
+    requirements = assess(loop, design.coupling, design.phi, held)
     with render.progress("searching the ranges") as move:
-        whole = check_set(loop, design.coupling, args.seed, args.samples, move)
+        whole = check_set(loop, design.coupling, args.seed, args.samples, move, best and best.searched, held)
     certificates = report.certificates_part(requirements)
     outcome = {
         "case": args.case,
@@ -69,9 +75,11 @@ def main(argv: list[str]) -> int:
         "stored": _store(loop, design, whole, out, BETA if args.limiter else None),
         "jitter_proof": _switching_figures(loop, design),
     }
+    if best:
+        outcome |= _best_figures(args, loop, best)
     if args.compare:
         outcome["comparison"] = [asdict(row) for row in compare_methods(loop)]
-    render.publish(args, outcome, _tables(outcome))
+    render.publish(args, outcome, _tables(outcome), outcome.get("notes", ()))
     holds = outcome["certificate"]["certified"] and (outcome["promise"] == ANY or not whole or whole.proved)
     switching = outcome["jitter_proof"]
     return options.DONE if holds and (switching is None or switching["certified"]) else options.DOES_NOT_HOLD
@@ -82,6 +90,10 @@ def _parser() -> options.Parser:
     parser = options.Parser("design", "Design a coupling, prove its certificate and store both.", example)
     options.add_loop_options(parser)
     parser.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
+    best = "the coupling of the least transparency error: --coupling optimal"
+    parser.add_argument("--best", dest="coupling", action="store_const", const="optimal", help=best)
+    around = "certify for every stiffness and mass this much more or less, as [box] of a scenario does"
+    parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
     options.add_condition_option(parser, "what to certify")
     jitter = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"
     parser.add_argument("--jitter", type=options.delay_ranges, metavar="LO,HI", help=jitter)
@@ -91,30 +103,44 @@ def _parser() -> options.Parser:
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
     ccl.add_argument("--method", choices=METHODS, help="complementarity is as printed (default inner)")
     ccl.add_argument("--compare", action="store_true", help="run every method, one state per channel (a minute)")
-    optimal = parser.add_argument_group("optimal: the best Q in the pair with a model of the environment")
+    optimal = parser.add_argument_group("optimal: the best filter of the environment's forces")
     add_optimal_options(optimal)
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"
     parser.add_argument("--samples", type=options.whole(0, 10_000), default=SAMPLES, metavar="N", help=samples)
-    both = parser.add_argument_group("ccl and optimal")
-    both.add_argument("--full", action="store_true", help="across channels (default: diagonal)")
+    ccl.add_argument("--full", action="store_true", help="across channels (default: diagonal)")
     options.add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case>.json)")
     return parser
 
 
-def add_optimal_options(group: argparse._ActionsContainer, functions: int | None = None, filters: str = "auto") -> None:
-    """What is asked of an optimal coupling; options that are not given are None where `functions` is."""
-    given = functions is not None
-    count = f"basis functions of each entry of Q (default {functions or 8})"
-    group.add_argument("--functions", type=options.whole(), default=functions, metavar="N", help=count)
-    poles = f"poles of the basis (default {filters})"
-    group.add_argument("--filter", choices=FILTERS, default=filters if given else None, help=poles)
+def add_optimal_options(group: argparse._ActionsContainer) -> None:
+    """What is asked of an optimal coupling; options that are not given are None."""
     error = "which transparency error is minimised (default rms)"
-    group.add_argument("--objective", choices=OBJECTIVES, default="rms" if given else None, help=error)
-    gain = "limit of |F|/|E| above 100 Hz, or none (default 1.5)"
-    high = {"type": _number_or_none, "metavar": "G", "default": 1.5 if given else None}
-    group.add_argument("--high-gain", help=gain, **high)
-    share, unused = options.number(), "of the damping that stays unused (default 0.005)"
-    group.add_argument("--margin", type=share, default=0.005 if given else None, metavar="SHARE", help=unused)
+    group.add_argument("--objective", choices=OBJECTIVES, help=error)
+    band = "frequencies where it counts [Hz] (default 0.5,80)"
+    group.add_argument("--band", dest="band_hz", type=options.pair, metavar="LOW,HIGH", help=band)
+    gain = "limit of |F|/|E| above 100 Hz (default none: the force there is kept low, not limited)"
+    group.add_argument("--high-gain", type=_number_or_none, metavar="G", help=gain)
+    limit = "begin no larger basis after this time [s] (default 60)"
+    group.add_argument("--seconds", type=options.number(0), metavar="S", help=limit)
+    for name in RETIRED_WITH_VALUE:
+        group.add_argument(f"--{name}", help=argparse.SUPPRESS)
+
+
+RETIRED_WITH_VALUE = ("functions", "filter", "margin")
+
+
+def optimal_options(args: argparse.Namespace) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """What is asked of an optimal coupling, and a note where an option is given that it no longer has."""
+    given = {name: getattr(args, name) for name in ("objective", "band_hz", "high_gain", "seconds")}
+    given = {name: value for name, value in given.items() if value is not None}
+    if given.get("high_gain") == "none":
+        given.pop("high_gain")
+    retired = [f"--{name}" for name in (*RETIRED_WITH_VALUE, "full", "diagonal") if getattr(args, name, None)]
+    return given, (NO_LONGER.format(", ".join(retired)),) if retired else ()
+
+
+def _percent(text: str) -> float:
+    return options.number(0.1, 90.0, "%")(text.removesuffix("%"))
 
 
 def _number_or_none(text: str) -> float | str:
@@ -132,17 +158,24 @@ OPTIONS = {
     "method": ("ccl",),
     "compare": ("ccl",),
     "full": ("ccl", "optimal"),
-    "functions": ("optimal",),
-    "filter": ("optimal",),
     "objective": ("optimal",),
+    "band_hz": ("optimal",),
     "high_gain": ("optimal",),
-    "margin": ("optimal",),
+    "seconds": ("optimal",),
+    **dict.fromkeys(RETIRED_WITH_VALUE, ("optimal",)),
 }
 
 
 def _loop(args: argparse.Namespace) -> Loop:
     """The scenario's loop with the range of delays that --jitter gives. Raises InputError."""
     loop = options.scenario_from(args).loop(args.case)
+    if args.ranges is not None:
+        if loop.box or loop.environment.walls:
+            raise InputError(f"--ranges and {'[box]' if loop.box else 'environment.walls'}: give one of them")
+        try:
+            loop = msgspec.structs.replace(loop, box=box_around(loop.environment, args.ranges))
+        except ValueError as error:
+            raise InputError(f"--ranges {args.ranges:g}: {error}") from None
     args.condition = args.condition or usual_condition(loop, args.coupling)
     if args.jitter is not None:
         if not _for_switching(args):
@@ -175,12 +208,13 @@ def _asked(args: argparse.Namespace, loop: Loop) -> dict[str, Any]:
     for name in given:
         if args.coupling not in OPTIONS[name]:
             allowed = " or ".join(OPTIONS[name])
-            raise InputError(f"--{name.replace('_', '-')} is for --coupling {allowed}, not {args.coupling}")
+            shown = name.removesuffix("_hz").replace("_", "-")
+            raise InputError(f"--{shown} is for --coupling {allowed}, not {args.coupling}")
+    if args.coupling == "optimal":
+        return optimal_options(args)[0]
     given.pop("compare", None)
     if args.limiter and loop.box:
         raise InputError("--limiter and [box]: limited forces are proved for one environment, not for ranges")
-    if given.get("high_gain") == "none":
-        given["high_gain"] = None
     if given.pop("full", False):
         given["diagonal"] = False
     return given
@@ -202,6 +236,33 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
 
 # ----------------------------------------------------------------------------------------------------
 # What was designed: its figures, its file.
+
+
+MOST_FOR_A_BOUND = 2  # devices: for more the bound takes minutes
+
+
+def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[str, Any]:
+    """What an optimal coupling is reported with: how it was found, and how it stands to what is possible."""
+    there = robustness(loop, best.coupling)
+    limit: dict[str, Any] = {"rms_mismatch_db": None}
+    if loop.channels > MOST_FOR_A_BOUND:
+        limit["reason"] = f"worked out for up to {MOST_FOR_A_BOUND} devices"
+    elif best.objective == 0:
+        limit["reason"] = "the mismatch is zero: there is nothing to bound"
+    else:
+        limit["rms_mismatch_db"] = bound(loop, args.band_hz or BAND_HZ).rms_db
+    return {
+        "bound": limit,
+        "robustness": {
+            "percent": there.percent,
+            "required_over_available": finite(there.worst),
+            "where": there.where,
+            "certified": there.kept,
+        },
+        "rendered_stiffness": finite(best.g),
+        "ladder": [asdict(rung) for rung in best.ladder],
+        "notes": list(optimal_options(args)[1]),
+    }
 
 
 def _switching_figures(loop: Loop, design: Design) -> dict[str, Any] | None:
@@ -253,6 +314,9 @@ def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path, beta: 
 
 def _proved(loop: Loop, design: Design, beta: float | None) -> tuple[Certificate | None, str | None]:
     """The certificate of all that the loop claims, or why there is none."""
+    held = design.certificate if isinstance(design, Optimal) else None
+    if held and held.scenario == digest(loop, design.coupling.form()):
+        return held, None
     try:
         phi = None if design.phi is None else design.phi.tolist()
         return prove(loop, design.coupling, design.condition, phi, beta), None
@@ -296,9 +360,26 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("guarantee, delays", switching["promise"] if switching.get("proof") else None),
         (outcome["objective_name"], f"{outcome['objective']:.5g}"),
         ("transparency error", render.transparency_error(transparent)),
+        *_best_rows(outcome),
         ("convex problems", f"{outcome['sdps']} in {outcome['wall_s']:.2f} s"),
         ("stored", f"{stored['file']} (proof: {stored['proof'] or stored['reason']})"),
         ("", f"for constant delays only: {switching['reason']}" if switching and not switching["proof"] else None),
+    ]
+
+
+def _best_rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
+    """What only an optimal coupling has."""
+    if "bound" not in outcome:
+        return []
+    limit, there = outcome["bound"], outcome["robustness"]
+    words = limit.get("reason") or f"no linear coupling can be better than {limit['rms_mismatch_db']:.2f} dB rms"
+    need = render.optional(there["required_over_available"], "{:.3f}", "infinite")
+    climbed = ", ".join(f"{rung['mismatch_db']:.2f}" for rung in outcome["ladder"])
+    return [
+        ("bound", words),
+        ("rendered stiffness", render.optional(outcome["rendered_stiffness"], "{:.3f} of the environment's")),
+        ("robustness", f"{need} of the damping is needed at {there['where']}, the worst within {there['percent']:g} %"),
+        ("ladder [dB]", climbed or None),
     ]
 
 

@@ -8,6 +8,7 @@ floats, a stack, Fractions, or sampled responses (controller.lti). Its form is w
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
@@ -17,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from controller.lti import Array, Block, Complex, Lti, Number, Sampled, frozen, numbers
 
 LARGEST_COEFFICIENT = 1e12  # of a stored coupling, SI units
+LARGEST_WEIGHT = 1e9  # of a force filter: beyond it arithmetic would overflow before the filter could be judged
 Rows = tuple[tuple[float, ...], ...]
 
 
@@ -179,17 +181,7 @@ class InternalModel:
 
     def parameter(self, T: Number) -> Lti:
         """Q(z), one chain of sections per input."""
-        poles, Q = numbers(self.poles, T) if self.poles.size else self.poles, numbers(self.Q, T)
-        n, m = self.poles.size, self.Q.shape[1]
-        signals = np.eye(n + 1, dtype=Q.dtype)
-        through, after = signals[-1], []
-        for a, state in zip(poles, signals, strict=False):
-            after.append(a * state + through)
-            through = (1 - a * a) * state - a * through
-        sections = np.array(after, dtype=Q.dtype).reshape(n, n + 1)
-        one = np.eye(m, dtype=Q.dtype)
-        C = np.moveaxis(Q[1:] * (1 - poles)[:, None, None], 0, 2).reshape(m, m * n)
-        return Lti(np.kron(one, sections[:, :n]), np.kron(one, sections[:, n:]), C, Q[0], T)
+        return _realised(self.poles, NO_PAIRS, self.Q, T)
 
     def compliance(self, T: Number) -> None:
         return None
@@ -210,17 +202,174 @@ class InternalModel:
         return InternalModelForm(tuple(self.poles.tolist()), tuple(_rows(q) for q in self.Q))
 
 
-def basis(poles: Array, z: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """b_0 = 1 and b_k = (1 - a_k)/(z - a_k) prod_{j<k} (1 - a_j z)/(z - a_j), k = 1..n; shape z.shape + (n + 1,).
+@dataclass(frozen=True, eq=False)
+class ForceFilter:
+    """R in F = Theta R Psi E: one copy of the environment, moved by the devices, then a filter R(z) of its forces.
 
-    Takenaka-Malmquist functions up to their lengths: all-pass sections in a row, each with a tap. Poles at zero make
-    them 1, 1/z, 1/z^2, ..
+    Nothing is fed back, so R and the environment are stable or not by themselves, and F is affine in R. R = I - Psi E Q
+    makes it the pair of `InternalModel`. R(z) = sum_k R_k b_k(z) over the functions of `basis`, all of them 1 at z = 1,
+    and R(1) = g I exactly so in the decimals of the coefficients: F(1) = g E(1) is symmetric whatever the springs are.
+    R_k has a column per channel's force and, where it has m + 1 of them, one for the sum of all forces.
+
+    Raises ValueError for poles that are not stable and for coefficients whose sum is not g I with g >= 0.
+    """
+
+    poles: Array  # (n,) in (-1, 1); at zero they make delays
+    pairs: Array  # (p, 2): b1, b2 of z^2 + b1 z + b2
+    R: Array  # (1 + n + 2 p, m, m) or (1 + n + 2 p, m, m + 1), without unit
+
+    if TYPE_CHECKING:
+
+        def __init__(self, poles: ArrayLike, pairs: ArrayLike, R: ArrayLike) -> None: ...
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "poles", frozen(self.poles, 1, "poles"))
+        object.__setattr__(self, "pairs", frozen(self.pairs if np.size(self.pairs) else NO_PAIRS, 2, "pairs"))
+        object.__setattr__(self, "R", frozen(self.R, 3, "R"))
+        if self.pairs.shape[1] != 2:
+            raise ValueError(f"pairs have {self.pairs.shape[1]} entries, expected two: b1, b2 of z^2 + b1 z + b2")
+        if not (np.abs(self.poles) < 1).all():
+            raise ValueError(f"poles are {self.poles.tolist()}, expected numbers between -1 and 1")
+        for b1, b2 in self.pairs:
+            if not (abs(b2) < 1 and abs(b1) < 1 + b2):
+                raise ValueError(
+                    f"pairs has [{b1:g}, {b2:g}]: z^2 + b1 z + b2 has a root on or outside the unit circle"
+                )
+        functions, rows, columns = self.R.shape
+        expected = 1 + self.poles.size + 2 * len(self.pairs)
+        if functions != expected or columns not in (rows, rows + 1) or not rows:
+            shapes = f"({expected}, channels, channels) or ({expected}, channels, channels + 1)"
+            raise ValueError(f"R has shape {self.R.shape}, expected {shapes}")
+        if not (np.isfinite(self.R).all() and np.abs(self.R).max() <= LARGEST_WEIGHT):
+            raise ValueError(
+                f"R has an entry of {np.abs(self.R).max():g}, allowed are numbers up to {LARGEST_WEIGHT:g}"
+            )
+        static = self._static()
+        if (static - static[0, 0] * np.eye(rows, dtype=object)).any() or static[0, 0] < 0:
+            shown = static.astype(float).tolist()
+            raise ValueError(f"the coefficients of R sum to {shown}, expected g times the identity with g >= 0")
+
+    @property
+    def channels(self) -> int:
+        return self.R.shape[1]
+
+    @property
+    def g(self) -> float:
+        """The rendered share of the static stiffness: F(1) = g E(1)."""
+        return float(self._static()[0, 0])
+
+    def _static(self) -> Array:
+        """R(1), exactly."""
+        return _own_columns(numbers(self.R, Fraction(1)).sum(axis=0))
+
+    def filter(self, T: Number) -> Lti:
+        """R(z), in the arithmetic of T."""
+        return _realised(self.poles, self.pairs, self.R, T)
+
+    def compliance(self, T: Number) -> None:
+        return None
+
+    def around(self, environment: Block, further: int = 0) -> Block:
+        """R Psi E, given Psi E."""
+        m = self.channels
+        if isinstance(environment, Sampled):
+            values = basis(self.poles, environment.z, self.pairs)
+            return (
+                Sampled(environment.z, np.tensordot(values, _own_columns(self.R), axes=1), environment.T) @ environment
+            )
+        if further:
+            raise ValueError("the coupling holds a linear model of the environment: walls behind it have none")
+        if environment.inputs != m or environment.outputs != m:
+            raise ValueError(f"the coupling is {m} x {m}, the environment has {environment.inputs} contacts")
+        return self.filter(environment.T) @ environment
+
+    def form(self) -> ForceFilterForm:
+        poles, pairs = tuple(self.poles.tolist()), tuple((b1, b2) for b1, b2 in self.pairs.tolist())
+        return ForceFilterForm(poles, pairs, tuple(_rows(R) for R in self.R))
+
+
+NO_PAIRS = np.zeros((0, 2))
+
+
+def basis(poles: Array, z: NDArray[np.complex128], pairs: Array = NO_PAIRS) -> NDArray[np.complex128]:
+    """b_k(z) of a filter, k = 0..n + 2 p; shape z.shape + (1 + n + 2 p,). All of them are 1 at z = 1.
+
+    b_0 = 1; a real pole a adds (1 - a)/(z - a), a pair the two functions (1 + b1 + b2) {z, 1}/(z^2 + b1 z + b2), each
+    behind the all-pass sections of those before it: Takenaka-Malmquist functions up to their lengths. Poles at zero
+    make 1, 1/z, 1/z^2, ..
     """
     values, through = [np.ones_like(z)], np.ones_like(z)
     for a in poles:
         values.append(through * (1 - a) / (z - a))
         through = through * (1 - a * z) / (z - a)
+    for b1, b2 in pairs:
+        section = through / (z * z + b1 * z + b2)
+        values += [(1 + b1 + b2) * section * z, (1 + b1 + b2) * section]
+        through = section * (b2 * z * z + b1 * z + 1)
     return np.stack(values, axis=-1)
+
+
+def _own_columns(R: Array) -> Array:
+    """Coefficients (.., m, m) of those of the forces and of their sum, (.., m, m + 1), if there are any of the sum."""
+    m = R.shape[-2]
+    return R[..., :m] + R[..., m:].sum(axis=-1)[..., None] if R.shape[-1] > m else R
+
+
+def _realised(poles: Array, pairs: Array, R: Array, T: Number) -> Lti:
+    """sum_k R_k b_k(z), one chain of sections per input, in the arithmetic of T.
+
+    A chain ends with the last function that has a coefficient. What the sum of all inputs drives is the sum of the
+    chains, and has states of its own only beyond the shortest of them.
+    """
+    rows, columns = R.shape[1:]
+    n, reals = R.shape[0] - 1, poles.size
+    poles, pairs, R = (numbers(part, T) if part.size else part for part in (poles, pairs, R))
+    signals = numbers(np.eye(n + 1), T)
+    one = signals[0, 0]
+    through, after, read = signals[-1], [], [one] * (n + 1)
+    for a in poles:
+        state = signals[len(after)]
+        read[len(after) + 1] = 1 - a
+        after.append(a * state + through)
+        through = (1 - a * a) * state - a * through
+    for b1, b2 in pairs:
+        first, second = signals[len(after)], signals[len(after) + 1]  # z/den and 1/den behind what comes through
+        read[len(after) + 1] = read[len(after) + 2] = 1 + b1 + b2
+        after += [through - b1 * first - b2 * second, first]
+        through = b2 * through + b1 * (1 - b2) * first + (1 - b2 * b2) * second
+    sections = np.array(after, dtype=R.dtype).reshape(n, n + 1)
+
+    reached = [_reached(R[1:, :, j], reals) for j in range(columns)]
+    shared = min(reached[:rows])  # the states of the sum's chain up to here are the sums of the others'
+    own = sum(reached[:rows])
+    total = own + sum(max(length - shared, 0) for length in reached[rows:])
+    A, B, C = (np.full(shape, one - one) for shape in ((total, total), (total, rows), (rows, total)))
+    starts = np.cumsum([0, *reached[: rows - 1]])
+    for j, (at, length) in enumerate(zip(starts, reached[:rows], strict=True)):
+        part = slice(at, at + length)
+        A[part, part] = sections[:length, :length]
+        B[part, j] = sections[:length, -1]
+        for k in range(length):
+            C[:, at + k] = R[k + 1, :, j] * read[k + 1]
+    for length in reached[rows:]:
+        for k in range(min(length, shared)):
+            C[:, starts + k] += (R[k + 1, :, rows] * read[k + 1])[:, None]
+        for k in range(shared, length):
+            for q in range(shared):
+                A[own + k - shared, starts + q] = sections[k, q]
+            A[own + k - shared, own:] = sections[k, shared:length]
+            B[own + k - shared] = sections[k, -1]
+            C[:, own + k - shared] = R[k + 1, :, rows] * read[k + 1]
+    return Lti(A, B, C, _own_columns(R[0]), T)
+
+
+def _reached(R: Array, reals: int) -> int:
+    """The states of a chain, given the coefficients of its functions: up to the last that is used, a pair whole."""
+    used = np.flatnonzero((R != 0).any(axis=1))
+    if not used.size:
+        return 0
+    length = int(used[-1]) + 1
+    return length + (length - reals) % 2 if length > reals else length
 
 
 def _feedback(environment: Lti, V: Lti, further: int) -> Lti:
@@ -306,7 +455,27 @@ class InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-mod
         return InternalModel(self.poles, self.Q)
 
 
-Form = NoForm | SpringDamperForm | ComplianceForm | InternalModelForm
+class ForceFilterForm(Strict, frozen=True, tag_field="kind", tag="force-filter"):
+    """The filter R(z) of the environment's forces: poles of its basis, and a coefficient per function."""
+
+    poles: tuple[float, ...]  # (n,)
+    pairs: tuple[tuple[float, float], ...]  # (p, 2)
+    R: tuple[Rows, ...]  # (1 + n + 2 p, m, m or m + 1)
+
+    def __post_init__(self) -> None:
+        if any([len(row) for row in rows] != [len(self.R[0][0])] * len(self.R[0]) for rows in self.R):
+            raise ValueError("R has coefficients that are not matrices of one size")
+        self.build(1.0)
+
+    @property
+    def shape(self) -> tuple[str, int, int]:
+        return "R", len(self.R[0]), len(self.R[0])
+
+    def build(self, T: float) -> ForceFilter:
+        return ForceFilter(self.poles, self.pairs, self.R)
+
+
+Form = NoForm | SpringDamperForm | ComplianceForm | InternalModelForm | ForceFilterForm
 
 
 def require_channels(form: Form, m: int) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-from controller.coupling import Compliance, Coupling, InternalModel, NoCoupling, SpringDamper
+from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring, environment, held
 from controller.loop import DelayRange, Loop, force_map
 from controller.lti import Lti, SingularLoop
@@ -387,6 +387,7 @@ KINDS = {
     SpringDamper: "spring-damper",
     Compliance: "compliance",
     InternalModel: "internal-model",
+    ForceFilter: "force-filter",
 }
 
 

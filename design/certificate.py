@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 import scipy
 
-from controller.coupling import Coupling, Form, InternalModel, SpringDamper, Strict, require_channels
+from controller.coupling import Coupling, ForceFilter, Form, InternalModel, SpringDamper, Strict, require_channels
 from controller.delay import delay
 from controller.environment import Member, frozen_states
 from controller.loop import DelayRange, Loop
@@ -111,7 +111,7 @@ class Stored(Strict, frozen=True):
     loop: Loop
     coupling: Form
     certificate: Certificate | None = None
-    version: Literal[1] = 1
+    version: Literal[1, 2] = 2  # 2: force filters
 
     def __post_init__(self) -> None:
         require_channels(self.coupling, self.loop.channels)
@@ -648,12 +648,13 @@ def prove(
     condition: Condition,
     phi: Sequence[float] | None = None,
     beta: float | None = None,
+    swept: Requirement | None = None,
 ) -> Certificate:
     """A certificate with an exact proof of the condition; `phi` [N s/m] is Theorem 4's multiplier where psi >= 1.
 
     With `beta` also of forces that are limited, by a limiter of rho = beta delta/T under this-environment; under
-    any-environment without delay in the environment rho is 0 and the certificate is the same. Raises NotProved with
-    the reason.
+    any-environment without delay in the environment rho is 0 and the certificate is the same. `swept` is what
+    `required_damping` gives, of a caller who has just asked. Raises NotProved with the reason.
     """
     _require_limits(loop, coupling, condition)
     if beta is not None and condition == "theorem4" and any(loop.psi):
@@ -661,7 +662,7 @@ def prove(
     if condition == "closed-loop" and loop.environment.walls:
         phi = walls_of(loop, coupling).g
     multiplier = None if phi is None else [rational(float(p)) for p in phi]
-    requirement = required_damping(loop, coupling, condition, multiplier)
+    requirement = swept or required_damping(loop, coupling, condition, multiplier)
     if not requirement.certified:
         needed = ", ".join(f"{d:.6g}" for d in requirement.required)
         have = ", ".join(f"{d:.6g}" for d in requirement.available)
@@ -858,7 +859,7 @@ LATE = "a latency of a fraction of a sample is derived for this environment only
 
 def no_compliance(coupling: Coupling) -> str:
     """Why Theorem 4 has nothing to say of a coupling that is no V of its own."""
-    if isinstance(coupling, InternalModel):
+    if isinstance(coupling, InternalModel | ForceFilter):
         return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
     return "without a coupling there is nothing that Theorem 4 could use"
 
@@ -990,17 +991,21 @@ def _multiplier(loop: Loop, certificate: Certificate) -> list[Fraction] | None:
 CONDITIONS: tuple[Condition, ...] = ("theorem4", "closed-loop")
 
 
-def assess(loop: Loop, coupling: Coupling, phi: Array | None = None) -> dict[str, Requirement]:
+def assess(
+    loop: Loop, coupling: Coupling, phi: Array | None = None, known: Certificate | None = None
+) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
 
     closed-loop is about the nominal environment alone (design.box.check asks for the rest of its box) and the constant
     theta (design.jitter.part asks for the rest of its range); where there are walls it is about the frozen contact
-    state that asks for most.
+    state that asks for most. What `known`, a certificate just made, proves is not proved again.
     """
     loop = loop.at(loop.environment).switching(None)
+    here = closed_loop_of(loop, coupling)
+    proved = known and known.condition == "closed-loop" and known.scenario == digest(loop, coupling.form())
     return {
         "theorem4": _proved(loop, coupling, theorem4_of(loop, coupling, phi), phi),
-        "closed-loop": _proved(loop, coupling, closed_loop_of(loop, coupling)),
+        "closed-loop": replace(here, proof="rational") if proved else _proved(loop, coupling, here),
     }
 
 

@@ -18,6 +18,7 @@ from controller.delay import delay
 from controller.environment import environment
 from controller.loop import Loop
 from controller.lti import Array, Lti
+from design.bound import bound
 from design.certificate import NotProved, digest, finite, prove, theorem4_of
 from design.conditions import (
     Condition,
@@ -31,7 +32,7 @@ from design.conditions import (
 )
 from design.designs import design_by_kind
 from design.frequency import Response, frequencies, on_circle
-from design.optimal import Wish
+from design.optimal import LADDER, Options
 from design.result import PUBLISHED, Design, DesignFailed
 from design.transparency import decibels, transparency
 
@@ -168,7 +169,7 @@ AXES = {
     "damping": Axis("damping of the devices (the least)", "N s/m", 0.5, 1.4, 1e-3, 1e3),
     "delay": Axis("transmission delay (the largest)", "samples", math.nan, math.nan, 0, 100),
     "period": Axis("sampling period", "s", 0.5, 2.5, 1e-5, 0.1),
-    "order": Axis("basis functions of each entry of Q", "functions", 0.2, 1.6, 1, 200),
+    "order": Axis("rungs of the optimal coupling's basis", "rungs", 0.2, 1.0, 1, len(LADDER)),
 }
 
 
@@ -178,11 +179,11 @@ class Setting:
 
     value: float
     loop: Loop
-    wish: Wish
+    wish: Options
 
 
 def settings(
-    axis: str, loop: Loop, wish: Wish, points: int, span: tuple[float, float] | None = None, kept: Kept = "samples"
+    axis: str, loop: Loop, wish: Options, points: int, span: tuple[float, float] | None = None, kept: Kept = "samples"
 ) -> list[Setting]:
     """The points of one axis, with what there is among them. Raises ValueError for a range that is none.
 
@@ -210,8 +211,8 @@ def settings(
         return [Setting(float(n), _delayed(loop, n - longest), wish) for n in steps]
     if axis == "period":
         return [Setting(T, _sampled(loop, T, kept), wish) for T in _spread(loop.T, AXES[axis], points, span).tolist()]
-    counts = {max(1, round(n)) for n in _spread(wish.functions, AXES[axis], points, span).tolist()}
-    return [Setting(float(n), loop, replace(wish, functions=n)) for n in sorted(counts)]
+    rungs = {max(1, round(n)) for n in _spread(len(wish.ladder), AXES[axis], points, span).tolist()}
+    return [Setting(float(n), loop, replace(wish, ladder=LADDER[:n])) for n in sorted(rungs)]
 
 
 @dataclass(frozen=True)
@@ -222,7 +223,7 @@ class Limit:
     delta: tuple[float, ...]  # [N s/m]
     theta: tuple[int, ...]  # [samples]
     T_s: float
-    functions: int | None  # None for a spring-damper
+    states: int | None  # of the loop; None: no design
     rms_mismatch_db: float | None
     relative_mismatch_db: float | None
     required_damping: tuple[float | None, ...] | None  # closed-loop, [N s/m]
@@ -239,9 +240,7 @@ Designer = Callable[[Setting], Limit]
 
 def optimum(setting: Setting) -> Limit:
     """The optimal coupling of a setting."""
-    wish = setting.wish
-    names = ("functions", "filter", "diagonal", "objective", "high_gain", "margin")
-    return measured(setting, "optimal", None, {name: getattr(wish, name) for name in names})
+    return measured(setting, "optimal", None, vars(setting.wish))
 
 
 def spring_damper(condition: Condition) -> Designer:
@@ -252,7 +251,8 @@ def spring_damper(condition: Condition) -> Designer:
 def measured(setting: Setting, kind: str, condition: Condition | None, options: dict[str, Any]) -> Limit:
     """One design and its figures, from the coupling alone; a request without a solution gives its reason."""
     loop, begin = setting.loop, time.perf_counter()
-    figures: dict[str, Any] = dict.fromkeys(("rms_mismatch_db", "relative_mismatch_db", "required_damping", "dc_ratio"))
+    names = ("states", "rms_mismatch_db", "relative_mismatch_db", "required_damping", "dc_ratio")
+    figures: dict[str, Any] = dict.fromkeys(names)
     bare: tuple[float | None, ...] = (None,) * len(loop.delta)
     try:
         bare = _damping(this_environment(loop.F(NoCoupling()), loop.delta, loop.T_max, loop.latency))
@@ -263,14 +263,14 @@ def measured(setting: Setting, kind: str, condition: Condition | None, options: 
         F = loop.F(design.coupling)
         transparent = transparency(F, loop.E(), loop.lam)
         figures = {
+            "states": F.order,
             "rms_mismatch_db": finite(decibels(transparent.rms_mismatch)),
             "relative_mismatch_db": finite(decibels(transparent.relative_mismatch)),
             "required_damping": _damping(this_environment(F, loop.delta, loop.T_max, loop.latency)),
             "dc_ratio": finite(transparent.dc_ratio),
         } | _proof(loop, design)
-    functions = setting.wish.functions if kind == "optimal" else None
     wall = time.perf_counter() - begin
-    place = (setting.value, loop.delta, loop.theta, loop.T, functions)
+    place = (setting.value, loop.delta, loop.theta, loop.T)
     return Limit(*place, **figures, bare_damping=bare, wall_s=wall)
 
 
@@ -292,7 +292,7 @@ def _damping(requirement: Requirement) -> tuple[float | None, ...]:
 
 def remembered(designer: Designer, whole: bool) -> Designer:
     """The same, but what was designed once is not designed again; `whole` if the wish matters to it."""
-    known: dict[tuple[str, Wish | None], Limit] = {}
+    known: dict[tuple[str, Options | None], Limit] = {}
 
     def recalled(setting: Setting) -> Limit:
         key = (digest(setting.loop), setting.wish if whole else None)
@@ -375,32 +375,21 @@ class LadderRow:
     reason: str | None = None
 
 
-def _optimal(functions: int, **options: Any) -> Entry:
-    """The optimal coupling of so many functions per entry of Q; `HF` is what devices may feel above 100 Hz."""
-    kind = "full" if options.get("diagonal") is False else "diagonal"
-    words = [f"optimal, {kind} {functions}"]
-    words += [options["objective"]] if "objective" in options else []
-    words += ["no HF limit"] if "high_gain" in options else []
-    return Entry(", ".join(words), "optimal", "closed-loop", {"functions": functions, **options})
-
-
 SHORT = (
     Entry("none", "none"),
     Entry("published", "published"),
     Entry("spring-damper, any-environment", "spring-damper", "theorem4"),
     Entry("spring-damper, this-environment", "spring-damper"),
-    _optimal(4, high_gain=None),
-    _optimal(8),
-    _optimal(8, high_gain=None),
+    Entry("optimal", "optimal"),
+    Entry("bound for any linear coupling", "bound"),
 )
 FULL = (
     *SHORT[:4],
     Entry("ccl, one state per channel, any-environment", "ccl", "theorem4"),
+    Entry("optimal, one rung", "optimal", options={"ladder": LADDER[:1]}),
+    Entry("optimal, |F| <= 1.5 |E| above 100 Hz", "optimal", options={"high_gain": 1.5}),
+    Entry("optimal, sup", "optimal", options={"objective": "sup"}),
     *SHORT[4:],
-    _optimal(16, high_gain=None),
-    _optimal(16, diagonal=False, filter="mixed", high_gain=None),
-    _optimal(37, diagonal=False, high_gain=None),
-    _optimal(37, diagonal=False, high_gain=None, objective="sup"),
 )
 LADDERS = {"short": SHORT, "full": FULL}
 
@@ -424,6 +413,8 @@ def compare_designs(
 def ladder_row(case: str, loop: Loop, entry: Entry) -> LadderRow:
     """One design with its proof; a request without a solution gives its reason."""
     begin = time.perf_counter()
+    if entry.kind == "bound":
+        return _bound_row(case, loop, entry)
     try:
         coupling, design = _made(loop, case, entry)
     except DesignFailed as error:
@@ -451,6 +442,14 @@ def ladder_row(case: str, loop: Loop, entry: Entry) -> LadderRow:
     )
 
 
+def _bound_row(case: str, loop: Loop, entry: Entry) -> LadderRow:
+    """What no linear coupling can be better than: no design, and of the rms mismatch only."""
+    found = bound(loop)
+    return LadderRow(
+        entry.name, case, None, False, entry.condition, None, finite(found.rms_db), None, found.seconds, 0.0
+    )
+
+
 def _name(entry: Entry, case: str) -> str:
     return f"{entry.name} {PRINTED[case]}" if entry.kind == "published" else entry.name
 
@@ -470,7 +469,7 @@ Sweeps = dict[str, dict[str, list[Limit]]]  # sweep -> design -> its points
 EXACT_DB = -60.0  # below it the difference to the environment is the solver's
 
 
-def gains(plan: dict[str, list[Setting]], curves: Sweeps, loop: Loop, wish: Wish) -> list[str]:
+def gains(plan: dict[str, list[Setting]], curves: Sweeps, loop: Loop, wish: Options) -> list[str]:
     """What there is to gain, in a line per sweep."""
     lines = []
     for name, rows in curves.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal, TypedDict, Unpack
@@ -9,7 +10,7 @@ from typing import Any, Literal, TypedDict, Unpack
 import msgspec
 
 from controller.coupling import Coupling
-from controller.loop import Loop
+from controller.loop import DelayRange, Loop
 from design import certificate as promises
 from design.certificate import LATE, Stored, assess, switching_requirement
 from design.conditions import Condition, Requirement, this_environment
@@ -40,8 +41,22 @@ def usual_condition(loop: Loop, kind: str | None) -> str | None:
 OPTIONS = {
     "spring-damper": ("switching", "limiter"),
     "ccl": ("order", "method", "diagonal"),
-    "optimal": ("functions", "filter", "diagonal", "objective", "high_gain", "margin", "switching"),
+    "optimal": (
+        "objective",
+        "band_hz",
+        "high_gain",
+        "seconds",
+        "switching",
+        "functions",
+        "filter",
+        "diagonal",
+        "margin",
+    ),
 }
+
+#: options of the optimal coupling before 0.2: accepted and without effect
+RETIRED = ("functions", "filter", "diagonal", "margin")
+NO_LONGER = "the optimal coupling chooses its own basis and margin; without effect: {}"
 
 
 def design_by_kind(
@@ -52,8 +67,7 @@ def design_by_kind(
     **options: Any,
 ) -> Design:
     """Design and verify a coupling; `options` are those of the design's own function: order, method, diagonal for ccl,
-    the fields of design.parameter.wish.Wish for optimal. `progress` hears what takes long: (what, steps done, of how
-    many).
+    those of design.optimal.Options for optimal. `progress` hears what takes long: (what, steps done, of how many).
 
     Raises ValueError for a kind or condition that does not exist, Infeasible or DesignFailed (design.failure) where
     there is nothing to return.
@@ -64,16 +78,15 @@ def design_by_kind(
     if condition not in KINDS[kind]:
         raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(KINDS[kind])}")
     from design import fixed_order as ccl  # cvxpy takes a second to import
-    from design import optimal, spring_damper
+    from design import spring_damper
     from design.lmi import Specification
-    from design.optimal import Wish
 
     def made(loop: Loop) -> Design:
+        if kind == "optimal":
+            return _optimal(loop, progress, **options)
         spec = Specification.of(loop)
         if kind == "ccl":
             return ccl.design(spec, **options)
-        if kind == "optimal":
-            return optimal.design(spec, Wish(**options), progress)
         return spring_damper.design(spec, condition, **options)
 
     if loop.latency is None:
@@ -106,6 +119,27 @@ def _with_latency(loop: Loop, made: Callable[[Loop], Design]) -> Design:
     return best
 
 
+def _optimal(
+    loop: Loop,
+    progress: Callable[[str, int, int], None],
+    switching: tuple[Sequence[int], Sequence[int]] | None = None,
+    **options: Any,
+) -> Design:
+    """The optimal coupling; the rungs of its ladder are the steps."""
+    from design import optimal
+
+    asked = optimal.Options(**options)
+    done = 0
+
+    def heard(rung: optimal.Rung) -> None:
+        nonlocal done
+        done += 1
+        progress(f"{rung.mismatch_db:.2f} dB after {rung.seconds:.1f} s", done, len(asked.ladder))
+
+    span = None if switching is None else DelayRange(*(tuple(map(int, end)) for end in switching))
+    return optimal.design(loop.switching(span), asked, progress=heard)
+
+
 def compare_methods(loop: Loop) -> tuple[Row, ...]:
     """Every method on the same specification: norm, convex problems, seconds."""
     from design import fixed_order as ccl
@@ -119,21 +153,20 @@ LOOP = 'a Loop, as scenario.loop("I") gives it'
 
 
 class Options(TypedDict, total=False):
-    """What else can be asked of a kind, see design.designs.OPTIONS.
-
-    design.parameter.wish.Wish says more about the last five.
-    """
+    """What else can be asked of a kind, see design.designs.OPTIONS; functions, filter and margin have no effect."""
 
     order: int  # ccl: states per channel
     method: str  # ccl: complementarity, inner or fixed-poles
-    diagonal: bool  # ccl, optimal: no gain across channels
+    diagonal: bool  # ccl: no gain across channels
     switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of delays that vary
     limiter: bool  # spring-damper, this-environment: covered also while forces are limited
-    functions: int  # optimal: basis functions per entry of Q
-    filter: str  # optimal: where the poles of the basis are
     objective: Literal["rms", "sup"]  # optimal: of the mismatch relative to the environment
-    high_gain: float | None  # optimal: times the environment that the devices may feel at high frequency
-    margin: float  # optimal: share of the damping that stays unused
+    band_hz: tuple[float, float]  # optimal: where the mismatch counts
+    high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: kept low, not limited
+    seconds: float  # optimal: no further rung of the ladder is begun later than this
+    functions: int
+    filter: str
+    margin: float
 
 
 def design_coupling(
@@ -154,7 +187,10 @@ def design_coupling(
     of_kind("loop", loop, Loop, LOOP)
     one_of("kind", kind, KINDS)
     known(options, OPTIONS[kind], f"kind {kind!r}")
-    return design_by_kind(loop, kind, condition, **options)
+    asked: dict[str, Any] = dict(options)
+    if kind == "optimal" and (retired := [name for name in RETIRED if asked.pop(name, None) is not None]):
+        warnings.warn(NO_LONGER.format(", ".join(retired)), DeprecationWarning, stacklevel=2)
+    return design_by_kind(loop, kind, condition, **asked)
 
 
 def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[str]]:

@@ -220,18 +220,25 @@ class SetCheck:
 
 
 def check_set(
-    loop: Loop, coupling: Coupling, seed: int = 0, samples: int = SAMPLES, progress: Progress = lambda done, total: None
+    loop: Loop,
+    coupling: Coupling,
+    seed: int = 0,
+    samples: int = SAMPLES,
+    progress: Progress = lambda done, total: None,
+    searched: Searched | None = None,
+    certificate: Certificate | None = None,
 ) -> SetCheck | None:
     """The coupling over the box of its loop, None where it has none.
 
-    The search is the same every time; `samples` more points are drawn from inside, from the seed.
+    The search is the same every time; `samples` more points are drawn from inside, from the seed. `searched` and
+    `certificate` are those of a design that has made them.
     """
     if loop.box is None:
         return None
-    searched = search_box(loop, coupling, progress)
+    searched = searched or search_box(loop, coupling, progress)
     members, drawn = loop.members(), inside(loop.environment, loop.box, samples, seed)
     try:
-        certificate, reason = prove(loop, coupling, "closed-loop"), None
+        certificate, reason = certificate or prove(loop, coupling, "closed-loop"), None
     except NotProved as error:
         certificate, reason = None, str(error)
     at_members, at_samples = in_each(loop, coupling, members), in_each(loop, coupling, drawn)

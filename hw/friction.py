@@ -199,11 +199,12 @@ def _solve(columns: Array, force: Array) -> Array:
 
 
 def _fitted(balance: _Balance, dry: Array, periodic: list[Array]) -> _Fit:
-    columns, mode, at = balance.matrix(dry, periodic), 0.0, np.zeros(0)
-    for _ in range(_ROUNDS):
-        at = columns(mode)
+    columns = balance.matrix(dry, periodic)
+    at = columns(0.0)
+    p = _solve(at, balance.applied)
+    for _ in range(_ROUNDS - 1):
+        at = columns(p[_MODE])
         p = _solve(at, balance.applied)
-        mode = p[_MODE]
     return _Fit(p, at, balance.applied - at @ p)
 
 

@@ -522,7 +522,7 @@ def _here(name: str, outcome: dict[str, Any]) -> float:
     """Where the scenario stands on this axis, in the unit drawn."""
     here = outcome["here"]
     each = {"damping": min(here["delta"]), "delay": max(here["theta"]), "period": 1e3 * here["T_s"]}
-    return (each | {"order": outcome["wish"]["functions"]})[name]
+    return (each | {"order": len(outcome["wish"]["ladder"])})[name]
 
 
 def _draw_sweep(axis: Axes, name: str, sweep: dict[str, Any], figure: str, here: float) -> dict[str, Any]:

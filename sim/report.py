@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import Compliance, Coupling, InternalModel, SpringDamper
+from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, SpringDamper
 from controller.delay import LOST, Jitter, Ticks, ages
 from controller.lti import Array
 from design.certificate import ANY, CAVEATS, MAKING, assess, certificate_part, encoder_part, finite
@@ -39,7 +39,7 @@ def certificates_part(requirements: Mapping[str, Requirement]) -> dict[str, Any]
 
 
 def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
-    """Kind, gains (None where it has none) and order of V, or of Q."""
+    """Kind, gains (None where it has none) and order of V, Q or R."""
     part: dict[str, Any] = {"kind": kind, "K": None, "B": None, "order": 0}
     match coupling:
         case SpringDamper(K=K, B=B):
@@ -48,6 +48,8 @@ def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
             part["order"] = V.order
         case InternalModel():
             part["order"] = coupling.parameter(T).order
+        case ForceFilter():
+            part["order"] = coupling.filter(T).order
     return part
 
 

@@ -3,29 +3,21 @@
 make bench
 """
 
-from time import perf_counter
-
 import pytest
 
-from controller.environment import environment
-from controller.loop import force_map
 from design import fixed_order as ccl
 from design import optimal, spring_damper
 from design.audit import Subject, report
 from design.certificate import Stored, assess, prove, verify
 from design.lmi import Specification
-from design.optimal import Wish
+from design.optimal import LADDER, Options
 from design.result import CASE_I
-from design.transparency import decibels, transparency
+from design.transparency import decibels
 from sim.scenario import load
 
 pytestmark = pytest.mark.benchmark(group="design")
 LOOP = load().loop("I")
-WISHES = {
-    "8 taps": Wish(),
-    "8 taps, no HF limit": Wish(high_gain=None),
-    "full 37, no HF limit": Wish(functions=37, diagonal=False, filter="mixed", high_gain=None),
-}
+ASKED = {"one rung": Options(ladder=LADDER[:1]), "the whole ladder": Options()}
 
 
 def test_spring_damper(benchmark):
@@ -43,20 +35,15 @@ def test_inner_convex_approximation(benchmark):
 
 
 @pytest.mark.parametrize("case", ["I", "II"])
-@pytest.mark.parametrize("name", WISHES)
+@pytest.mark.parametrize("name", ASKED)
 def test_optimal(benchmark, case, name):
-    """The proof is timed beside it, once."""
+    """The proof is part of the design."""
     loop = load().loop(case)
-    design = benchmark.pedantic(lambda: optimal.design(Specification.of(loop), WISHES[name]), rounds=3, warmup_rounds=1)
-    begin = perf_counter()
-    proof = prove(loop, design.coupling, "closed-loop").proof
-    proving = perf_counter() - begin
-    E = environment(loop.environment, loop.T)
-    found = transparency(force_map(E, design.coupling, loop.theta, loop.psi), E, loop.lam)
-    seconds = benchmark.stats.stats.median
+    design = benchmark.pedantic(lambda: optimal.design(loop, ASKED[name]), rounds=3, warmup_rounds=1)
+    found, seconds = design.figures, benchmark.stats.stats.median
     figures = f"{decibels(found.relative_mismatch):.2f} / {decibels(found.rms_mismatch):.2f} dB"
-    print(f"\ncase {case}, {name}: {figures} in {seconds:.2f} s, swept; proof {proof} in {proving:.2f} s")
-    assert proof == "rational"
+    print(f"\ncase {case}, {name}: {figures} in {seconds:.2f} s, swept and proved")
+    assert design.proved
 
 
 def test_both_margins_and_their_proofs(benchmark):

@@ -69,8 +69,8 @@ def test_delay_inside_the_environment_is_proved_with_its_multiplier(psi):
 
 
 def test_a_model_too_large_to_prove_in_seconds_is_said_so():
-    loop = change(DEFAULT, theta=(100, 100), delta=(400.0, 400.0))
-    with pytest.raises(NotProved, match="over 206 states takes long: up to 200 are tried"):
+    loop = change(DEFAULT, theta=(150, 150), delta=(600.0, 600.0))
+    with pytest.raises(NotProved, match="over 306 states takes long: up to 300 are tried"):
         prove(loop, SpringDamper((4.0, 4.0), (0.5, 0.5)), "closed-loop")
 
 
@@ -246,8 +246,8 @@ def test_a_forger_who_repairs_the_digests_still_has_to_prove():
         (b'"T": 0.0012', b'"T": -1', "$.loop.T"),
         (b'"T": 0.0012', b'"T": "0.0012"', "$.loop.T"),
         (b'"kind": "spring-damper"', b'"kind": "magic"', "$.coupling.kind"),
-        (b'"version": 1', b'"version": 2', "$.version"),
-        (b'"version": 1', b'"version": 1, "extra": 0', "extra"),
+        (b'"version": 2', b'"version": 3', "$.version"),
+        (b'"version": 2', b'"version": 2, "extra": 0', "extra"),
         (b"7806.0", b"-7806.0", "K is [-7806.0, 3137.0]"),
         (b'"theta": [', b'"theta": [0, ', "theta has 3 entries"),
         (b'"proof": "rational"', b'"proof": "faith"', "$.certificate.proof"),

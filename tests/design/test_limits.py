@@ -12,13 +12,14 @@ from controller.loop import force_map
 from design import compare as limit_curve
 from design.compare import AXES, LADDERS, SHORT, Setting, ladder_row, measured, optimum, remembered, settings
 from design.conditions import this_environment
-from design.optimal import Wish
+from design.optimal import LADDER, Options
 from design.result import CASE_I
 from sim.plots import plot_limits
 from sim.scenario import InputError, load
 
 LOOP = load().loop("I")
-SMALL = Wish(functions=4, diagonal=True, high_gain=None)
+SMALL = Options(ladder=LADDER[:1])
+IMPOSSIBLE = Setting(0.0, load().replace(theta=(60, 60), delta=(1e-3, 1e-3)).loop("I"), SMALL)
 
 
 def run(tmp_path, *options):
@@ -82,16 +83,15 @@ def test_more_damping_is_never_worse_and_the_figures_are_the_designs_own():
         np.testing.assert_allclose(limit.bare_damping, 1.7229, rtol=1e-4)
 
 
-def test_more_functions_are_never_worse():
-    along = [Setting(n, LOOP, Wish(functions=n, high_gain=None)) for n in (4, 5, 8)]
-    rms = [optimum(s).rms_mismatch_db for s in along]
+def test_more_rungs_are_never_worse():
+    rms = [optimum(Setting(n, LOOP, Options(ladder=LADDER[:n]))).rms_mismatch_db for n in (1, 2, 3)]
     assert rms == sorted(rms, reverse=True)
 
 
 def test_a_point_without_a_solution_keeps_its_reason():
-    limit = optimum(Setting(1.0, LOOP, Wish(functions=1)))
+    limit = measured(IMPOSSIBLE, "spring-damper", "closed-loop", {})
     assert limit.rms_mismatch_db is None
-    assert "no diagonal Q of 1 functions is certified" in limit.reason
+    assert limit.reason
     assert limit.wall_s > 0
 
 
@@ -103,26 +103,32 @@ def test_nothing_is_designed_twice():
         return measured(setting, "spring-damper", "theorem4", {})
 
     recall = remembered(counted, False)
-    first, again = (recall(s) for s in settings("order", LOOP, SMALL, 2))
+    along = settings("order", LOOP, Options(), 2)
+    first, again = (recall(s) for s in along)
     assert len(calls) == 1
     assert first.rms_mismatch_db == again.rms_mismatch_db
-    assert (first.value, again.value) == tuple(s.value for s in settings("order", LOOP, SMALL, 2))
+    assert (first.value, again.value) == tuple(s.value for s in along)
 
 
 # the command --------------------------------------------------------------------------------------------------------
 
 
-def test_the_command_draws_and_reports(tmp_path):
-    wish = ("--functions", "4", "--diagonal", "--filter", "fir", "--beside", "theorem4")
-    code, report = run(tmp_path, "--over", "damping=1:2,order=4:5", "--points", "3", *wish)
+def test_the_command_draws_and_reports(tmp_path, capsys):
+    wish = ("--beside", "theorem4", "--functions", "4", "--diagonal")  # the last two no longer matter
+    code, report = run(tmp_path, "--over", "damping=1:2,order=1:2", "--points", "3", *wish)
     assert code == 0
     assert set(report["sweeps"]) == {"damping", "order"}
     damping = report["sweeps"]["damping"]
     assert damping["values"] == [row["value"] for row in damping["optimal"]] == [1.0, 1.37, 2.0]
     first, here, free = damping["optimal"]
-    assert first["reason"] is not None  # four taps with the limit above 100 Hz: shown, not dropped
-    assert here["rms_mismatch_db"] == pytest.approx(-21.75, abs=0.1)
-    assert free["rms_mismatch_db"] < -60
+    assert first["rms_mismatch_db"] > here["rms_mismatch_db"]
+    assert here["rms_mismatch_db"] == pytest.approx(-34.9, abs=0.1)
+    assert free["relative_mismatch_db"] is None  # safe without any coupling: no mismatch at all
+    assert free["reason"] is None
+    assert any(
+        "without effect: --functions, --diagonal" in " ".join(line.split())
+        for line in capsys.readouterr().out.split("·")
+    )
     assert len(damping["theorem4"]) == 3
     assert "closed-loop" not in damping
     assert any("(here)" in line for line in report["gains"])
@@ -131,10 +137,9 @@ def test_the_command_draws_and_reports(tmp_path):
     assert not report["interrupted"]
 
 
-def test_nothing_found_is_exit_code_1(tmp_path):
-    code, report = run(
-        tmp_path, "--over", "order=1:2", "--points", "2", "--diagonal", "--filter", "fir", "--beside", "none"
-    )
+def test_nothing_found_is_exit_code_1(tmp_path, monkeypatch):
+    monkeypatch.setattr(command, "optimum", lambda setting: measured(IMPOSSIBLE, "spring-damper", "closed-loop", {}))
+    code, report = run(tmp_path, "--over", "order=1:2", "--points", "2", "--beside", "none")
     assert code == 1
     assert all(row["reason"] for row in report["sweeps"]["order"]["optimal"])
     assert (tmp_path / "out" / "limits.png").is_file()
@@ -150,8 +155,7 @@ def test_interrupting_keeps_the_points_that_are_done(tmp_path, monkeypatch):
         return measured(setting, "spring-damper", "theorem4", {})  # what is designed does not matter here
 
     monkeypatch.setattr(command, "optimum", interrupted)
-    wish = ("--functions", "4", "--diagonal", "--filter", "fir", "--beside", "none")
-    code, report = run(tmp_path, "--over", "damping=1.3:1.5", "--points", "4", *wish)
+    code, report = run(tmp_path, "--over", "damping=1.3:1.5", "--points", "4", "--beside", "none")
     assert code == 130
     assert report["interrupted"]
     assert len(report["sweeps"]["damping"]["optimal"]) == 2
@@ -168,14 +172,14 @@ def test_interrupting_keeps_the_points_that_are_done(tmp_path, monkeypatch):
         (["--over", "delay=0:3"], "--over delay=0:3: delay starts at 0, but the channels differ by 1 samples"),
         (["--over", "delay=1.5:3"], "expected whole numbers of samples"),
         (["--over", "--points", "0"], "--points is 0, allowed are 1 to 100"),
-        (["--over", "--functions", "0"], "--functions is 0, allowed are 1 to 200"),
-        (["--over", "--margin", "2"], "--margin is 2.0, allowed are shares"),
+        (["--over", "--high-gain", "0.5"], "--high-gain is 0.5, expected a factor of at least 1"),
+        (["--over", "--band", "8"], "--band is '8', expected two numbers"),
         (["--over", "--case", "none"], "--case none has no coupling to design"),
         (["--ladder", "--over", "order"], "--over with --ladder: give one of them"),
-        (["--ladder", "--diagonal"], "--diagonal is for --over, not for --ladder"),
+        (["--ladder", "--seconds", "3"], "--seconds is for --over, not for --ladder"),
         (["--ladder", "--case", "II"], "--ladder shows both cases"),
         (["--ladder", "long"], "argument --ladder: invalid choice: 'long'"),
-        (["--over", "order=1:500"], "--over order=1:500: the range 1:500 is none between 1 and 200 functions"),
+        (["--over", "order=1:500"], "--over order=1:500: the range 1:500 is none between 1 and 5 rungs"),
         (["--over", "period=1e-9:1"], "--over period=1e-9:1: the range"),
         (["--over", "--delta", "0"], "expected positive dampings"),
     ],
@@ -192,7 +196,7 @@ def test_a_picture_of_every_number_of_panels(tmp_path):
     row = {"value": 1.0, "rms_mismatch_db": -10.0, "relative_mismatch_db": -5.0}
     sweep = {"label": "x", "unit": "s", "values": [1.0], "optimal": [row, row | {"rms_mismatch_db": None}]}
     here = {"delta": [1.37], "theta": [1], "T_s": 1e-3}
-    outcome = {"objective": "rms", "scenario": "s", "case": "I", "here": here, "wish": {"functions": 8}}
+    outcome = {"objective": "rms", "scenario": "s", "case": "I", "here": here, "wish": {"ladder": [[4, 3]]}}
     for n in range(1, 5):
         chosen = dict.fromkeys(list(AXES)[:n], sweep)
         assert plot_limits(outcome | {"sweeps": chosen}, tmp_path / f"{n}.png").stat().st_size > 5000
@@ -216,10 +220,13 @@ def test_rungs_are_the_designs_that_they_name():
     assert theorem4.required_damping == pytest.approx([0.7145] * 2, abs=1e-4)
     assert theorem4.condition == "theorem4"
     assert theorem4.proof == "rational"
-    optimal = ladder_row("I", LOOP, by_name["optimal, diagonal 4, no HF limit"])
-    assert optimal.relative_mismatch_db <= -16.9
+    optimal = ladder_row("I", LOOP, by_name["optimal"])
+    assert optimal.rms_mismatch_db <= -34.8
     assert optimal.proof == "rational"
     assert optimal.certified
+    limit = ladder_row("I", LOOP, by_name["bound for any linear coupling"])
+    assert optimal.rms_mismatch_db - 1 < limit.rms_mismatch_db < optimal.rms_mismatch_db
+    assert limit.required_damping is None
 
 
 def test_a_rung_that_does_not_exist_says_so():
@@ -249,8 +256,7 @@ def test_a_point_says_what_is_proved_of_it(monkeypatch):
     """Each design's own condition; a proof that fails leaves the point sampled, with the reason."""
     setting = settings("order", LOOP, SMALL, 1)[0]
     assert (optimum(setting).proof, optimum(setting).proof_reason) == ("rational", None)
-    infeasible = Setting(0.0, LOOP, Wish(functions=1, diagonal=True, filter="fir", high_gain=1.0))
-    assert optimum(infeasible).proof is None
+    assert measured(IMPOSSIBLE, "spring-damper", "closed-loop", {}).proof is None
 
     def hopeless(*arguments):
         raise limit_curve.NotProved("too many states")

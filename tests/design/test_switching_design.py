@@ -11,9 +11,8 @@ from controller.delay import Jitter
 from controller.loop import force_map
 from design.certificate import load as load_stored
 from design.conditions import jitter_proof
+from design.designs import design_coupling
 from design.lmi import Specification
-from design.optimal import Wish
-from design.optimal import design as optimal_design
 from design.result import DesignFailed
 from design.spring_damper import design
 from models.scene import Crowd, variants
@@ -88,13 +87,14 @@ def test_theorem4_is_not_designed_for_delays_that_vary():
 
 
 def test_an_optimal_coupling_for_switching_delays():
-    """A full Q of 12 functions: swept, proved, and met by lossless hands under the worst switching."""
+    """Swept, proved, and met by lossless hands under the worst switching."""
     spec = Specification.of(load().loop("I"))
-    made = optimal_design(spec, Wish(functions=12, diagonal=False, switching=RANGE))
+    made = design_coupling(load().loop("I"), "optimal", switching=RANGE)
+    assert made.proved
     swept = jitter_proof(force_map(spec.environment, made.coupling, (0, 0), (0, 0)), *RANGE, spec.delta)
-    assert swept.requirement.ratio == pytest.approx(0.995, abs=1e-3)  # the margin that was asked, all else is spent
-    # found: -12.8 dB, against -3.4 dB of the best spring-damper
-    assert 20 * np.log10(made.objective) < -12.5
+    assert swept.requirement.ratio == pytest.approx(0.998, abs=2e-4)  # the margin, all else is spent
+    # found: -13.3 dB, against -3.4 dB of the best spring-damper
+    assert 20 * np.log10(made.objective) < -12.8
     rng = np.random.default_rng(0)
     links = np.exp(rng.uniform(np.log([0.01, 1.0, 10.0]), np.log([1.0, 1.001, 3000.0]), size=(60, 2, 1, 3)))
     links[..., 1] = 0.0

@@ -1,0 +1,182 @@
+"""A least-squares problem under linear matrix inequalities at many frequencies, by a log-det barrier.
+
+minimise |A x - b|^2 + c'x  subject to  S_k(x) = constant_k + sum_a x_a slope_ka > 0 (Hermitian, one per frequency)
+
+The barrier follows x(t), the minimiser of t (|A x - b|^2 + c'x) - sum_k log det S_k(x): a strictly feasible point at
+most degree/t above the minimum, degree the total size of the S_k. A Newton step is a least-squares problem in the
+directions S^-1/2 dS S^-1/2, and the best length of a step follows from their eigenvalues without further evaluations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, qr, solve_triangular
+
+from controller.lti import Array, Complex
+
+CENTRED = 0.5  # Newton decrement squared at which a point counts as central: 0.05/t above the best value
+MOST_STEPS = 60
+KEPT = 0.3  # of an eigenvalue, at least, after a step
+LONGEST = 1e3  # times the Newton step
+RIDGE = 1e-9  # of its column: what a direction that neither objective nor inequalities see is charged
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """constant + sum_a x_a slope_a > 0 at k frequencies."""
+
+    constant: Complex  # (k, r, r), Hermitian
+    slope: Complex  # (k, n, r, r), Hermitian
+
+    @property
+    def degree(self) -> int:
+        return self.constant.shape[0] * self.constant.shape[1]
+
+    def at(self, x: Array) -> Complex:
+        """S(x), shape (k, r, r)."""
+        k, n, r, _ = self.slope.shape
+        return self.constant + (x @ self.slope.reshape(k, n, r * r)).reshape(k, r, r)
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """The problem in coordinates y, x = change y, in which its directions are of similar size at the start."""
+
+    A: Array  # (rows, n)
+    b: Array  # (rows,)
+    c: Array  # (n,)
+    blocks: tuple[Block, ...]
+
+    @property
+    def degree(self) -> int:
+        return sum(block.degree for block in self.blocks)
+
+    def value(self, x: Array) -> float:
+        """|A x - b|^2 + c'x."""
+        residual = self.A @ x - self.b
+        return float(residual @ residual + self.c @ x)
+
+    def feasible(self, x: Array) -> bool:
+        """Whether every inequality holds strictly."""
+        return all(_definite(block.at(x)) for block in self.blocks)
+
+    def conditioned(self, x: Array) -> tuple[Program, Array]:
+        """(the program in y, the upper triangle U with x = U^-1 y), for which objective and barrier at x are balanced.
+
+        U is the triangle of the stacked rows of both, so that no inner product is ever formed in the ill-conditioned
+        coordinates of a basis of filters.
+        """
+        rows = [_directions(block, x)[0] for block in self.blocks]
+        scale = np.linalg.norm(np.vstack([self.A, *rows]), axis=0)
+        scale = np.where(scale > 0, scale, 1.0)
+        stacked = np.vstack([self.A, *rows, RIDGE * np.diag(scale)])
+        U = np.asarray(qr(stacked, mode="r")[0])[: x.size]
+        A = solve_triangular(U, self.A.T, trans=1).T
+        blocks = tuple(Block(block.constant, _changed(block.slope, U)) for block in self.blocks)
+        return Program(A, self.b, solve_triangular(U, self.c, trans=1), blocks), U
+
+
+def centre(program: Program, x: Array, t: float) -> Array:
+    """The minimiser of t (|A x - b|^2 + c'x) - sum log det S, from a strictly feasible x."""
+    for _ in range(MOST_STEPS):
+        parts = [_directions(block, x) for block in program.blocks]
+        gradient = 2 * t * program.A.T @ (program.A @ x - program.b) + t * program.c
+        hessian = 2 * t * program.A.T @ program.A
+        for rows, ones in parts:
+            gradient -= rows.T @ ones
+            hessian += rows.T @ rows
+        step = _solved(hessian, -gradient)
+        decrement = float(-gradient @ step)
+        if not decrement > CENTRED:
+            break
+        x = x + _length(program, step, x, t) * step
+    return x
+
+
+def towards(start: Array, x: Array, program: Program, reserve: float = 0.9) -> Array:
+    """The point between `start`, strictly feasible, and x that is strictly feasible: x itself where it is one."""
+    if program.feasible(x):
+        return x
+    low, high = 0.0, 1.0
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if program.feasible(start + middle * (x - start)) else (low, middle)
+    return start + reserve * low * (x - start)
+
+
+def _solved(hessian: Array, right: Array) -> Array:
+    scale = 1 / np.sqrt(np.diag(hessian))
+    unit = scale[:, None] * hessian * scale
+    ridge = 0.0
+    while True:
+        try:
+            return scale * cho_solve(cho_factor(unit + ridge * np.eye(len(unit))), scale * right)
+        except LinAlgError:
+            ridge = max(10 * ridge, 1e-14)
+
+
+def _length(program: Program, step: Array, x: Array, t: float) -> float:
+    """The minimiser of the barrier function along the step, where no inequality loses more than it may at once.
+
+    A point that an exact search has taken close to the boundary leaves it in tiny steps only, along a curve.
+    """
+    along = np.concatenate([_eigenvalues(block, x, step) for block in program.blocks])
+    residual, slope = program.A @ x - program.b, program.A @ step
+    linear, square = 2 * t * residual @ slope + t * program.c @ step, 2 * t * slope @ slope
+
+    def rises(s: float) -> bool:
+        return linear + square * s > (along / (1 + s * along)).sum()
+
+    low, high = 0.0, (1 - KEPT) / -along.min() if along.min() < 0 else LONGEST
+    if not rises(high):
+        return high
+    while high - low > 0.01 * high:
+        middle = (low + high) / 2
+        low, high = (low, middle) if rises(middle) else (middle, high)
+    return (low + high) / 2
+
+
+def _eigenvalues(block: Block, x: Array, step: Array) -> Array:
+    """Those of S^-1/2 dS S^-1/2 for the step, at every frequency."""
+    inverse = _inverse_root(block.at(x))
+    k, n, r, _ = block.slope.shape
+    moved = (step @ block.slope.reshape(k, n, r * r)).reshape(k, r, r)
+    return np.linalg.eigvalsh(inverse @ moved @ np.conj(np.swapaxes(inverse, 1, 2))).ravel()
+
+
+def _directions(block: Block, x: Array) -> tuple[Array, Array]:
+    """(rows, ones): the real vectors of S^-1/2 slope_a S^-1/2 as columns, (k r^2, n), and that of the identity."""
+    adjoint = np.conj(np.swapaxes(_inverse_root(block.at(x)), 1, 2))
+    k, n, r, _ = block.slope.shape
+    half = (block.slope.reshape(k, n * r, r) @ adjoint).reshape(k, n, r, r)
+    H = (np.conj(np.swapaxes(half, 2, 3)).reshape(k, n * r, r) @ adjoint).reshape(k, n, r, r)
+    upper = np.triu_indices(r, 1)
+    off = np.asarray(H[:, :, upper[0], upper[1]] * np.sqrt(2))
+    on = np.real(np.diagonal(H, axis1=2, axis2=3))
+    rows = np.concatenate([on, np.real(off), np.imag(off)], axis=2)
+    ones = np.tile(np.concatenate([np.ones(r), np.zeros(r * (r - 1))]), k)
+    return np.swapaxes(rows, 1, 2).reshape(k * r * r, n), ones
+
+
+def _inverse_root(S: Complex) -> Complex:
+    """W with W S W* = I."""
+    return np.linalg.inv(np.linalg.cholesky(S)).astype(np.complex128, copy=False)
+
+
+def _definite(S: Complex) -> bool:
+    try:
+        np.linalg.cholesky(S)
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.isfinite(S).all())
+
+
+def _changed(slope: Complex, U: Array) -> Complex:
+    """The slopes of y where x = U^-1 y."""
+    k, n, r, _ = slope.shape
+    columns = np.moveaxis(slope, 1, 0).reshape(n, -1)
+    solved = solve_triangular(U, np.hstack([np.real(columns), np.imag(columns)]), trans=1)
+    half = columns.shape[1]
+    return np.moveaxis((solved[:, :half] + 1j * solved[:, half:]).reshape(n, k, r, r), 0, 1)
