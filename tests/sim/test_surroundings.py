@@ -14,7 +14,9 @@ from models.scene import variants
 from sim.couplings import choose
 from sim.crowds import crowds
 from sim.scenario import load
+from sim.limit_cycles import HeldDevices
 from sim.stability import dominant_mode, exact_loops
+from sim.zwidth import EnvironmentSweep
 
 PAIR, STAR = load("omega-pair"), load("three-rigid")
 WALL = Network(("tip",), (Spring(("tip", GROUND), 2000.0, 0.2),))
