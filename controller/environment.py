@@ -289,6 +289,10 @@ class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.between[0] == self.between[1]:
             raise ValueError(f"between joins {self.between[0]!r} to itself; name two different nodes")
 
+    def amounts(self, number: Callable[[float], Any]) -> tuple[Any, Any, Any]:
+        """Mass [kg], damping [N s/m] and stiffness [N/m] between the ends: what another linear element overrides."""
+        return number(0.0), number(self.damping), number(self.stiffness)
+
 
 class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A one-sided spring-damper: it pushes the first node back once it is `gap` beyond the second; see contact.py."""
@@ -346,8 +350,8 @@ class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
         D, K = np.zeros_like(M), np.zeros_like(M)
         for spring, across in zip(self.springs, self.across(self.springs), strict=True):
             pattern = np.outer(across, across)
-            D += number(spring.damping) * pattern
-            K += number(spring.stiffness) * pattern
+            mass, damping, stiffness = spring.amounts(number)
+            M, D, K = M + mass * pattern, D + damping * pattern, K + stiffness * pattern
         return M, D, K
 
     def across(self, parts: Sequence[Spring | Wall]) -> NDArray[np.int64]:

@@ -10,11 +10,13 @@
     $ python -m sim.accuracy
 
 A toml block whose first line is `# NAME.toml` is a file for the commands after it; `<!-- picture: FROM TO -->` keeps a
-picture that a command has drawn. tests/test_docs.py runs the same steps and compares, but for what is measured.
+picture that a command has drawn; `<!-- source: FILE FUNCTION -->` before a python block puts that function there.
+tests/project/test_docs.py runs the same steps and compares, but for what is measured.
 """
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import shlex
@@ -32,6 +34,7 @@ _BLOCK = r"(<!-- {}(?:: (.+))? -->\n```{}\n\$ (python (?:-m|examples/).+)\n)((?:
 SHOWN = re.compile(_BLOCK.format("output", "console"))
 MEASURED = re.compile(_BLOCK.format("measured", "text"))
 BLOCK = re.compile(r"^```(sh|console|toml|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
+SOURCE = re.compile(r"(<!-- source: (\S+) (\S+) -->\n)```python\n(?:.*\n)*?```")
 PICTURE = re.compile(r"<!-- picture: (\S+) (\S+) -->")
 
 
@@ -51,6 +54,17 @@ def steps(text: str) -> Iterator[Step]:
         elif kind in ("sh", "console"):
             lines = (line.removeprefix("$ ") for line in body.splitlines())
             yield from (Step("command", line) for line in lines if line.startswith(("python -m", "python examples/")))
+
+
+def sourced(text: str) -> str:
+    """The page with the code of its own functions where it asks for them: <!-- source: FILE FUNCTION -->."""
+
+    def code(match: re.Match[str]) -> str:
+        lines = (ROOT / match[2]).read_text(encoding="utf-8").splitlines()
+        node = next(n for n in ast.parse("\n".join(lines)).body if getattr(n, "name", "") == match[3])
+        return f"{match[1]}```python\n" + "\n".join(lines[node.lineno - 1 : node.end_lineno]) + "\n```"
+
+    return SOURCE.sub(code, text)
 
 
 def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
@@ -98,7 +112,7 @@ def main() -> int:
                     printed[step.text] = done.stdout
             for source, target in PICTURE.findall(text):
                 shutil.copyfile(folder / source, page.parent / target)
-            fresh = renewed(text, printed)
+            fresh = sourced(renewed(text, printed))
             if fresh != text:
                 page.write_text(fresh, encoding="utf-8")
                 print(f"changed: {page.relative_to(ROOT)}")

@@ -103,6 +103,11 @@ def test_every_snippet_runs(page, place, monkeypatch):
             exec(compile(snippet, f"{page.name}, Python block {number}", "exec"), namespace)
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
+def test_code_that_a_page_shows_is_the_code(page):
+    assert regenerate.sourced(TEXTS[page]) == TEXTS[page]
+
+
 def test_a_page_gets_the_lines_that_it_asks_for():
     page = "<!-- output: certified -->\n```console\n$ python -m x\nold\n```\nafter\n```console\n$ python -m x\n```\n"
     fresh = regenerate.renewed(page, {"python -m x": "noise\nis certified  \nmore noise\n"})
