@@ -224,12 +224,12 @@ def delayed_coupling_block(
     [[T (H(1)/2 - R), 0], [2 H, S]]. Raises ValueError for a multiplier that is none.
     """
     T = V.T
-    delta = even_damping(delta, T, T_max)
-    if len(phi) != len(delta) or not all(0 <= p < d for p, d in zip(phi, delta, strict=True)):
+    damping = even_damping(delta, T, T_max)
+    if len(phi) != len(delta) or not all(0 <= p < d for p, d in zip(phi, damping, strict=True)):
         raise ValueError("the multiplier Phi is not between 0 and the device damping on every channel")
-    H = V - np.diag(T / (2 * delta)) @ moving_sum(theta, T)
+    H = V - np.diag(T / (2 * damping)) @ moving_sum(theta, T)
     H1, R = H.split_at_one()
-    excess = [(1 / p - 1 / d) * (1 - STRICT) if p else UNLIMITED / d for p, d in zip(phi, delta, strict=True)]
+    excess = [(1 / p - 1 / d) * (1 - STRICT) if p else UNLIMITED / d for p, d in zip(phi, damping, strict=True)]
     m = len(delta)
     right = np.vstack([np.zeros((m, m), dtype=object), np.diag(numbers(excess, T))])
     return H1, hstack(vstack(T * (H1 / 2 - R), 2 * H), Lti.constant(right, T))
@@ -437,11 +437,11 @@ def walls_proof(
     sampled = Sampled(z[None], G.at(z)[None], G.T)
 
     def needed(values: Array) -> float:
-        demand = walls_demand(sampled, available, stiffness, values, None, T_max)
+        demand = walls_demand(sampled, available, stiffness, values.tolist(), None, T_max)
         return float(least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G)).max())
 
     found = _best_g(needed, w) if g is None else np.asarray(g, dtype=float)
-    demand = walls_demand(G, available, stiffness, found, None, T_max)
+    demand = walls_demand(G, available, stiffness, found.tolist(), None, T_max)
     ratio, at = supremum(lambda w: least_scale(demand, w), grid)
     if np.isinf(ratio):
         return refused("no multiplier was found with which the walls are covered, whatever the damping")
