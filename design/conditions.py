@@ -263,7 +263,7 @@ UNLIMITED = 10**6
 
 
 def delayed_coupling_block(
-    V: Lti, theta: Sequence[int], phi: Sequence[Any], delta: Sequence[Any], T_max: float | None = None
+    V: Lti, theta: Sequence[int], phi: Sequence[Any], delta: Any, T_max: float | None = None
 ) -> tuple[Array, Lti]:
     """H(1), which must be symmetric, and the block that carries the excess of V-hat, exactly, for the multiplier phi.
 
