@@ -174,7 +174,8 @@ FROZEN = "each frozen contact state of this environment (contact that makes and 
 
 #: What no certificate covers.
 CAVEATS = (
-    "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted), "
+    "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted) "
+    "or leave through the limiter that a report names, "
     "not for contacts that make and break (except walls under theorem4, without delay in the environment), "
     "jitter of T, quantisation, velocity filters or friction compensation."
 )

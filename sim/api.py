@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from controller.coupling import Coupling, NoCoupling
@@ -26,12 +27,14 @@ def simulate(
     integrator: str | None = None,
     substeps: int | None = None,
     seed: int = 0,
+    lag: Sequence[float] | None = None,
 ) -> Trace:
     """The scenario's run, from rest, for `scenario.duration` seconds.
 
     `coupling` None is the loop without one; `engine` is "mujoco" or "exact" (the linear loop, no Coulomb friction);
     `integrator` of MuJoCo, None for "exponential", or "RK4" where a device has Coulomb friction; `substeps` steps per
-    period, None for what the plant asks; `seed` draws delays that vary.
+    period, None for what the plant asks; `seed` draws delays that vary; `lag`, rho (m,) [N/m], limits forces as
+    `design.certificate.covered_limits` says that a guarantee covers it, None clips them.
 
     Returns a Trace of N samples and m channels: t (N,) [s], x (N, m) and x_handle (N, m) [m], v_handle (N, m) [m/s],
     f (N, m) [N] (the devices feel -f) and `meta`, with the scenario's digest and `meta["stability"]`: growth rates
@@ -48,7 +51,9 @@ def simulate(
         one_of("integrator", integrator, tuple(INTEGRATORS))
     if substeps is not None:
         substeps = whole("substeps", substeps, 1, MOST)
-    simulation = assemble(scenario, alone)
+    if lag is not None and scenario.switches:
+        raise ValueError("lag: limited forces are covered for constant delays only")
+    simulation = assemble(scenario, alone, lag)
     if scenario.switches:
         simulation, _ = switching(simulation, alone, seed, scenario.samples)
     integrator, substeps, remarks = settle(simulation, engine, integrator, substeps)
