@@ -214,7 +214,8 @@ MAKING = "this environment, with walls up to their stiffness that make and break
 
 #: What no certificate covers.
 CAVEATS = (
-    "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted), "
+    "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted) "
+    "or leave through the limiter that a report names, "
     "not for walls with dampers that make and break contact (except under any-environment without delay in the "
     "environment), periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb "
     "friction pays for, velocity filters or friction compensation."

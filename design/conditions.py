@@ -272,12 +272,12 @@ def delayed_coupling_block(
     [[T (H(1)/2 - R), 0], [2 H, S]]. Raises ValueError for a multiplier that is none.
     """
     T = V.T
-    delta = even_damping(delta, T, T_max)
-    if len(phi) != len(delta) or not all(0 <= p < d for p, d in zip(phi, delta, strict=True)):
+    damping = even_damping(delta, T, T_max)
+    if len(phi) != len(delta) or not all(0 <= p < d for p, d in zip(phi, damping, strict=True)):
         raise ValueError("the multiplier Phi is not between 0 and the device damping on every channel")
-    H = V - np.diag(T / (2 * numbers(delta, T))) @ moving_sum(theta, T)
+    H = V - np.diag(T / (2 * damping)) @ moving_sum(theta, T)
     H1, R = H.split_at_one()
-    excess = [(1 / p - 1 / d) * (1 - STRICT) if p else UNLIMITED / d for p, d in zip(phi, delta, strict=True)]
+    excess = [(1 / p - 1 / d) * (1 - STRICT) if p else UNLIMITED / d for p, d in zip(phi, damping, strict=True)]
     m = len(delta)
     right = np.vstack([np.zeros((m, m), dtype=object), np.diag(numbers(excess, T))])
     return H1, hstack(vstack(T * (H1 / 2 - R), 2 * H), Lti.constant(right, T))

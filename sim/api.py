@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from controller.coupling import Coupling, NoCoupling
@@ -31,12 +31,14 @@ def simulate(
     seed: int = 0,
     environment: Callable[[Array], Array] | None = None,
     energy_budget: float | None = None,
+    lag: Sequence[float] | None = None,
 ) -> Trace:
     """The scenario's run, from rest, for `scenario.duration` seconds.
 
     `coupling` None is the loop without one; `engine` is "mujoco" or "exact" (the linear loop, no Coulomb friction);
     `integrator` of MuJoCo, None for "exponential", or "RK4" where a device has Coulomb friction; `substeps` steps per
-    period, None for what the plant asks; `seed` draws delays that vary.
+    period, None for what the plant asks; `seed` draws delays that vary; `lag`, rho (m,) [N/m], limits forces as
+    `design.certificate.covered_limits` says that a guarantee covers it, None clips them.
 
     `environment` takes the place of the scenario's: anything that answers, once a tick, where its port would be if it
     gave no force, (m,) [m], with a force fed back (m,) [N]. A shell makes it passive, which may give `energy_budget`
@@ -58,7 +60,9 @@ def simulate(
         one_of("integrator", integrator, tuple(INTEGRATORS))
     if substeps is not None:
         substeps = whole("substeps", substeps, 1, MOST)
-    simulation = assemble(scenario, alone)
+    if lag is not None and scenario.switches:
+        raise ValueError("lag: limited forces are covered for constant delays only")
+    simulation = assemble(scenario, alone, lag)
     if scenario.switches:
         simulation, _ = switching(simulation, alone, seed, scenario.samples)
     integrator, substeps, remarks = settle(simulation, engine, integrator, substeps)

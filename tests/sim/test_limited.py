@@ -9,6 +9,7 @@ import pytest
 from cli.run import main
 from controller.coupling import SpringDamper
 from design.certificate import assess, covered_limits
+from sim.api import simulate
 from sim.run import assemble, run
 from sim.scenario import load
 
@@ -30,6 +31,7 @@ def test_which_limiter_a_coupling_may_have():
     assert any_environment.rho == (0.0, 0.0)
     own = covered_limits(loop, BUILT, assess(loop, BUILT))
     assert own.rho == pytest.approx((11.4167, 11.4167))
+    assert own.requirement is not None
     assert own.requirement.proof == "rational"
     stiff = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
     refused = covered_limits(loop, stiff, assess(loop, stiff))
@@ -55,6 +57,13 @@ def test_limited_and_clipped_runs_agree_while_no_force_is_at_its_limit():
     limited, clipped = (run(assemble(scenario, BUILT, lag), "exact") for lag in ((11.4167, 11.4167), None))
     np.testing.assert_allclose(limited.f, clipped.f, atol=1e-10)
     np.testing.assert_allclose(limited.x, clipped.x, atol=1e-13)
+
+
+def test_a_script_limits_forces_as_the_command_does():
+    scenario = weak(0.3, 0.2)
+    loop = scenario.loop("I")
+    trace = simulate(scenario, SOFT, "exact", lag=covered_limits(loop, SOFT, assess(loop, SOFT)).rho)
+    np.testing.assert_array_equal(trace.f, run(assemble(scenario, SOFT, (0.0, 0.0)), "exact").f)
 
 
 def test_the_report_says_which_guarantee_holds(tmp_path):

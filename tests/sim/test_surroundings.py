@@ -13,8 +13,8 @@ from design.frequency import on_circle
 from models.scene import variants
 from sim.couplings import choose
 from sim.crowds import crowds
-from sim.scenario import load
 from sim.limit_cycles import HeldDevices
+from sim.scenario import load
 from sim.stability import dominant_mode, exact_loops
 from sim.zwidth import EnvironmentSweep
 
