@@ -329,13 +329,14 @@ def least_multiple(free: Complex, gain: Complex) -> Array:
     scale = np.where(eigenvalues > floor, 1 / np.sqrt(np.maximum(eigenvalues, floor)), 1.0)
     whitened = np.conj(np.swapaxes(basis, -1, -2)) * scale[..., :, None]
     H = whitened @ (free @ np.conj(np.swapaxes(whitened, -1, -2)))
-    flat, missing = H.reshape(-1, *H.shape[-2:]), (eigenvalues <= floor).sum(axis=-1).ravel()
+    flat, shape = H.reshape(-1, *H.shape[-2:]), H.shape[:-2]
+    missing = np.broadcast_to((eigenvalues <= floor).sum(axis=-1), shape).ravel()
     needed = np.empty(missing.size)
     for r in np.unique(missing):  # eigenvalues ascend: the first r directions are those that the gain does not reach
         here = flat[missing == r]
         needed[missing == r] = _beyond_the_null_space(here, r) if r else np.linalg.eigvalsh(-here)[:, -1]
-    needed[(eigenvalues < -floor).any(axis=-1).ravel()] = np.inf
-    return needed.reshape(H.shape[:-2])
+    needed[np.broadcast_to((eigenvalues < -floor).any(axis=-1), shape).ravel()] = np.inf
+    return needed.reshape(shape)
 
 
 def _beyond_the_null_space(H: Complex, r: int) -> Array:
