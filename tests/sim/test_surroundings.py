@@ -151,7 +151,7 @@ def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
     for name in report["conditions"]:
         missing = any(value is None for row in report[name]["required_over_available"] for value in row)
         assert missing == ("reason" in report[name])
-    for words in ("guarantee: this environment", "for its environment alone", "model set to the cell's environment"):
+    for words in ("guarantee: this environment", "for its environment alone"):
         assert words in " ".join(text.split())
     assert (tmp_path / "zwidth.png").read_bytes().startswith(b"\x89PNG")
 
