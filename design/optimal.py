@@ -540,6 +540,8 @@ def design(
     Raises ValueError for a loop with walls or an environment that is not stable, DesignFailed where not even a
     millionth of the environment keeps what is asked.
     """
+    if min(loop.delta) <= 0:
+        raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
     climb = _Climb.of(loop, options, further)
     if exactly := climb.nothing():
         return exactly

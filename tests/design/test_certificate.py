@@ -344,7 +344,7 @@ def test_a_sweep_that_says_no_is_not_outvoted(monkeypatch):
 @pytest.mark.parametrize(
     ("loop", "coupling", "said"),
     [
-        (change(DEFAULT, theta=(100, 100), psi=(1, 0)), STIFF, "over 201 states takes long: up to 200 are tried"),
+        (change(DEFAULT, theta=(150, 150), psi=(1, 0)), STIFF, "over 301 states takes long: up to 300 are tried"),
         (DEFAULT, SpringDamper((7806.0, 3137.0), (1e-300, 1.0)), "1e-300 has too many digits for exact arithmetic"),
     ],
 )

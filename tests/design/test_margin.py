@@ -186,3 +186,14 @@ def test_with_a_multiplier_the_factor_is_the_least_by_definition():
     assert (np.abs(least(s)) < 1e-9 * scale).all()
     assert (least(1.001 * s) > 0).all()
     assert (least(0.999 * s) < 0).all()
+
+
+def test_weights_for_separate_humans_gain_nothing_where_the_loop_is_reciprocal():
+    """Each human's energy weighed by d > 0 turns F/delta into sqrt(d) F/delta sqrt(d)^-1: never a smaller need."""
+    F = force_map(environment(FIGURE_4, 1.2e-3), SpringDamper([900.0, 600.0], [0.4, 0.6]), (1, 2), (0, 0))
+    rng, z = np.random.default_rng(8), np.exp(1j * np.geomspace(1e-2, 3.1, 60))
+    X = -F.at(z) / (z - 1)[:, None, None]
+    need = np.linalg.eigvalsh((X + np.conj(np.swapaxes(X, 1, 2))) / 2)[:, -1]
+    for d in np.exp(rng.normal(size=(30, 2))):
+        weighed = np.sqrt(d)[:, None] * X / np.sqrt(d)
+        assert (np.linalg.eigvalsh((weighed + np.conj(np.swapaxes(weighed, 1, 2))) / 2)[:, -1] >= need - 1e-9).all()

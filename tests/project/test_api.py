@@ -80,7 +80,12 @@ def test_promise_and_transparency_are_those_of_the_commands(tmp_path):
 
     loop = load().loop("I")
     found = design_coupling(loop)
-    assert design_command(["--out", str(tmp_path / "c.json"), "--json", str(tmp_path / "r.json")]) == 0
+    assert (
+        design_command(
+            ["--condition", "any-environment", "--out", str(tmp_path / "c.json"), "--json", str(tmp_path / "r.json")]
+        )
+        == 0
+    )
     report = json.loads((tmp_path / "r.json").read_text())
     assert promise(loop, certify(loop, found)) == report["promise"] == "any passive environment"
     figures = transparency_of(loop, found)
