@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, NoCoupling, SpringDamper
+from controller.coupling import (
+    Compliance,
+    Coupling,
+    ForceFilter,
+    InternalModel,
+    MovingAverage,
+    NoCoupling,
+    SpringDamper,
+)
 from controller.environment import GROUND, Network, Spring, environment, held
 from controller.loop import DelayRange, Loop, force_map
 from controller.lti import Lti, SingularLoop
@@ -385,6 +393,7 @@ def _smaller(vary: Callable[[float], Subject], describe: Callable[[float], str],
 KINDS = {
     NoCoupling: "none",
     SpringDamper: "spring-damper",
+    MovingAverage: "moving-average",
     Compliance: "compliance",
     InternalModel: "internal-model",
     ForceFilter: "force-filter",
