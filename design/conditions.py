@@ -429,7 +429,7 @@ def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float], T_max:
     return from_ratio("theorem4", ratio, available, w / (2 * np.pi * V.T))
 
 
-#: V is taken to vanish in a direction in which it is smaller than this, beside V(1): nearer to a zero, rounding decides.
+#: V is taken to vanish in a direction in which it is smaller than this, beside V(1): nearer to a zero is rounding.
 _VANISHES = 1e-5
 #: What stands there in place of its passivity, beside V(1), and the ratio from which on nothing else does.
 _SOFTENED, _NEVER = 1e-12, 1e6
