@@ -183,8 +183,8 @@ def design_coupling(
     """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
 
     `kind` is "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal"; `condition` is
-    "theorem4" (any passive environment) or "closed-loop" (this environment), None for the kind's own. `options` are those of the kind, see Options; switching is not taken
-    from loop.jitter.
+    "theorem4" (any passive environment) or "closed-loop" (this environment), None for the kind's own. `options` are
+    those of the kind, see Options; switching is not taken from loop.jitter.
 
     Returns a Design: `coupling` (for a spring-damper with K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the damping
     that it needs, from a sweep of the coupling alone), `figure` and `objective` (what was minimised, and its value).
