@@ -43,7 +43,7 @@ def main(argv: list[str]) -> int:
     out = options.out_folder(args, "audit")
 
     begin = time.perf_counter()
-    with render.progress("searching the ranges") as move:
+    with render.progress("searching the ranges" if not args.rigid and scenario.box else "judging the coupling") as move:
         loop = None if args.rigid else scenario.loop(args.case)
         whole = loop and check_set(loop, subject.coupling, args.seed, progress=move)
     outcome = {
@@ -277,17 +277,25 @@ def _remarks(outcome: dict[str, Any]) -> list[str]:
         sensitivity = part["sensitivity"].get("reason") if part["certified"] else None
         reasons = {"": part.get("reason"), ", stiffest K": part["stiffest"].get("reason"), ", sensitivity": sensitivity}
         lines += [f"{name}{of}: {reason}." for of, reason in reasons.items() if reason]
-    for helping in outcome["helps"]:
-        enough = "enough" if helping["certified"] else "not enough alone"
-        need = (
-            f"{CONDITION_NAMES[helping['condition']]} then needs {listed(helping['required_damping'])} N s/m, {enough}"
-        )
-        lines.append(f"What helps: {helping['change']} ({need}).")
+    if not outcome["certified"]:
+        lines += _proposed(outcome["helps"])
     if (part := outcome["jitter-proof"]) is not None:
         lines += _switching_remarks(part)
     if part := outcome["encoder"]:
         lines.append(f"{part['words'][0].upper()}{part['words'][1:]}.")
     return [*lines, outcome["not_covered"]]
+
+
+def _proposed(helps: Sequence[dict[str, Any]]) -> list[str]:
+    """Changes that were certified, the one that leaves most damping over first."""
+    enough = sorted((each for each in helps if each["certified"]), key=lambda each: max(each["required_damping"]))
+    if not enough:
+        return ["What helps: no single change of delay, damper or period was certified; a design finds other gains."]
+    return [
+        f"What helps: {each['change']} ({CONDITION_NAMES[each['condition']]} then needs "
+        f"{listed(each['required_damping'])} N s/m, certified)."
+        for each in enough
+    ]
 
 
 def _switching_remarks(part: dict[str, Any]) -> list[str]:

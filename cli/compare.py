@@ -336,7 +336,7 @@ def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
         files.append(plot_baselines(outcome, out / "baselines.png"))
     heads = ("", "error %", "> 40 Hz N", "peak N", "acted %", "hands", "m/s", "guarantee")
     cells = [_rival(row) for row in rows]
-    shown = [render.grid(f"on the same runs · {scenario.name}, case {args.case}", heads, cells, left=(0, 7))]
+    shown = [render.grid(f"on the same runs · {scenario.title(args.case)}", heads, cells, left=(0, 7))]
     lines = [f"* baseline {row.name}: {row.source}." for row in rows if row.source]
     lines.append(f"hands: of {PAIRS} lossless pairs, faster after {SECONDS:g} s than the {SLOW:g} m/s they began with.")
     lines += sorted({f"error: {row.reason}." for row in rows if row.reason})

@@ -40,7 +40,7 @@ from design.spring_damper import STIFFEST
 from design.transparency import BAND_HZ, transparency
 from sim import report
 from sim.files import out_file
-from sim.scenario import InputError
+from sim.scenario import InputError, Scenario
 
 
 def main(argv: list[str]) -> int:
@@ -49,13 +49,14 @@ def main(argv: list[str]) -> int:
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
     options.check_json(args)
-    out = out_file(args.out, f"out/design-{args.case}.json", "the file of the coupling")
-    loop = _loop(args)
+    out = out_file(args.out, f"out/design-{options.place(args)}.json", "the file of the coupling")
+    scenario = options.scenario_from(args)
+    loop = _loop(args, scenario)
     design = _design(args, loop)
     best = design if isinstance(design, Optimal) else None
     held = best and best.certificate
     requirements = assess(loop, design.coupling, design.phi, held)
-    with render.progress("searching the ranges") as move:
+    with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:
         whole = check_set(loop, design.coupling, args.seed, args.samples, move, best and best.searched, held)
     certificates = report.certificates_part(requirements)
     outcome = {
@@ -79,7 +80,7 @@ def main(argv: list[str]) -> int:
         outcome |= _best_figures(args, loop, best)
     if args.compare:
         outcome["comparison"] = [asdict(row) for row in compare_methods(loop)]
-    render.publish(args, outcome, _tables(outcome), outcome.get("notes", ()))
+    render.publish(args, outcome, _tables(scenario, outcome), outcome.get("notes", ()))
     holds = outcome["certificate"]["certified"] and (outcome["promise"] == ANY or not whole or whole.proved)
     switching = outcome["jitter_proof"]
     return options.DONE if holds and (switching is None or switching["certified"]) else options.DOES_NOT_HOLD
@@ -108,7 +109,7 @@ def _parser() -> options.Parser:
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"
     parser.add_argument("--samples", type=options.whole(0, 10_000), default=SAMPLES, metavar="N", help=samples)
     ccl.add_argument("--full", action="store_true", help="across channels (default: diagonal)")
-    options.add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case>.json)")
+    options.add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case or scenario>.json)")
     return parser
 
 
@@ -166,9 +167,9 @@ OPTIONS = {
 }
 
 
-def _loop(args: argparse.Namespace) -> Loop:
+def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     """The scenario's loop with the range of delays that --jitter gives. Raises InputError."""
-    loop = options.scenario_from(args).loop(args.case)
+    loop = scenario.loop(args.case)
     if args.ranges is not None:
         if loop.box or loop.environment.walls:
             raise InputError(f"--ranges and {'[box]' if loop.box else 'environment.walls'}: give one of them")
@@ -328,10 +329,10 @@ def _proved(loop: Loop, design: Design, beta: float | None) -> tuple[Certificate
 # The report as tables.
 
 
-def _tables(outcome: dict[str, Any]) -> list[Table]:
+def _tables(scenario: Scenario, outcome: dict[str, Any]) -> list[Table]:
     condition = CONDITION_NAMES[outcome["certificate"]["condition"]]
-    title = f"{outcome['coupling']['kind']}, case {outcome['case']}, {condition}"
-    shown = [render.facts(title, _rows(outcome))]
+    title = f"{scenario.title(outcome['case'])}: {outcome['coupling']['kind']} for {condition}"
+    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(outcome)])]
     if outcome["price"]:
         shown.append(_over_the_ranges(outcome["price"]))
     if "comparison" in outcome:
@@ -359,13 +360,22 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("guarantee", outcome["promise"] or "none"),
         ("guarantee, forces", "holds also while forces are limited" if stored["limited_forces"] else None),
         ("guarantee, delays", switching["promise"] if switching.get("proof") else None),
-        (outcome["objective_name"], f"{outcome['objective']:.5g}"),
+        ("designed for", f"{OBJECTIVE_WORDS[outcome['objective_name']]}: {outcome['objective']:.5g}"),
         ("transparency error", render.transparency_error(transparent)),
         *_best_rows(outcome),
         ("convex problems", f"{outcome['sdps']} in {outcome['wall_s']:.2f} s"),
         ("stored", f"{stored['file']} (proof: {stored['proof'] or stored['reason']})"),
         ("", f"for constant delays only: {switching['reason']}" if switching and not switching["proof"] else None),
     ]
+
+
+#: what a design minimised or maximised -> in words
+OBJECTIVE_WORDS = {
+    "loop-norm": "the least norm of W1 L W2, (23) of the paper",
+    "rms": "the least rms transparency error, a ratio",
+    "sup": "the least largest transparency error, a ratio",
+    "stiffness": "the most stiffness, of all channels together [N/m]",
+}
 
 
 def _best_rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:

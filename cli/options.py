@@ -235,7 +235,7 @@ def add_energy_budget_option(parser: argparse._ActionsContainer) -> None:
 def add_output_options(
     parser: argparse.ArgumentParser,
     out: str = "DIR",
-    what: str = "folder for files, made if it is not there (default out/<command>-<case>)",
+    what: str = "folder for files, made if it is not there (default out/<command>-<case or scenario>)",
     picture: bool = False,
 ) -> None:
     """Where results go, and the seed."""
@@ -262,7 +262,14 @@ def check_json(args: argparse.Namespace) -> None:
 def out_folder(args: argparse.Namespace, command: str) -> Path:
     """The folder for the files of a command, made before any work is done. Raises InputError."""
     check_json(args)
-    return folder(Path(args.out or f"out/{command}{f'-{args.case}' if 'case' in args else ''}"))
+    return folder(Path(args.out or f"out/{command}{f'-{place(args)}' if 'case' in args else ''}"))
+
+
+def place(args: argparse.Namespace) -> str:
+    """The case, or of a scenario of one's own its name, for the names of files."""
+    if args.scenario == DEFAULT:
+        return args.case
+    return Path(args.scenario).stem + ("" if args.case == "I" else f"-{args.case}")
 
 
 def seed_from(args: argparse.Namespace) -> int:
@@ -381,10 +388,10 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
         with threadpool_limits(1, user_api="blas"):
             code = main(sys.argv[1:] if argv is None else argv)
     except (InputError, SingularLoop) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"error: {one_line(str(error))}", file=sys.stderr)
         code = BAD_INPUT
     except DesignFailed as error:
-        print(f"not possible: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"not possible: {one_line(str(error))}", file=sys.stderr)
         code = DOES_NOT_HOLD
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -400,6 +407,16 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
     except OSError as error:
         code = _cannot(error)
     sys.exit(code)
+
+
+QUOTED = 80  # characters of what the user gave that an error repeats
+LONG = re.compile(rf"'[^']{{{QUOTED + 1},}}'|[^\s/]{{{QUOTED + 1},}}")
+
+
+def one_line(message: str) -> str:
+    """The message without control characters, and with at most 80 characters of anything that it quotes."""
+    plain = "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in message)
+    return LONG.sub(lambda found: f"{found[0][: QUOTED - 3]}...", " ".join(plain.split()))
 
 
 def _cannot(error: OSError) -> int:

@@ -33,7 +33,7 @@ def main(argv: list[str]) -> int:
     condition = args.condition or usual_condition(scenario.loop(args.case), args.coupling)
     chosen = choose(scenario, args.case, args.coupling, None if args.case == "none" else condition)
     loop = scenario.loop(args.case)
-    with render.progress("searching the ranges") as move:
+    with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)
     environments = _environments(args, whole)
     requirements = assess(loop, chosen.coupling, chosen.phi)
@@ -67,7 +67,7 @@ def main(argv: list[str]) -> int:
         if worst:
             _add(outcome, "adversary", report.adversary_part(worst, ratio, certified))
     files = _save(args, out, question, findings, worst, outcome)
-    title = f"case {args.case} · {scenario.name} · coupling {chosen.kind}"
+    title = f"{scenario.title(args.case)}: coupling {chosen.kind}"
     render.publish(args, outcome, [render.facts(title, _rows(outcome), ("", ""))], _lines(outcome), out, files)
     if outcome["interrupted"]:
         return options.INTERRUPTED
@@ -185,7 +185,8 @@ def _save(
         from sim.plots import plot_population
 
         kind = "no coupling" if args.case == "none" else f"{outcome['coupling']['kind']} coupling"
-        title = f"{scenario.name}, case {args.case}, {kind}: {outcome['humans']} random humans"
+        what = scenario.title(args.case).removesuffix(", no coupling")
+        title = f"{what}, {kind}: {outcome['humans']} random humans"
         files.append(plot_population(findings.mass, findings.damping, findings.exact, out / "population.png", title))
     return files
 

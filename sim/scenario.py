@@ -143,6 +143,12 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return (0,) * self.channels
         return tuple(t + p for t, p in zip(self.theta, self.psi, strict=True))
 
+    def title(self, case: str) -> str:
+        """What reports and pictures are headed with: the paper's cases have names for its own loop only."""
+        if (case == "none" or self.jitter is None) and self.loop(case) == load().loop(case):
+            return f"{self.name}, case {case}"
+        return self.name + {"none": ", no coupling", "II": ", reference without delay"}.get(case, "")
+
     def loop(self, case: str) -> Loop:
         """All that a design may know: no device but its damping, no human. `case` is "none", "I" or "II".
 
