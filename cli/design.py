@@ -68,7 +68,9 @@ def main(argv: list[str]) -> int:
         "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
         "set": whole and set_part(whole),
         "price": _robustness_loss(args, loop, design) if whole else None,
-        "transparency": report.transparency_part(transparency(loop.F(design.coupling), loop.E(), loop.lam)),
+        "transparency": report.transparency_part(
+            transparency(loop.F(design.coupling), loop.E(), loop.lam, args.band_hz or BAND_HZ)
+        ),
         "objective": design.objective,
         "objective_name": design.figure,
         "sdps": design.sdps,
@@ -117,8 +119,7 @@ def add_optimal_options(group: argparse._ActionsContainer) -> None:
     """What is asked of an optimal coupling; options that are not given are None."""
     error = "which transparency error is minimised (default rms)"
     group.add_argument("--objective", choices=OBJECTIVES, help=error)
-    band = "frequencies where it counts [Hz] (default 0.5,80)"
-    group.add_argument("--band", dest="band_hz", type=options.pair, metavar="LOW,HIGH", help=band)
+    options.add_band_option(group)
     gain = "limit of |F|/|E| above 100 Hz (default none: the force there is kept low, not limited)"
     group.add_argument("--high-gain", type=_number_or_none, metavar="G", help=gain)
     limit = "begin no larger basis after this time [s] (default 60)"
@@ -160,7 +161,7 @@ OPTIONS = {
     "compare": ("ccl",),
     "full": ("ccl", "optimal"),
     "objective": ("optimal",),
-    "band_hz": ("optimal",),
+    "band_hz": ("optimal", "spring-damper"),
     "high_gain": ("optimal",),
     "seconds": ("optimal",),
     **dict.fromkeys(RETIRED_WITH_VALUE, ("optimal",)),
@@ -389,7 +390,7 @@ def _best_rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
     return [
         ("bound", words),
         ("rendered stiffness", render.optional(outcome["rendered_stiffness"], "{:.3f} of the environment's")),
-        ("robustness", f"{need} of the damping is needed at {there['where']}, the worst within {there['percent']:g} %"),
+        ("robustness", f"needs {need} of the damping at {there['where']}"),
         ("ladder [dB]", climbed or None),
     ]
 

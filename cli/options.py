@@ -23,7 +23,7 @@ from controller.lti import SingularLoop
 from design.result import CONDITION_NAMES, DesignFailed
 from models.device import MOST_DAMPING
 from sim.files import check_file, folder, nobody_reads
-from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
+from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load, load_humans
 
 DONE, DOES_NOT_HOLD, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
@@ -85,6 +85,14 @@ def pair(text: str) -> tuple[float, float]:
     except ValueError:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected two numbers separated by a comma") from None
     return first, second
+
+
+def band_of(text: str) -> tuple[float, float]:
+    """Two rising frequencies [Hz]."""
+    low, high = pair(text)
+    if not 0 < low < high < math.inf:
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected two rising frequencies in Hz, the first above 0")
+    return low, high
 
 
 def energy_budget(text: str) -> tuple[float, float]:
@@ -211,6 +219,29 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
         changes["latency"] = per_channel("--latency", args.latency, scenario.channels)
     delta = None if args.delta is None else per_channel("--delta", args.delta, scenario.channels)
     return scenario.replace(delta, **changes) if changes or delta else scenario
+
+
+def add_band_option(parser: argparse._ActionsContainer) -> None:
+    """--band."""
+    band = "frequencies over which the transparency error counts [Hz] (default 0.5,80)"
+    parser.add_argument("--band", dest="band_hz", type=band_of, metavar="LOW,HIGH", help=band)
+
+
+def add_human_option(parser: argparse.ArgumentParser, more: str = "") -> None:
+    """--human."""
+    who = f"other humans: [[human]] per channel in a .toml, or `humans`{more} in a .py"
+    parser.add_argument("--human", metavar="FILE", help=who)
+
+
+def with_humans(args: argparse.Namespace, scenario: Scenario) -> Scenario:
+    """The scenario in the hands that --human names. Raises InputError."""
+    if args.human is None:
+        return scenario
+    people = load_humans(args.human, scenario.channels)
+    who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
+    if people.population is not None:
+        who["population"] = people.population
+    return scenario.replace(**who)
 
 
 def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: str = "spring-damper") -> None:

@@ -15,7 +15,7 @@ from design.certificate import Limits, assess, covered_limits, promise_of
 from design.designs import usual_condition
 from design.ranges import SetCheck, check_set, set_part, set_rows
 from design.result import listed
-from design.transparency import transparency
+from design.transparency import BAND_HZ, transparency
 from sim import report
 from sim.accuracy import ForceError, credible_part, force_error, position_error
 from sim.alternatives import Alternative, alternatives
@@ -24,7 +24,7 @@ from sim.engines import INTEGRATORS, default_integrator
 from sim.files import write
 from sim.nets import BASELINES, Classic, EnergyNet, idle, netted
 from sim.run import ENGINES, Simulation, assemble, make_engine, run
-from sim.scenario import InputError, Scenario, load_humans
+from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, stability_part
 from sim.stepping import MOST, check_substeps, default_substeps
 from sim.switching import Period, switching
@@ -50,7 +50,9 @@ def main(argv: list[str]) -> int:
         "coupling": report.coupling_part(chosen.kind, chosen.coupling, scenario.T),
         **_certified(chosen, requirements, done.loop(args.case), whole),
         "encoder": report.encoder_steps(scenario, args.case, chosen.coupling),
-        "transparency": report.transparency_part(transparency(done.simulation.felt, done.simulation.E, loop.lam)),
+        "transparency": report.transparency_part(
+            transparency(done.simulation.felt, done.simulation.E, loop.lam, args.band_hz or BAND_HZ)
+        ),
         **_stability(chosen, done, any(requirement.certified for requirement in requirements.values())),
         "run": _settings(args, done, loop.lam) | {"environment": environment},
         "limiter": limits.part([device.force_limit for device in simulated.device]),
@@ -85,8 +87,8 @@ def _parser() -> options.Parser:
     steps = "MuJoCo steps per period (default: what the plant asks)"
     parser.add_argument("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
     parser.add_argument("--duration", type=options.number(), metavar="SECONDS", help="default: the scenario's")
-    who = "other humans: [[human]] per channel in a .toml, or `humans` in a .py"
-    parser.add_argument("--human", metavar="FILE", help=who)
+    options.add_human_option(parser)
+    options.add_band_option(parser)
     clip = "clip forces at the devices' limits, in place of the limiter that a guarantee covers"
     parser.add_argument("--no-limiter", action="store_true", help=clip)
     vertex = "simulate at this vertex of the scenario's ranges (default 0: nominal)"
@@ -114,10 +116,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     scenario = options.with_varying_delays(args, options.scenario_from(args))
     if args.duration is not None:
         scenario = scenario.replace(duration=args.duration)
-    if args.human is not None:
-        people = load_humans(args.human, scenario.channels)
-        scenario = scenario.replace(human=people.human, person=people.person)
-    return scenario
+    return options.with_humans(args, scenario)
 
 
 def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Scenario]:

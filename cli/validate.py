@@ -12,8 +12,10 @@ import numpy as np
 from cli import options, render
 from controller.environment import Member
 from design.certificate import ANY, assess, promise_of
+from design.conditions import this_environment
 from design.designs import usual_condition
 from design.ranges import SetCheck, check_set, set_part
+from models.human import Human
 from sim import report
 from sim.adversary import Worst, search
 from sim.couplings import NAMES, Chosen, choose
@@ -83,6 +85,7 @@ def _parser() -> options.Parser:
     options.add_loop_options(parser)
     options.add_varying_delay_options(parser)
     options.add_coupling_options(parser, ", ".join(NAMES))
+    options.add_human_option(parser, " and `population`, whose draw(rng, n) gives n hands,")
     humans, count = "random humans per device (default 1000)", options.whole(1, 1_000_000)
     parser.add_argument("--humans", type=count, default=1000, metavar="N", help=humans)
     parser.add_argument("--links", choices=tuple(LINKS), help="of each human (default: the scenario's population)")
@@ -103,8 +106,8 @@ def _parser() -> options.Parser:
 
 def _scenario(args: argparse.Namespace) -> Scenario:
     """The scenario, which must be linear. Raises InputError."""
-    scenario = options.with_varying_delays(args, options.scenario_from(args))
-    require_linear(scenario, "sim.validate")
+    scenario = options.with_humans(args, options.with_varying_delays(args, options.scenario_from(args)))
+    require_linear(scenario, "sim.validate", walls=True)
     if args.dask is not None and args.shards > 1:
         raise InputError(f"--shards {args.shards} with --dask: the cluster decides who does what, give one of them")
     if not (args.duration == 0 or 4 * scenario.T <= args.duration <= 1e5):
@@ -129,7 +132,7 @@ def _environments(args: argparse.Namespace, whole: SetCheck | None) -> tuple[Mem
 def _question(
     args: argparse.Namespace, scenario: Scenario, chosen: Chosen, environments: tuple[Member, ...]
 ) -> Validation:
-    links = LINKS[args.links] if args.links else scenario.population.links
+    links = LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)  # a user's own has none
     work = args.humans, links, args.engine, args.duration
     return Validation(scenario, chosen.coupling, args.seed, *work, environments=environments)
 
@@ -155,7 +158,9 @@ def _attack(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, outcom
     """The worst human, or None where the keyboard ends the search: what was found out before is kept."""
     try:
         with render.progress("searching the worst human") as move:
-            return search(scenario, assemble(scenario, chosen.coupling).F, args.seed, args.generations, progress=move)
+            frozen = assemble(scenario, chosen.coupling).process.frozen().values()
+            F = max(frozen, key=lambda F: this_environment(F, scenario.delta).ratio)  # the contact state that asks most
+            return search(scenario, F, args.seed, args.generations, progress=move)
     except KeyboardInterrupt:
         outcome["interrupted"] = True
         return None
@@ -176,6 +181,8 @@ def _save(
         named |= {"worst-human.toml": int(findings.index[np.argmax(findings.radius)])}
     for name, i in named.items():
         crowd = question.crowd(i)
+        if not isinstance(crowd.humans(0)[0], Human):  # a user's own class, which draws this hand again
+            continue
         remark = f"seed {question.seed}, index {i}"
         files.append(save_humans(out / name, crowd.humans(0), remark, crowd.persons(0)))
     if adversary:
@@ -212,6 +219,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
             render.optional(outcome["largest_difference_per_s"], "within {:.1e} 1/s of the exact ones", "") or None,
         ),
         ("traces", traces and f"{traces['duration_s']:g} s each, {traces['clipped_runs']} clipped"),
+        ("contacts made", f"{traces['contacts']} on these traces" if traces and traces["contacts"] else None),
         ("handles come to rest", traces and _settled(traces)),
         ("energy audit W >= 0", audit and _audited(audit)),
         *(_switching_rows(switching) if switching else []),

@@ -16,7 +16,7 @@ from design.certificate import LATE, Stored, assess, switching_requirement
 from design.conditions import Condition, Requirement, this_environment
 from design.ranges import check_set
 from design.result import CONDITION_NAMES, Design, DesignFailed, Row, bare, known, of_kind, one_of
-from design.transparency import Transparency, transparency
+from design.transparency import BAND_HZ, Transparency, transparency
 
 # ----------------------------------------------------------------------------------------------------
 # The designs by name.
@@ -44,7 +44,7 @@ def usual_condition(loop: Loop, kind: str | None) -> str | None:
 
 #: kind -> what else can be asked of it, in words of design.api.Options
 OPTIONS = {
-    "spring-damper": ("switching", "limiter"),
+    "spring-damper": ("switching", "limiter", "band_hz"),
     "moving-average": (),
     "ccl": ("order", "method", "diagonal"),
     "optimal": (
@@ -169,7 +169,7 @@ class Options(TypedDict, total=False):
     switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of delays that vary
     limiter: bool  # spring-damper, this-environment: covered also while forces are limited
     objective: Literal["rms", "sup"]  # optimal: of the mismatch relative to the environment
-    band_hz: tuple[float, float]  # optimal: where the mismatch counts
+    band_hz: tuple[float, float]  # optimal, spring-damper for this environment: where the mismatch counts
     high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: kept low, not limited
     seconds: float  # optimal: no further rung of the ladder is begun later than this
     functions: int
@@ -243,17 +243,17 @@ def promise(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str | N
     return promises.promise_of(requirements, loop, whole_set)
 
 
-def transparency_of(loop: Loop, coupling: Coupling | Design) -> Transparency:
+def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
     """How close what the devices feel comes to the environment: figures of the mismatch (8), M = F - Lambda E.
 
-    `mismatch_db` is its largest share of the environment between 0.5 and 80 Hz, `rms_mismatch_db` the mean one: 0 dB
+    `mismatch_db` is its largest share of the environment over `band_hz`, `rms_mismatch_db` the mean one: 0 dB
     is as wrong as feeling nothing. `dc_ratio` is the share of the static stiffness that is felt. In the loop's own
     environment; of one with walls, touching them all.
 
     Raises TypeError and ValueError as `certify` does.
     """
     of_kind("loop", loop, Loop, LOOP)
-    return transparency(loop.F(_fitting(loop, coupling)), loop.E(), loop.lam)
+    return transparency(loop.F(_fitting(loop, coupling)), loop.E(), loop.lam, band_hz)
 
 
 def _fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:

@@ -31,6 +31,7 @@ from controller.lti import Array, Lti
 from design.conditions import dampings, even_damping, regular_part, uncovered
 from design.frequency import frequencies, hermitian, on_circle, supremum
 from design.result import Attempt, DesignFailed, Infeasible
+from design.transparency import BAND_HZ
 
 #: Designs ask for (1 - RESERVE) of the damping that there is, so that they are certified as stored.
 RESERVE = 1e-4
@@ -49,6 +50,7 @@ class Specification:
     W2: Lti | None = None  # diagonal weight on its right; low_pass if None
     others: Mapping[str, Lti] = field(default_factory=dict)  # by name: what else the environment may be, for `optimal`
     regions: tuple[Region, ...] = ()  # the box of the others, in which the design is searched for violations
+    band_hz: tuple[float, float] = BAND_HZ  # where the mismatch counts [Hz]
     shrunk: Callable[[float], Mapping[str, Lti]] | None = None  # the others of a box with ranges so many times as wide
 
     def __post_init__(self) -> None:

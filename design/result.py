@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from controller.coupling import Coupling, SpringDamper
-from controller.lti import Array
+from controller.lti import Array, Lti
 from design.conditions import Condition, Requirement
 
 # ----------------------------------------------------------------------------------------------------
@@ -109,6 +109,8 @@ def of_kind(name: str, value: Any, kind: type, expected: str) -> None:
 def bare(coupling: Coupling | Design, expected: str = COUPLING) -> Coupling:
     """The coupling of a design, or the one given. Raises TypeError for anything else."""
     found = coupling.coupling if isinstance(coupling, Design) else coupling
+    if isinstance(found, Lti):
+        raise TypeError("coupling is an Lti, expected a coupling: wrap it in Compliance(...) (controller.coupling)")
     if isinstance(found, type) or not callable(getattr(found, "around", None)):
         raise TypeError(f"coupling is {shown(coupling)}, expected {expected}")
     return found

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import cast
 
@@ -36,7 +37,7 @@ from design.conditions import limiter as limiter_proof
 from design.frequency import frequencies, hermitian, on_circle, peaks
 from design.lmi import RESERVE, Complex, Shaping, Specification, affine_lmis, gain_lmi, shortage, solve, solved
 from design.result import Design, DesignFailed, Infeasible
-from design.transparency import BAND_HZ, transparency
+from design.transparency import transparency
 
 # ----------------------------------------------------------------------------------------------------
 # The exact convex set of spring-damper gains that satisfy Theorem 4, channel by channel.
@@ -220,7 +221,7 @@ class SampledLoop:
     def __init__(self, spec: Specification) -> None:
         self.spec = spec
         per_hz = 2 * np.pi * spec.T
-        low, high = (per_hz * f for f in BAND_HZ)
+        low, high = (per_hz * f for f in spec.band_hz)
         self.band = frequencies(spec.environment, low=low, high=min(high, np.pi), points=80)
         self.conditions = frequencies(spec.environment, low=1e-3, points=80)
         self.loop_in_band, self.loop_at_conditions = self._loop(self.band), self._loop(self.conditions)
@@ -306,7 +307,7 @@ def least_rms(
         if coupling is None:
             continue
         F = force_map(spec.environment, coupling, spec.theta, spec.psi)
-        rms = transparency(F, spec.environment, spec.lam).rms_mismatch
+        rms = transparency(F, spec.environment, spec.lam, spec.band_hz).rms_mismatch
         if rms < least:
             best, least = coupling, rms
     return best, least, searches
@@ -488,6 +489,7 @@ def design(
     starts: Sequence[SpringDamper] = (),
     switching: tuple[Sequence[int], Sequence[int]] | None = None,
     limiter: bool = False,
+    band_hz: tuple[float, float] | None = None,
 ) -> Design:
     """The best spring-damper under `condition`; by default the starts are chosen, a start need not be feasible.
 
@@ -495,8 +497,10 @@ def design(
     closed-loop: minimises the rms mismatch in this environment from every start, local optima only; with
     `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it, with `limiter` also
     while forces are limited (any-environment is anyway, at no cost).
-    Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for closed-loop.
+    `band_hz` is where the mismatch counts. Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the
+    search finds none for closed-loop.
     """
+    spec = replace(spec, band_hz=band_hz) if band_hz else spec
     if condition == "theorem4" and switching is None:
         return _for_any_environment(spec, starts[0] if starts else None)
     if condition == "closed-loop":

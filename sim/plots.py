@@ -414,7 +414,7 @@ def plot_population(mass: Array, damping: Array, growth: Array, path: Path, titl
             count = f"{name}: {int(chosen.sum())}"
             axis.scatter(values[chosen], growth[chosen], s=10, marker=marker, color=style["color"], label=count)
         axis.axhline(0.0, color="black", linewidth=0.8)
-        axis.set(xscale="log", xlabel=label)
+        axis.set(xscale="log" if (values > 0).any() else "linear", xlabel=label)
         axis.set_yscale("symlog", linthresh=1e-1)
     axes[0, 0].set_ylabel("growth rate [1/s]")
     _plain_numbers(axes)

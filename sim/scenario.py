@@ -22,7 +22,7 @@ from controller.delay import Jitter
 from controller.environment import Box, Network, Spring, UncertainSpring, Wall, environment
 from controller.loop import DelayRange, Loop
 from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
-from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
+from models.human import Cross, Human, Link, MeasuredHand, Person, Population, Voluntary, check_holds
 from sim.files import InputError, write
 
 CASES = ("none", "I", "II")
@@ -213,13 +213,13 @@ def built_in() -> list[str]:
     return sorted(path.stem for path in SCENARIOS.glob("*.toml"))
 
 
-def require_linear(scenario: Scenario, what: str) -> None:
-    """Raises InputError where a loop has walls or Coulomb friction, for what decides linear loops only."""
+def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
+    """Raises InputError where a loop has Coulomb friction or, unless `walls` are decided too, walls."""
     for i, device in enumerate(scenario.device):
         if device.friction:
             instead = "sim.run and sim.zwidth simulate it"
             raise InputError(f"device[{i}].friction is {device.friction:g} N: {what} decides linear loops; {instead}")
-    if scenario.environment.walls:
+    if scenario.environment.walls and not walls:
         raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
 
 
@@ -243,8 +243,9 @@ def require_forces_at_ticks(scenario: Scenario, what: str) -> None:
 class HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The whole file."""
 
-    human: tuple[Human, ...]
+    human: tuple[Any, ...]  # Human, MeasuredHand, or a user's own
     person: tuple[Person, ...] = ()
+    population: Any = None  # of a Python file: who else is drawn, what has draw(rng, n)
 
 
 def load_humans(path: str | Path, channels: int) -> HumanFile:
@@ -256,16 +257,34 @@ def load_humans(path: str | Path, channels: int) -> HumanFile:
     what = "[[human]] tables"
     if Path(path).suffix == ".py":
         names, what = _run_file(path), "`humans`"
-        people = HumanFile(tuple(names.get("humans", ())), tuple(names.get("persons", ())))
+        hands, persons = (tuple(names.get(name, ())) for name in ("humans", "persons"))
+        people = HumanFile(hands, persons, names.get("population"))
     else:
-        people = _converted(_read(Path(path), f"--human {path}"), HumanFile, f"--human {path}")
-    if len(people.human) != channels:
+        people = _humans_of(_read(Path(path), f"--human {path}"), f"--human {path}")
+    if len(people.human) != channels and not (people.population and not people.human):
         raise InputError(f"--human {path} has {len(people.human)} {what}, expected {channels} (one per channel)")
     try:
         check_holds([person.holds for person in people.person], channels)
     except ValueError as error:
         raise InputError(f"--human {path}: {error}") from None
     return people
+
+
+def _humans_of(text: str, source: str) -> HumanFile:
+    """A file of humans; a [[human]] with A, B, C and D is a measured transfer function, any other a chain."""
+    people: HumanFile = _converted(text, HumanFile, source)
+    made = []
+    for i, human in enumerate(people.human):
+        kind = MeasuredHand if isinstance(human, dict) and "A" in human else Human
+        try:
+            made.append(msgspec.convert(human, kind))
+        except msgspec.ValidationError as error:
+            joint = "." if re.search(r" - at `\$\.", str(error)) else ": "
+            place = _located(str(error), human if isinstance(human, dict) else {})
+            raise InputError(f"{source}: human[{i}]{joint}{place}") from None
+        except ValueError as error:
+            raise InputError(f"{source}: human[{i}]: {error}") from None
+    return HumanFile(tuple(made), people.person)
 
 
 def _run_file(path: str | Path) -> dict[str, Any]:
