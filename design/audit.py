@@ -21,13 +21,13 @@ from design.certificate import (
     ANY,
     CAVEATS,
     LATE,
+    any_environment_of,
     certificate_part,
-    closed_loop_of,
+    guarantee,
     making_covered,
-    promise,
     switching_part,
     switching_requirement,
-    theorem4_of,
+    this_environment_of,
 )
 from design.conditions import (
     Condition,
@@ -139,7 +139,7 @@ class Subject:
 
     def requirement(self, condition: Condition) -> Requirement:
         """The damping that the condition asks of the devices."""
-        return self._closed_loop() if condition == "closed-loop" else self._theorem4()
+        return self._this_environment() if condition == "this-environment" else self._any_environment()
 
     def with_period(self, T: float) -> Self:
         """The same gains (of a state-space coupling: the same coefficients) and delays in samples at another T [s]."""
@@ -153,21 +153,21 @@ class Subject:
         """The same loop with another spring-damper [N/m, N s/m]."""
         return replace(self, coupling=SpringDamper(K, B))
 
-    def _closed_loop(self) -> Requirement:
+    def _this_environment(self) -> Requirement:
         try:
             if self.network is None:
                 return this_environment(self.F, self.delta, self.T_max, self.latency)
-            return closed_loop_of(self._loop(self.network), self.coupling)
+            return this_environment_of(self._loop(self.network), self.coupling)
         except ValueError as error:  # no solution of the algebraic loop, or a latency that is longer than a period
-            return refusal("closed-loop", self.delta, str(error))
+            return refusal("this-environment", self.delta, str(error))
 
-    def _theorem4(self) -> Requirement:
+    def _any_environment(self) -> Requirement:
         # what is behind a wall's coupling does not matter to Theorem 4
         network = self.network or Network(("contact",), masses={"contact": 1.0})
         try:
-            return theorem4_of(self._loop(network), self.coupling)
+            return any_environment_of(self._loop(network), self.coupling)
         except ValueError as error:
-            return refusal("theorem4", self.delta, str(error))
+            return refusal("any-environment", self.delta, str(error))
 
     def _loop(self, network: Network) -> Loop:
         timing = {"T_max": self.T_max, "latency": self.latency}
@@ -214,7 +214,7 @@ def stiffest(subject: Subject, condition: Condition) -> Stiffest:
     unknown = (None,) * subject.channels
     if not isinstance(subject.coupling, SpringDamper):
         return Stiffest(unknown, "only a spring-damper has a K")
-    if condition == "theorem4":
+    if condition == "any-environment":
         return _stiffest_for_any_environment(subject, subject.coupling)
     K, B = subject.coupling.K, subject.coupling.B
 
@@ -261,7 +261,7 @@ def tolerance(subject: Subject, requirement: Requirement) -> Tolerance:
     condition = requirement.condition
     if not requirement.certified:
         return Tolerance(None, None, None, NOT_CERTIFIED)
-    if condition == "theorem4" and any(subject.psi):
+    if condition == "any-environment" and any(subject.psi):
         reason = "with psi >= 1 every T and delay needs a multiplier of its own: not searched"
         return Tolerance(requirement.required, None, None, reason)
     largest = _largest_period(subject, condition)
@@ -329,7 +329,7 @@ class Remedy:
 def remedies(subject: Subject, requirement: Requirement) -> list[Remedy]:
     """What certifies, or lowers the required damping by 10 % or more, each change alone; [] where it is certified."""
     condition = requirement.condition
-    if requirement.certified or (condition == "theorem4" and any(subject.psi)):
+    if requirement.certified or (condition == "any-environment" and any(subject.psi)):
         return []
     found = [_fewer_samples(subject, condition, name) for name in ("theta", "psi")]
     coupling = subject.coupling
@@ -402,11 +402,11 @@ def report(
     box around the environment, if there is one.
     """
     requirements = {condition: subject.requirement(condition) for condition in reversed(get_args(Condition))}
-    here, anywhere = requirements["closed-loop"].certified, requirements["theorem4"].certified
+    here, anywhere = requirements["this-environment"].certified, requirements["any-environment"].certified
     proved = bool(whole and whole.proved)
     rigid = subject.network is None
     making = subject.network is not None and making_covered(subject._loop(subject.network))
-    promised = promise(anywhere, here, rigid=rigid, walls=subject.walls, making=making, whole_set=proved)
+    guaranteed = guarantee(anywhere, here, rigid=rigid, walls=subject.walls, making=making, whole_set=proved)
     gains = subject.coupling if isinstance(subject.coupling, SpringDamper) else None
     return {
         "coupling": {
@@ -426,9 +426,9 @@ def report(
         **{condition: _condition_part(subject, requirement) for condition, requirement in requirements.items()},
         "jitter-proof": _switching_part(subject, switching) if switching else None,
         "set": whole and set_part(whole),
-        "certified": here and (whole is None or proved or promised == ANY),
-        "promise": promised,
-        "helps": _helps(subject, requirements["theorem4" if here else "closed-loop"]),
+        "certified": here and (whole is None or proved or guaranteed == ANY),
+        "promise": guaranteed,
+        "helps": _helps(subject, requirements["any-environment" if here else "this-environment"]),
         "not_covered": CAVEATS,
     }
 
@@ -467,7 +467,7 @@ def _because(reason: str | None) -> dict[str, str]:
 
 
 def _helps(subject: Subject, requirement: Requirement) -> list[dict[str, Any]]:
-    """Changes that help the condition that fails first: closed-loop, else any_environment."""
+    """Changes that help the condition that fails first: this-environment, else any_environment."""
     return [
         {
             "change": remedy.change,

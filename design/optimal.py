@@ -689,7 +689,7 @@ class _Climb:
         from design.lmi import Specification
 
         try:
-            gains = spring_damper.design(Specification.of(self.loop), "closed-loop").coupling
+            gains = spring_damper.design(Specification.of(self.loop), "this-environment").coupling
             return self._proved(self._assessed(gains, np.nan))
         except (DesignFailed, ValueError):
             return None
@@ -715,7 +715,7 @@ class _Climb:
         objective = self.options.objective
         return Optimal(
             coupling,
-            "closed-loop",
+            "this-environment",
             objective,
             figures.rms_mismatch if objective == "rms" else figures.relative_mismatch,
             requirement,
@@ -731,7 +731,7 @@ class _Climb:
     def _proved(self, found: Optimal) -> Optimal:
         """The same with its certificate, or why it has none."""
         try:
-            certificate = prove(self.loop, found.coupling, "closed-loop", swept=found.requirement)
+            certificate = prove(self.loop, found.coupling, "this-environment", swept=found.requirement)
         except NotProved as error:
             return replace(found, wall_s=self.elapsed, reason=str(error))
         requirement = replace(found.requirement, proof="rational")

@@ -37,7 +37,7 @@ from controller.loop import Loop, force_map
 from controller.lti import Array, Complex, Lti, Sampled, SingularLoop, as_like
 from controller.process import Process, contact
 from design.audit import LONGEST_DELAY, edge
-from design.certificate import CONDITIONS, theorem4_of
+from design.certificate import CONDITIONS, any_environment_of
 from design.conditions import (
     Requirement,
     any_environment_delayed,
@@ -146,7 +146,7 @@ class CouplingSweep(_Sweep):
     def refusals(self) -> dict[str, str]:
         """Conditions that say nothing of any cell, and why."""
         reason = self.multiplier[1]
-        return {"theorem4": reason} if reason else {}
+        return {"any-environment": reason} if reason else {}
 
     @cached_property
     def multiplier(self) -> tuple[Array | None, str | None]:
@@ -179,9 +179,9 @@ class CouplingSweep(_Sweep):
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Required over available damping, (n,); inf where no damping is enough. Of walls, in the worst state."""
-        if condition == "closed-loop":
+        if condition == "this-environment":
             couplings = self._couplings(K, B)
-            return np.max([self._closed_loop_ratios(E, couplings) for E in self._environments], axis=0)
+            return np.max([self._this_environment_ratios(E, couplings) for E in self._environments], axis=0)
         phi, reason = self.multiplier
         if reason:
             return np.full(K.size, np.inf)
@@ -196,12 +196,12 @@ class CouplingSweep(_Sweep):
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """The same of one coupling by a sweep of its own, which a map is checked against."""
         coupling = SpringDamper([K] * self.channels, [B] * self.channels, self.cutoff)
-        if condition == "closed-loop":
+        if condition == "this-environment":
             states = [this_environment(self._force_map(E, coupling), self.delta) for E in self._environments]
             return max(states, key=lambda requirement: requirement.ratio)
         phi, reason = self.multiplier
         if reason:
-            return refusal("theorem4", self.delta, reason)
+            return refusal("any-environment", self.delta, reason)
         E = self._environments[0]
         if phi is None or E is None:
             return any_environment_per_channel(coupling.channels(self.T), self.theta, self.delta)
@@ -225,7 +225,7 @@ class CouplingSweep(_Sweep):
             return delay(self.theta, self.T) @ coupling.compliance(self.T).inverse()
         return force_map(E, coupling, self.theta, self.psi)
 
-    def _closed_loop_ratios(self, E: Lti | None, couplings: SpringDamper) -> Array:
+    def _this_environment_ratios(self, E: Lti | None, couplings: SpringDamper) -> Array:
         delayed = E and delay(self.psi, self.T) @ E
 
         def sent(z: Complex) -> Sampled:
@@ -241,7 +241,7 @@ class EnvironmentSweep(_Sweep):
     An optimal coupling is the pair of a fixed Q and a model of the environment, and where that is another one than the
     model was of, two things may happen:
 
-        closed-loop   the model is the environment of the cell: F = Theta (Psi E - Psi E Q Psi E), as with ranges
+        this-environment   the model is the environment of the cell: F = Theta (Psi E - Psi E Q Psi E), as with ranges
         model kept    nobody tells the coupling: V = Q (I - Psi E0 Q)^-1 of the scenario's E0 faces E
 
     A coupling of each cell's own would be certified everywhere, since Q near E^-1 turns the force off. Raises
@@ -276,9 +276,9 @@ class EnvironmentSweep(_Sweep):
         """Conditions that say nothing of any cell, and why."""
         if any(self.psi):
             why = "with delay in the environment it takes a multiplier for each: ask design.audit about single ones"
-            return {"theorem4": why}
+            return {"any-environment": why}
         reason = self._any_environment.reason
-        return {"theorem4": reason} if reason else {}
+        return {"any-environment": reason} if reason else {}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
         """F in every environment, the coupling's model following it; one stack, since there is no contact to freeze."""
@@ -291,7 +291,7 @@ class EnvironmentSweep(_Sweep):
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Required over available damping, (n,); inf where no damping is enough."""
-        if condition == "theorem4":
+        if condition == "any-environment":
             return np.full(K.size, self._any_environment.ratio)
         matrices, coupling, psi = self._matrices(K, B), self._facing(condition), delay(self.psi, self.T)
 
@@ -303,20 +303,20 @@ class EnvironmentSweep(_Sweep):
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """The damping that the condition asks of the devices in one environment, by a sweep of its own."""
-        if condition == "theorem4":
+        if condition == "any-environment":
             return self._any_environment
         try:
             F = self._force_map(self._matrices(np.array([K]), np.array([B])), self._facing(condition))[0]
             return this_environment(F, self.delta)
         except SingularLoop as error:
-            return refusal("closed-loop", self.delta, str(error))
+            return refusal("this-environment", self.delta, str(error))
 
     @cached_property
     def _any_environment(self) -> Requirement:
-        """theorem4's requirement, which no spring of the environment changes."""
+        """any-environment's requirement, which no spring of the environment changes."""
         if any(self.psi):
-            return refusal("theorem4", self.delta, "not asked")
-        return theorem4_of(self._loop(self.network), self.coupling)
+            return refusal("any-environment", self.delta, "not asked")
+        return any_environment_of(self._loop(self.network), self.coupling)
 
     def _facing(self, condition: str) -> Coupling:
         """The coupling; for MODEL_KEPT as the V whose model stays that of the scenario's environment."""

@@ -15,10 +15,10 @@ from controller.environment import FIGURE_4, GROUND, Network, Spring
 from controller.lti import Lti
 from design import certificate as store
 from design.audit import MOST_EXTRA_SAMPLES, PRESETS, Subject, edge, remedies, report, stiffest, tolerance
-from design.certificate import CAVEATS, promise
+from design.certificate import CAVEATS, guarantee
 from design.result import CASE_I
 
-CONDITIONS = ("closed-loop", "theorem4")
+CONDITIONS = ("this-environment", "any-environment")
 T = 1.2e-3
 SAFE = SpringDamper([870.0, 545.0], [0.38, 0.52])
 
@@ -57,24 +57,24 @@ def strict(text: str) -> dict:
 
 
 @pytest.mark.parametrize(
-    ("K", "B", "theta", "closed_loop", "theorem4"),
+    ("K", "B", "theta", "this_environment", "any_environment"),
     [(5000, 0, 0, 2.5, 2.5), (5000, 30, 0, 32.5, 32.5), (800, 0.7, 0, 1.1, 1.1), (5000, 0, 1, 7.5, 10.0)],
 )
-def test_closed_forms_of_a_rigid_wall(K, B, theta, closed_loop, theorem4):
+def test_closed_forms_of_a_rigid_wall(K, B, theta, this_environment, any_environment):
     """K T/2 + B without delay, 3 K T/2 with one sample; Theorem 4 asks (theta + 1)^2 K T/2 of a spring."""
     subject = wall(K, B, theta)
-    assert subject.requirement("closed-loop").required[0] == pytest.approx(closed_loop, rel=1e-9)
-    assert subject.requirement("theorem4").required[0] == pytest.approx(theorem4, rel=1e-9)
+    assert subject.requirement("this-environment").required[0] == pytest.approx(this_environment, rel=1e-9)
+    assert subject.requirement("any-environment").required[0] == pytest.approx(any_environment, rel=1e-9)
 
 
 def test_a_wall_is_the_limit_of_a_stiff_environment():
     ground = Network(("a",), (Spring(("a", GROUND), 1e9),))
     soft, rigid = replace(wall(2000, 0.4, 1), network=ground), wall(2000, 0.4, 1)
-    ratio = soft.requirement("closed-loop").ratio
-    assert ratio == pytest.approx(rigid.requirement("closed-loop").ratio, rel=1e-5)
+    ratio = soft.requirement("this-environment").ratio
+    assert ratio == pytest.approx(rigid.requirement("this-environment").ratio, rel=1e-5)
 
 
-@pytest.mark.parametrize(("condition", "theta", "K"), [("closed-loop", 0, 2340), ("theorem4", 0, 2340)])
+@pytest.mark.parametrize(("condition", "theta", "K"), [("this-environment", 0, 2340), ("any-environment", 0, 2340)])
 def test_the_stiffest_spring_before_a_wall_is_colgates(condition, theta, K):
     """2 (delta - B)/T."""
     assert stiffest(wall(100, 0.2, theta), condition).K[0] == pytest.approx(K, rel=1e-6)
@@ -89,19 +89,19 @@ def test_the_largest_period_before_a_wall_is_colgates():
 
 def test_the_papers_gains_and_their_figures():
     outcome = report(pair(CASE_I))
-    assert outcome["closed-loop"]["required_damping"] == pytest.approx([1.39871] * 2, rel=1e-5)
-    assert outcome["theorem4"]["required_damping"] == pytest.approx([7.63, 7.84], abs=0.005)
+    assert outcome["this-environment"]["required_damping"] == pytest.approx([1.39871] * 2, rel=1e-5)
+    assert outcome["any-environment"]["required_damping"] == pytest.approx([7.63, 7.84], abs=0.005)
     assert not outcome["certified"]
     assert outcome["promise"] is None
-    assert outcome["theorem4"]["stiffest"]["K"] == [None, None]
-    assert "B = 5.47 N s/m alone uses up delta = 1.37" in outcome["theorem4"]["stiffest"]["reason"]
+    assert outcome["any-environment"]["stiffest"]["K"] == [None, None]
+    assert "B = 5.47 N s/m alone uses up delta = 1.37" in outcome["any-environment"]["stiffest"]["reason"]
 
 
-def test_the_theorem4_gains_as_the_literature_rounds_them():
-    """(879, 552) / (.39, .52) are 0.02 % beyond Theorem 4, and far inside the closed-loop condition."""
+def test_the_any_environment_gains_as_the_literature_rounds_them():
+    """(879, 552) / (.39, .52) are 0.02 % beyond Theorem 4, and far inside the this-environment condition."""
     outcome = report(pair(SpringDamper([879.0, 552.0], [0.39, 0.52])))
-    assert outcome["closed-loop"]["required_damping"] == pytest.approx([0.714344] * 2, rel=1e-6)
-    assert outcome["theorem4"]["required_damping"] == pytest.approx([1.37026, 1.37015], abs=1e-5)
+    assert outcome["this-environment"]["required_damping"] == pytest.approx([0.714344] * 2, rel=1e-6)
+    assert outcome["any-environment"]["required_damping"] == pytest.approx([1.37026, 1.37015], abs=1e-5)
     assert outcome["promise"] == "this environment"
 
 
@@ -133,55 +133,57 @@ def test_just_inside_is_certified_and_just_outside_is_not(subject, condition):
 
 def test_figures_that_do_not_exist_say_why():
     spring = wall(0.01, 0.0, delta=1.0)
-    found = tolerance(spring, spring.requirement("closed-loop"))
+    found = tolerance(spring, spring.requirement("this-environment"))
     assert (found.largest_T, found.extra_samples) == (None, None)
     assert f"{MOST_EXTRA_SAMPLES} samples more" in found.reason
     assert "largest T tried" in found.reason
-    assert "no scale of K" in stiffest(wall(5000, 30), "closed-loop").reason
-    assert "stiffest K tried" in stiffest(pair(SAFE, delta=(3.0, 3.0)), "closed-loop").reason
-    assert "nothing to lose" in tolerance(pair(CASE_I), pair(CASE_I).requirement("closed-loop")).reason
+    assert "no scale of K" in stiffest(wall(5000, 30), "this-environment").reason
+    assert "stiffest K tried" in stiffest(pair(SAFE, delta=(3.0, 3.0)), "this-environment").reason
+    assert "nothing to lose" in tolerance(pair(CASE_I), pair(CASE_I).requirement("this-environment")).reason
 
 
 def test_remedies_are_tried_and_mild():
     subject = wall(5000, 0.5, 1)
-    requirement = subject.requirement("closed-loop")
+    requirement = subject.requirement("this-environment")
     changes = {r.change.split(":")[0]: r for r in remedies(subject, requirement)}
     assert changes["less delay"].requirement.required[0] == pytest.approx(3.0)
     assert not changes["less delay"].requirement.certified
     assert changes["faster"].requirement.certified
     assert changes["faster"].requirement.required[0] > 0.98 * 1.37
-    assert remedies(wall(500, 0), wall(500, 0).requirement("closed-loop")) == []
-    assert {helping["condition"] for helping in report(wall(5000, 0))["helps"]} == {"closed-loop"}
+    assert remedies(wall(500, 0), wall(500, 0).requirement("this-environment")) == []
+    assert {helping["condition"] for helping in report(wall(5000, 0))["helps"]} == {"this-environment"}
 
 
 def test_a_delayed_environment_needs_a_multiplier_that_the_default_scenario_has_not():
-    requirement = pair(SAFE, psi=(1, 1)).requirement("theorem4")
+    requirement = pair(SAFE, psi=(1, 1)).requirement("any-environment")
     assert not requirement.certified
     assert "the environment alone uses up" in requirement.reason
     softer = Network(("a",), (Spring(("a", GROUND), 100.0, 0.2),))
     subject = Subject(SpringDamper([200.0], [0.2]), softer, T, (0,), (1,), (1.37,))
-    assert subject.requirement("theorem4").certified
-    assert "multiplier" in stiffest(subject, "theorem4").reason
+    assert subject.requirement("any-environment").certified
+    assert "multiplier" in stiffest(subject, "any-environment").reason
 
 
 def test_any_coupling_can_be_audited():
     V = SAFE.compliance(T)
     general, structured = report(pair(Compliance(V))), report(pair(SAFE))
-    assert general["closed-loop"]["required_damping"] == pytest.approx(structured["closed-loop"]["required_damping"])
-    assert general["theorem4"]["margin"] == pytest.approx(structured["theorem4"]["margin"], rel=1e-6)
+    assert general["this-environment"]["required_damping"] == pytest.approx(
+        structured["this-environment"]["required_damping"]
+    )
+    assert general["any-environment"]["margin"] == pytest.approx(structured["any-environment"]["margin"], rel=1e-6)
     assert general["coupling"]["kind"] == "compliance"
-    assert "only a spring-damper" in general["theorem4"]["stiffest"]["reason"]
+    assert "only a spring-damper" in general["any-environment"]["stiffest"]["reason"]
     nothing = report(pair(NoCoupling()))
-    assert nothing["closed-loop"]["required_damping"] == pytest.approx([1.7229] * 2, rel=3e-5)
-    assert nothing["theorem4"]["required_damping"] == [None, None]
-    assert "without a coupling" in nothing["theorem4"]["reason"]
+    assert nothing["this-environment"]["required_damping"] == pytest.approx([1.7229] * 2, rel=3e-5)
+    assert nothing["any-environment"]["required_damping"] == [None, None]
+    assert "without a coupling" in nothing["any-environment"]["reason"]
 
 
 def test_promises():
-    assert promise(True, True) == "any passive environment"
-    assert promise(False, True) == "this environment"
-    assert promise(False, True, rigid=True) == "a rigid wall only"
-    assert promise(False, False) is None
+    assert guarantee(True, True) == "any passive environment"
+    assert guarantee(False, True) == "this environment"
+    assert guarantee(False, True, rigid=True) == "a rigid wall only"
+    assert guarantee(False, False) is None
     assert report(wall(900, 0.2, 1))["promise"] == "any passive environment"
     assert report(wall(900, 0, 1))["promise"] == "a rigid wall only"
 
@@ -213,8 +215,8 @@ def test_the_command(run, argv, code, required):
     assert exit_code == code
     assert outcome["certified"] == (code == 0)
     if required:
-        assert outcome["closed-loop"]["required_damping"][0] == pytest.approx(required, rel=3e-5)
-    assert set(outcome) >= {"theorem4", "closed-loop", "promise", "helps", "not_covered", "wall_s"}
+        assert outcome["this-environment"]["required_damping"][0] == pytest.approx(required, rel=3e-5)
+    assert set(outcome) >= {"any-environment", "this-environment", "promise", "helps", "not_covered", "wall_s"}
     assert outcome["not_covered"] == CAVEATS
     assert "certified" in err
     assert "not for walls with dampers that make and break" in " ".join(err.split())
@@ -250,7 +252,7 @@ def test_stored_couplings(run):
         assert strict(out)["promise"] == "any passive environment"
     code, out, _ = run("--coupling", "unstable.json", "--json", "-")
     assert code == 1
-    assert "unit circle" in strict(out)["theorem4"]["reason"]
+    assert "unit circle" in strict(out)["any-environment"]["reason"]
     assert run("--coupling", "gains.json", "--T", "1e-3")[0] == 0
 
 
