@@ -438,7 +438,7 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
     with render.progress("searching the ranges") as move:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)
     requirements = assess(loop, chosen.coupling, chosen.phi)
-    springs = contact_springs(loop.environment)
+    springs = contact_springs(loop.network)
     return {
         "axes": "environment",
         "coupling": report.coupling_part(chosen.kind, chosen.coupling, scenario.T),
