@@ -335,6 +335,10 @@ class Environment:
         """G = (I + Psi E V)^-1 Psi E: the forces that leave through the coupling. Raises SingularLoop."""
         return coupling.around(delay(psi, T) @ self.E(T))
 
+    def sent_at(self, coupling: Coupling, psi: Sequence[int], z: Complex, T: float) -> Sampled:
+        """The same at points z of the circle."""
+        return coupling.around(Sampled.of(delay(psi, T) @ self.E(T), z))
+
     def frozen(self) -> Sequence[Environment]:
         """The linear environments that it is made of, by the walls that touch."""
         return (self,)
@@ -367,6 +371,9 @@ class RigidWall(Environment, enum.Enum):
         if V is None:
             raise ValueError("a rigid wall needs a spring-damper or another V in front of it")
         return V.inverse()
+
+    def sent_at(self, coupling: Coupling, psi: Sequence[int], z: Complex, T: float) -> Sampled:
+        return Sampled.of(self.sent(coupling, psi, T), z)
 
 
 RIGID_WALL = RigidWall.RIGID_WALL

@@ -18,7 +18,7 @@ import msgspec
 from controller.coupling import Coupling, Strict
 from controller.delay import delay
 from controller.environment import Box, Environment, Member, Network, RigidWall, members, walled_force_map
-from controller.lti import Lti, Number, rational
+from controller.lti import Complex, Lti, Number, Sampled, rational
 
 Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=100)], ...]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -118,6 +118,10 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
     def sent(self, coupling: Coupling, exact: bool = False) -> Lti:
         """G = (I + Psi E V)^-1 Psi E: the forces as they leave for the devices. Raises SingularLoop."""
         return self.environment.sent(coupling, self.psi, self.period(exact))
+
+    def sent_at(self, coupling: Coupling, z: Complex) -> Sampled:
+        """The same at points z of the circle, (n, k) or (1, k)."""
+        return self.environment.sent_at(coupling, self.psi, z, self.T)
 
     def F(self, coupling: Coupling, exact: bool = False) -> Lti:
         """F = Theta G (6): displacements to forces, as the devices see them. Raises SingularLoop."""

@@ -13,7 +13,15 @@ import msgspec
 import numpy as np
 from scipy.optimize import brentq
 
-from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, NoCoupling, SpringDamper
+from controller.coupling import (
+    Compliance,
+    Coupling,
+    ForceFilter,
+    InternalModel,
+    MovingAverage,
+    NoCoupling,
+    SpringDamper,
+)
 from controller.environment import RIGID_WALL
 from controller.loop import DelayRange, Loop
 from design.certificate import (
@@ -94,7 +102,8 @@ def _at_period(loop: Loop, coupling: Coupling, condition: Condition, T: float) -
     return _varied(loop, coupling, condition, T=T, T_max=longest)
 
 
-def _check(loop: Loop) -> None:
+def check_loop(loop: Loop) -> None:
+    """Raises ValueError naming the field where a loop asks for no audit."""
     for name in ("theta", "psi"):
         steps = getattr(loop, name)
         if max(steps) > LONGEST_DELAY:
@@ -306,6 +315,7 @@ def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], s
 KINDS = {
     NoCoupling: "none",
     SpringDamper: "spring-damper",
+    MovingAverage: "moving-average",
     Compliance: "compliance",
     InternalModel: "internal-model",
     ForceFilter: "force-filter",
@@ -325,7 +335,7 @@ def report(
     Raises ValueError naming the field of the loop that is wrong.
     """
     loop = loop.at(loop.environment).switching(None)
-    _check(loop)
+    check_loop(loop)
     requirements = {name: requirement(loop, coupling, name) for name in reversed(get_args(Condition))}
     here = requirements["closed-loop"].certified
     proved = bool(whole and whole.proved)
