@@ -97,7 +97,7 @@ def _subject(args: argparse.Namespace, scenario: Scenario) -> Subject:
     coupling = _coupling(args, len(loop["delta"]), scenario)
     try:
         m, late = len(loop["delta"]), scenario.latency
-        return Subject(coupling, T=scenario.T, T_max=scenario.T_max, latency=late and late[:m], **loop)
+        return Subject(coupling, T=scenario.T, T_max=scenario.longest_period, latency=late and late[:m], **loop)
     except ValueError as error:
         raise InputError(str(error)) from None
 

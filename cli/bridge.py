@@ -47,7 +47,7 @@ from hw.recording import Recorder, outcome, save
 from hw.session import session_for
 from sim.couplings import NAMES
 from sim.files import write_json
-from sim.scenario import InputError, require_constant_delay, require_linear
+from sim.scenario import InputError, require_constant_delay, require_even_ticks, require_linear
 from sim.trace import format_growth
 
 LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
@@ -59,6 +59,7 @@ def main(argv: list[str]) -> int:
     scenario, seed, settings = scenario_from(args), seed_from(args), check_link(args)
     require_linear(scenario, "hw.bridge")
     require_constant_delay(scenario, "hw.bridge")
+    require_even_ticks(scenario, "hw.bridge")
     seconds = number(args, "duration", 0.1, LONGEST, scenario.duration)
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")

@@ -25,7 +25,7 @@ from hw.monitor import Ages, LinkSettings
 from hw.protocol import Phase
 from hw.recording import Recorder, result_of
 from hw.session import Operator, Session, session_for
-from sim.scenario import InputError, Scenario, require_constant_delay, require_linear
+from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 from sim.trace import Trace
 
 _MEASURE = 200  # answers that are timed: virtual time does not scatter
@@ -233,6 +233,7 @@ def rehearse(
         raise InputError(f"seconds is {seconds:g}, allowed are 0.1 to 3600")
     require_linear(scenario, "rehearse")
     require_constant_delay(scenario, "rehearse")
+    require_even_ticks(scenario, "rehearse")
     if min(scenario.delta) <= 0:
         raise InputError(f"delta is {list(scenario.delta)}: a device without damping can promise no human anything")
     session = session_for(scenario, LinkSettings(measure=_MEASURE))
