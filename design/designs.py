@@ -23,7 +23,12 @@ from design.transparency import Transparency, transparency
 
 
 #: name -> the conditions that it can be made for, its own first
-KINDS = {"spring-damper": ("theorem4", "closed-loop"), "ccl": ("theorem4",), "optimal": ("closed-loop",)}
+KINDS = {
+    "spring-damper": ("theorem4", "closed-loop"),
+    "moving-average": ("theorem4",),
+    "ccl": ("theorem4",),
+    "optimal": ("closed-loop",),
+}
 
 
 def usual_condition(loop: Loop, kind: str | None) -> str | None:
@@ -40,6 +45,7 @@ def usual_condition(loop: Loop, kind: str | None) -> str | None:
 #: kind -> what else can be asked of it, in words of design.api.Options
 OPTIONS = {
     "spring-damper": ("switching", "limiter"),
+    "moving-average": (),
     "ccl": ("order", "method", "diagonal"),
     "optimal": (
         "objective",
@@ -87,6 +93,8 @@ def design_by_kind(
         spec = Specification.of(loop)
         if kind == "ccl":
             return ccl.design(spec, **options)
+        if kind == "moving-average":
+            return spring_damper.moving_average(spec)
         return spring_damper.design(spec, condition, **options)
 
     if loop.latency is None:
@@ -148,7 +156,7 @@ def compare_methods(loop: Loop) -> tuple[Row, ...]:
     return ccl.compare(Specification.of(loop))
 
 
-Kind = Literal["spring-damper", "ccl", "optimal"]
+Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]
 LOOP = 'a Loop, as scenario.loop("I") gives it'
 
 
@@ -174,9 +182,9 @@ def design_coupling(
 ) -> Design:
     """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
 
-    `kind` is "spring-damper", "ccl" or "optimal"; `condition` is "theorem4" (any passive environment) or "closed-loop"
-    (this environment), None for the kind's own. `options` are those of the kind, see Options; switching is not taken
-    from loop.jitter.
+    `kind` is "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal"; `condition` is
+    "theorem4" (any passive environment) or "closed-loop" (this environment), None for the kind's own. `options` are
+    those of the kind, see Options; switching is not taken from loop.jitter.
 
     Returns a Design: `coupling` (for a spring-damper with K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the damping
     that it needs, from a sweep of the coupling alone), `figure` and `objective` (what was minimised, and its value).
