@@ -300,7 +300,7 @@ def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
             theta,
             scenario.delta[:1],
             RIGID_WALL,
-            T_max=scenario.T_max,
+            T_max=scenario.longest_period,
             latency=late and late[:1],
         )
     except ValueError as error:
