@@ -12,19 +12,21 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from rich.table import Table
 
 from cli import options, render
+from controller.environment import RIGID_WALL
+from controller.loop import Loop
 from controller.lti import Array
-from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, promise_of
+from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, guarantee_of
 from design.ranges import check_set, set_part
-from design.result import CONDITION_NAMES
 from sim import report
 from sim.couplings import NAMES, Chosen, choose
 from sim.files import write
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
-from sim.scenario import InputError, Scenario, require_constant_delay, require_forces_at_ticks
+from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks
 from sim.stability import MARGINAL
 from sim.trace import SUSTAINED, slowest_seen
 from sim.zwidth import (
@@ -57,7 +59,7 @@ def _table(outcome: dict[str, Any]) -> Table:
     for name in outcome["conditions"]:
         error = outcome.get("error", {}).get(name)
         near = f"; edge within {100 * error['edge_relative_in_K']:.2g} % of the condition's own sweep" if error else ""
-        rows.append((f"certified, {_word(name)}", f"{_share(outcome[name]['certified_cells'], cells)}{near}"))
+        rows.append((f"certified, {name}", f"{_share(outcome[name]['certified_cells'], cells)}{near}"))
     stable = f"{_share(crowd['stable_cells'], cells)} ({crowd['decided_cells']} decided)"
     rows.append((f"stable with all of {crowd['humans']} random humans", stable))
     if simulation["points"]:
@@ -68,18 +70,14 @@ def _table(outcome: dict[str, Any]) -> Table:
     return render.facts(title, [*rows, ("seconds", seconds)], left=True)
 
 
-def _word(name: str) -> str:
-    return CONDITION_NAMES.get(name, name)
-
-
 def _designed_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
     """The fixed coupling in the environment that it was designed for."""
     designed = outcome["designed_for"]
     each = (f"{' - '.join(s['between'])} {s['K']:g} N/m, {s['B']:g} N s/m" for s in designed["contact_springs"])
     needs = "; ".join(
-        f"{word} needs {100 / designed['certificates'][name]['margin']:.4g} % of the damping "
+        f"{name} needs {100 / designed['certificates'][name]['margin']:.4g} % of the damping "
         f"({designed['certificates'][name]['proof']})"
-        for name, word in CONDITION_NAMES.items()
+        for name in render.ORDER
         if designed["certificates"][name]["margin"]
     )
     return [
@@ -101,9 +99,9 @@ def _about(outcome: dict[str, Any]) -> str:
 
 
 def _mark_line(mark: dict[str, Any], humans: int) -> str:
-    ends = ", ".join(f"{_word(name)} {_stiffest(K)}" for name, K in mark["stiffest_K_at_this_B"].items())
+    ends = ", ".join(f"{name} {_stiffest(K)}" for name, K in mark["stiffest_K_at_this_B"].items())
     needs = ", ".join(
-        f"{_word(name)} needs {max(mark[name]['required_damping'], key=lambda d: d or np.inf) or np.inf:.6g} of "
+        f"{name} needs {max(mark[name]['required_damping'], key=lambda d: d or np.inf) or np.inf:.6g} of "
         f"{min(mark[name]['available_damping']):.6g} N s/m "
         f"({'[green]certified[/]' if mark[name]['certified'] else '[red]not certified[/]'})"
         for name in mark["stiffest_K_at_this_B"]
@@ -136,7 +134,7 @@ def _remarks(outcome: dict[str, Any]) -> list[str]:
         lines += [*outcome["remarks"], _about(outcome)]
     for name in outcome["conditions"]:
         if outcome[name].get("reason"):
-            lines.append(f"{_word(name)}: {outcome[name]['reason']}.")
+            lines.append(f"{name}: {outcome[name]['reason']}.")
         if outcome[name].get("contradicted_cells"):
             lines.append(f"[red]CONTRADICTION[/]: {outcome[name]['contradicted_cells']} certified cells are unstable.")
     if not simulation["nonlinear"] and simulation["differ_from_linear"]:
@@ -172,14 +170,14 @@ NOT_REACHED = "not reached before the interruption"
 
 def summary(sweep: Sweep, drawn: Map, plan: Plan, population: dict[str, Any]) -> dict[str, Any]:
     """The whole map. Rows are stiffnesses; null is infinite, or not reached before an interruption."""
-    known = np.isfinite(drawn.growth)
+    known, loop = np.isfinite(drawn.growth), sweep.loop
     unsafe = known & (drawn.growth > MARGINAL)
     part: dict[str, Any] = {
-        "rigid": sweep.network is None,
-        "T": sweep.T,
-        "theta": list(sweep.theta),
-        "psi": list(sweep.psi),
-        "delta": list(sweep.delta),
+        "rigid": loop.environment is RIGID_WALL,
+        "T": loop.T,
+        "theta": list(loop.theta),
+        "psi": list(loop.psi),
+        "delta": list(loop.delta),
         "velocity_filter_hz": sweep.cutoff,
         "one_sided": sweep.walled is not None,
         "conditions": list(drawn.ratio),
@@ -283,7 +281,7 @@ def add_marks(outcome: dict[str, Any], marks: Sequence[Mark]) -> None:
         }
         for mark in marks
     ]
-    certified = all(mark.requirement["closed-loop"].certified for mark in marks)
+    certified = all(mark.requirement["this-environment"].certified for mark in marks)
     outcome["holds"] = outcome["holds"] and certified
 
 
@@ -330,7 +328,7 @@ def main(argv: list[str]) -> int:
     args.press = (3.0 if of_coupling else 0.0) if args.press is None else args.press
     scenario = options.scenario_from(args)
     require_constant_delay(scenario, "sim.zwidth")
-    require_forces_at_ticks(scenario, "sim.zwidth")
+    require_even_ticks(scenario, "sim.zwidth")
     if scenario.T_max is not None:
         raise InputError("T_max: a map is of even periods; scale --delta by T/T_max instead")
     _check_case(args)
@@ -339,7 +337,7 @@ def main(argv: list[str]) -> int:
     marks = _marks(args)
     grid, plan, out = _grid(args, sweep, marks), _plan(args, sweep), options.out_folder(args, "zwidth")
 
-    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.T, args.seed, args.humans)
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, args.seed, args.humans)
     with render.progress("certificates") as move:
         drawn = draw_map(sweep, grid, crowd, plan, lambda stage, k, of: move(k, of, stage))
     outcome = summary(sweep, drawn, plan, {"humans": args.humans, "seed": args.seed})
@@ -407,7 +405,7 @@ def _check_case(args: argparse.Namespace) -> None:
         raise InputError(f"--case none is the loop without coupling, and the map is of couplings: {instead}")
     if args.coupling is None and args.condition:
         why = "without --coupling nothing is designed, and both are drawn"
-        raise InputError(f"--condition {_word(args.condition)}: {why}")
+        raise InputError(f"--condition {args.condition}: {why}")
     for name in ("rigid", "wall", "velocity_filter"):
         if args.coupling is not None and getattr(args, name):
             what = "is about a map of spring-dampers; with --coupling the axes are the environment's"
@@ -425,9 +423,8 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
 
 def _environment_sweep(scenario: Scenario, chosen: Chosen) -> EnvironmentSweep:
     """The loop with that coupling. Raises InputError."""
-    who = scenario.device, scenario.population
     try:
-        return EnvironmentSweep(*who, scenario.environment, scenario.T, scenario.theta, scenario.psi, chosen.coupling)
+        return EnvironmentSweep(scenario.device, scenario.population, _nominal(scenario.loop("I")), chosen.coupling)
     except ValueError as error:
         raise InputError(str(error)) from None
 
@@ -438,14 +435,14 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
     with render.progress("searching the ranges") as move:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)
     requirements = assess(loop, chosen.coupling, chosen.phi)
-    springs = contact_springs(loop.environment)
+    springs = contact_springs(loop.network)
     return {
         "axes": "environment",
         "coupling": report.coupling_part(chosen.kind, chosen.coupling, scenario.T),
         "designed_for": {
             "contact_springs": [{"between": s.between, "K": s.stiffness, "B": s.damping} for s in springs],
             "certificates": report.certificates_part(requirements),
-            "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
+            "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
             "set": whole and set_part(whole),
         },
         "remarks": list(chosen.notes),
@@ -454,17 +451,20 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
 
 def _coupling_sweep(args: argparse.Namespace, scenario: Scenario) -> CouplingSweep:
     """The loop without its coupling. Raises InputError."""
-    loop: dict[str, Any] = {"network": scenario.environment, "theta": scenario.theta, "psi": scenario.psi}
-    devices = scenario.device
+    devices, loop = scenario.device, _nominal(scenario.loop("I"))
     try:
         if args.rigid:
-            loop, devices = {"network": None, **options.rigid_loop(args, scenario)}, devices[:1]
+            loop, devices = _nominal(options.rigid_loop(args, scenario)), devices[:1]
         elif args.wall:
-            loop["network"] = one_sided(scenario.environment)
-        loop |= {"T": scenario.T, "cutoff": args.velocity_filter, "one_sided": args.rigid and args.wall}
-        return CouplingSweep(devices, scenario.population, **loop)
+            loop = loop.at(one_sided(scenario.environment))
+        return CouplingSweep(devices, scenario.population, loop, args.velocity_filter, args.rigid and args.wall)
     except ValueError as error:
         raise error if isinstance(error, InputError) else InputError(str(error)) from None
+
+
+def _nominal(loop: Loop) -> Loop:
+    """With the environment itself, constant delays and even periods: what a map is about."""
+    return msgspec.structs.replace(loop, box=None, jitter=None, T_max=None, latency=None)
 
 
 def _marks(args: argparse.Namespace) -> tuple[Range, ...]:
@@ -483,7 +483,7 @@ def _plan(args: argparse.Namespace, sweep: Sweep) -> Plan:
     effects = Effects(args.quantisation, args.friction, args.saturation)
     coarsest = max(device.encoder_step for device in effects.on(sweep.devices))
     threshold = max(2 * coarsest, FINEST) if args.threshold is None else args.threshold
-    shortest = max(1.5, 1024 * sweep.T)
+    shortest = max(1.5, 1024 * sweep.loop.T)
     if not shortest <= args.duration <= 1e4:
         raise InputError(f"--duration is {args.duration:g}, allowed are {shortest:g} to 10000 s")
     return Plan(effects, args.points, args.trials, args.start, args.press, args.duration, threshold)
