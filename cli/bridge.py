@@ -23,6 +23,7 @@ from cli.options import (
     INTERRUPTED,
     Parser,
     add_energy_budget_option,
+    add_limiter_option,
     add_loop_options,
     add_output_options,
     out_folder,
@@ -71,8 +72,9 @@ def main(argv: list[str]) -> int:
 
     def plan(ages: Ages) -> Sequence[CertifiedCoupling]:
         link = measured_link(args, ages, scenario.T)
-        programs = certified_couplings(scenario, args.case, args.coupling, args.condition, link)
-        print_certificate(ages, link, programs, console(args))
+        asked = args.case, args.coupling, args.condition
+        programs = certified_couplings(scenario, *asked, link, limiter=args.limiter)
+        print_certificate(ages, link, programs, session.limits.cap, console(args))
         return programs
 
     live = hold_session(args, session, plan, seconds, seed, out)
@@ -105,13 +107,16 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
     add_energy_budget_option(parser)
+    add_limiter_option(parser)
     parser.add_argument("--duration", metavar="SECONDS", help="of forces at full gain (default: the scenario's)")
     parser.add_argument("--no-plot", action="store_true", help="write no picture")
     add_output_options(parser)
     return parser
 
 
-def print_certificate(ages: Ages, link: int, programs: Sequence[CertifiedCoupling], console: Console) -> None:
+def print_certificate(
+    ages: Ages, link: int, programs: Sequence[CertifiedCoupling], cap: Sequence[float], console: Console
+) -> None:
     """What was measured, and what is certified for it: printed before anything is armed."""
     at = {p: int(np.percentile(ages.values, p)) for p in (50, 99)}
     console.print(
@@ -123,7 +128,7 @@ def print_certificate(ages: Ages, link: int, programs: Sequence[CertifiedCouplin
     for column in ("K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "promise"):
         table.add_column(column)
     for program in programs:
-        part = program.part()
+        part = program.part(cap)
         certificate = next(c for c in (part["certificate"], *part["certificates"].values()) if c["certified"])
         coupling = part["coupling"]
         table.add_row(
@@ -135,7 +140,7 @@ def print_certificate(ages: Ages, link: int, programs: Sequence[CertifiedCouplin
         )
     console.print(table)
     for program in programs:
-        for remark in program.remarks():
+        for remark in (program.limits.words(cap), *program.remarks()):
             console.print(f"[dim]·[/] theta = {list(program.scenario.theta)}: {remark}", highlight=False)
     if len(programs) == 1:
         console.print("no reserve: nothing softer is certified, so late answers end the session")

@@ -446,6 +446,18 @@ class Limiter:
 
         return walled_tick
 
+    def at_rest(self, x: Array) -> Array:
+        """The state that displacements x (m,) [m] lead to where they are held, no wall touching: see resting.
+
+        The slip is the one that a force of F(1) x needs, so that the lines hold forces within the limits.
+        """
+        m, G = self.channels, self.sent
+        free = Lti(G.A, G.B[:, :m], G.C[:m], G.D[:m, :m], G.T)
+        stiffness = np.stack([free.C @ resting(free, unit) for unit in np.eye(m)], axis=1) + free.D
+        (e,), (f,) = (side.T for side in BoxProblem(stiffness, -self.limit, self.limit).solve(stiffness @ x[:, None]))
+        lines = np.repeat(f, self.theta)
+        return np.concatenate([resting(free, x - e), e, lines, np.zeros(len(self.walls))])
+
     def depths(self, z: Array) -> Array:
         """h [m] at each tick but the last, (ticks - 1, w, ..), from the states at all of them, (ticks, order, ..)."""
         return z[1:, z.shape[1] - len(self.walls) :]
@@ -469,6 +481,14 @@ def limited(
     late = Lti.diag(delay(psi, T), Lti.constant(np.eye(w), T))
     sent = coupling.around(late @ walled_environment(network, T), further=w)
     return Limiter(sent, tuple(theta), np.asarray(limit), np.asarray(rho), network.walls)
+
+
+def resting(F: Lti, x: Array) -> Array:
+    """The state z = A z + B x in which F rests with the displacements x held.
+
+    Where F drifts (an environment with a free mass, whose place no x decides), the shortest such z.
+    """
+    return np.asarray(np.linalg.lstsq(np.eye(F.order) - F.A, F.B @ x, rcond=None)[0], dtype=np.float64)
 
 
 class Net(Protocol):
@@ -536,6 +556,10 @@ class Process:
             return x
         step = np.where(coarse, self.encoder_step, 1.0)
         return np.where(coarse, np.round(x / step) * step, x)
+
+    def at_rest(self, x: Array) -> Array:
+        """The state in which the process rests with the displacements x (m,) [m] held."""
+        return self.limiter.at_rest(x) if self.limiter else resting(self.F, x)
 
     def frozen(self) -> dict[State, Lti]:
         """The linear force maps that the process switches between, by the walls that touch: F alone without walls."""

@@ -19,7 +19,6 @@ from controller.delay import delay
 from controller.loop import force_map
 from controller.lti import Array, Sampled
 from design.conditions import (
-    BETA,
     Lags,
     LimiterProof,
     Requirement,
@@ -28,7 +27,6 @@ from design.conditions import (
     half_widths,
     jitter_proof,
     limiter_demand,
-    limiter_lag,
     switching_block,
     this_environment,
 )
@@ -416,8 +414,8 @@ def _safe_optimum(sampled: SwitchingLoop, start: SpringDamper) -> tuple[SpringDa
 class LimiterLoop(SampledLoop):
     """As Sampled, with x = (log K, B/delta, c) and one weight c per channel, of the lag 1."""
 
-    def __init__(self, spec: Specification) -> None:
-        self.rho = limiter_lag(spec.delta, spec.T, BETA)
+    def __init__(self, spec: Specification, rho: Sequence[float]) -> None:
+        self.rho = rho  # (m,) [N/m]
         super().__init__(spec)
 
     def coupling(self, x: Array) -> SpringDamper:
@@ -459,9 +457,9 @@ class LimiterLoop(SampledLoop):
         return x[: 2 * self.spec.channels]
 
 
-def _limited_optimum(spec: Specification, start: SpringDamper) -> tuple[SpringDamper | None, int]:
+def _limited_optimum(spec: Specification, rho: Sequence[float], start: SpringDamper) -> tuple[SpringDamper | None, int]:
     """(a local optimum that passes the limiter's refined sweep or None, searches)."""
-    sampled = LimiterLoop(spec)
+    sampled = LimiterLoop(spec, rho)
     x = sampled.point(start)
     for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
@@ -487,22 +485,22 @@ def design(
     condition: str = "theorem4",
     starts: Sequence[SpringDamper] = (),
     switching: tuple[Sequence[int], Sequence[int]] | None = None,
-    limiter: bool = False,
+    lag: Sequence[float] | None = None,
 ) -> Design:
     """The best spring-damper under `condition`; by default the starts are chosen, a start need not be feasible.
 
     any-environment: minimises ||W1 L W2||_inf (23) over the exact set; the result does not depend on the start.
     closed-loop: minimises the rms mismatch in this environment from every start, local optima only; with
-    `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it, with `limiter` also
-    while forces are limited (any-environment is anyway, at no cost).
+    `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it, with `lag`, rho (m,)
+    [N/m] of a limiter, also while forces are limited (any-environment is anyway, at no cost).
     Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for closed-loop.
     """
     if condition == "theorem4" and switching is None:
         return _for_any_environment(spec, starts[0] if starts else None)
     if condition == "closed-loop":
-        if switching and limiter:
+        if switching and lag is not None:
             raise ValueError("limiter and switching: limited forces are proved for constant delays, ask for one")
-        return _for_this_environment(spec, starts, switching, limiter)
+        return _for_this_environment(spec, starts, switching, lag)
     if switching:
         raise ValueError("delays that vary are designed for by the closed-loop condition only")
     raise ValueError(f"condition is {condition!r}, expected 'any_environment' or 'closed-loop'")
@@ -532,18 +530,23 @@ def _for_this_environment(
     spec: Specification,
     starts: Sequence[SpringDamper],
     switching: tuple[Sequence[int], Sequence[int]] | None,
-    limiter: bool,
+    lag: Sequence[float] | None,
 ) -> Design:
     started, starts = time.perf_counter(), starts or _default_starts(spec)
     search = partial(least_rms_switching, spec, *switching) if switching else partial(least_rms, spec)
-    if limiter:
-        search = partial(least_rms, spec, optimum=partial(_limited_optimum, spec))
     coupling, rms, searches = search(starts)
+    if lag is not None:  # a little softer than without limits: nearly always found from there
+        search = partial(least_rms, spec, optimum=partial(_limited_optimum, spec, lag))
+        linear, before = coupling, searches
+        coupling, rms, searches = search([linear] if linear else starts)
+        if coupling is None and linear:
+            coupling, rms, searches = search(starts)
+        searches += before
     if coupling is None:
         certifies = "the closed-loop condition certifies"
         if switching:
             certifies += f" under any switching from {tuple(switching[0])} to {tuple(switching[1])} samples"
-        if limiter:
+        if lag is not None:
             certifies += " while forces are limited"
         line = (
             f"no spring-damper was found that {certifies} for theta = {spec.theta}, psi = {spec.psi}, "
