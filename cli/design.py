@@ -362,6 +362,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("K [N/m]", coupling["K"] and listed(coupling["K"])),
         ("", end if max(coupling["K"] or [0]) > 0.999 * STIFFEST else None),
         ("B [N s/m]", coupling["K"] and listed(coupling["B"])),
+        ("stiffness, static [N/m]", coupling.get("stiffness") and listed(coupling["stiffness"])),
         *render.certificate_rows(outcome["certificates"], proof=False),
         ("damping, any switching", proof and _switching_words(proof)),
         *(set_rows(outcome["set"]) if outcome["set"] else []),

@@ -354,6 +354,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
     position = "-" if apart is None else f"{apart:.1e} relative rms, {error['position_max_m']:.1e} m at most"
     return [
         ("coupling K / B", gains or None),
+        ("coupling, static", coupling.get("stiffness") and f"{listed(coupling['stiffness'], 5)} N/m"),
         *render.certificate_rows(outcome["certificates"], 5),
         *(set_rows(outcome["set"]) if outcome["set"] else []),
         ("guarantee", f"holds for {outcome['promise']}" if outcome["promise"] else "none"),

@@ -7,6 +7,7 @@ floats, a stack, Fractions, or sampled responses (controller.lti). Its form is w
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any, Protocol
@@ -15,9 +16,10 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controller.lti import Array, Block, Complex, Lti, Number, Sampled, frozen, numbers
+from controller.lti import Array, Block, Complex, Lti, Number, Sampled, frozen, numbers, taps
 
 LARGEST_COEFFICIENT = 1e12  # of a stored coupling, SI units
+MOST_TERMS = 2000  # of a moving average; every one is a state
 LARGEST_WEIGHT = 1e9  # of a force filter: beyond it arithmetic would overflow before the filter could be judged
 Rows = tuple[tuple[float, ...], ...]
 
@@ -128,6 +130,56 @@ def _spring_damper(k: Array, b: Array, beta: Any, T: Number) -> Lti:
 def _scalar(value: Any) -> Any:
     """A number, or numbers with axes, as 1 x 1 matrices."""
     return np.asarray(value)[..., None, None]
+
+
+@dataclass(frozen=True, eq=False)
+class MovingAverage:
+    """V_i = weight_i (1 + 1/z + ... + z^-(terms_i - 1)) + constant_i: the sum of the last forces, and a plain spring.
+
+    With weight T/(2 delta), as many terms as a force takes ticks to act and a constant however small it is the
+    stiffest coupling that any-environment admits (docs/theory.md).
+    """
+
+    weight: Array  # (m,) [m/N]
+    terms: tuple[int, ...]  # (m,)
+    constant: Array  # (m,) [m/N]
+
+    if TYPE_CHECKING:
+
+        def __init__(self, weight: ArrayLike, terms: Sequence[int], constant: ArrayLike) -> None: ...
+
+    def __post_init__(self) -> None:
+        for name in ("weight", "constant"):
+            values = frozen(getattr(self, name), 1, name)
+            object.__setattr__(self, name, values)
+            if not ((values >= 0).all() and (values <= LARGEST_COEFFICIENT).all()):
+                raise ValueError(f"{name} is {values.tolist()}, allowed are 0 to {LARGEST_COEFFICIENT:g} m/N")
+        object.__setattr__(self, "terms", tuple(int(n) for n in self.terms))
+        if not len(self.weight) == len(self.constant) == len(self.terms):
+            sizes = f"{len(self.weight)}, {len(self.terms)} and {len(self.constant)}"
+            raise ValueError(f"weight, terms and constant have {sizes} entries; give one of each per device")
+        if not all(1 <= n <= MOST_TERMS for n in self.terms):
+            raise ValueError(f"terms are {list(self.terms)}, allowed are 1 to {MOST_TERMS}")
+
+    @property
+    def stiffness(self) -> Array:
+        """1/V(1) [N/m], (m,)."""
+        return 1 / (self.weight * self.terms + self.constant)
+
+    def channels(self, T: Number) -> list[Lti]:
+        """V_i(z)."""
+        rows = zip(numbers(self.weight, T), self.terms, numbers(self.constant, T), strict=True)
+        return [taps([w + e, *[w] * (n - 1)], T) for w, n, e in rows]
+
+    def compliance(self, T: Number) -> Lti:
+        """V(z), diagonal."""
+        return Lti.diag(*self.channels(T))
+
+    def around(self, environment: Block, further: int = 0) -> Block:
+        return Compliance(self.compliance(environment.T)).around(environment, further)
+
+    def form(self) -> MovingAverageForm:
+        return MovingAverageForm(tuple(self.weight.tolist()), self.terms, tuple(self.constant.tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,6 +464,24 @@ class SpringDamperForm(Strict, frozen=True, tag_field="kind", tag="spring-damper
         return SpringDamper(self.K, self.B)
 
 
+class MovingAverageForm(Strict, frozen=True, tag_field="kind", tag="moving-average"):
+    """A weighted sum of the last forces and a plain spring per channel."""
+
+    weight: tuple[float, ...]  # (m,) [m/N]
+    terms: tuple[int, ...]  # (m,)
+    constant: tuple[float, ...]  # (m,) [m/N]
+
+    def __post_init__(self) -> None:
+        self.build(1.0)
+
+    @property
+    def shape(self) -> tuple[str, int]:
+        return "weight", len(self.weight)
+
+    def build(self, T: float) -> MovingAverage:
+        return MovingAverage(self.weight, self.terms, self.constant)
+
+
 class ComplianceForm(Strict, frozen=True, tag_field="kind", tag="compliance"):
     """A general V(z), as the rows of its state-space matrices."""
 
@@ -475,7 +545,7 @@ class ForceFilterForm(Strict, frozen=True, tag_field="kind", tag="force-filter")
         return ForceFilter(self.poles, self.pairs, self.R)
 
 
-Form = NoForm | SpringDamperForm | ComplianceForm | InternalModelForm | ForceFilterForm
+Form = NoForm | SpringDamperForm | MovingAverageForm | ComplianceForm | InternalModelForm | ForceFilterForm
 
 
 def require_channels(form: Form, m: int) -> None:

@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
-from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, NoCoupling, SpringDamper
+from controller.coupling import (
+    Compliance,
+    Coupling,
+    ForceFilter,
+    InternalModel,
+    MovingAverage,
+    NoCoupling,
+    SpringDamper,
+)
 from controller.environment import GROUND, Network, Spring, environment, held
 from controller.loop import DelayRange, Loop, force_map
 from controller.lti import Lti, SingularLoop
@@ -41,31 +49,6 @@ from design.conditions import (
 )
 from design.ranges import SetCheck, set_part
 from design.result import listed
-
-# ----------------------------------------------------------------------------------------------------
-# Limits that public frameworks ship, as data: what an application may ask of a device when it trusts them.
-
-
-@dataclass(frozen=True)
-class Preset:
-    """A spring-damper against a rigid wall, one channel without delay."""
-
-    K: float  # [N/m]
-    B: float  # [N s/m]
-    T: float  # [s]
-    source: str  # of each number
-
-
-PRESETS = {
-    "chai3d-omega3": Preset(
-        K=5000.0,
-        B=30.0,
-        T=1e-3,
-        source="K and B: m_maxLinearStiffness and m_maxLinearDamping of the omega.3 in CHAI3D's "
-        "src/devices/CDeltaDevices.cpp; T: the 1 kHz that haptic loops customarily run at",
-    ),
-}
-
 
 # ----------------------------------------------------------------------------------------------------
 # What an audit is about: a coupling in its loop, judged by either condition and ready to be varied.
@@ -385,6 +368,7 @@ def _smaller(vary: Callable[[float], Subject], describe: Callable[[float], str],
 KINDS = {
     NoCoupling: "none",
     SpringDamper: "spring-damper",
+    MovingAverage: "moving-average",
     Compliance: "compliance",
     InternalModel: "internal-model",
     ForceFilter: "force-filter",

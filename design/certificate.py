@@ -18,7 +18,16 @@ import msgspec
 import numpy as np
 import scipy
 
-from controller.coupling import Coupling, ForceFilter, Form, InternalModel, SpringDamper, Strict, require_channels
+from controller.coupling import (
+    Coupling,
+    ForceFilter,
+    Form,
+    InternalModel,
+    MovingAverage,
+    SpringDamper,
+    Strict,
+    require_channels,
+)
 from controller.delay import delay
 from controller.environment import Member, frozen_states
 from controller.loop import DelayRange, Loop
@@ -1045,7 +1054,7 @@ def theorem4_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Req
     if loop.environment.walls and any(loop.psi):
         reason = "with delay in the environment its multiplier is of a linear one: no walls"
         return refusal("theorem4", loop.delta, reason)
-    if isinstance(coupling, SpringDamper) and not any(loop.psi):
+    if isinstance(coupling, SpringDamper | MovingAverage) and not any(loop.psi):
         return any_environment_per_channel(coupling.channels(loop.T), loop.theta, loop.delta, loop.T_max)
     V = coupling.compliance(loop.T)
     if V is None:

@@ -422,10 +422,31 @@ def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float], T_max:
     V1 = demand.static["V(1)"]
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return refused("the static compliance V(1) is not symmetric")
-    ratio, w = supremum(lambda w: least_scale(demand, w), np.concatenate([[0.0], frequencies(V)]))
-    if np.isinf(ratio):
+    least = lambda w: _scale_beside_zeros(V, demand, w)  # noqa: E731
+    ratio, w = supremum(least, np.concatenate([[0.0], frequencies(V)]))
+    if ratio > _NEVER:
         return refused(f"V is not passive enough at {w / (2 * np.pi * V.T):.4g} Hz: its damping vanishes there")
     return from_ratio("theorem4", ratio, available, w / (2 * np.pi * V.T))
+
+
+#: V is taken to vanish in a direction in which it is smaller than this, beside V(1): nearer to a zero is rounding.
+_VANISHES = 1e-5
+#: What stands there in place of its passivity, beside V(1), and the ratio from which on nothing else does.
+_SOFTENED, _NEVER = 1e-12, 1e6
+
+
+def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
+    """As `least_scale`, (k,), but a direction in which V vanishes needs no passivity of its own.
+
+    Where V and the delays' window vanish together, so does V-hat, and He V-hat >= Delta_V |V-hat|^2 is 0 >= 0: the
+    moving average does it at every zero of its window. Where only V does, the ratio is large.
+    """
+    z = on_circle(w)
+    free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z))
+    _, sizes, right = np.linalg.svd(V.at(z))
+    static = float(np.abs(demand.static["V(1)"]).max())
+    idle = (sizes <= _VANISHES * static) * (_SOFTENED * static)
+    return least_multiple(free, gain + np.conj(np.swapaxes(right, -1, -2)) @ (idle[..., None] * right))
 
 
 def any_environment_per_channel(

@@ -26,7 +26,12 @@ if TYPE_CHECKING:
 
 
 #: name -> the conditions that it can be made for, its own first
-KINDS = {"spring-damper": ("closed-loop", "theorem4"), "ccl": ("theorem4",), "optimal": ("closed-loop",)}
+KINDS = {
+    "spring-damper": ("closed-loop", "theorem4"),
+    "moving-average": ("theorem4",),
+    "ccl": ("theorem4",),
+    "optimal": ("closed-loop",),
+}
 
 
 def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
@@ -42,6 +47,7 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
 #: kind -> what else can be asked of it, in words of design.api.Options
 OPTIONS = {
     "spring-damper": ("switching", "limiter"),
+    "moving-average": (),
     "ccl": ("order", "method", "diagonal"),
     "optimal": (
         "objective",
@@ -82,6 +88,7 @@ def design_by_kind(
     if condition not in KINDS[kind]:
         raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(KINDS[kind])}")
     from design import fixed_order as ccl  # cvxpy takes a second to import
+    from design import spring_damper
     from design.lmi import Specification
 
     def made(loop: Loop) -> Design:
@@ -90,6 +97,8 @@ def design_by_kind(
         spec = Specification.of(loop)
         if kind == "ccl":
             return ccl.design(spec, **options)
+        if kind == "moving-average":
+            return spring_damper.moving_average(spec)
         return _spring_damper(loop, spec, condition, **options)
 
     if loop.latency is None:
@@ -103,21 +112,21 @@ def _spring_damper(
     loop: Loop, spec: Specification, condition: str, limiter: bool | None = None, **options: Any
 ) -> Design:
     """A spring-damper, with the limiter's block in the place of the linear one where that is asked for or usual."""
-    from design import spring_damper
+    from design.spring_damper import design
 
     if limiter is False or condition == "theorem4":  # with rho = 0 any-environment covers limited forces anyway
-        return spring_damper.design(spec, condition, **options)
+        return design(spec, condition, **options)
     refusal = limiter_refusal(loop)
     if limiter and refusal:
         raise ValueError(refusal)
     if refusal or options.get("switching"):
-        return spring_damper.design(spec, condition, **options)
+        return design(spec, condition, **options)
     try:
-        return spring_damper.design(spec, condition, lag=limiter_lag(loop.delta, loop.T, BETA), **options)
+        return design(spec, condition, lag=limiter_lag(loop.delta, loop.T, BETA), **options)
     except DesignFailed:
         if limiter:
             raise
-        return spring_damper.design(spec, condition, **options)
+        return design(spec, condition, **options)
 
 
 #: A design for forces that latch late leaves at most this share of the damping, and is sought so often.
@@ -172,7 +181,7 @@ def compare_methods(loop: Loop) -> tuple[Row, ...]:
     return ccl.compare(Specification.of(loop))
 
 
-Kind = Literal["spring-damper", "ccl", "optimal"]
+Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]
 LOOP = 'a Loop, as scenario.loop("I") gives it'
 
 
@@ -198,10 +207,10 @@ def design_coupling(
 ) -> Design:
     """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
 
-    `kind` is "spring-damper", "ccl" or "optimal"; `condition` is "theorem4" (any passive environment) or "closed-loop"
-    (this environment), None for what the commands design: a spring-damper for this environment, also while forces are
-    limited; for any environment before walls, ranges or delays that vary. `options` are those of the kind, see Options;
-    switching is not taken from loop.jitter.
+    `kind` is "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal"; `condition` is
+    "theorem4" (any passive environment) or "closed-loop" (this environment), None for what the commands design: a
+    spring-damper for this environment, also while forces are limited; for any environment before walls, ranges or
+    delays that vary. `options` are those of the kind, see Options; switching is not taken from loop.jitter.
 
     Returns a Design: `coupling` (for a spring-damper with K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the damping
     that it needs, from a sweep of the coupling alone), `figure` and `objective` (what was minimised, and its value).

@@ -1,4 +1,4 @@
-"""Spring-damper couplings (26): the best under either condition, and the stiffest under Theorem 4.
+"""Spring-damper couplings (26): the best under either condition, the stiffest, and the moving average.
 
 Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT/d, b = B/d (design.gains.gain_set).
 """
@@ -14,7 +14,7 @@ import cvxpy as cp
 import numpy as np
 from scipy.optimize import OptimizeResult, minimize
 
-from controller.coupling import SpringDamper
+from controller.coupling import MovingAverage, SpringDamper
 from controller.delay import delay
 from controller.loop import force_map
 from controller.lti import Array, Sampled
@@ -585,7 +585,22 @@ def stiffest(spec: Specification) -> Design:
     return Design(coupling, "theorem4", "stiffness", total, requirement, sdps, time.perf_counter() - started, phi)
 
 
-def verified(spec: Specification, coupling: SpringDamper, phi: Array | None) -> Requirement:
+def moving_average(spec: Specification) -> Design:
+    """The stiffest linear coupling that Theorem 4 admits; objective in N/m, of all channels together.
+
+    V = T/(2 delta) (1 + ... + z^-theta) needs exactly delta at every frequency. With the constant e n^2 T/(2 delta)
+    beside it, n = theta + 1, it needs delta/(1 + e) where the sum is largest, and less elsewhere.
+    """
+    started = time.perf_counter()
+    phi = shortage(spec)
+    weight, terms = spec.T / (2 * np.asarray(spec.delta)), np.array(spec.theta) + 1
+    coupling = MovingAverage(weight, terms.tolist(), RESERVE / (1 - RESERVE) * terms**2 * weight)
+    requirement = verified(spec, coupling, phi)
+    total = float(coupling.stiffness.sum())
+    return Design(coupling, "theorem4", "stiffness", total, requirement, 0, time.perf_counter() - started, phi)
+
+
+def verified(spec: Specification, coupling: SpringDamper | MovingAverage, phi: Array | None) -> Requirement:
     """Theorem 4's requirement from the coupling alone; raises DesignFailed unless it is certified."""
     V = coupling.compliance(spec.T)
     requirement = (

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, SpringDamper
+from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, MovingAverage, SpringDamper
 from controller.delay import LOST, Jitter, Ticks, ages
 from controller.lti import Array
 from design.certificate import ANY, CAVEATS, MAKING, assess, certificate_part, encoder_part, finite
@@ -44,6 +44,8 @@ def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
     match coupling:
         case SpringDamper(K=K, B=B):
             part |= {"K": K.tolist(), "B": B.tolist(), "order": coupling.compliance(T).order}
+        case MovingAverage():
+            part |= {"stiffness": coupling.stiffness.tolist(), "order": coupling.compliance(T).order}
         case Compliance(V=V):
             part["order"] = V.order
         case InternalModel():

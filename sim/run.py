@@ -15,7 +15,7 @@ from functools import partial
 import msgspec
 import numpy as np
 
-from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
+from controller.coupling import Compliance, Coupling, MovingAverage, NoCoupling, SpringDamper
 from controller.environment import environment, held
 from controller.loop import force_map
 from controller.lti import Array, Lti
@@ -84,7 +84,7 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
     """
     require_forces_at_ticks(scenario, "a simulation")
     network, delays = scenario.environment, (scenario.theta, scenario.psi)
-    if network.walls and not isinstance(coupling, NoCoupling | SpringDamper | Compliance):
+    if network.walls and not isinstance(coupling, NoCoupling | SpringDamper | MovingAverage | Compliance):
         raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
     E = environment(held(network), scenario.T)
     limits, steps = (np.array([getattr(d, of) for d in scenario.device]) for of in ("force_limit", "encoder_step"))

@@ -5,16 +5,11 @@ import subprocess
 import sys
 
 import pytest
+from worlds import PAIR, SOFT
 
 from cli.check import main
 from cli.options import execute
-from controller.coupling import SpringDamper
-from controller.environment import FIGURE_4
-from controller.loop import Loop
 from design.certificate import Stored, prove, save
-
-LOOP = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
-GAINS = SpringDamper((878.7, 551.8), (0.3865, 0.5220))
 
 
 def leave(monkeypatch, *argv: str) -> int:
@@ -28,7 +23,7 @@ def leave(monkeypatch, *argv: str) -> int:
 @pytest.fixture
 def path(tmp_path):
     file = tmp_path / "coupling.json"
-    save(Stored.of(LOOP, GAINS, prove(LOOP, GAINS, "theorem4")), file)
+    save(Stored.of(PAIR, SOFT, prove(PAIR, SOFT, "theorem4")), file)
     return file
 
 

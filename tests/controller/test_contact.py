@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from worlds import SOFT
 
 from cli.accuracy import main as accuracy
 from cli.run import main
@@ -28,7 +29,6 @@ from sim.run import assemble, run
 from sim.scenario import SCENARIOS, InputError, load, parse
 
 T = 1e-3
-SOFT = SpringDamper([878.0, 551.0], [0.386, 0.521])  # within theorem4's set for theta = (1, 2), T = 1.2 ms
 WALL = ("tip", GROUND)
 
 

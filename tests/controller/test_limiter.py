@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from worlds import STIFF, T
 
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Wall, environment
@@ -9,8 +10,6 @@ from controller.loop import force_map
 from controller.lti import Lti, SingularLoop
 from controller.process import BoxProblem, Limiter, Process, StepBuffer, contact, limited
 
-T = 1.2e-3
-STIFF = SpringDamper([7806.0, 3137.0], [0.105, 1.68])
 LIMITS = (12.0, 5.657)
 
 

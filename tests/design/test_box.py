@@ -7,6 +7,7 @@ from itertools import pairwise, product
 import msgspec
 import numpy as np
 import pytest
+from worlds import environment_by_hand, filter_by_hand
 
 from cli.audit import main as audit_main
 from cli.check import main as check_main
@@ -162,20 +163,8 @@ def test_a_vertex_that_cannot_be_simulated_is_refused():
 
 def by_hand(network: Network, coupling, w):
     """F = Theta R E from the network's own matrices and the definition of the basis, shape (k, 2, 2)."""
-    M, D, K = network.matrices()
     z = np.exp(1j * w)
-    s = ((z - 1) / (T * z))[:, None, None]
-    Z = M * s**2 + D * s + K
-    E = Z[:, :2, :2] - Z[:, :2, 2:] @ Z[:, 2:, :2] / Z[:, 2:, 2:]
-    R, through = coupling.R[0].astype(complex), np.ones_like(z)
-    for a, coefficient in zip(coupling.poles, coupling.R[1:], strict=False):
-        R = R + coefficient * (through * (1 - a) / (z - a))[:, None, None]
-        through = through * (1 - a * z) / (z - a)
-    rest = coupling.R[1 + coupling.poles.size :]
-    for (b1, b2), first, second in zip(coupling.pairs, rest[::2], rest[1::2], strict=True):
-        section = (through * (1 + b1 + b2) / (z * z + b1 * z + b2))[:, None, None]
-        R = R + (first * z[:, None, None] + second) * section
-        through = through * (b2 * z * z + b1 * z + 1) / (z * z + b1 * z + b2)
+    E, R = environment_by_hand(network, z), filter_by_hand(coupling, z)
     late = np.stack([z ** -THETA[0], z ** -THETA[1]], axis=1)[:, :, None]
     return late * (R @ E)
 

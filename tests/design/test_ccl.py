@@ -3,9 +3,10 @@
 import cvxpy as cp
 import numpy as np
 import pytest
+from worlds import DELTA, SOFT_NETWORK, T
 
 from controller.coupling import SpringDamper
-from controller.environment import FIGURE_4, Network, Spring, environment
+from controller.environment import FIGURE_4, environment
 from controller.loop import force_map
 from controller.lti import Lti
 from design import fixed_order as ccl
@@ -14,15 +15,8 @@ from design.conditions import any_environment, this_environment
 from design.fixed_order import FixedOrder, FixedPoles, descend
 from design.lmi import RESERVE, Shaping, Specification, affine, symmetric_from, v_hat_regular
 
-T = 1.2e-3
-DELTA = (1.37, 1.37)
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
 NO_MULTIPLIER = np.full(2, np.inf)
-SOFT = Network(
-    ("contact 1", "contact 2"),
-    (Spring(("contact 1", "mass"), 200.0, 0.25), Spring(("mass", "contact 2"), 175.0, 0.25)),
-    {"mass": 1.0},
-)
 
 
 def specification(lam=(1, 2), network=FIGURE_4, psi=(0, 0), delta=DELTA):
@@ -136,7 +130,7 @@ def test_richer_families_start_no_worse(order, diagonal, structured):
 
 
 def test_delay_in_the_environment_is_paid_for():
-    spec = specification((0, 0), SOFT, psi=(1, 1))
+    spec = specification((0, 0), SOFT_NETWORK, psi=(1, 1))
     found = ccl.design(spec, most_sdps=3)
     assert found.requirement.certified
     assert found.phi is not None

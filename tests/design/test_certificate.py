@@ -6,6 +6,7 @@ from fractions import Fraction
 import msgspec
 import numpy as np
 import pytest
+from worlds import SOFT, SOFT_NETWORK, STIFF
 
 from controller import coupling as controller_coupling
 from controller.coupling import Compliance, ComplianceForm, InternalModelForm, NoCoupling, SpringDamper
@@ -33,8 +34,6 @@ from design.lmi import Specification
 from design.result import PUBLISHED
 
 DEFAULT = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
-STIFF = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
-THEOREM_4 = SpringDamper((878.77, 551.88), (0.3865, 0.5220))
 change = msgspec.structs.replace
 
 
@@ -44,17 +43,10 @@ def wall(stiffness: float, damping: float, delta: float, T: float = 1e-3) -> Loo
     return Loop(T, (0,), (0,), (0,), (delta,), network)
 
 
-SOFT = Network(
-    ("contact 1", "contact 2"),
-    (Spring(("contact 1", "mass"), 200.0, 0.25), Spring(("mass", "contact 2"), 175.0, 0.25)),
-    {"mass": 1.0},
-)
-
-
 @pytest.mark.parametrize("psi", [(1, 1), (1, 0)])
 def test_delay_inside_the_environment_is_proved_with_its_multiplier(psi):
     """Theorem 4 with psi >= 1: the design's Phi is stored, and only for this environment is anything promised."""
-    loop = change(DEFAULT, psi=psi, environment=SOFT)
+    loop = change(DEFAULT, psi=psi, environment=SOFT_NETWORK)
     found = spring_damper.design(Specification.of(loop))
     stored = Stored.of(loop, found.coupling, prove(loop, found.coupling, "theorem4", found.phi))
     assert stored.certificate.promise == "this environment"
@@ -90,8 +82,8 @@ def certified(loop: Loop, coupling, condition: str) -> Stored:
     [
         (STIFF, "closed-loop", 1.363 / 1.37),
         (SpringDamper((879, 552), (0.39, 0.52)), "closed-loop", 0.714344 / 1.37),
-        (THEOREM_4, "closed-loop", 0.714 / 1.37),
-        (THEOREM_4, "theorem4", 0.9999),
+        (SOFT, "closed-loop", 0.714 / 1.37),
+        (SOFT, "theorem4", 0.9999),
         (SpringDamper((400.0, 300.0), (0.0, 0.5)), "theorem4", None),
     ],
 )

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from worlds import PAIR, SOFT
 
 from cli.compare import main
 from controller.coupling import Compliance, NoCoupling, SpringDamper
@@ -14,8 +15,7 @@ from design.result import CASE_I, DesignFailed
 from sim.scenario import InputError
 
 T, DELTA = 1.2e-3, 1.37
-LOOP = Loop(T, (1, 2), (0, 0), (1, 2), (DELTA, DELTA), FIGURE_4)
-SOFT = SpringDamper([878.7, 551.8], [0.3865, 0.5220])
+
 HZ = np.array([0.3, 6.17, 40.0, 133.0, 400.0])
 
 #: rounding of a state-space response against a formula, with poles 1e-3 from the circle
@@ -42,8 +42,8 @@ def wall(K, B=0.0, theta=0):
 
 
 def test_singular_values_and_effective_impedance_by_hand():
-    lines = curves(LOOP, judge(LOOP, CASE_I), HZ)
-    sigma_E, undelayed = ideal(LOOP, HZ)
+    lines = curves(PAIR, judge(PAIR, CASE_I), HZ)
+    sigma_E, undelayed = ideal(PAIR, HZ)
     for k, (E, F, theta) in enumerate(by_hand(HZ)):
         np.testing.assert_allclose(sigma_E[k], np.linalg.svd(E)[1], rtol=ROUNDING)
         np.testing.assert_allclose(lines.sigma_F[k], np.linalg.svd(F)[1], rtol=ROUNDING)
@@ -76,7 +76,7 @@ def test_a_delayed_spring_feeds_and_a_damper_dissipates():
 
 def test_demand_by_hand():
     """closed-loop: -T He[F/(z-1)] / delta; theorem4, by channel: (1 - cos n w) / (2 delta Re[(z-1) V/(Tz)])."""
-    demands = curves(LOOP, judge(LOOP, CASE_I), HZ).demands
+    demands = curves(PAIR, judge(PAIR, CASE_I), HZ).demands
     for k, (_, F, _) in enumerate(by_hand(HZ)):
         z = np.exp(2j * np.pi * HZ[k] * T)
         H = F / (z - 1)
@@ -92,9 +92,9 @@ def test_demand_by_hand():
     "coupling", [NoCoupling(), CASE_I, SOFT, Compliance(SOFT.compliance(T))], ids=lambda c: str(c)[:9]
 )
 def test_the_curve_reaches_the_required_damping_and_no_more(coupling):
-    judged = judge(LOOP, coupling)
-    hz = grid(LOOP, [judged])
-    for condition, demand in curves(LOOP, judged, hz).demands.items():
+    judged = judge(PAIR, coupling)
+    hz = grid(PAIR, [judged])
+    for condition, demand in curves(PAIR, judged, hz).demands.items():
         ratio = judged.requirements[condition].ratio
         if demand is None:
             assert ratio == np.inf

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
+from worlds import STIFF, T
 
 from controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, Box, Network, Spring, UncertainSpring
@@ -30,10 +31,8 @@ from design.conditions import (
 )
 from design.exact import find_storage, prove_positive_real
 
-T = 1.2e-3
 CLOSE = 1e-6  # relative, on either side of a limit
 change = msgspec.structs.replace
-STIFF = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
 
 
 def assert_limit(block: Callable[[float], Lti], limit: float) -> None:

@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+from worlds import PAIR, SOFT, T
 
 from cli.export import main
 from controller.coupling import Compliance, NoCoupling, SpringDamper
@@ -21,14 +22,11 @@ from design.certificate import Stored, prove, save
 from design.export import process_block, sequential, trial
 from sim.scenario import InputError
 
-T = 1.2e-3
-LOOP = Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
-GAINS = SpringDamper((878.7, 551.8), (0.3865, 0.5220))
 SPRINGS = SpringDamper((300.0, 200.0), (0.0, 0.0))  # no state at all
 FULL = Compliance(
     Lti([[0.5, 0.1], [-0.2, 0.3]], [[1e-3, 0], [2e-4, 1e-3]], [[0.4, 0], [0.1, 0.5]], [[1e-3, 1e-4], [1e-4, 2e-3]], T)
 )
-COUPLINGS = {"gains": GAINS, "springs": SPRINGS, "full": FULL}
+COUPLINGS = {"gains": SOFT, "springs": SPRINGS, "full": FULL}
 
 CC = shutil.which("gcc") or shutil.which("cc")
 needs_cc = pytest.mark.skipif(CC is None, reason="neither gcc nor cc is here: exported C files are not compiled")
@@ -40,8 +38,8 @@ def place(tmp_path_factory):
     """A folder with the stored couplings; the first is certified."""
     folder = tmp_path_factory.mktemp("export")
     for name, data in COUPLINGS.items():
-        certificate = prove(LOOP, GAINS, "theorem4") if name == "gains" else None
-        save(Stored.of(LOOP, data, certificate), folder / f"{name}.json")
+        certificate = prove(PAIR, SOFT, "theorem4") if name == "gains" else None
+        save(Stored.of(PAIR, data, certificate), folder / f"{name}.json")
     return folder
 
 
@@ -64,7 +62,7 @@ def run(program):
 
 def test_the_order_of_the_sums_in_plain_python():
     """Floats of Python, one rounding per operation: equal to the last bit."""
-    block = process_block(Stored.of(LOOP, GAINS))
+    block = process_block(Stored.of(PAIR, SOFT))
     test, G = trial(block), block.system
     z = [0.0] * G.order
     for u, y in zip(test.inputs.tolist(), test.outputs.tolist(), strict=True):
@@ -81,7 +79,7 @@ def test_the_order_of_the_sums_in_plain_python():
 @pytest.mark.parametrize("data", COUPLINGS.values(), ids=COUPLINGS)
 def test_the_process_of_the_simulator_differs_by_rounding_alone(data):
     """It sums by BLAS, in any order: each tick each side is wrong by at most gamma_N |row| |v|, carried on by A."""
-    block = process_block(Stored.of(LOOP, data))
+    block = process_block(Stored.of(PAIR, data))
     test, G = trial(block), block.system
     limits = np.full(2, np.inf)
     tape = StepBuffer(Process(G, limits, np.zeros(2)), len(test.inputs), plant_states=2)
@@ -159,7 +157,7 @@ def test_other_code_closes_the_loop_around_springs_of_its_own(place):
     out = subprocess.run([compiled([driver, source])], capture_output=True, text=True, check=True).stdout
     f = np.array([float.fromhex(line) for line in out.split()]).reshape(40, 2)
     x = 1e-3 * np.stack([np.arange(40) % 5, np.arange(40) % 6], axis=1)
-    F = Gains(GAINS.K, GAINS.B).around(Lti.constant(900 * np.eye(2), T))
+    F = Gains(SOFT.K, SOFT.B).around(Lti.constant(900 * np.eye(2), T))
     np.testing.assert_allclose(f, sequential(F, x), atol=1e-13)  # a few roundings of forces up to 1 N
 
 
@@ -177,7 +175,7 @@ def test_plain_data_is_the_force_map_of_the_paper(place, kind):
     for hz in (1.0, 30.0, 300.0):
         z = np.exp(2j * np.pi * hz * T)
         found = plain["C"] @ np.linalg.solve(z * np.eye(len(plain["A"])) - plain["A"], plain["B"]) + plain["D"]
-        V = np.diag(1 / (np.array(GAINS.K) + np.array(GAINS.B) * (z - 1) / (T * z)))
+        V = np.diag(1 / (np.array(SOFT.K) + np.array(SOFT.B) * (z - 1) / (T * z)))
         expected = np.diag([1 / z, 1 / z**2]) @ np.linalg.inv(np.eye(2) + E.at(z) @ V) @ E.at(z)
         np.testing.assert_allclose(found, expected, rtol=1e-9)
     assert plain["T_s"] == T
@@ -193,7 +191,7 @@ def test_the_control_script_builds_the_same_block_and_tests_itself(place):
     spec.loader.exec_module(module)
     system = module.statespace()
     z = np.exp(2j * np.pi * 30.0 * T)
-    F = force_map(environment(FIGURE_4, T), Gains(GAINS.K, GAINS.B), LOOP.theta, LOOP.psi)
+    F = force_map(environment(FIGURE_4, T), Gains(SOFT.K, SOFT.B), PAIR.theta, PAIR.psi)
     np.testing.assert_allclose(system(z), F.at(z), rtol=1e-9)
     assert (system.dt, system.input_labels, system.output_labels) == (T, ["x1", "x2"], ["f1", "f2"])
     assert module.main() == 0
@@ -202,7 +200,7 @@ def test_the_control_script_builds_the_same_block_and_tests_itself(place):
 
 
 def test_without_theta_the_link_is_the_delay():
-    stored = Stored.of(LOOP, GAINS)
+    stored = Stored.of(PAIR, SOFT)
     with_it, without = (process_block(stored, flag) for flag in (True, False))
     z = np.exp(0.3j)
     theta = np.diag([1 / z, 1 / z**2])
@@ -231,7 +229,7 @@ def test_a_certificate_that_does_not_hold_is_said_and_exits_with_1(place, tmp_pa
 
 def test_a_hostile_name_stays_inside_the_comments(tmp_path):
     path = tmp_path / "a\nimport os; #.json"
-    save(Stored.of(LOOP, GAINS), path)
+    save(Stored.of(PAIR, SOFT), path)
     assert main([str(path), "--format", "control", "--out", str(tmp_path / "out.py")]) == 0
     code = [line for line in (tmp_path / "out.py").read_text().splitlines() if not line.startswith("#")]
     assert code[0] == "import sys"
@@ -251,7 +249,7 @@ def test_a_hostile_name_stays_inside_the_comments(tmp_path):
     ],
 )
 def test_bad_input_is_one_line(place, options, message):
-    save(Stored.of(LOOP, NoCoupling()), place / "none.json")
+    save(Stored.of(PAIR, NoCoupling()), place / "none.json")
     with pytest.raises(InputError, match=message):
         main([option.format(gains=place / "gains.json", place=place) for option in options])
 

@@ -5,6 +5,7 @@ import json
 import cvxpy as cp
 import numpy as np
 import pytest
+from worlds import DELTA, SOFT, STIFF, T
 
 from cli.audit import main
 from controller.coupling import NoCoupling, SpringDamper
@@ -17,10 +18,6 @@ from design.exact import Matrix
 from design.frequency import hermitian
 from design.lmi import solve
 from sim.scenario import InputError
-
-T, DELTA = 1.2e-3, (1.37, 1.37)
-STIFF = SpringDamper([7806, 3137], [0.105, 1.68])
-SOFT = SpringDamper([878.767, 551.883], [0.386476, 0.521984])
 
 
 def sent(coupling=STIFF, T=T) -> Lti:

@@ -5,6 +5,7 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
+from worlds import DELTA, PAIR, T
 
 from cli.design import main as design_main
 from controller.coupling import NoCoupling, SpringDamper
@@ -34,14 +35,12 @@ from design.spring_damper import design
 from design.transparency import transparency
 from sim.scenario import InputError
 
-T, DELTA = 1.2e-3, (1.37, 1.37)
-LOOP = Loop(T, (1, 2), (0, 0), (1, 2), DELTA, FIGURE_4)
 LAG = limiter_lag(DELTA, T, 0.01)
 BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # designed with the limiter's block
 
 
 def required(coupling, c=None, lag=LAG) -> float:
-    return limiter(LOOP.sent(coupling), LOOP.theta, DELTA, lag, c).requirement.required[0]
+    return limiter(PAIR.sent(coupling), PAIR.theta, DELTA, lag, c).requirement.required[0]
 
 
 def test_the_block_of_one_channel():
@@ -112,10 +111,10 @@ def test_a_delayed_spring_by_its_multiplier(c, factor):
 
 def test_the_coupling_designed_with_the_block():
     """K = (5832, 2545), B = (0.187, 1.386): 1.30132 linear, more with the limiter by its multiplier."""
-    assert this_environment(LOOP.F(BUILT), DELTA).required[0] == pytest.approx(1.30132, abs=5e-6)
+    assert this_environment(PAIR.F(BUILT), DELTA).required[0] == pytest.approx(1.30132, abs=5e-6)
     for c, expected in (((0, 0), 1.42465), ((0.3, 0.3), 1.34059), ((0.278, 0.632), 1.32327)):
         assert required(BUILT, tuple((float(v),) for v in c)) == pytest.approx(expected, abs=5e-6)
-    refused = limiter(LOOP.sent(BUILT), LOOP.theta, DELTA, LAG, ((1.0,), (1.0,))).requirement
+    refused = limiter(PAIR.sent(BUILT), PAIR.theta, DELTA, LAG, ((1.0,), (1.0,))).requirement
     assert not refused.certified
     assert "no damping is enough" in str(refused.reason)
 
@@ -132,18 +131,18 @@ def test_the_coupling_designed_with_the_block():
     ids=["none", "published", "any-environment", "this-environment", "built"],
 )
 def test_the_default_loop_with_its_best_multiplier(coupling, expected):
-    found = limiter(LOOP.sent(coupling), LOOP.theta, DELTA, LAG)
+    found = limiter(PAIR.sent(coupling), PAIR.theta, DELTA, LAG)
     assert found.requirement.required[0] == pytest.approx(expected, abs=1e-4)
     assert found.requirement.ratio <= found.bound * (1 + 2e-5)
     assert required(coupling, found.c) == pytest.approx(found.requirement.required[0], rel=1e-9)
-    linear = this_environment(LOOP.F(coupling), DELTA).required[0]
+    linear = this_environment(PAIR.F(coupling), DELTA).required[0]
     assert found.requirement.required[0] >= linear * (1 - 1e-9)  # the block's first row is that of the linear loop
 
 
 def test_no_multiplier_on_a_grid_is_better():
-    best = limiter(LOOP.sent(BUILT), LOOP.theta, DELTA, LAG).requirement.ratio
+    best = limiter(PAIR.sent(BUILT), PAIR.theta, DELTA, LAG).requirement.ratio
     grid = product(np.linspace(0.1, 0.6, 6), np.linspace(0.4, 0.9, 6))
-    others = [limiter(LOOP.sent(BUILT), LOOP.theta, DELTA, LAG, ((a,), (b,))).requirement.ratio for a, b in grid]
+    others = [limiter(PAIR.sent(BUILT), PAIR.theta, DELTA, LAG, ((a,), (b,))).requirement.ratio for a, b in grid]
     assert min(others) >= best * (1 - 1e-6)
 
 
@@ -155,12 +154,12 @@ def test_unequal_weights_need_enough_lag():
 
 
 def test_bad_requests_are_named():
-    G = LOOP.sent(BUILT)
+    G = PAIR.sent(BUILT)
     with pytest.raises(ValueError, match="one entry for each of 2 channels"):
         limiter(G, (1,), DELTA, LAG)
     with pytest.raises(ValueError, match="expected numbers >= 0"):
         limiter(G, (1, 2), DELTA, LAG, ((-0.1,), (0.0,)))
-    swinging = limiter(LOOP.sent(SpringDamper((1e6, 1e6), (50.0, 50.0))), (9, 9), DELTA, LAG).requirement
+    swinging = limiter(PAIR.sent(SpringDamper((1e6, 1e6), (50.0, 50.0))), (9, 9), DELTA, LAG).requirement
     assert not swinging.certified
 
 
@@ -187,7 +186,7 @@ def test_the_least_multiple_of_a_singular_gain(rank):
 
 @pytest.fixture(scope="module")
 def stored() -> Stored:
-    return Stored.of(LOOP, BUILT, prove(LOOP, BUILT, "closed-loop", limiter=prove_limiter(LOOP, BUILT)))
+    return Stored.of(PAIR, BUILT, prove(PAIR, BUILT, "closed-loop", limiter=prove_limiter(PAIR, BUILT)))
 
 
 def test_the_exact_proof_survives_the_file(stored, tmp_path):
@@ -199,7 +198,7 @@ def test_the_exact_proof_survives_the_file(stored, tmp_path):
     proof = read.certificate.limiter
     assert isinstance(proof, LimiterCertificate)
     assert proof.rho == LAG
-    assert lag(LOOP, read.certificate) == LAG
+    assert lag(PAIR, read.certificate) == LAG
     assert proof.required == pytest.approx((1.32327, 1.32327), abs=5e-6)
     assert proof.margin == pytest.approx(1.37 / 1.32327, rel=1e-5)
 
@@ -207,16 +206,16 @@ def test_the_exact_proof_survives_the_file(stored, tmp_path):
 def test_files_without_it_stay_as_they_were(tmp_path):
     """A coupling needs 1.385 with the limiter: its linear proof is untouched, the other is refused with the figure."""
     stiff = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
-    plain = prove(LOOP, stiff, "closed-loop")
+    plain = prove(PAIR, stiff, "closed-loop")
     assert "limiter" not in msgspec.to_builtins(plain)
-    assert lag(LOOP, plain) is None
+    assert lag(PAIR, plain) is None
     with pytest.raises(NotProved, match=r"limiter: needs 1.38533, 1.38533 N s/m of damping, has 1.37, 1.37"):
-        prove_limiter(LOOP, stiff)
+        prove_limiter(PAIR, stiff)
 
 
 def test_any_environment_is_its_own_proof():
     soft = SpringDamper((879.0, 552.0), (0.39, 0.52))
-    loop = msgspec.structs.replace(LOOP, delta=(1.4, 1.4))
+    loop = msgspec.structs.replace(PAIR, delta=(1.4, 1.4))
     assert lag(loop, prove(loop, soft, "theorem4")) == (0.0, 0.0)
 
 
@@ -260,14 +259,14 @@ def test_a_storage_matrix_of_something_else_proves_nothing(stored):
     ],
 )
 def test_loops_that_are_not_covered_are_refused_in_words(change, reason):
-    loop = msgspec.structs.replace(LOOP, **change)
+    loop = msgspec.structs.replace(PAIR, **change)
     assert reason in str(limiter_requirement(loop, BUILT).requirement.reason)
 
 
 def test_delay_in_the_environment_is_open_under_any_environment():
-    loop = msgspec.structs.replace(LOOP, psi=(1, 1))
-    some = Certificate("theorem4", (1.0, 1.0), DELTA, 1.37, "any passive environment", "rational", {}, "", {})
-    assert lag(LOOP, some) == (0.0, 0.0)
+    loop = msgspec.structs.replace(PAIR, psi=(1, 1))
+    some = Certificate("theorem4", (1.0, 1.0), PAIR.delta, 1.37, "any passive environment", "rational", {}, "", {})
+    assert lag(PAIR, some) == (0.0, 0.0)
     assert lag(loop, some) is None
 
 
@@ -276,13 +275,13 @@ def test_delay_in_the_environment_is_open_under_any_environment():
 
 def test_a_spring_damper_designed_with_the_block():
     """All of the damping is spent on the limited loop: 1.4 dB better than K = (5832, 2545), B = (0.187, 1.386)."""
-    spec = Specification.of(LOOP)
+    spec = Specification.of(PAIR)
 
     def rms_db(coupling) -> float:
-        return 20 * np.log10(transparency(LOOP.F(coupling), spec.environment, spec.lam).rms_mismatch)
+        return 20 * np.log10(transparency(PAIR.F(coupling), spec.environment, spec.lam).rms_mismatch)
 
     made = design(spec, "closed-loop", lag=LAG)
-    assert 0.999 < 1 / prove_limiter(LOOP, made.coupling).margin < 1
+    assert 0.999 < 1 / prove_limiter(PAIR, made.coupling).margin < 1
     assert rms_db(BUILT) == pytest.approx(-9.16, abs=0.01)
     assert rms_db(made.coupling) < -10.5  # found; the linear design has -11.19 and is not proved with limited forces
     with pytest.raises(ValueError, match="proved for constant delays, ask for one"):
@@ -353,8 +352,8 @@ def test_any_environment_covers_the_limiter_without_lag():
     rng, coupling = np.random.default_rng(5), SpringDamper((879.0, 552.0), (0.39, 0.52))
     walls = (Wall(("mass", GROUND), 3000.0, 2.0, 1e-3), Wall((GROUND, "mass"), 2000.0, 0.0, 2e-3))
     network = Network(FIGURE_4.contacts, FIGURE_4.springs, FIGURE_4.masses, walls)
-    needed = any_environment(coupling.compliance(T), LOOP.theta, DELTA).required
-    limits = limited(network, coupling, LOOP.theta, LOOP.psi, T, (2.0, 1.0), (0.0, 0.0))
+    needed = any_environment(coupling.compliance(T), PAIR.theta, DELTA).required
+    limits = limited(network, coupling, PAIR.theta, PAIR.psi, T, (2.0, 1.0), (0.0, 0.0))
     for greed in (0.0, 0.5, 1.0):
         pushed = pushes(rng, 700, 700 if greed == 0 else 150)
         energy, _ = taken(limits, [1.01 * d for d in needed], pushed, greed)

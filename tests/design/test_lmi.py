@@ -4,6 +4,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from analysis import analysis
+from worlds import DELTA, T
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
@@ -25,8 +26,6 @@ from design.lmi import (
     v_hat_regular,
 )
 
-T = 1.2e-3
-DELTA = (1.37, 1.37)
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
 
 

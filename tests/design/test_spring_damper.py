@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from analysis import analysis
 from scipy.optimize import brentq
+from worlds import DELTA, SOFT_NETWORK, T
 
 from controller.coupling import SpringDamper
 from controller.delay import delay
@@ -16,15 +17,8 @@ from design.lmi import CROSS_CHECK, RESERVE, Shaping, Specification, solve
 from design.result import DesignFailed, Infeasible
 from design.spring_damper import design, gain_set, solve_within, stiffest
 
-T = 1.2e-3
-DELTA = (1.37, 1.37)
 CASES = {"I": (1, 2), "II": (0, 0)}
 WALL = Network(("c",), (Spring(("c", "ground"), 100.0),))
-SOFT = Network(
-    ("contact 1", "contact 2"),
-    (Spring(("contact 1", "mass"), 200.0, 0.25), Spring(("mass", "contact 2"), 175.0, 0.25)),
-    {"mass": 1.0},
-)
 
 
 def specification(lam=(1, 2), network=FIGURE_4, theta=(1, 2), psi=(0, 0), delta=DELTA, period=T, **weights):
@@ -165,7 +159,7 @@ def test_weights_shift_the_optimum():
 
 @pytest.mark.parametrize("psi", [(1, 1), (1, 0), (0, 2)])
 def test_delay_in_the_environment(psi):
-    spec = specification((0, 0), SOFT, psi=psi)
+    spec = specification((0, 0), SOFT_NETWORK, psi=psi)
     found = design(spec)
     V = found.coupling.compliance(T)
     assert found.requirement.certified

@@ -6,6 +6,7 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
+from worlds import DELTA, PAIR, SOFT, STIFF, T
 
 from cli.audit import main as audit_main
 from cli.check import main as check_main
@@ -40,12 +41,8 @@ from design.frequency import hermitian
 from hw.control import certified_couplings
 from sim.scenario import load as scenario_of
 
-T, DELTA = 1.2e-3, (1.37, 1.37)
 RANGE = DelayRange((1, 1), (2, 2))
-CONSTANT = Loop(T, (1, 2), (0, 0), (1, 2), DELTA, FIGURE_4)
-LOOP = CONSTANT.switching(RANGE)
-SOFT = SpringDamper((878.767, 551.883), (0.386476, 0.521984))  # any switching within [1, 2] needs 1.078 of its 1.37
-STIFF = SpringDamper((7806.0, 3137.0), (0.105, 1.68))  # proved for the constants (1, 2), not for switching
+LOOP = PAIR.switching(RANGE)
 change = msgspec.structs.replace
 
 
@@ -62,7 +59,7 @@ def file(stored, tmp_path) -> str:
 
 @pytest.fixture
 def constant_file(tmp_path) -> str:
-    save(Stored.of(CONSTANT, STIFF, prove(CONSTANT, STIFF, "closed-loop")), tmp_path / "constant.json")
+    save(Stored.of(PAIR, STIFF, prove(PAIR, STIFF, "closed-loop")), tmp_path / "constant.json")
     return str(tmp_path / "constant.json")
 
 
@@ -101,7 +98,7 @@ def test_what_is_on_file_is_a_witness_on_a_dense_sweep(stored):
 @pytest.mark.parametrize(("lo", "hi"), [((1, 2), (1, 2)), ((0, 1), (2, 4)), ((1, 2), (3, 2))])
 def test_other_ranges_are_proved_too(lo, hi):
     soft = SpringDamper((300.0, 250.0), (0.3, 0.3))
-    loop = CONSTANT.switching(DelayRange(lo, hi))
+    loop = PAIR.switching(DelayRange(lo, hi))
     made = Stored.of(loop, soft, prove(loop, soft, "theorem4"))
     assert verify(made).proved
     assert [a > 0 for a in made.certificate.switching.alpha] == [a < b for a, b in zip(lo, hi, strict=True)]
@@ -117,7 +114,7 @@ def test_every_constant_delay_of_the_range_asks_no_more(coupling):
 
 
 def test_what_is_not_jitter_proof_is_not_certified_as_such():
-    assert prove(CONSTANT, STIFF, "closed-loop").switching is msgspec.UNSET
+    assert prove(PAIR, STIFF, "closed-loop").switching is msgspec.UNSET
     with pytest.raises(NotProved, match=r"^delays switching within \[1, 2\] samples: needs 2\.04"):
         prove(LOOP, STIFF, "closed-loop")
 
@@ -125,7 +122,7 @@ def test_what_is_not_jitter_proof_is_not_certified_as_such():
 def test_files_without_a_range_keep_their_digests():
     """Made before there were ranges."""
     expected = "b8cae9c8ced7f5c0abcd4246af3ea609fa292b47b365d074618a2702234f644a"
-    assert digest(CONSTANT, STIFF.form()) == expected
+    assert digest(PAIR, STIFF.form()) == expected
     assert digest(LOOP, STIFF.form()) != expected
     matrices, figures = {"P": (("1/2", "0"), ("0", "3"))}, ((1.25, 1.25), (1.37, 1.37), 1.096)
     old = Certificate("closed-loop", *figures, "this environment", "rational", matrices, "ab" * 32, {"numpy": "2.0.0"})
@@ -172,13 +169,13 @@ def test_a_forger_who_repairs_the_digests_still_has_to_prove(stored):
 def test_a_proof_goes_with_its_range(stored):
     bare = sealed(change(stored.certificate, switching=msgspec.UNSET))
     assert verify(change(stored, certificate=bare)).reason.endswith("no proof is on file")
-    smuggled = sealed(change(stored.certificate, scenario=digest(CONSTANT, SOFT.form())))
-    assert "delays are constant" in verify(Stored.of(CONSTANT, SOFT, smuggled)).reason
+    smuggled = sealed(change(stored.certificate, scenario=digest(PAIR, SOFT.form())))
+    assert "delays are constant" in verify(Stored.of(PAIR, SOFT, smuggled)).reason
 
 
 def test_a_multiplier_below_zero_lends_no_damping():
     """On a channel whose delay is constant alpha stands in no second row: a negative one would add damping for free."""
-    loop = CONSTANT.switching(DelayRange((1, 2), (2, 2)))
+    loop = PAIR.switching(DelayRange((1, 2), (2, 2)))
     found = jitter_proof(sent(STIFF), (1, 2), (2, 2), DELTA)
     with pytest.raises(ValueError, match="expected a positive number where the delay varies and 0 elsewhere"):
         condition_block(loop, STIFF, (found.alpha[0], -1e6))
@@ -313,7 +310,7 @@ def test_without_an_exact_proof_the_file_keeps_the_constants(tmp_path, capsys, m
     assert outcome["stored"]["proof"] == "rational"
     assert outcome["stored"]["switching"]["proof"] is None
     assert "states takes long" in outcome["stored"]["switching"]["reason"]
-    assert load(out).loop == CONSTANT
+    assert load(out).loop == PAIR
     assert verify(load(out)).proved
 
 
@@ -332,7 +329,7 @@ def test_the_scenarios_range_is_the_loops():
     scenario = scenario_of().replace(jitter=Jitter((1, 1), (2, 2)))
     assert scenario.loop("I") == LOOP
     for steady in (Jitter((1, 1), (2, 2), "constant"), Jitter((1, 2), (1, 2)), Jitter((1, 2), (1, 2), loss=0.1)):
-        assert scenario.replace(jitter=steady).loop("I") == CONSTANT
+        assert scenario.replace(jitter=steady).loop("I") == PAIR
 
 
 def test_certify_judges_any_switching():
@@ -340,16 +337,16 @@ def test_certify_judges_any_switching():
     found = certify(LOOP, coupling)
     assert found["jitter-proof"].certified
     assert found["jitter-proof"].proof == "rational"
-    assert found["closed-loop"] == certify(CONSTANT, coupling)["closed-loop"]
-    assert "jitter-proof" not in certify(CONSTANT, coupling)
+    assert found["closed-loop"] == certify(PAIR, coupling)["closed-loop"]
+    assert "jitter-proof" not in certify(PAIR, coupling)
 
 
 @pytest.mark.parametrize(("K", "certified"), [((2000.0, 1500.0), True), ((7806.0, 3137.0), False)])
 def test_certify_judges_every_vertex_of_a_box(K, certified):
     """The nominal environment alone would certify both."""
-    loop = change(CONSTANT, box=Box((UncertainSpring(("mass", "contact 1"), (640.0, 960.0), absent=True),)))
+    loop = change(PAIR, box=Box((UncertainSpring(("mass", "contact 1"), (640.0, 960.0), absent=True),)))
     coupling = built.SpringDamper(K, (0.105, 1.68))
-    found, nominal = certify(loop, coupling)["closed-loop"], certify(CONSTANT, coupling)["closed-loop"]
+    found, nominal = certify(loop, coupling)["closed-loop"], certify(PAIR, coupling)["closed-loop"]
     at = [
         this_environment(force_map(environment(m.network, T), coupling, (1, 2), (0, 0)), DELTA) for m in loop.members()
     ]

@@ -6,6 +6,7 @@ from itertools import product
 import msgspec
 import numpy as np
 import pytest
+from worlds import VERTICES_ONLY, environment_by_hand, filter_by_hand
 
 from cli.check import main as check_main
 from cli.design import _store
@@ -22,19 +23,6 @@ from sim.scenario import SCENARIOS
 
 T, THETA, DELTA = 1.2e-3, (1, 2), 1.37
 BOX = scenario.load(SCENARIOS / "omega-pair-box.toml").loop("I")
-#: eight functions, optimal at the vertices of that box and at nothing else
-POLES = (0.0, 0.0, 0.5, 0.822172, 0.936754, 0.977506, 0.992)
-DIAGONAL = (
-    (-3.6184269801e-05, -2.9144270496e-05),
-    (0.000102208762709, 0.000107901901795),
-    (-7.4892424558e-05, 0.000122368778376),
-    (-3.3979578197e-05, -0.000118115991834),
-    (1.5604976381e-05, -2.036782868e-05),
-    (-2.2851948999e-05, 1.6201929781e-05),
-    (-5.3162829524e-05, 7.7158066584e-05),
-    (-0.000183213977119, 0.000179575913546),
-)
-VERTICES_ONLY = InternalModel(POLES, np.array([np.diag(pair) for pair in DIAGONAL]))
 _first, _second = FIGURE_4.springs
 STIFF = (msgspec.structs.replace(_first, stiffness=840.0), msgspec.structs.replace(_second, stiffness=735.0))
 #: that edge of the box on which it is violated, as a box of its own
@@ -54,10 +42,7 @@ def needed(network: Network, coupling: InternalModel) -> float:
     """The share of the damping that is needed, from the raw matrices on a dense grid: no code of the project."""
     w = np.concatenate([np.geomspace(1e-4, np.pi, 2000), np.linspace(1e-3, np.pi, 2000)])
     z = np.exp(1j * w)
-    s = ((z - 1) / (T * z))[:, None, None]
-    M, D, K = network.matrices()
-    Z = M * s**2 + D * s + K
-    E = Z[:, :2, :2] - Z[:, :2, 2:] @ Z[:, 2:, :2] / Z[:, 2:, 2:]
+    E = environment_by_hand(network, z)
     Q, through = coupling.Q[0].astype(complex), np.ones_like(z)
     for a, coefficient in zip(coupling.poles, coupling.Q[1:], strict=True):
         Q = Q + coefficient * (through * (1 - a) / (z - a))[:, None, None]
@@ -216,19 +201,7 @@ def needed_by_filter(network: Network, coupling: ForceFilter) -> float:
     """`needed` for F = Theta R Psi E, R by its own functions."""
     w = np.concatenate([np.geomspace(1e-4, np.pi, 2000), np.linspace(1e-3, np.pi, 2000)])
     z = np.exp(1j * w)
-    s = ((z - 1) / (T * z))[:, None, None]
-    M, D, K = network.matrices()
-    Z = M * s**2 + D * s + K
-    E = Z[:, :2, :2] - Z[:, :2, 2:] @ Z[:, 2:, :2] / Z[:, 2:, 2:]
-    R, through = coupling.R[0].astype(complex), np.ones_like(z)
-    for a, coefficient in zip(coupling.poles, coupling.R[1:], strict=False):
-        R = R + coefficient * (through * (1 - a) / (z - a))[:, None, None]
-        through = through * (1 - a * z) / (z - a)
-    rest = coupling.R[1 + coupling.poles.size :]
-    for (b1, b2), first, second in zip(coupling.pairs, rest[::2], rest[1::2], strict=True):
-        section = (through * (1 + b1 + b2) / (z * z + b1 * z + b2))[:, None, None]
-        R = R + (first * z[:, None, None] + second) * section
-        through = through * (b2 * z * z + b1 * z + 1) / (z * z + b1 * z + b2)
+    E, R = environment_by_hand(network, z), filter_by_hand(coupling, z)
     late = np.stack([z ** -THETA[0], z ** -THETA[1]], axis=1)[:, :, None]
     H = late * (R @ E) / (z - 1)[:, None, None]
     return float(-np.linalg.eigvalsh(T / DELTA * (H + np.conj(np.swapaxes(H, 1, 2))) / 2).min())

@@ -9,6 +9,7 @@ from inspect import signature
 
 import numpy as np
 import pytest
+from worlds import SOFT
 
 import design
 import hw
@@ -24,7 +25,6 @@ from sim import InputError, Result, Scenario, load, parse, simulate, validate
 from sim.scenario import SCENARIOS
 
 SHORT = load().replace(duration=0.3)
-GAINS = SpringDamper([878.7, 551.8], [0.3864, 0.5219])
 
 
 def test_every_name_that_is_exported_is_there():
@@ -109,8 +109,8 @@ def test_a_session_is_rehearsed():
     assert session.result.x.shape == session.result.f.shape == (len(session.result.t), 2)
     force = np.abs(session.result.f).max(axis=1)
     assert force[-1] < 0.05 * force.max()  # the last tick of a ramp of 100 to 250
-    given = rehearse(scenario, GAINS, seconds=0.5)
-    assert given.coupling is GAINS
+    given = rehearse(scenario, SOFT, seconds=0.5)
+    assert given.coupling is SOFT
     assert given.requirements["closed-loop"].certified
 
 
@@ -135,7 +135,7 @@ def test_simulate_is_the_commands_run(tmp_path):
 
 
 def test_engines_agree_on_a_run():
-    mujoco, exact = simulate(SHORT, GAINS), simulate(SHORT, GAINS, engine="exact")
+    mujoco, exact = simulate(SHORT, SOFT), simulate(SHORT, SOFT, engine="exact")
     assert exact.meta["substeps"] is None
     difference = np.abs(mujoco.x - exact.x).max()
     assert difference <= 1e-10 * np.abs(exact.x).max()
@@ -164,7 +164,7 @@ def test_a_design_is_certified_and_goes_where_a_coupling_goes():
 def test_delays_that_vary_are_simulated():
     text = (SCENARIOS / "omega-pair.toml").read_text()
     scenario = parse(text + "\n[jitter]\nlo = [0, 1]\nhi = [2, 3]\n").replace(duration=0.3)
-    first, again, other = (simulate(scenario, GAINS, seed=seed) for seed in (0, 0, 1))
+    first, again, other = (simulate(scenario, SOFT, seed=seed) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first.f, again.f)
     assert np.any(first.f != other.f)
     assert first.meta["stability"] is None
@@ -214,11 +214,11 @@ LOOP = SHORT.loop("I")
         (lambda: design_coupling(LOOP, order=3), "order is no option of kind 'spring-damper', allowed are switching"),
         (lambda: design_coupling(LOOP, "optimal", high_gain="x"), "high_gain is 'x' (str), expected a number"),
         (lambda: design_coupling(LOOP, "ccl", order=1.5), "order is 1.5 (float), allowed are whole numbers, 1 or more"),
-        (lambda: certify(SHORT, GAINS), "loop is a Scenario, expected a Loop"),
+        (lambda: certify(SHORT, SOFT), "loop is a Scenario, expected a Loop"),
         (lambda: certify(LOOP, None), "coupling is None, expected a coupling (controller.coupling), or a Design"),
         (lambda: certify(LOOP, SpringDamper), "expected a coupling (controller.coupling), or a Design"),
         (lambda: transparency_of(LOOP, "spring-damper"), "coupling is 'spring-damper' (str), expected a coupling"),
-        (lambda: promise(LOOP, GAINS), "expected what certify returned"),
+        (lambda: promise(LOOP, SOFT), "expected what certify returned"),
         (lambda: simulate(LOOP), 'scenario is a Loop, expected a Scenario, as load("omega-pair") gives it'),
         (lambda: simulate(SHORT, "spring-damper"), "coupling is 'spring-damper' (str), expected a coupling"),
         (lambda: simulate(SHORT, substeps=1.5), "substeps is 1.5 (float), allowed are whole numbers, 1 to 10000"),
@@ -241,5 +241,5 @@ def test_an_argument_of_another_type_is_named(call, message):
 
 
 def test_numbers_of_numpy_are_numbers():
-    findings = validate(SHORT, GAINS, humans=np.int64(2), seed=np.int64(1), engine="exact", duration=np.float64(0))
+    findings = validate(SHORT, SOFT, humans=np.int64(2), seed=np.int64(1), engine="exact", duration=np.float64(0))
     assert findings.index.size == 2

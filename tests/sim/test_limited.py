@@ -5,6 +5,7 @@ import json
 import msgspec
 import numpy as np
 import pytest
+from worlds import SOFT
 
 from cli.run import main
 from controller.coupling import SpringDamper
@@ -14,7 +15,6 @@ from sim.run import assemble, run
 from sim.scenario import load
 
 BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # covered with limited forces in this environment
-SOFT = SpringDamper((878.0, 551.0), (0.386, 0.521))  # certified for any environment
 
 
 def weak(*limits):

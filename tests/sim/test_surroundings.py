@@ -4,10 +4,11 @@ import json
 
 import numpy as np
 import pytest
+from worlds import VERTICES_ONLY
 
 from cli import zwidth
 from cli.options import BAD_INPUT, DONE, execute
-from controller.coupling import InternalModel, NoCoupling, SpringDamper
+from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, Network, Spring
 from design.frequency import on_circle
 from models.scene import variants
@@ -72,23 +73,9 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
         assert sweep.requirement("closed-loop", K, B).ratio == pytest.approx(found, rel=1e-7)
 
 
-#: of version 0.1, for the springs of omega-pair: eight functions of a diagonal Q
-POLES = (0.0, 0.0, 0.5, 0.822172, 0.936754, 0.977506, 0.992)
-DIAGONAL = (
-    (-3.6184269801e-05, -2.9144270496e-05),
-    (0.000102208762709, 0.000107901901795),
-    (-7.4892424558e-05, 0.000122368778376),
-    (-3.3979578197e-05, -0.000118115991834),
-    (1.5604976381e-05, -2.036782868e-05),
-    (-2.2851948999e-05, 1.6201929781e-05),
-    (-5.3162829524e-05, 7.7158066584e-05),
-    (-0.000183213977119, 0.000179575913546),
-)
-
-
 def test_the_model_of_a_pair_may_stay_behind():
     """With V = Q (I - E0 Q)^-1 from the network of the scenario, in the pair's own environment the two are one loop."""
-    coupling = InternalModel(POLES, np.array([np.diag(pair) for pair in DIAGONAL]))
+    coupling = VERTICES_ONLY
     sweep = around(PAIR, coupling)
 
     def kept(z, E):

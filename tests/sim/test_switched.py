@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from worlds import STIFF
 
 from cli.run import main
 from cli.validate import main as validate
-from controller.coupling import SpringDamper
 from controller.delay import Jitter, ages, realising
 from controller.process import StepBuffer
 from design import certificate as store
@@ -30,7 +30,6 @@ from sim.switching import (
     worst_switching,
 )
 
-STIFF = SpringDamper([7806, 3137], [0.105, 1.68])  # certified for the constants (1, 2) in the default environment
 ASSEMBLY = assemble(load(), STIFF)
 
 

@@ -1,0 +1,92 @@
+"""The moving average: the stiffest coupling for any environment, its design, its file, and zeros that coincide."""
+
+import numpy as np
+import pytest
+
+from controller.coupling import MovingAverage, SpringDamper
+from controller.lti import Lti, taps
+from design import certify, design_coupling, transparency_of
+from design.certificate import Stored, load, prove, save, verify
+from design.conditions import any_environment
+from design.transparency import decibels
+from sim import load as scenario_of
+from sim import simulate
+
+T = 1e-3
+
+
+def window(theta, delta, factor=1.0):
+    """factor T/(2 delta) (1 + ... + z^-theta), the moving average without a constant."""
+    return taps([factor * T / (2 * delta)] * (theta + 1), T)
+
+
+@pytest.mark.parametrize("theta", range(5))
+@pytest.mark.parametrize("factor", [0.9, 0.98, 1.02, 1.5])
+def test_a_scaled_moving_average_needs_so_much_less_damping(theta, factor):
+    """V and the window vanish together at its zeros, where nothing is asked: s = 1/factor at every frequency."""
+    needs = any_environment(window(theta, 1.3, factor), [theta], [1.3])
+    assert needs.reason is None
+    assert needs.ratio == pytest.approx(1 / factor, rel=1e-5)
+    assert needs.certified == (factor > 1)
+
+
+def test_channels_whose_zeros_differ():
+    V = Lti.diag(window(1, 1.3, 1.02), window(2, 0.7, 1.02))
+    assert any_environment(V, [1, 2], [1.3, 0.7]).ratio == pytest.approx(1 / 1.02, rel=1e-5)
+
+
+@pytest.mark.parametrize(("weights", "theta"), [([1.0, 1.0], 2), ([1.0, 1.0], 0), ([1.0, 0.0, 1.0], 3)])
+def test_a_zero_of_the_coupling_alone_is_refused(weights, theta):
+    """There the delay asks for damping and the coupling has no passivity to spend."""
+    assert "damping vanishes" in (any_environment(taps([1e-3 * w for w in weights], T), [theta], [1.0]).reason or "")
+
+
+@pytest.mark.parametrize(("name", "case"), [("omega-pair", "I"), ("omega-pair", "II"), ("three-rigid", "I")])
+def test_it_beats_the_spring_damper(name, case):
+    loop = scenario_of(name).loop(case)
+    stiff, soft = (design_coupling(loop, kind, "theorem4") for kind in ("moving-average", "spring-damper"))
+    limit = 2 * np.array(loop.delta) / ((np.array(loop.theta) + 1) * loop.T)  # of every linear coupling
+    assert isinstance(stiff.coupling, MovingAverage)
+    assert isinstance(soft.coupling, SpringDamper)
+    assert (stiff.coupling.stiffness < limit).all()
+    np.testing.assert_allclose(stiff.coupling.stiffness, limit, rtol=1e-3)
+    assert (stiff.coupling.stiffness > soft.coupling.K).all()
+    better, worse = (decibels(transparency_of(loop, each).rms_mismatch) for each in (stiff, soft))
+    assert better < worse - 0.5
+    if (name, case) == ("omega-pair", "I"):
+        assert better == pytest.approx(-1.129, abs=2e-3)
+    assert certify(loop, stiff)["theorem4"].proof == "rational"
+
+
+def test_delay_in_the_environment():
+    """Phi covers what the environment lacks; the coupling's own excess is so large that it costs nothing."""
+    scenario = scenario_of("omega-pair").replace(psi=(1, 0), delta=(3.0, 3.0))
+    loop = scenario.loop("I")
+    made = design_coupling(loop, "moving-average")
+    requirements = certify(loop, made)
+    assert requirements["theorem4"].proof == "rational"
+    assert requirements["closed-loop"].certified
+    assert simulate(scenario.replace(duration=1.0), made, "exact").meta["stability"]["exact_verdict"] == "stable"
+
+
+def test_stored_proved_and_read_again(tmp_path):
+    loop = scenario_of("omega-pair").loop("I")
+    made = design_coupling(loop, "moving-average").coupling
+    file = tmp_path / "coupling.json"
+    save(Stored.of(loop, made, prove(loop, made, "theorem4")), file)
+    stored = load(file)
+    assert verify(stored).proved
+    np.testing.assert_array_equal(stored.coupling.build(loop.T).compliance(loop.T).D, made.compliance(loop.T).D)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (([-1e-3], [2], [0.0]), "weight is"),
+        (([1e-3], [0], [0.0]), "terms are"),
+        (([1e-3, 1e-3], [2], [0.0]), "2, 1 and 1 entries"),
+    ],
+)
+def test_what_is_no_moving_average(fields, message):
+    with pytest.raises(ValueError, match=message):
+        MovingAverage(*fields)

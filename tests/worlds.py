@@ -1,0 +1,59 @@
+"""What many tests share: the default pair, couplings for it, and formulas written out by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from controller.coupling import ForceFilter, InternalModel, SpringDamper
+from controller.environment import FIGURE_4, Network, Spring
+from controller.loop import Loop
+
+T = 1.2e-3  # [s]
+DELTA = (1.37, 1.37)  # [N s/m]
+#: the default scenario, case I
+PAIR = Loop(T, (1, 2), (0, 0), (1, 2), DELTA, FIGURE_4)
+#: certified for the default environment and the constant delays (1, 2) only
+STIFF = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
+#: certified for every passive environment; with delays that switch within [1, 2] it needs 1.078 of the 1.37
+SOFT = SpringDamper((878.767, 551.883), (0.386476, 0.521984))
+#: Figure 4 with springs that are four times softer
+SOFT_NETWORK = Network(
+    ("contact 1", "contact 2"),
+    (Spring(("contact 1", "mass"), 200.0, 0.25), Spring(("mass", "contact 2"), 175.0, 0.25)),
+    {"mass": 1.0},
+)
+#: of version 0.1: eight functions of a diagonal Q, optimal at the vertices of omega-pair-box and at nothing else
+POLES = (0.0, 0.0, 0.5, 0.822172, 0.936754, 0.977506, 0.992)
+DIAGONAL = (
+    (-3.6184269801e-05, -2.9144270496e-05),
+    (0.000102208762709, 0.000107901901795),
+    (-7.4892424558e-05, 0.000122368778376),
+    (-3.3979578197e-05, -0.000118115991834),
+    (1.5604976381e-05, -2.036782868e-05),
+    (-2.2851948999e-05, 1.6201929781e-05),
+    (-5.3162829524e-05, 7.7158066584e-05),
+    (-0.000183213977119, 0.000179575913546),
+)
+VERTICES_ONLY = InternalModel(POLES, np.array([np.diag(pair) for pair in DIAGONAL]))
+
+
+def environment_by_hand(network: Network, z: np.ndarray, period: float = T) -> np.ndarray:
+    """(M s^2 + D s + K)^-1 as the contacts feel it, the inner node eliminated: shape (k, 2, 2) at k points z."""
+    M, D, K = network.matrices()
+    s = ((z - 1) / (period * z))[:, None, None]
+    Z = M * s**2 + D * s + K
+    return Z[:, :2, :2] - Z[:, :2, 2:] @ Z[:, 2:, :2] / Z[:, 2:, 2:]
+
+
+def filter_by_hand(coupling: ForceFilter, z: np.ndarray) -> np.ndarray:
+    """R(z) from the definition of its basis: shape (k, m, m) at k points z."""
+    R, through = coupling.R[0].astype(complex), np.ones_like(z)
+    for a, coefficient in zip(coupling.poles, coupling.R[1:], strict=False):
+        R = R + coefficient * (through * (1 - a) / (z - a))[:, None, None]
+        through = through * (1 - a * z) / (z - a)
+    rest = coupling.R[1 + coupling.poles.size :]
+    for (b1, b2), first, second in zip(coupling.pairs, rest[::2], rest[1::2], strict=True):
+        section = (through * (1 + b1 + b2) / (z * z + b1 * z + b2))[:, None, None]
+        R = R + (first * z[:, None, None] + second) * section
+        through = through * (b2 * z * z + b1 * z + 1) / (z * z + b1 * z + b2)
+    return R
