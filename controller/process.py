@@ -217,7 +217,7 @@ class BoxProblem:
             object.__setattr__(self, name, frozen(getattr(self, name), 1, name))
         if not (self.lower < self.upper).all():
             raise ValueError(f"limits are {self.lower.tolist()} to {self.upper.tolist()}, expected lower < upper")
-        _ = self._regular
+        _ = self.regular
 
     def solve(self, q: Array) -> tuple[Array, Array]:
         """(v, f) for every column of q, both (n, nsim); what is at a limit is exactly there."""
@@ -238,7 +238,7 @@ class BoxProblem:
         return np.count_nonzero(self.M - np.diag(np.diag(self.M))) == 0
 
     @cached_property
-    def _regular(self) -> bool:
+    def regular(self) -> bool:
         """Whether all principal minors are positive; of more than ten unknowns, those of order one."""
         n = len(self.M)
         scale = np.sqrt(np.maximum(np.abs(np.diag(self.M)), 1e-300))
@@ -294,7 +294,7 @@ class BoxProblem:
         of its three states at most once. The same holds of n - 1 in between, and so on.
         """
         n, k = q.shape
-        M = self.M if self._regular else self.M + GROUNDED * self._diagonal.max() * np.eye(n)
+        M = self.M if self.regular else self.M + GROUNDED * self._diagonal.max() * np.eye(n)
         lower, upper, one = self.lower[:, None], self.upper[:, None], np.eye(n)
         signs, v, left = np.zeros((n, k)), np.zeros((n, k)), np.arange(k)
         for turn in range(4 * n + 3**n):
@@ -379,6 +379,19 @@ class Limiter:
         lower = np.concatenate([-self.limit, np.full(w, -np.inf)])
         return BoxProblem(M, lower, np.concatenate([self.limit, np.zeros(w)]))
 
+    @cached_property
+    def kick(self) -> Array:
+        """What [e; p] adds to [f; z+], (m + order, m + w)."""
+        G, m, w = self._whole, self.channels, len(self.walls)
+        return np.vstack([G.D[:m, m:], G.B[:, m:], np.zeros((w, m + w))])
+
+    @cached_property
+    def sent_rows(self) -> Array:
+        """Where [f; z+] holds f_e, (m,): the output itself, or the first place of its line."""
+        m = self.channels
+        lines = m + self._step.order + np.concatenate([[0], np.cumsum(self.theta)[:-1]]).astype(int)
+        return np.where(np.array(self.theta) == 0, np.arange(m), lines)
+
     @property
     def open(self) -> Lti:
         """F while no force is limited and no wall touches, with the state of the whole."""
@@ -395,11 +408,7 @@ class Limiter:
     def transition(self) -> Callable[[Array, Array], None]:
         """One tick for any number of simulations: see Process.transition."""
         m, w, F, step, whole = self.channels, len(self.walls), self.open, self._step, self._whole
-        linear = np.block([[F.C, F.D], [F.A, F.B]]).dot
-        kick = np.vstack([whole.D[:m, m:], whole.B[:, m:], np.zeros((w, m + w))])
-        # the rows of [f; z+] that hold f_e: the output itself, or the first place of its line
-        lines = m + step.order + np.concatenate([[0], np.cumsum(self.theta)[:-1]]).astype(int)
-        sent = np.where(np.array(self.theta) == 0, np.arange(m), lines)
+        linear, kick, sent = np.block([[F.C, F.D], [F.A, F.B]]).dot, self.kick, self.sent_rows
         limit, solve = self.limit[:, None], self.problem.solve
         finite = [(i, most) for i, most in zip(sent.tolist(), self.limit.tolist(), strict=True) if most < np.inf]
         if not w:
