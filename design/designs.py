@@ -13,13 +13,13 @@ from controller.coupling import Coupling
 from controller.loop import DelayRange, Loop
 from design import certificate as promises
 from design.certificate import LATE, Stored, assess, limiter_refusal, switching_requirement
-from design.conditions import BETA, Condition, Requirement, limiter_lag, this_environment
+from design.conditions import Condition, Requirement, this_environment
 from design.ranges import check_set
 from design.result import CONDITION_NAMES, Design, DesignFailed, Row, bare, known, of_kind, one_of
 from design.transparency import Transparency, transparency
 
 if TYPE_CHECKING:
-    from design.lmi import Specification
+    pass
 
 # ----------------------------------------------------------------------------------------------------
 # The designs by name.
@@ -89,17 +89,15 @@ def design_by_kind(
         raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(KINDS[kind])}")
     from design import fixed_order as ccl  # cvxpy takes a second to import
     from design import spring_damper
-    from design.lmi import Specification
 
     def made(loop: Loop) -> Design:
         if kind == "optimal":
             return _optimal(loop, progress, **options)
-        spec = Specification.of(loop)
         if kind == "ccl":
-            return ccl.design(spec, **options)
+            return ccl.design(loop, **options)
         if kind == "moving-average":
-            return spring_damper.moving_average(spec)
-        return _spring_damper(loop, spec, condition, **options)
+            return spring_damper.moving_average(loop)
+        return _spring_damper(loop, condition, **options)
 
     if loop.latency is None:
         return made(loop)
@@ -108,25 +106,23 @@ def design_by_kind(
     return _with_latency(loop, made)
 
 
-def _spring_damper(
-    loop: Loop, spec: Specification, condition: str, limiter: bool | None = None, **options: Any
-) -> Design:
+def _spring_damper(loop: Loop, condition: str, limiter: bool | None = None, **options: Any) -> Design:
     """A spring-damper, with the limiter's block in the place of the linear one where that is asked for or usual."""
     from design.spring_damper import design
 
     if limiter is False or condition == "theorem4":  # with rho = 0 any-environment covers limited forces anyway
-        return design(spec, condition, **options)
+        return design(loop, condition, **options)
     refusal = limiter_refusal(loop)
     if limiter and refusal:
         raise ValueError(refusal)
     if refusal or options.get("switching"):
-        return design(spec, condition, **options)
+        return design(loop, condition, **options)
     try:
-        return design(spec, condition, lag=limiter_lag(loop.delta, loop.T, BETA), **options)
+        return design(loop, condition, limiter=True, **options)
     except DesignFailed:
         if limiter:
             raise
-        return design(spec, condition, **options)
+        return design(loop, condition, **options)
 
 
 #: A design for forces that latch late leaves at most this share of the damping, and is sought so often.
@@ -174,11 +170,10 @@ def _optimal(
 
 
 def compare_methods(loop: Loop) -> tuple[Row, ...]:
-    """Every method on the same specification: norm, convex problems, seconds."""
+    """Every method for the same loop: norm, convex problems, seconds."""
     from design import fixed_order as ccl
-    from design.lmi import Specification
 
-    return ccl.compare(Specification.of(loop))
+    return ccl.compare(loop)
 
 
 Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]

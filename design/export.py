@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from controller.environment import environment
-from controller.loop import Loop, force_map
+from controller.delay import delay
+from controller.loop import Loop
 from controller.lti import Array, Lti
 from controller.process import GROUNDED, PIVOT_ROUNDING, Limiter, limited
 from design.certificate import Stored, lag
@@ -87,10 +87,11 @@ def process_block(stored: Stored, with_theta: bool = True, force_limit: Sequence
     """
     loop = stored.loop
     theta = loop.theta if with_theta else (0,) * len(loop.theta)
+    if loop.environment.walls:
+        raise NothingToExport("environment.walls: contact that makes and breaks is not a linear block")
     if force_limit is not None:
         return _limited_block(stored, theta, force_limit, with_theta)
-    E = environment(loop.environment, loop.T)
-    F = force_map(E, stored.coupling.build(loop.T), theta, loop.psi)
+    F = delay(theta, loop.T) @ loop.sent(stored.built())
     about = (
         "f = F x: the whole discrete process; the devices get -f, held for T. Forces are not limited here.",
         _delays(loop, with_theta),
@@ -102,9 +103,7 @@ def _limited_block(stored: Stored, theta: Sequence[int], force_limit: Sequence[f
     loop, rho = stored.loop, lag(stored.loop, stored.certificate)
     if rho is None:
         raise NothingToExport("its certificate covers no limited forces: design it anew, or leave out --force-limit")
-    if loop.environment.walls:
-        raise NothingToExport("walls are not exported")
-    limiter = limited(loop.environment, stored.coupling.build(loop.T), theta, loop.psi, loop.T, force_limit, rho)
+    limiter = limited(loop.environment, stored.built(), theta, loop.psi, loop.T, force_limit, rho)
     about = (
         "f: the whole discrete process with its limiter; the devices get -f, held for T. Forces never exceed "
         f"{', '.join(f'{f:g}' for f in force_limit)} N: the contact slips instead, and the certificate holds there.",
