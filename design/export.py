@@ -121,7 +121,7 @@ def with_a_state(system: Lti) -> Lti:
 
 
 def trial(block: Block, seed: int = 0) -> Trial:
-    """Normally distributed inputs and the outputs that `sequential` gives; where forces are limited, in a third of the ticks."""
+    """Normally distributed inputs, with a limiter such that a third of the ticks are limited, and the outputs."""
     rng = np.random.default_rng(seed)
     inputs = block.input.size * rng.standard_normal((TICKS, block.system.inputs))
     if block.limiter:
