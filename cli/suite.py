@@ -322,9 +322,9 @@ def _meets(name: str, asks: str, loop: str) -> Check:
 
 CHECKS = (
     _meets("none", "Two devices without a coupling", "--case none"),
-    _meets("I", "A coupling for any passive environment", "--case I"),
-    _meets("II", "The same, designed against an undelayed reference", "--case II"),
-    _meets("stiff", "The stiffest coupling for this environment alone", "--case I --condition this-environment"),
+    _meets("I", "A coupling for any passive environment", "--case I --condition any-environment"),
+    _meets("II", "The same, against an undelayed reference", "--case II --condition any-environment"),
+    _meets("stiff", "The usual coupling: for this environment, also while forces are limited", "--case I"),
     _meets("optimal", "The best linear coupling for this environment", "--case I --coupling optimal"),
     _meets("published", "The gains that the paper prints", "--case I --coupling published"),
     _meets("three", "Three people, rigid devices, unequal delays", "--scenario three-rigid --case I"),

@@ -474,7 +474,9 @@ class Limits:
         limit = f"{', '.join(amounts if len(set(amounts)) > 1 else amounts[:1])} N"
         if self.rho is None:
             return f"clipped at {limit}: not covered ({self.reason})"
-        return f"{'proved' if self.proved else 'certified'}, also while forces are limited to {limit} ({self.reason})"
+        if not self.proved:
+            return f"certified, also while forces are limited to {limit} ({self.reason})"
+        return f"proved, also while forces are limited to {limit}"
 
     @property
     def proved(self) -> bool:
