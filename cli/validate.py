@@ -11,7 +11,7 @@ import numpy as np
 
 from cli import options, render
 from controller.environment import Member
-from design.certificate import ANY, assess, promise_of
+from design.certificate import ANY, assess, guarantee_of
 from design.ranges import SetCheck, check_set, set_part
 from sim import report
 from sim.adversary import Worst, search
@@ -36,7 +36,7 @@ def main(argv: list[str]) -> int:
     environments = _environments(args, whole)
     requirements = assess(loop, chosen.coupling, chosen.phi)
     proved = bool(whole and whole.proved)
-    guarantee = promise_of(requirements, loop, proved)
+    guarantee = guarantee_of(requirements, loop, proved)
     certified = guarantee is not None and (not environments or guarantee == ANY or proved)
 
     limits = limits_of(scenario, chosen.coupling, requirements, args.limiter)
@@ -59,7 +59,7 @@ def main(argv: list[str]) -> int:
         _add(outcome, "switching", report.varying_delays_part(findings, covered))
     worst = None
     if args.adversary and not findings.interrupted:
-        attacked, ratio = scenario, requirements["closed-loop"].ratio
+        attacked, ratio = scenario, requirements["this-environment"].ratio
         if environments and whole:
             member, requirement = whole.worst_found
             attacked, ratio = scenario.replace(environment=member.network, box=None), requirement.ratio

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from controller.loop import Loop
     from design.conditions import Requirement
-    from design.designs import Options, certify, design_coupling, promise, transparency_of
+    from design.designs import Options, certify, design_coupling, guarantee, transparency_of
     from design.result import Design, DesignFailed
     from design.transparency import Transparency
 

@@ -11,7 +11,7 @@ import msgspec
 
 from controller.coupling import Coupling
 from controller.loop import DelayRange, Loop
-from design import certificate as promises
+from design import certificate as guarantees
 from design.certificate import LATE, Stored, assess, limiter_refusal, switching_requirement
 from design.conditions import Condition, Requirement, this_environment
 from design.ranges import check_set
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 #: name -> the conditions that it can be made for, its own first
 KINDS = {
-    "spring-damper": ("closed-loop", "theorem4"),
-    "moving-average": ("theorem4",),
-    "ccl": ("theorem4",),
-    "optimal": ("closed-loop",),
+    "spring-damper": ("this-environment", "any-environment"),
+    "moving-average": ("any-environment",),
+    "ccl": ("any-environment",),
+    "optimal": ("this-environment",),
 }
 
 
@@ -41,7 +41,7 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     delays that vary. Other kinds for their own condition.
     """
     less = loop.environment.walls or loop.box or loop.jitter
-    return "theorem4" if less and "theorem4" in KINDS[kind] else KINDS[kind][0]
+    return "any-environment" if less and "any-environment" in KINDS[kind] else KINDS[kind][0]
 
 
 #: kind -> what else can be asked of it, in words of design.api.Options
@@ -101,8 +101,8 @@ def design_by_kind(
 
     if loop.latency is None:
         return made(loop)
-    if condition == "theorem4":
-        raise ValueError(f"latency: {LATE}, or design for {CONDITION_NAMES['closed-loop']}")
+    if condition == "any-environment":
+        raise ValueError(f"latency: {LATE}, or design for {CONDITION_NAMES['this-environment']}")
     return _with_latency(loop, made)
 
 
@@ -110,7 +110,7 @@ def _spring_damper(loop: Loop, condition: str, limiter: bool | None = None, **op
     """A spring-damper, with the limiter's block in the place of the linear one where that is asked for or usual."""
     from design.spring_damper import design
 
-    if limiter is False or condition == "theorem4":  # with rho = 0 any-environment covers limited forces anyway
+    if limiter is False or condition == "any-environment":  # with rho = 0 any-environment covers limited forces anyway
         return design(loop, condition, **options)
     refusal = limiter_refusal(loop)
     if limiter and refusal:
@@ -203,7 +203,7 @@ def design_coupling(
     """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
 
     `kind` is "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal"; `condition` is
-    "theorem4" (any passive environment) or "closed-loop" (this environment), None for what the commands design: a
+    "any-environment" (any passive environment) or "this-environment" (this environment), None for what the commands design: a
     spring-damper for this environment, also while forces are limited; for any environment before walls, ranges or
     delays that vary. `options` are those of the kind, see Options; switching is not taken from loop.jitter.
 
@@ -223,9 +223,9 @@ def design_coupling(
 
 
 def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[str]]:
-    """What both conditions, "theorem4" and "closed-loop", ask of a coupling in its loop.
+    """What both conditions, "any-environment" and "this-environment", ask of a coupling in its loop.
 
-    With a box around the loop's environment closed-loop is about the environment and every vertex: the figure is that
+    With a box around the loop's environment this-environment is about the environment and every vertex: the figure is that
     of the one that asks the most, proved only if all are. Between the vertices nothing is proved, but searched: a
     violation found there (design.box.worst_member) is the figure then, and not certified. With a range of delays,
     loop.jitter, there is a third, "jitter-proof": what any switching within the range asks.
@@ -243,13 +243,13 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[st
     requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, phi))
     if whole := check_set(loop, alone, samples=0):
         _, worst = whole.worst if whole.proved else whole.worst_found
-        requirements["closed-loop"] = replace(worst, proof="rational" if whole.proved else "sampled")
+        requirements["this-environment"] = replace(worst, proof="rational" if whole.proved else "sampled")
     if loop.jitter:
         requirements["jitter-proof"] = switching_requirement(loop, alone).requirement
     return requirements
 
 
-def promise(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str | None:
+def guarantee(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str | None:
     """For which environments `certify(loop, coupling)` says that a coupling is safe, in words; None where for none.
 
     "any passive environment", "a set" (the loop's environment and its box), "this environment", or each contact state
@@ -257,11 +257,11 @@ def promise(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str | N
     """
     of_kind("loop", loop, Loop, LOOP)
     of_kind("requirements", requirements, Mapping, "what certify returned")
-    if "closed-loop" not in requirements:
+    if "this-environment" not in requirements:
         raise ValueError(f"requirements has {', '.join(requirements) or 'nothing'}, expected what certify returned")
-    held = requirements["closed-loop"]
+    held = requirements["this-environment"]
     whole_set = loop.box is not None and held.certified and held.proof == "rational"
-    return promises.promise_of(requirements, loop, whole_set)
+    return guarantees.guarantee_of(requirements, loop, whole_set)
 
 
 def transparency_of(loop: Loop, coupling: Coupling | Design) -> Transparency:

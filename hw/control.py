@@ -23,7 +23,7 @@ from controller.loop import force_map
 from controller.lti import Array, Lti
 from controller.process import Limiter, limited
 from design.certificate import Limits as ForceLimits
-from design.certificate import assess, certificate_part, promise_of
+from design.certificate import assess, certificate_part, guarantee_of
 from design.conditions import Requirement
 from design.result import DesignFailed
 from hw.limits import Fault, Gain, Heat, Limits, Units, check_jolt, check_jump, check_range, check_speed, shape
@@ -34,7 +34,7 @@ from sim.report import coupling_part
 from sim.scenario import InputError, Scenario
 
 _SPEED_SECONDS = 0.01  # over which a speed is taken: one count of the coarsest encoder is 0.03 m/s
-_FALLBACK = ("spring-damper", "theorem4")  # what softer couplings are where the one asked for cannot be had
+_FALLBACK = ("spring-damper", "any-environment")  # what softer couplings are where the one asked for cannot be had
 
 
 class Controller(Protocol):
@@ -362,7 +362,7 @@ class CertifiedCoupling:
             "coupling": coupling_part(self.chosen.kind, self.chosen.coupling, self.scenario.T),
             "certificate": certificate_part(self.requirements[self.chosen.condition]),
             "certificates": {name: certificate_part(r) for name, r in self.requirements.items()},
-            "promise": promise_of(self.requirements, self.scenario.loop(self.case)),
+            "promise": guarantee_of(self.requirements, self.scenario.loop(self.case)),
             "limiter": self.limits.part(cap),
             "remarks": self.remarks(),
         }
@@ -394,7 +394,7 @@ def certified_coupling(
         raise Fault(f"the link takes {link} ticks, the protocol carries at most theta = {MAX_THETA}")
     slower = scenario.replace(theta=tuple(max(n, link) for n in scenario.theta))
     try:
-        chosen = Chosen("given", given, "closed-loop") if given else choose(slower, case, name, condition, limiter)
+        chosen = Chosen("given", given, "this-environment") if given else choose(slower, case, name, condition, limiter)
     except DesignFailed as error:
         raise Fault(f"no coupling for a link of {link} ticks: {error}") from None
     requirements = assess(slower.loop(case), chosen.coupling, chosen.phi)

@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 
 from controller.coupling import Coupling
-from design.certificate import Limits, assess, promise_of
+from design.certificate import Limits, assess, guarantee_of
 from design.conditions import Requirement
 from design.designs import KINDS
 from sim.couplings import Chosen, choose, limits_of
@@ -145,7 +145,7 @@ class PreparedLoop:
     assembly: Simulation
     mode: Mode  # of the exact linear loop; before walls, of the worst contact state
     requirements: dict[str, Requirement]
-    promise: str | None
+    guarantee: str | None
     limits: Limits
 
     @property
@@ -187,5 +187,5 @@ def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> Prep
     loop = scenario.loop(menu.case)
     requirements = assess(loop, chosen.coupling, chosen.phi)
     limits = limits_of(scenario, chosen.coupling, requirements, menu.limiter)
-    assembly, promise = assemble(scenario, chosen.coupling, limits.rho), promise_of(requirements, loop)
-    return PreparedLoop(menu, label, chosen, assembly, worst_mode(assembly), requirements, promise, limits)
+    assembly, guarantee = assemble(scenario, chosen.coupling, limits.rho), guarantee_of(requirements, loop)
+    return PreparedLoop(menu, label, chosen, assembly, worst_mode(assembly), requirements, guarantee, limits)
