@@ -12,14 +12,14 @@ from rich.table import Table
 from cli import options, render
 from design.certificate import HERE, SET, Stored, SwitchingProof, Verdict, lag, switching_guarantee, verify
 from design.ranges import Searched, search_box, search_part, search_words, violated_between
-from design.result import CONDITION_NAMES, listed
+from design.result import listed
 from sim.couplings import read_coupling
 from sim.scenario import InputError
 
 
 @dataclass(frozen=True)
 class _Switching:
-    """The claim for delays that vary; promise and proof are null where it fails."""
+    """The claim for delays that vary; guarantee and proof are null where it fails."""
 
     lo: Sequence[int]
     hi: Sequence[int]
@@ -35,7 +35,7 @@ class _Checked:
 
     proved: bool
     reason: str | None = render.figure("reason")
-    condition: str | None = render.figure("condition", CONDITION_NAMES.__getitem__)
+    condition: str | None = render.figure("condition")
     guarantee: str | None = render.figure("guarantee")
     proof: str | None = render.figure("proof")
     vertices: int | None = render.figure("vertices")
