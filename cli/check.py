@@ -19,11 +19,11 @@ from sim.scenario import InputError
 
 @dataclass(frozen=True)
 class _Switching:
-    """The claim for delays that vary; guarantee and proof are null where it fails."""
+    """The claim for delays that vary; promise and proof are null where it fails."""
 
     lo: Sequence[int]
     hi: Sequence[int]
-    guarantee: str | None = render.figure("switching, guarantee")
+    promise: str | None = render.figure("switching, guarantee")  # older name, as JSON has it
     proof: str | None = render.figure("switching, proof")
     required_damping: Sequence[float] | None = render.figure("switching, required damping [N s/m]", listed)
     margin: float | None = render.figure("switching, margin", "{:.6g}")
@@ -36,7 +36,7 @@ class _Checked:
     proved: bool
     reason: str | None = render.figure("reason")
     condition: str | None = render.figure("condition")
-    guarantee: str | None = render.figure("guarantee")
+    promise: str | None = render.figure("guarantee")  # older name, as JSON has it
     proof: str | None = render.figure("proof")
     vertices: int | None = render.figure("vertices")
     between: Mapping[str, Any] | None = render.figure("between", search_words)

@@ -163,9 +163,9 @@ def load(path: str | Path) -> Stored:
     if not content.strip():
         raise BadFile(f"{path}: is empty, expected a coupling as python -m design stores it")
     try:
-        whole = msgspec.json.decode(content)
+        stored = msgspec.json.decode(_renamed(content), type=Stored)
         json.loads(content, object_pairs_hook=_once)
-        return msgspec.convert(_renamed(whole), Stored)
+        return stored
     except _Twice as error:
         raise BadFile(f"{path}: names {str(error)!r} twice in one object") from None
     except msgspec.ValidationError as error:
@@ -189,12 +189,16 @@ def _content(path: Path) -> bytes:
     return content
 
 
-def _renamed(whole: Any) -> Any:
-    """A file's content, its condition by the name of today."""
+def _renamed(content: bytes) -> bytes:
+    """The content with the condition by its name of today; as it is where it has that, or is no certificate."""
+    try:
+        whole = msgspec.json.decode(content)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return content
     match whole:
-        case {"certificate": {"condition": str(name)} as claim}:
-            return whole | {"certificate": claim | {"condition": OLDER_NAMES.get(name, name)}}
-    return whole
+        case {"certificate": {"condition": str(name)} as claim} if name in OLDER_NAMES:
+            return msgspec.json.encode(whole | {"certificate": claim | {"condition": OLDER_NAMES[name]}})
+    return content
 
 
 class _Twice(Exception):
@@ -491,7 +495,7 @@ class Limits:
         amounts = [f"{f:.4g}" for f in force_limit]
         limit = f"{', '.join(amounts if len(set(amounts)) > 1 else amounts[:1])} N"
         if self.rho is None:
-            return f"clipped at {limit}: not covered ({self.reason})"
+            return f"clipped at {limit}: a guarantee holds while forces stay below ({self.reason})"
         if not self.proved:
             return f"certified, also while forces are limited to {limit} ({self.reason})"
         return f"proved, also while forces are limited to {limit}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
+from typing import Any, Literal, TypedDict, Unpack
 
 import msgspec
 
@@ -17,9 +17,6 @@ from design.conditions import Condition, Requirement, this_environment
 from design.ranges import check_set
 from design.result import Design, DesignFailed, Row, bare, known, of_kind, one_of
 from design.transparency import Transparency, transparency
-
-if TYPE_CHECKING:
-    pass
 
 # ----------------------------------------------------------------------------------------------------
 # The designs by name.
