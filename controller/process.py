@@ -22,7 +22,7 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from controller.coupling import Coupling
 from controller.delay import HeldLine, Ticks, delay, packet_delays
@@ -385,7 +385,7 @@ class Limiter:
         return np.vstack([G.D[:m, m:], G.B[:, m:], np.zeros((w, m + w))])
 
     @cached_property
-    def sent_rows(self) -> Array:
+    def sent_rows(self) -> NDArray[np.intp]:
         """Where [f; z+] holds f_e, (m,): the output itself, or the first place of its line."""
         m = self.channels
         lines = m + self._step.order + np.concatenate([[0], np.cumsum(self.theta)[:-1]]).astype(int)

@@ -13,7 +13,7 @@ import numpy as np
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
-from controller.process import GROUNDED, PIVOT_ROUNDING, Limiter, limited
+from controller.process import GROUNDED, PIVOT_ROUNDING, Limiter
 from design.certificate import Stored, lag
 
 # ----------------------------------------------------------------------------------------------------
@@ -103,7 +103,7 @@ def _limited_block(stored: Stored, theta: Sequence[int], force_limit: Sequence[f
     loop, rho = stored.loop, lag(stored.loop, stored.certificate)
     if rho is None:
         raise NothingToExport("its certificate covers no limited forces: design it anew, or leave out --force-limit")
-    limiter = limited(loop.environment, stored.built(), theta, loop.psi, loop.T, force_limit, rho)
+    limiter = Limiter(loop.sent(stored.built()), tuple(theta), np.array(force_limit), np.array(rho))
     about = (
         "f: the whole discrete process with its limiter; the devices get -f, held for T. Forces never exceed "
         f"{', '.join(f'{f:g}' for f in force_limit)} N: the contact slips instead, and the certificate holds there.",

@@ -216,7 +216,7 @@ def _limits(rng: np.random.Generator, factor: float) -> _Case:
     loop, coupling = _pair(rng)
     rho = limiter_lag(loop.delta, loop.T, BETA)
     needed = limiter(loop.sent(coupling), loop.theta, loop.delta, rho).requirement.required
-    limit = limited(loop.environment, coupling, loop.theta, loop.psi, loop.T, (2.0, 1.0), rho)
+    limit = limited(loop.network, coupling, loop.theta, loop.psi, loop.T, (2.0, 1.0), rho)
     process = Process(limit.open, *_free(2), limit)
     return _Case(lambda nsim, ticks: process, factor * np.array(needed), loop.T, 1e-3)
 
@@ -261,7 +261,7 @@ def _scenario(loop: Loop, delta: Array) -> Scenario:
     """The loop with rigid devices of this damping, held by somebody."""
     devices = tuple(RigidDevice(mass=0.1, damping=float(d)) for d in delta)
     people = tuple(Human((Link(0.5, 1.0, 100.0),)) for _ in devices)
-    return Scenario("drawn", loop.T, loop.theta, loop.psi, devices, people, loop.environment)
+    return Scenario("drawn", loop.T, loop.theta, loop.psi, devices, people, loop.network)
 
 
 #: guarantee -> how a case of it is made, and how much is far too little of what it asks for
