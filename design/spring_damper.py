@@ -420,9 +420,9 @@ def _safe_optimum(sampled: SwitchingLoop, start: SpringDamper) -> tuple[SpringDa
 class LimiterLoop(SampledLoop):
     """As Sampled, with x = (log K, B/delta, c) and one weight c per channel, of the lag 1."""
 
-    def __init__(self, loop: Loop) -> None:
+    def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.rho = limiter_lag(loop.delta, loop.T, BETA)
-        super().__init__(loop)
+        super().__init__(loop, band_hz)
 
     def coupling(self, x: Array) -> SpringDamper:
         return super().coupling(self._gains(x))
@@ -462,9 +462,9 @@ class LimiterLoop(SampledLoop):
         return x[: 2 * self.loop.channels]
 
 
-def _limited_optimum(loop: Loop, start: SpringDamper) -> tuple[SpringDamper | None, int]:
+def _limited_optimum(loop: Loop, band_hz: tuple[float, float], start: SpringDamper) -> tuple[SpringDamper | None, int]:
     """(a local optimum that passes the limiter's refined sweep or None, searches)."""
-    sampled = LimiterLoop(loop)
+    sampled = LimiterLoop(loop, band_hz)
     x = sampled.point(start)
     for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
@@ -543,16 +543,20 @@ def _for_this_environment(
     band_hz: tuple[float, float] | None,
 ) -> Design:
     started, starts = time.perf_counter(), starts or _default_starts(loop)
-    search = (
-        partial(least_rms_switching, loop, *switching)
-        if switching
-        else partial(least_rms, loop, band_hz=band_hz or BAND_HZ)
-    )
-    if band_hz and (switching or limiter):
-        raise ValueError("band_hz: designs for delays that vary or limited forces count 0.5 to 80 Hz, ask for one")
-    if limiter:
-        search = partial(least_rms, loop, optimum=partial(_limited_optimum, loop))
+    band = band_hz or BAND_HZ
+    if band_hz and switching:
+        raise ValueError("band_hz: designs for delays that vary count 0.5 to 80 Hz, ask for one of them")
+    search = partial(least_rms, loop, band_hz=band)
+    if switching:
+        search = partial(least_rms_switching, loop, *switching)
     coupling, rms, searches = search(starts)
+    if limiter:  # a little softer than without limits: nearly always found from there
+        search = partial(least_rms, loop, optimum=partial(_limited_optimum, loop, band), band_hz=band)
+        linear, before = coupling, searches
+        coupling, rms, searches = search([linear] if linear else starts)
+        if coupling is None and linear:
+            coupling, rms, searches = search(starts)
+        searches += before
     if coupling is None:
         certifies = "the this-environment condition certifies"
         if switching:
