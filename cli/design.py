@@ -97,7 +97,7 @@ def _parser() -> options.Parser:
     options.add_condition_option(parser, "what to certify")
     jitter = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"
     parser.add_argument("--jitter", type=options.delay_ranges, metavar="LO,HI", help=jitter)
-    limiter = "spring-damper for this-environment, proved also while forces are limited (any-environment is anyway)"
+    limiter = "spring-damper or optimal for this-environment, proved also while forces are limited (any-environment is anyway)"
     parser.add_argument("--limiter", action="store_true", help=limiter)
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
@@ -133,6 +133,8 @@ def optimal_options(args: argparse.Namespace) -> tuple[dict[str, Any], tuple[str
     """What is asked of an optimal coupling, and a note where an option is given that it no longer has."""
     given = {name: getattr(args, name) for name in ("objective", "band_hz", "high_gain", "seconds")}
     given = {name: value for name, value in given.items() if value is not None}
+    if getattr(args, "limiter", False):
+        given["limiter"] = True
     if given.get("high_gain") == "none":
         given.pop("high_gain")
     retired = [f"--{name}" for name in (*RETIRED_WITH_VALUE, "full", "diagonal") if getattr(args, name, None)]
@@ -153,7 +155,7 @@ def _number_or_none(text: str) -> float | str:
 
 #: options of a design -> the couplings that take them
 OPTIONS = {
-    "limiter": ("spring-damper",),
+    "limiter": ("spring-damper", "optimal"),
     "order": ("ccl",),
     "method": ("ccl",),
     "compare": ("ccl",),

@@ -51,6 +51,7 @@ OPTIONS = {
         "objective",
         "band_hz",
         "high_gain",
+        "limiter",
         "seconds",
         "switching",
         "functions",
@@ -97,7 +98,7 @@ def design_by_kind(
             return spring_damper.moving_average(spec)
         return spring_damper.design(spec, condition, **options)
 
-    if loop.latency is None:
+    if loop.latency is None or kind == "optimal":
         return made(loop)
     if condition == "theorem4":
         raise ValueError(f"latency: {LATE}, or design for {CONDITION_NAMES['closed-loop']}")
@@ -167,7 +168,7 @@ class Options(TypedDict, total=False):
     method: str  # ccl: complementarity, inner or fixed-poles
     diagonal: bool  # ccl: no gain across channels
     switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of delays that vary
-    limiter: bool  # spring-damper, this-environment: covered also while forces are limited
+    limiter: bool  # spring-damper for this-environment, optimal: covered also while forces are limited
     objective: Literal["rms", "sup"]  # optimal: of the mismatch relative to the environment
     band_hz: tuple[float, float]  # optimal: where the mismatch counts
     high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: kept low, not limited
