@@ -97,7 +97,7 @@ def _parser() -> options.Parser:
     options.add_condition_option(parser, "what to certify")
     jitter = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"
     parser.add_argument("--jitter", type=options.delay_ranges, metavar="LO,HI", help=jitter)
-    limiter = "spring-damper or optimal for this-environment, proved also while forces are limited (any-environment is anyway)"
+    limiter = "for this-environment: proved also while forces are limited (any-environment is anyway)"
     parser.add_argument("--limiter", action="store_true", help=limiter)
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
@@ -175,7 +175,7 @@ def _loop(args: argparse.Namespace) -> Loop:
         if loop.box or loop.environment.walls:
             raise InputError(f"--ranges and {'[box]' if loop.box else 'environment.walls'}: give one of them")
         try:
-            loop = msgspec.structs.replace(loop, box=box_around(loop.environment, args.ranges))
+            loop = msgspec.structs.replace(loop, box=box_around(loop.network, args.ranges))
         except ValueError as error:
             raise InputError(f"--ranges {args.ranges:g}: {error}") from None
     args.condition = args.condition or usual_condition(loop, args.coupling)

@@ -399,7 +399,7 @@ def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
     assert verify(load_file(tmp_path / "c.json")).proved
 
 
-# the period, the latency and the limiter -------------------------------------------------------------------------------
+# the period, the latency and the limiter ------------------------------------------------------------------------------
 
 
 def test_a_longer_period_is_a_smaller_damping():
