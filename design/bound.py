@@ -36,7 +36,7 @@ Indices = NDArray[np.intp]  # of points of the transform
 POINTS = 65536  # of the transform
 KNOTS = {1: 60, 2: 40, 3: 24}  # of h, by channels; fewer for more
 FEWEST = 16
-NEAR_ENDS = (0.22, 0.5)  # of a step between knots: h rises from zero at both ends of the band
+NEAR_END = (0.22, 0.5)  # of a step between knots: h falls to zero at the upper end of the band
 DEGREE = 3  # of the splines that h is made of
 GAP = 0.01  # of the bound, relatively, that the barrier leaves
 SWEEPS = 6
@@ -88,7 +88,7 @@ class _Dual:
         knots = np.geomspace(low, high, count)
         width = knots[1] / knots[0]
         extra = [w * f for w in modes for f in (width**-0.5, 1.0, width**0.5) if low < w * f < high]
-        extra += [end * width ** (sign * f) for end, sign in ((low, 1), (high, -1)) for f in NEAR_ENDS]
+        extra += [high * width**-f for f in NEAR_END]
         knots = np.union1d(knots, extra)
         knots = knots[np.concatenate([[True], np.diff(np.log(knots)) > 0.2 * np.log(width)])]
         x = np.log(knots)

@@ -63,7 +63,7 @@ SLOWER = 0.999  # modes of larger radius get no section
 RICH, RIPPLED = 2, 14  # channels up to which, and taps from which on, there are sections within the band
 RIPPLES, RIPPLE_DAMPING = (0.1, 0.215, 0.464, 1.0), 0.1  # their frequencies beside the band's end, their damping ratio
 FULL = 4  # channels up to which every force has a filter to every device
-STATIC = 0.2  # weight of g - 1 beside the relative mismatch
+STATIC, STATIC_OF_MANY = 0.2, 0.35  # weight of g - 1 beside the relative mismatch; for more than RICH channels
 HIGH_HZ = 100.0  # above it the force is kept low by a soft row, or capped
 SOFT = 0.05, 0.3  # the soft row's weight: the first number times the mismatch so far, which counts up to the second
 LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # (beta, c) of a limiter to begin with: without psi the first alone
@@ -429,11 +429,11 @@ class Problem:
                 w = np.geomspace(edge, np.pi, 20)
                 self._force_rows(case, w, np.full(20, self.soft * np.sqrt(case.weight / 20)), None, rows, right)
         static = np.zeros((1, self.unknowns))
-        static[0, 0] = STATIC
+        static[0, 0] = held = _static(self.cases[0].loop)
         cost = np.zeros(self.unknowns)
         cost[self.span.unknowns :] = [v for case in self.cases for c in case.constraints for v in c.cost]
         small = SMALL * np.eye(self.span.unknowns, self.unknowns)
-        return np.vstack([*rows, static, small]), np.concatenate([*right, [STATIC], np.zeros(len(small))]), cost
+        return np.vstack([*rows, static, small]), np.concatenate([*right, [held], np.zeros(len(small))]), cost
 
     def _force_rows(
         self, case: Case, w: Array, weight: Array, lam: Sequence[int] | None, rows: list[Array], right: list[Array]
@@ -571,6 +571,10 @@ class Problem:
         return start
 
 
+def _static(loop: Loop) -> float:
+    return STATIC if loop.channels <= RICH else STATIC_OF_MANY
+
+
 def _band(loop: Loop, band_hz: tuple[float, float]) -> tuple[float, float]:
     """The band in rad/sample."""
     return 2 * np.pi * band_hz[0] * loop.T, min(2 * np.pi * band_hz[1] * loop.T, np.pi)
@@ -686,9 +690,12 @@ class _Climb:
         figures = found.figures
         return figures.rms_mismatch if self.options.objective == "rms" else figures.relative_mismatch
 
+    def decibels(self, found: Optimal) -> float:
+        return decibels(self.mismatch(found))
+
     def merit(self, found: Optimal) -> float:
         """The objective of the climb: mismatch and lost static stiffness, as a ratio."""
-        static = STATIC * (found.g - 1) if np.isfinite(found.g) else 0.0
+        static = _static(self.loop) * (found.g - 1) if np.isfinite(found.g) else 0.0
         return float(np.hypot(self.mismatch(found), static))
 
     def nothing(self) -> Optimal | None:
@@ -714,8 +721,7 @@ class _Climb:
         """The optimum over a basis, scaled until every sweep passes, and proved where there are no ranges."""
         tried = [self._solved(taps, poles, before, slip) for slip in self.slips(before)]
         found = min(tried, key=lambda one: (one.reason is not None, self.merit(one)))
-        mismatch = decibels(self.mismatch(found))
-        return found, Rung(taps, poles, found.states, mismatch, found.g, found.reason, self.elapsed)
+        return found, Rung(taps, poles, found.states, self.decibels(found), found.g, found.reason, self.elapsed)
 
     def _solved(self, taps: int, poles: int, before: Optimal | None, slip: Slip | None) -> Optimal:
         share = self.mismatch(before) if before else 1.0
@@ -745,15 +751,19 @@ class _Climb:
 
         Where the worst environment that was found asks for more damping than there is, the forces are scaled down.
         """
-        coupling = found.coupling
-        assert isinstance(coupling, ForceFilter)
-        searched = ranges.search_box(self.loop, coupling)
-        if (ratio := searched.worst[0].ratio) > (limit := 1 - self.options.margin / 2):
-            coupling = _scaled(coupling, limit / ratio)
-            found = self._assessed(coupling, coupling.g)
-            lower = tuple(replace(one, ratio=one.ratio * limit / ratio) for one in searched.worst)  # each need scales
-            searched = replace(searched, worst=lower)
-        return replace(self._proved(found, None), searched=searched)
+        whole = found.coupling
+        assert isinstance(whole, ForceFilter)
+        searched = ranges.search_box(self.loop, whole)
+        ratio, last = searched.worst[0].ratio, found
+        for limit in (1 - self.options.margin / 2, 1 - 2.5 * self.options.margin):
+            share = min(1.0, limit / ratio)
+            coupling = _scaled(whole, share)
+            lower = tuple(replace(one, ratio=one.ratio * share) for one in searched.worst)  # each need scales
+            last = self._proved(self._assessed(coupling, coupling.g), None)
+            last = replace(last, searched=replace(searched, worst=lower))
+            if last.proved:
+                break
+        return last
 
     def scaled(self) -> Optimal:
         """The environment itself, scaled down until it is safe."""
@@ -882,6 +892,31 @@ def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> Robustn
         if ratio > worst:
             worst, where = ratio, name
     return Robustness(percent, worst, where, worst < 1)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """What it costs to keep the condition over `vertices`, too: two designs over one small basis."""
+
+    mismatch_db: float  # of the design for the vertices, in the nominal environment
+    price_db: float  # beside the design for the nominal environment alone
+    g: float
+    worst: float  # times the damping that there is, over the vertices
+
+
+def spread(loop: Loop, options: Options = Options(), percent: float = 10.0) -> Spread | None:
+    """The design for `vertices` beside the nominal one, by sweeps: a price, not a coupling to run. None without one."""
+    taps, poles = options.ladder[: 2 if loop.channels <= RICH else 1][-1]
+    climb = _Climb.of(loop.at(loop.environment), options, ())
+    around = [_at(loop, network) for network in vertices(loop.environment, percent).values()]
+    more = tuple(Case(there, there.E(), (this_environment(there, options.margin),), 0.0) for there in around)
+    try:
+        alone, wide = (each.rung(taps, poles, None)[0] for each in (climb, replace(climb, cases=climb.cases + more)))
+    except DesignFailed:
+        return None
+    mismatch = climb.decibels(wide)
+    worst = robustness(loop, wide.coupling, percent).worst
+    return Spread(mismatch, mismatch - climb.decibels(alone), wide.g, worst)
 
 
 def box_around(network: Network, percent: float) -> Box:
