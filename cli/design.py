@@ -23,12 +23,12 @@ from design.certificate import (
     assess,
     digest,
     finite,
+    guarantee_of,
     lag,
-    promise_of,
     prove,
     save,
+    switching_guarantee,
     switching_part,
-    switching_promise,
     switching_requirement,
 )
 from design.conditions import BETA
@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
         "coupling": report.coupling_part(args.coupling, design.coupling, loop.T),
         "certificate": certificates[design.condition],
         "certificates": certificates,
-        "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
+        "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
         "set": whole and set_part(whole),
         "price": _robustness_loss(args, loop, design) if whole else None,
         "transparency": report.transparency_part(transparency(loop.F(design.coupling), loop.E(), loop.lam)),
@@ -201,7 +201,7 @@ def _loop(args: argparse.Namespace) -> Loop:
 def _for_switching(args: argparse.Namespace) -> bool:
     """Whether this design can be made for delays that vary; any other is only judged under them."""
     condition = args.condition or KINDS[args.coupling][0]
-    return args.coupling in ("spring-damper", "optimal") and condition == "closed-loop"
+    return args.coupling in ("spring-damper", "optimal") and condition == "this-environment"
 
 
 def _asked(args: argparse.Namespace, loop: Loop) -> dict[str, Any]:
@@ -265,7 +265,7 @@ def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[s
 
 def _robustness(loop: Loop, design: Design) -> dict[str, Any] | None:
     """What the coupling needs where springs and masses are a little off; None with walls, and where that is covered."""
-    if loop.environment.walls or design.condition == "theorem4":
+    if loop.environment.walls or design.condition == "any-environment":
         return None
     there = robustness(loop, design.coupling)
     return {
@@ -302,15 +302,15 @@ def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path, beta: 
     What is not proved for a whole set, or for switching delays, is kept as what it is: a coupling for the nominal
     environment, or for constant delays.
     """
-    if whole and whole.proved and design.condition == "closed-loop":
+    if whole and whole.proved and design.condition == "this-environment":
         certificate, reason = whole.certificate, None
     else:
-        loop = loop if design.condition == "theorem4" else loop.at(loop.environment)
+        loop = loop if design.condition == "any-environment" else loop.at(loop.environment)
         certificate, reason = _proved(loop, design, beta)
     switching = None
     if loop.jitter:
         proof = certificate.proof if certificate else None
-        switching = {"promise": f"{switching_promise(loop.jitter)}, in {HERE}", "proof": proof, "reason": reason}
+        switching = {"promise": f"{switching_guarantee(loop.jitter)}, in {HERE}", "proof": proof, "reason": reason}
         if certificate is None:
             loop = loop.switching(None)
             certificate, reason = _proved(loop, design, beta)

@@ -184,7 +184,7 @@ def _formed(value: Any, form: Form) -> str:
 # Phrases that several reports share.
 
 
-ORDER = ("closed-loop", "theorem4")  # of conditions in a table
+ORDER = ("this-environment", "any-environment")  # of conditions in a table
 
 
 def certified(part: Mapping[str, Any]) -> str:

@@ -20,7 +20,7 @@ from cli import options, render
 from controller.environment import RIGID_WALL
 from controller.loop import Loop
 from controller.lti import Array
-from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, promise_of
+from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, guarantee_of
 from design.ranges import check_set, set_part
 from design.result import CONDITION_NAMES
 from sim import report
@@ -286,7 +286,7 @@ def add_marks(outcome: dict[str, Any], marks: Sequence[Mark]) -> None:
         }
         for mark in marks
     ]
-    certified = all(mark.requirement["closed-loop"].certified for mark in marks)
+    certified = all(mark.requirement["this-environment"].certified for mark in marks)
     outcome["holds"] = outcome["holds"] and certified
 
 
@@ -447,7 +447,7 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
         "designed_for": {
             "contact_springs": [{"between": s.between, "K": s.stiffness, "B": s.damping} for s in springs],
             "certificates": report.certificates_part(requirements),
-            "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
+            "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
             "set": whole and set_part(whole),
         },
         "remarks": list(chosen.notes),

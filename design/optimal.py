@@ -782,7 +782,7 @@ class _Climb:
         from design import spring_damper  # its solvers load slowly, and most designs end before
 
         try:
-            gains = spring_damper.design(self.loop, "closed-loop").coupling
+            gains = spring_damper.design(self.loop, "this-environment").coupling
             return self._proved(self._assessed(gains, np.nan), None)
         except (DesignFailed, ValueError):
             return None
@@ -808,7 +808,7 @@ class _Climb:
         objective = self.options.objective
         return Optimal(
             coupling,
-            "closed-loop",
+            "this-environment",
             objective,
             figures.rms_mismatch if objective == "rms" else figures.relative_mismatch,
             requirement,
@@ -825,7 +825,7 @@ class _Climb:
         """The same with its certificate, or why it has none."""
         beta = slip.beta if slip else None
         try:
-            certificate = prove(self.loop, found.coupling, "closed-loop", beta=beta, swept=found.requirement)
+            certificate = prove(self.loop, found.coupling, "this-environment", beta=beta, swept=found.requirement)
         except NotProved as error:
             return replace(found, wall_s=self.elapsed, reason=str(error))
         requirement = replace(found.requirement, proof="rational")

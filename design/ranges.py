@@ -137,7 +137,7 @@ class Cost:
 
     name: str
     ratio: tuple[float, float]  # required over available damping: in the nominal environment, and the most
-    violated: int  # members at which the closed-loop condition fails
+    violated: int  # members at which the this-environment condition fails
     rms_db: tuple[float, float]  # mismatch: in the nominal environment, and at its worst vertex
     sup_db: tuple[float, float]
     worst: str  # the vertex with the largest rms mismatch
@@ -187,7 +187,7 @@ WHAT_IS_PROVED = (
 
 @dataclass(frozen=True, eq=False)
 class SetCheck:
-    """The closed-loop condition over a box. `members` and `at_members` are the environment and the vertices."""
+    """The this-environment condition over a box. `members` and `at_members` are the environment and the vertices."""
 
     members: tuple[Member, ...]
     at_members: tuple[Requirement, ...]
@@ -238,7 +238,7 @@ def check_set(
     searched = searched or search_box(loop, coupling, progress)
     members, drawn = loop.members(), inside(loop.network, loop.box, samples, seed)
     try:
-        certificate, reason = certificate or prove(loop, coupling, "closed-loop"), None
+        certificate, reason = certificate or prove(loop, coupling, "this-environment"), None
     except NotProved as error:
         certificate, reason = None, str(error)
     at_members, at_samples = in_each(loop, coupling, members), in_each(loop, coupling, drawn)

@@ -45,7 +45,7 @@ class Infeasible(DesignFailed):
 
 
 #: the key of a condition in files and reports -> its name in words and options
-CONDITION_NAMES: dict[str, str] = {"closed-loop": "this-environment", "theorem4": "any-environment"}
+CONDITION_NAMES: dict[str, str] = {"this-environment": "this-environment", "any-environment": "any-environment"}
 
 
 def listed(values: Iterable[float | None], digits: int = 6) -> str:

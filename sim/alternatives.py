@@ -14,7 +14,7 @@ from typing import Any
 
 from controller.coupling import Coupling
 from controller.lti import Array
-from design.certificate import assess, finite, promise_of
+from design.certificate import assess, finite, guarantee_of
 from design.conditions import Requirement
 from design.result import CONDITION_NAMES
 from design.transparency import decibels, transparency
@@ -29,9 +29,9 @@ from sim.trace import Trace
 _ROWS = (
     ("none", None),
     ("published", None),
-    ("spring-damper", "theorem4"),
-    ("spring-damper", "closed-loop"),
-    ("optimal", "closed-loop"),
+    ("spring-damper", "any-environment"),
+    ("spring-damper", "this-environment"),
+    ("optimal", "this-environment"),
 )
 _QUICK = 2
 
@@ -44,7 +44,7 @@ class Alternative:
     condition: str | None
     coupling: Coupling | None = None
     requirements: dict[str, Requirement] | None = None
-    promise: str | None = None
+    guarantee: str | None = None
     rendered: float | None = None  # share of the static stiffness that is felt
     rms_mismatch_db: float | None = None
     growth: float | None = None  # [1/s] of the exact loop
@@ -71,7 +71,7 @@ class Alternative:
             "coupling": self.kind,
             "condition": CONDITION_NAMES.get(self.condition or "", self.condition),
             "required_damping": damping,
-            "promise": self.promise,
+            "promise": self.guarantee,
             "dc_ratio": self.rendered,
             "rms_mismatch_db": self.rms_mismatch_db,
             "growth_rate_per_s": self.growth,
@@ -110,7 +110,7 @@ def _possible(scenario: Scenario, case: str, kind: str, condition: str | None) -
     if kind == "published":
         return scenario.loop(case) == load().loop(case)
     one_environment = scenario.environment.walls or scenario.box
-    if condition == "closed-loop" and one_environment:
+    if condition == "this-environment" and one_environment:
         return False
     return kind != "optimal" or scenario.channels <= _QUICK
 
@@ -129,7 +129,7 @@ def _alternative(scenario: Scenario, case: str, kind: str, condition: str | None
         condition,
         chosen.coupling,
         dict(requirements),
-        promise_of(requirements, loop, False),
+        guarantee_of(requirements, loop, False),
         finite(felt.dc_ratio),
         finite(decibels(felt.rms_mismatch)),
         finite(growth),

@@ -88,13 +88,13 @@ def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> dict[str
 def remarks(outcome: dict[str, Any]) -> list[str]:
     """What a reader must know to read the figures rightly."""
     lines = []
-    certificates = {name: outcome["certificates"][name] for name in ("theorem4", "closed-loop")}
-    name = "theorem4" if outcome["certificate"]["condition"] == "theorem4" else "closed-loop"
+    certificates = {name: outcome["certificates"][name] for name in ("any-environment", "this-environment")}
+    name = "any-environment" if outcome["certificate"]["condition"] == "any-environment" else "this-environment"
     part = certificates[name]
     if not part["certified"] and "reason" not in part:
         worst = max(n / a for n, a in zip(part["required_damping"], part["available_damping"], strict=True))
         condition = f"the {CONDITION_NAMES[name]} condition" + (
-            " (the paper's Theorem 4)" if name == "theorem4" else ""
+            " (the paper's Theorem 4)" if name == "any-environment" else ""
         )
         what = "The loop without coupling fails" if outcome["coupling"]["kind"] == "none" else "This coupling fails"
         lines.append(f"{what} {condition}: it needs {worst:.3g} times the damping that the devices guarantee.")
@@ -130,7 +130,7 @@ def beside_the_paper(scenario: Scenario, case: str, outcome: dict[str, Any]) -> 
 def _printed_gains(scenario: Scenario, case: str, outcome: dict[str, Any]) -> list[dict[str, str]]:
     printed, got = PUBLISHED[case], outcome["coupling"]
     need = assess(scenario.loop(case), printed)
-    theorem4, closed_loop = (need[name].required for name in ("theorem4", "closed-loop"))
+    any_environment, this_environment = (need[name].required for name in ("any-environment", "this-environment"))
     here = "none" if got["K"] is None else f"K = {listed(got['K'], 5)}, B = {listed(got['B'], 5)}"
     return [
         {
@@ -142,7 +142,7 @@ def _printed_gains(scenario: Scenario, case: str, outcome: dict[str, Any]) -> li
         {
             "what": "damping that the printed gains need [N s/m]",
             "paper": f"at most {listed(scenario.delta, 5)}",
-            "here": f"{listed(theorem4, 5)} by Theorem 4; {listed(closed_loop, 5)} in this environment",
+            "here": f"{listed(any_environment, 5)} by Theorem 4; {listed(this_environment, 5)} in this environment",
             "why": "Theorem 4 as printed is strictly infeasible (E-hat has a pole at z = 1); mended, it refuses them",
         },
     ]

@@ -13,8 +13,12 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 #: what each must print; figures are those that docs and other tests have
 SAYS = {
-    "audit": ["closed-loop: needs 1.3987, 1.3987 of 1.37 N s/m: not certified", "the gains times 0.8995"],
-    "compare_couplings": ["any passive environment", "closed-loop +1.36.. ", r"-17.6. .*-34.8. .*this environment"],
+    "audit": ["this-environment: needs 1.3987, 1.3987 of 1.37 N s/m: not certified", "the gains times 0.8995"],
+    "compare_couplings": [
+        "any passive environment",
+        "this-environment +1.36.. ",
+        r"-17.6. .*-34.8. .*this environment",
+    ],
     "neural_environment": [
         r"budget 1e\+09 J: limited 0 of 5000",
         r"budget 0.01 J: limited [34]\d{3} of 5000",
