@@ -12,7 +12,7 @@ from rich.table import Table
 from cli import options, render
 from design.certificate import HERE, SET, Stored, SwitchingProof, Verdict, switching_guarantee, verify
 from design.ranges import Searched, search_box, search_part, search_words, violated_between
-from design.result import CONDITION_NAMES, listed
+from design.result import listed
 from sim.couplings import read_coupling
 from sim.scenario import InputError
 
@@ -23,7 +23,7 @@ class _Switching:
 
     lo: Sequence[int]
     hi: Sequence[int]
-    guarantee: str | None = render.figure("switching, guarantee")
+    promise: str | None = render.figure("switching, guarantee")  # older name, as JSON has it
     proof: str | None = render.figure("switching, proof")
     required_damping: Sequence[float] | None = render.figure("switching, required damping [N s/m]", listed)
     margin: float | None = render.figure("switching, margin", "{:.6g}")
@@ -35,8 +35,8 @@ class _Checked:
 
     proved: bool
     reason: str | None = render.figure("reason")
-    condition: str | None = render.figure("condition", CONDITION_NAMES.__getitem__)
-    guarantee: str | None = render.figure("guarantee")
+    condition: str | None = render.figure("condition")
+    promise: str | None = render.figure("guarantee")  # older name, as JSON has it
     proof: str | None = render.figure("proof")
     vertices: int | None = render.figure("vertices")
     between: Mapping[str, Any] | None = render.figure("between", search_words)

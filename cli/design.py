@@ -35,7 +35,7 @@ from design.conditions import BETA
 from design.designs import KINDS, NO_LONGER, compare_methods, design_by_kind, usual_condition
 from design.optimal import OBJECTIVES, Optimal, Options, box_around, robustness, spread
 from design.ranges import SAMPLES, SetCheck, check_set, cost_part, price, set_part, set_rows
-from design.result import CONDITION_NAMES, METHODS, Design, DesignFailed, listed
+from design.result import METHODS, Design, DesignFailed, listed
 from design.spring_damper import STIFFEST
 from design.transparency import BAND_HZ, transparency
 from sim import report
@@ -340,7 +340,7 @@ def _proved(loop: Loop, design: Design, beta: float | None) -> tuple[Certificate
 
 
 def _tables(outcome: dict[str, Any]) -> list[Table]:
-    condition = CONDITION_NAMES[outcome["certificate"]["condition"]]
+    condition = outcome["certificate"]["condition"]
     title = f"{outcome['coupling']['kind']}, case {outcome['case']}, {condition}"
     shown = [render.facts(title, _rows(outcome))]
     if outcome["price"]:

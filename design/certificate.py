@@ -61,6 +61,7 @@ from design.conditions import (
 )
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
 from design.frequency import frequencies, on_circle, rounding
+from design.result import OLDER_NAMES
 
 # ----------------------------------------------------------------------------------------------------
 # The file in which a coupling is kept: the loop it was made for, its coefficients and its certificate, as JSON.
@@ -104,7 +105,7 @@ class Certificate(Strict, frozen=True):
     required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep
     available: tuple[float, ...]  # (m,) [N s/m], the damping for which it is proved
     margin: float  # available / required
-    guarantee: Literal["any passive environment", "a set", "this environment"]
+    guarantee: Literal["any passive environment", "a set", "this environment"] = msgspec.field(name="promise")
     proof: Literal["sampled", "kyp", "rational"]
     matrices: dict[str, tuple[tuple[Rational, ...], ...]]  # rationals "p/q"
     scenario: str  # digest of the loop and the coupling
@@ -137,14 +138,23 @@ class Stored(Strict, frozen=True):
 
 def digest(*parts: msgspec.Struct) -> str:
     """sha256 over the canonical JSON (sorted keys, shortest decimals, 7 as 7.0 where it is a float) of the parts."""
-    read_back = [msgspec.json.decode(msgspec.json.encode(part), type=type(part)) for part in parts]
-    return hashlib.sha256(msgspec.json.encode(read_back, order="deterministic")).hexdigest()
+    return _sha256([_plain(part) for part in parts])
+
+
+def _plain(part: msgspec.Struct) -> Any:
+    return msgspec.to_builtins(msgspec.json.decode(msgspec.json.encode(part), type=type(part)))
+
+
+def _sha256(plain: list[Any]) -> str:
+    return hashlib.sha256(msgspec.json.encode(plain, order="deterministic")).hexdigest()
 
 
 def sealed(certificate: Certificate) -> Certificate:
-    """The certificate with the digest of all its other fields."""
-    plain = msgspec.structs.replace(certificate, seal="")
-    return msgspec.structs.replace(certificate, seal=digest(plain))
+    """The certificate with the digest of all its other fields, its condition by the name of the first files."""
+    older = {name: before for before, name in OLDER_NAMES.items()}
+    plain = _plain(msgspec.structs.replace(certificate, seal=""))
+    seal = _sha256([plain | {"condition": older[certificate.condition]}])
+    return msgspec.structs.replace(certificate, seal=seal)
 
 
 def load(path: str | Path) -> Stored:
@@ -153,7 +163,7 @@ def load(path: str | Path) -> Stored:
     if not content.strip():
         raise BadFile(f"{path}: is empty, expected a coupling as python -m design stores it")
     try:
-        stored = msgspec.json.decode(content, type=Stored)
+        stored = msgspec.json.decode(_renamed(content), type=Stored)
         json.loads(content, object_pairs_hook=_once)
         return stored
     except _Twice as error:
@@ -176,6 +186,18 @@ def _content(path: Path) -> bytes:
         content = file.read(MOST_BYTES + 1)
     if len(content) > MOST_BYTES:
         raise BadFile(f"{path}: is larger than {MOST_BYTES // 10**6} MB, expected a coupling as design stores it")
+    return content
+
+
+def _renamed(content: bytes) -> bytes:
+    """The content with the condition by its name of today; as it is where it has that, or is no certificate."""
+    try:
+        whole = msgspec.json.decode(content)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return content
+    match whole:
+        case {"certificate": {"condition": str(name)} as claim} if name in OLDER_NAMES:
+            return msgspec.json.encode(whole | {"certificate": claim | {"condition": OLDER_NAMES[name]}})
     return content
 
 
@@ -602,8 +624,8 @@ def switching_part(found: JitterProof, G: Lti, span: DelayRange, T_max: float | 
 # this-environment, forces that latch late, or walls without dampers: the blocks of latency_demand and walls_demand, the
 # latter with the multipliers g of its walls, stored too.
 #
-# any-environment, psi = 0: with H = V - Theta-hat (11), (12), V-hat = (1 - 1/z) H/T, H(1) is exactly symmetric, and with
-# H(z) = H(1) + (z - 1) R(z) the block
+# any-environment, psi = 0: with H = V - Theta-hat (11), (12), V-hat = (1 - 1/z) H/T, H(1) is exactly symmetric, and
+# with H(z) = H(1) + (z - 1) R(z) the block
 #     H(1)/2 - R
 # is strictly positive real. Then He V-hat = |1 - 1/z|^2 He[H(1)/2 - R]/T >= Delta_V V-hat* V-hat for a small
 # Delta_V > 0, as V-hat carries the same factor: V-hat is stable and output strictly passive. The environment is
@@ -615,7 +637,7 @@ def switching_part(found: JitterProof, G: Lti, span: DelayRange, T_max: float | 
 #
 # A loop whose delays may switch within a range carries a second proof, of any switching (design.jitter.proof).
 #
-# any-environment, psi >= 1: a multiplier Phi, stored too, and two blocks (design.proof.delayed); it is of this environment.
+# any-environment, psi >= 1: a multiplier Phi, stored too, and two blocks (delayed_blocks); it is of this environment.
 
 
 CLAIM_TOLERANCE_CERTIFICATE = (
@@ -784,7 +806,7 @@ def verify(stored: Stored) -> Verdict:
 def required_damping(
     loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[Fraction] | None = None
 ) -> Requirement:
-    """The damping that the condition asks, from a refined sweep: this-environment, the most over all members of the set.
+    """The damping that the condition asks, from a refined sweep; this-environment: the most over all members.
 
     Raises NotProved where it is undefined: any-environment with psi >= 1 needs the multiplier phi.
     """
@@ -940,7 +962,7 @@ def _refuted_claims(loop: Loop, coupling: Coupling, certificate: Certificate) ->
     if certificate.proof != "rational":
         return f"the certificate is {certificate.proof}: it carries no exact proof"
     if certificate.guarantee != _guarantee(loop, certificate.condition):
-        return f"{certificate.condition} does not promise {certificate.guarantee!r}"
+        return f"{certificate.condition} does not guarantee {certificate.guarantee!r}"
     if certificate.available != loop.delta:
         return f"available is {list(certificate.available)}, the loop has delta = {list(loop.delta)}"
     _require_limits(loop, coupling, certificate.condition)
@@ -997,9 +1019,9 @@ def assess(
 ) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
 
-    this-environment is about the nominal environment alone (design.box.check asks for the rest of its box) and the constant
-    theta (design.jitter.part asks for the rest of its range); where there are walls it is about the frozen contact
-    state that asks for most. What `known`, a certificate just made, proves is not proved again.
+    this-environment is about the nominal environment alone (ranges.check asks for the rest of its ranges) and the
+    constant theta (sim.switching.certified_part asks for the rest of its range); where there are walls it is about the
+    frozen contact state that asks for most. What `known`, a certificate just made, proves is not proved again.
     """
     loop = loop.at(loop.environment).switching(None)
     here = this_environment_of(loop, coupling)

@@ -56,7 +56,6 @@ from design.frequency import (
     supremum,
 )
 
-#: as files and options of today name them: any-environment is any-environment, this-environment is this-environment
 Condition = Literal["this-environment", "any-environment"]
 
 C = TypeVar("C", bound=str)  # a Condition, "jitter-proof" or "limiter"

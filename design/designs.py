@@ -15,7 +15,7 @@ from design import certificate as guarantees
 from design.certificate import LATE, Stored, assess, switching_requirement
 from design.conditions import Condition, Requirement, this_environment
 from design.ranges import check_set
-from design.result import CONDITION_NAMES, Design, DesignFailed, Row, bare, known, of_kind, one_of
+from design.result import Design, DesignFailed, Row, bare, known, of_kind, one_of
 from design.transparency import Transparency, transparency
 
 # ----------------------------------------------------------------------------------------------------
@@ -99,7 +99,7 @@ def design_by_kind(
     if loop.latency is None or kind == "optimal":
         return made(loop)
     if condition == "any-environment":
-        raise ValueError(f"latency: {LATE}, or design for {CONDITION_NAMES['this-environment']}")
+        raise ValueError(f"latency: {LATE}, or design for this-environment")
     return _with_latency(loop, made)
 
 
@@ -181,8 +181,8 @@ def design_coupling(
     """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
 
     `kind` is "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal"; `condition` is
-    "any-environment" (any passive environment) or "this-environment" (this environment), None for the kind's own. `options` are
-    those of the kind, see Options; switching is not taken from loop.jitter.
+    "any-environment" or "this-environment", None for the kind's own. `options` are those of the kind, see
+    Options; switching is not taken from loop.jitter.
 
     Returns a Design: `coupling` (for a spring-damper with K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the damping
     that it needs, from a sweep of the coupling alone), `figure` and `objective` (what was minimised, and its value).
@@ -202,8 +202,8 @@ def design_coupling(
 def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[str]]:
     """What both conditions, "any-environment" and "this-environment", ask of a coupling in its loop.
 
-    With a box around the loop's environment this-environment is about the environment and every vertex: the figure is that
-    of the one that asks the most, proved only if all are. Between the vertices nothing is proved, but searched: a
+    With ranges around the loop's environment this-environment is about the environment and every vertex: the figure is
+    that of the one that asks the most, proved only if all are. Between the vertices nothing is proved, but searched: a
     violation found there (design.box.worst_member) is the figure then, and not certified. With a range of delays,
     loop.jitter, there is a third, "jitter-proof": what any switching within the range asks.
 

@@ -505,7 +505,7 @@ def design(
         return _for_this_environment(loop, starts, switching, limiter)
     if switching:
         raise ValueError("delays that vary are designed for by the this-environment condition only")
-    raise ValueError(f"condition is {condition!r}, expected 'any_environment' or 'this-environment'")
+    raise ValueError(f"condition is {condition!r}, expected 'any-environment' or 'this-environment'")
 
 
 def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design:

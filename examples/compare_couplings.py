@@ -1,4 +1,4 @@
-"""Design three couplings for one loop and compare what each promises, what it costs and how transparent it is."""
+"""Design three couplings for one loop and compare what each guarantees, what it costs and how transparent it is."""
 
 from design import certify, design_coupling, guarantee, transparency_of
 from sim import load

@@ -352,7 +352,7 @@ class CertifiedCoupling:
         return host_controller(self.scenario, self.chosen.coupling, self.link)
 
     def part(self) -> dict[str, Any]:
-        """As plain data: coupling, certificates, promise."""
+        """As plain data: coupling, certificates, guarantee."""
         return {
             "link_delay": self.link,
             "theta": list(self.scenario.theta),
@@ -404,7 +404,7 @@ def certified_couplings(
     """The coupling for the measured delay and up to `spare` softer ones, each for one tick more.
 
     A softer one is of the same kind or from the same file; where that is not certified for the longer delay, it is
-    the spring-damper by Theorem 4, which promises the most. Raises Fault where the first coupling is not certified;
+    the spring-damper by Theorem 4, which guarantees the most. Raises Fault where the first coupling is not certified;
     where no softer one is, the ladder ends.
     """
     found, wanted = [certified_coupling(scenario, case, name, condition, link)], [(name, condition), _FALLBACK]

@@ -239,7 +239,9 @@ def rehearse(
     require_constant_delay(scenario, "rehearse")
     require_even_ticks(scenario, "rehearse")
     if min(scenario.delta) <= 0:
-        raise InputError(f"delta is {list(scenario.delta)}: a device without damping can promise no human anything")
+        raise InputError(
+            f"delta is {list(scenario.delta)}: a device without damping can guarantee nothing to any human"
+        )
     session = session_for(scenario, LinkSettings(measure=_MEASURE))
     session.record = recorder = Recorder(scenario.channels)
     programs: list[CertifiedCoupling] = []

@@ -1,4 +1,4 @@
-"""The same devices and hands with other couplings: what each promise costs, from no coupling to the best one.
+"""The same devices and hands with other couplings: what each guarantee costs, from no coupling to the best one.
 
 A run is of one coupling. Beside it stand the loop without any, the paper's printed gains where the loop is the paper's,
 the spring-damper for any passive environment, the one for this environment, and the optimal coupling where it is quick
@@ -16,7 +16,6 @@ from controller.coupling import Coupling
 from controller.lti import Array
 from design.certificate import assess, finite, guarantee_of
 from design.conditions import Requirement
-from design.result import CONDITION_NAMES
 from design.transparency import decibels, transparency
 from sim.accuracy import credible_part, force_error
 from sim.couplings import choose
@@ -58,18 +57,18 @@ class Alternative:
     def name(self) -> str:
         """As tables and pictures call it: a spring-damper by its condition."""
         if self.kind == "spring-damper":
-            return CONDITION_NAMES[self.condition or ""]
+            return self.condition or ""
         return {"optimal": "best (optimal)"}.get(self.kind, self.kind)
 
     def part(self) -> dict[str, Any]:
         """As plain data."""
         damping = {
-            CONDITION_NAMES.get(name, name): [finite(float(x)) for x in requirement.required]
+            name: [finite(float(x)) for x in requirement.required]
             for name, requirement in (self.requirements or {}).items()
         }
         part: dict[str, Any] = {
             "coupling": self.kind,
-            "condition": CONDITION_NAMES.get(self.condition or "", self.condition),
+            "condition": self.condition,
             "required_damping": damping,
             "promise": self.guarantee,
             "dc_ratio": self.rendered,

@@ -1,9 +1,9 @@
 """A search for hands that switching contact keeps in motion, though every frozen contact state is certified.
 
 Every draw is a loop of one channel: a light rigid device, a random delay, an environment of a spring, a mass and one
-or two walls at random places, a random spring-damper coupling. The device gets just the damping that the this-environment
-condition asks in the worst frozen contact state, so all of them are certified; draws that any-environment certifies as well
-are left out, because there the answer is known. Lossless hands are let go from random states: half of them of random
+or two walls at random places, a random spring-damper coupling. The device gets just the damping that this-environment
+asks in the worst frozen contact state, so all of them are certified; draws that any-environment certifies as well are
+left out, because there the answer is known. Lossless hands are let go from random states: half of them of random
 mass and stiffness, half those of many whose modes above 5 Hz decay most slowly in a frozen state. No force limit, no
 outside force.
 

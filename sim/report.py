@@ -16,7 +16,7 @@ from controller.lti import Array
 from controller.timing import Timing
 from design.certificate import ANY, CAVEATS, MAKING, assess, certificate_part, encoder_part, finite
 from design.conditions import Requirement
-from design.result import CONDITION_NAMES, PRINTED_TAU_DB, PUBLISHED, listed
+from design.result import OLDER_NAMES, PRINTED_TAU_DB, PUBLISHED, listed
 from design.transparency import Transparency, decibels
 from models.human import Person
 from sim.adversary import Worst
@@ -35,7 +35,7 @@ from sim.trace import Trace
 def certificates_part(requirements: Mapping[str, Requirement]) -> dict[str, Any]:
     """Both conditions, each under its name and under the name that it had before: the same objects."""
     parts = {name: certificate_part(requirement) for name, requirement in requirements.items()}
-    return parts | {CONDITION_NAMES[name]: part for name, part in parts.items()}
+    return parts | {older: parts[name] for older, name in OLDER_NAMES.items() if name in parts}
 
 
 def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
@@ -93,9 +93,7 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
     part = certificates[name]
     if not part["certified"] and "reason" not in part:
         worst = max(n / a for n, a in zip(part["required_damping"], part["available_damping"], strict=True))
-        condition = f"the {CONDITION_NAMES[name]} condition" + (
-            " (the paper's Theorem 4)" if name == "any-environment" else ""
-        )
+        condition = f"the {name} condition" + (" (the paper's Theorem 4)" if name == "any-environment" else "")
         what = "The loop without coupling fails" if outcome["coupling"]["kind"] == "none" else "This coupling fails"
         lines.append(f"{what} {condition}: it needs {worst:.3g} times the damping that the devices guarantee.")
     if "contact" in outcome["stability"]:
@@ -107,7 +105,7 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
             lines.append(f"{name}: {outcome[name]['reason']}.")
     for name, part in certificates.items():
         if "reason" in part:
-            lines.append(f"{CONDITION_NAMES[name]}: {part['reason']}.")
+            lines.append(f"{name}: {part['reason']}.")
     if outcome.get("jitter"):
         lines.append(f"Delays that vary: {outcome['jitter']['covers']}.")
     if part := outcome.get("encoder"):

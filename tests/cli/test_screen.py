@@ -66,6 +66,6 @@ def test_a_name_is_no_markup(name):
 def test_our_own_tags_are_colours():
     text = io.StringIO()
     Screen(file=text, width=60, force_terminal=True, color_system="standard", highlight=False).print(
-        "[red]not promised[/]: [m]"
+        "[red]not guaranteed[/]: [m]"
     )
-    assert text.getvalue() == "\x1b[31mnot promised\x1b[0m: [m]\n"
+    assert text.getvalue() == "\x1b[31mnot guaranteed\x1b[0m: [m]\n"

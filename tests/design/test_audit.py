@@ -59,7 +59,7 @@ def strict(text: str) -> dict:
 
 
 @pytest.mark.parametrize(
-    ("K", "B", "theta", "closed_loop", "any-environment"),
+    ("K", "B", "theta", "this_environment", "any_environment"),
     [(5000, 0, 0, 2.5, 2.5), (5000, 30, 0, 32.5, 32.5), (800, 0.7, 0, 1.1, 1.1), (5000, 0, 1, 7.5, 10.0)],
 )
 def test_closed_forms_of_a_rigid_wall(K, B, theta, this_environment, any_environment):

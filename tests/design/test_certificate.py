@@ -208,6 +208,16 @@ def test_tampering_is_rejected_with_the_reason():
         assert any(part in verdict.reason for part in reason.split("|")), verdict.reason
 
 
+def test_a_file_that_calls_the_condition_by_its_older_name_is_read_and_still_proved(tmp_path):
+    good = certified(DEFAULT, STIFF, "this-environment")
+    save(good, tmp_path / "new.json")
+    older = (tmp_path / "new.json").read_text().replace("this-environment", "closed-loop")  # older name
+    (tmp_path / "old.json").write_text(older)  # older name
+    assert "closed-loop" in older  # older name
+    assert load(tmp_path / "old.json") == good
+    assert verify(load(tmp_path / "old.json")).proved
+
+
 def test_a_forger_who_repairs_the_digests_still_has_to_prove():
     good = certified(DEFAULT, STIFF, "this-environment")
     starved = change(DEFAULT, delta=(1.36, 1.36))
@@ -222,7 +232,7 @@ def test_a_forger_who_repairs_the_digests_still_has_to_prove():
         "margin is": change(good.certificate, margin=2.0),
         "required is": change(good.certificate, required=(0.1, 0.1)),
         "available is": change(good.certificate, available=(2.0, 2.0)),
-        "does not promise": change(good.certificate, guarantee="any passive environment"),
+        "does not guarantee": change(good.certificate, guarantee="any passive environment"),
         "carries no exact proof": change(good.certificate, proof="sampled"),
         "expected P": change(good.certificate, matrices={}),
         "the model has 9 states": change(good.certificate, matrices={"P": (("1",),)}),

@@ -75,7 +75,7 @@ def test_a_delayed_spring_feeds_and_a_damper_dissipates():
 
 
 def test_demand_by_hand():
-    """this-environment: -T He[F/(z-1)] / delta; any-environment, by channel: (1 - cos n w) / (2 delta Re[(z-1) V/(Tz)])."""
+    """This environment: -T He[F/(z-1)] / delta; any, by channel: (1 - cos n w) / (2 delta Re[(z-1) V/(Tz)])."""
     demands = curves(PAIR, judge(PAIR, CASE_I), HZ).demands
     for k, (_, F, _) in enumerate(by_hand(HZ)):
         z = np.exp(2j * np.pi * HZ[k] * T)

@@ -347,7 +347,7 @@ def test_the_proof_of_one_condition_does_not_serve_the_other():
     assert len(here.matrices["P"]) == len(anywhere.matrices["P"])  # it is not the size that gives it away
     assert forged(asked, coupling, anywhere) is None
     assert forged(asked, coupling, anywhere, matrices=here.matrices) == NEGATIVE
-    assert "does not promise" in forged(asked, coupling, here, guarantee="any passive environment")
+    assert "does not guarantee" in forged(asked, coupling, here, guarantee="any passive environment")
     soft = change(asked, environment=to_ground(100.0))  # any-environment's proof is far from this environment's need
     assert forged(soft, coupling, prove(soft, coupling, "this-environment"), matrices=anywhere.matrices) is not None
 

@@ -1,4 +1,4 @@
-"""The search for the worst environment of a box, and what a violation between the vertices does to a promise."""
+"""The search for the worst environment of a box, and what a violation between the vertices does to a guarantee."""
 
 import json
 from itertools import product
@@ -157,7 +157,7 @@ def test_neither_the_vertices_nor_random_points_see_it_but_no_set_is_promised(kn
     part = set_part(known)
     assert (part["proof"], part["certified"], part["search"]["violated"]) == ("rational", False, True)
     assert part["reason"].startswith("proved at the vertices, but violated between them: 1.04")
-    assert any("not promised" in words for _, words in set_rows(part))
+    assert any("not guaranteed" in words for _, words in set_rows(part))
 
 
 def test_fewer_samples_do_not_make_it_a_guarantee():

@@ -40,7 +40,7 @@ def test_a_device_without_damping_ends_the_example_with_one_line(tmp_path):
         [sys.executable, "mine.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 1
-    assert done.stderr == "error: delta is [0.0, 0.0]: a device without damping can promise no human anything\n"
+    assert done.stderr == "error: delta is [0.0, 0.0]: a device without damping can guarantee nothing to any human\n"
 
 
 def test_examples_import_only_what_is_for_scripts():
