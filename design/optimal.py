@@ -34,6 +34,7 @@ from design.certificate import (
     limiter_refusal,
     limiter_requirement,
     prove,
+    prove_limiter,
     worst,
 )
 from design.conditions import (
@@ -823,9 +824,10 @@ class _Climb:
 
     def _proved(self, found: Optimal, slip: Slip | None) -> Optimal:
         """The same with its certificate, or why it has none."""
-        beta = slip.beta if slip else None
+        loop, coupling = self.loop, found.coupling
         try:
-            certificate = prove(self.loop, found.coupling, "this-environment", beta=beta, swept=found.requirement)
+            limited = prove_limiter(loop, coupling, slip.beta) if slip else None
+            certificate = prove(loop, coupling, "this-environment", limiter=limited, swept=found.requirement)
         except NotProved as error:
             return replace(found, wall_s=self.elapsed, reason=str(error))
         requirement = replace(found.requirement, proof="rational")
