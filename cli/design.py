@@ -33,13 +33,13 @@ from design.certificate import (
 )
 from design.conditions import BETA
 from design.designs import KINDS, NO_LONGER, compare_methods, design_by_kind, usual_condition
+from design.files import out_file
 from design.optimal import OBJECTIVES, Optimal, box_around, robustness
 from design.ranges import SAMPLES, SetCheck, check_set, cost_part, price, set_part, set_rows
 from design.result import CONDITION_NAMES, METHODS, Design, DesignFailed, listed
 from design.spring_damper import STIFFEST
 from design.transparency import BAND_HZ, transparency
 from sim import report
-from sim.files import out_file
 from sim.scenario import InputError
 
 

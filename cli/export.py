@@ -26,9 +26,9 @@ from design.export import (
     process_block,
     trial,
 )
+from design.files import out_file, write
 from design.result import CONDITION_NAMES, listed
 from sim.couplings import read_coupling
-from sim.files import out_file, write
 from sim.scenario import InputError
 
 SUFFIX = {"c": ".c", "json": ".json", "npz": ".npz", "control": ".py"}
@@ -125,7 +125,7 @@ def _destination(args: argparse.Namespace, block: Block) -> Path:
 
 
 def _content(kind: str, block: Block, test: Trial, file: str) -> Any:
-    """What `sim.files.write` takes."""
+    """What `design.files.write` takes."""
     if kind == "c":
         return c_source(block, test, file)
     if kind == "control":

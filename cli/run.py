@@ -12,6 +12,7 @@ from cli import options, render
 from controller.loop import Loop
 from design.certificate import Limits, assess, covered_limits, promise_of
 from design.designs import usual_condition
+from design.files import write
 from design.ranges import SetCheck, check_set, set_part, set_rows
 from design.result import listed
 from design.transparency import transparency
@@ -20,7 +21,6 @@ from sim.accuracy import ForceError, credible_part, force_error, position_error
 from sim.alternatives import Alternative, alternatives
 from sim.couplings import NAMES, Chosen, choose
 from sim.engines import INTEGRATORS, default_integrator
-from sim.files import write
 from sim.nets import BASELINES, Classic, EnergyNet, idle, netted
 from sim.run import ENGINES, Simulation, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, load_humans

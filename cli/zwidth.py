@@ -18,11 +18,11 @@ from rich.table import Table
 from cli import options, render
 from controller.lti import Array
 from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, promise_of
+from design.files import write
 from design.ranges import check_set, set_part
 from design.result import CONDITION_NAMES
 from sim import report
 from sim.couplings import NAMES, Chosen, choose
-from sim.files import write
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
 from sim.scenario import InputError, Scenario, require_constant_delay, require_forces_at_ticks
 from sim.stability import MARGINAL

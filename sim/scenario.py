@@ -10,7 +10,6 @@ import difflib
 import hashlib
 import re
 import runpy
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self, get_args
@@ -21,9 +20,9 @@ import numpy as np
 from controller.delay import Jitter
 from controller.environment import Box, Network, Spring, UncertainSpring, Wall, environment
 from controller.loop import DelayRange, Loop
+from design.files import InputError, read_text, toml, write
 from models.device import MOST_DAMPING, Device, passivity_level, require, with_damping
 from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
-from sim.files import InputError, write
 
 CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"
@@ -186,7 +185,7 @@ def load(source: str | Path = DEFAULT) -> Scenario:
         kind = type(source).__name__
         raise InputError(f"scenario is {source!r} ({kind}), expected a TOML file or one of: {', '.join(built_in())}")
     path = SCENARIOS / f"{source}.toml" if str(source) in built_in() else Path(source)
-    text = _read(path, f"scenario {source}", f"; give a TOML file or one of: {', '.join(built_in())}")
+    text = read_text(path, f"scenario {source}", f"; give a TOML file or one of: {', '.join(built_in())}")
     return parse(text, str(source))
 
 
@@ -252,7 +251,7 @@ def load_humans(path: str | Path, channels: int) -> HumanFile:
         names, what = _run_file(path), "`humans`"
         people = HumanFile(tuple(names.get("humans", ())), tuple(names.get("persons", ())))
     else:
-        people = _converted(_read(Path(path), f"--human {path}"), HumanFile, f"--human {path}")
+        people = _converted(read_text(path, f"--human {path}"), HumanFile, f"--human {path}")
     if len(people.human) != channels:
         raise InputError(f"--human {path} has {len(people.human)} {what}, expected {channels} (one per channel)")
     try:
@@ -263,11 +262,12 @@ def load_humans(path: str | Path, channels: int) -> HumanFile:
 
 
 def _run_file(path: str | Path) -> dict[str, Any]:
-    """The names that a Python file defines. Raises InputError where it cannot be read."""
+    """The names that a Python file defines. Raises InputError where it cannot be read or run."""
+    read_text(path, f"--human {path}")
     try:
         return runpy.run_path(str(path))
-    except OSError as error:
-        raise InputError(f"--human {path}: {error.strerror}") from None
+    except Exception as error:
+        raise InputError(f"--human {path}: {type(error).__name__}: {error}") from None
 
 
 def save_humans(path: Path, humans: tuple[Any, ...], remark: str, persons: tuple[Person, ...] = ()) -> Path:
@@ -291,22 +291,9 @@ def save_humans(path: Path, humans: tuple[Any, ...], remark: str, persons: tuple
 # ---- strictness: what a file may hold, and how its errors are worded
 
 
-def _read(path: Path, name: str, hint: str = "") -> str:
-    """The text of a file that the user named. Raises InputError."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{name}: {error.strerror}{hint}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{name}: not a text file in UTF-8") from None
-
-
 def _converted(text: str, kind: Any, source: str) -> Any:
     """TOML text as `kind`. Raises InputError with the path of the field and the value that came."""
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{source}: not valid TOML: {error}") from None
+    raw = toml(text, source)
     try:
         return msgspec.convert(raw, kind)
     except msgspec.ValidationError as error:

@@ -17,24 +17,27 @@ growth        how fast does it grow? An oscillation that grows like exp(g t) is 
 from __future__ import annotations
 
 import json
-import zlib
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from controller.lti import Array, frozen
 from controller.process import Net
-from sim.files import InputError, write
+from design.files import InputError, read_arrays, write
 
 _MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # axes of what files keep
 _STATES = {"z": 2, "s": 2}
 
-#: what NumPy and zipfile raise of a file that is no npz, is damaged, or holds something else
-DAMAGED = (KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, BadZipFile, zlib.error)
+
+def _real(name: str, values: NDArray[Any]) -> Array:
+    """Raises ValueError for an array that holds anything but real numbers."""
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"{name} is of type {values.dtype}, expected real numbers")
+    return values
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +102,15 @@ class Trace:
     @classmethod
     def load_npz(cls, path: Path) -> Self:
         """A trace written by `save_npz`. Raises InputError where it is none."""
+        return cls.of_arrays(path, read_arrays(path, "a trace of this program"))
+
+    @classmethod
+    def of_arrays(cls, path: Path, arrays: Mapping[str, NDArray[Any]]) -> Self:
+        """A trace from the arrays of its file. Raises InputError where they are none."""
         try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                return cls(**{name: archive[name] for name in _MEASURED}, meta=json.loads(str(archive["meta"])))
-        except OSError as error:
-            raise InputError(f"{path}: {error.strerror or error}") from None
-        except DAMAGED as error:
+            measured = {name: _real(name, arrays[name]) for name in _MEASURED}
+            return cls(**measured, meta=json.loads(str(arrays["meta"])))
+        except (KeyError, ValueError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: not a trace of this program ({error})") from None
 
     def save_csv(self, path: Path) -> Path:
