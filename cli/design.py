@@ -49,6 +49,8 @@ def main(argv: list[str]) -> int:
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
     options.check_json(args)
+    if args.samples is not None and _loop(args).box is None:
+        raise InputError("--samples without ranges: give --ranges, or a scenario with [box]")
     out = out_file(args.out, f"out/design-{args.case}.json", "the file of the coupling")
     loop = _loop(args)
     design = _design(args, loop)
@@ -56,7 +58,15 @@ def main(argv: list[str]) -> int:
     held = best and best.certificate
     requirements = assess(loop, design.coupling, design.phi, held)
     with render.progress("searching the ranges") as move:
-        whole = check_set(loop, design.coupling, args.seed, args.samples, move, best and best.searched, held)
+        whole = check_set(
+            loop,
+            design.coupling,
+            args.seed,
+            SAMPLES if args.samples is None else args.samples,
+            move,
+            best and best.searched,
+            held,
+        )
     certificates = report.certificates_part(requirements)
     outcome = {
         "case": args.case,
@@ -106,7 +116,7 @@ def _parser() -> options.Parser:
     optimal = parser.add_argument_group("optimal: the best filter of the environment's forces")
     add_optimal_options(optimal)
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"
-    parser.add_argument("--samples", type=options.whole(0, 10_000), default=SAMPLES, metavar="N", help=samples)
+    parser.add_argument("--samples", type=options.whole(0, 10_000), metavar="N", help=samples)
     ccl.add_argument("--full", action="store_true", help="across channels (default: diagonal)")
     options.add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case>.json)")
     return parser

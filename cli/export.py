@@ -90,6 +90,8 @@ def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> Block:
         block = process_block(stored, not args.without_theta) if args.process else coupling_block(stored)
     except NothingToExport as error:
         raise InputError(f"{args.coupling}: {error} (--process)") from None
+    except ValueError as error:  # coefficients beyond floating point
+        raise InputError(f"{args.coupling}: {error}") from None
     origin = (
         f"Written by python -m design.export from {Path(args.coupling).name}: {_gains(stored)}",
         *block.about,
@@ -118,10 +120,7 @@ def _guarantee(stored: Stored, verdict: Verdict) -> str:
 
 
 def _destination(args: argparse.Namespace, block: Block) -> Path:
-    path = out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}{SUFFIX[args.format]}")
-    if path.resolve() == Path(args.coupling).resolve():
-        raise InputError(f"--out {path}: is the coupling that is exported; name another file")
-    return path
+    return out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}{SUFFIX[args.format]}")
 
 
 def _content(kind: str, block: Block, test: Trial, file: str) -> Any:

@@ -48,6 +48,14 @@ class Parser(argparse.ArgumentParser):
             allow_abbrev=False,
         )
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # what parse_args calls
+        """As argparse's; an empty word is no name, number or choice, whatever the option is."""
+        found, rest = super().parse_known_args(args, namespace)
+        for action in self._actions:
+            if getattr(found, action.dest, None) == "":
+                raise InputError(f"{action.option_strings[-1] if action.option_strings else action.dest} is empty")
+        return found, rest
+
     def error(self, message: str) -> NoReturn:
         own = OWN_WORDS.fullmatch(message)
         raise InputError(f"{own[1]} {own[2]}" if own else f"{message} (--help lists the options)")
@@ -260,7 +268,7 @@ def add_json_option(parser: argparse._ActionsContainer) -> None:
 
 def check_json(args: argparse.Namespace) -> None:
     """Whether the file of --json can be written, before any work is done. Raises InputError."""
-    if args.json and args.json != "-":
+    if args.json is not None and args.json != "-":
         check_file("--json", Path(args.json), "a file or -")
 
 

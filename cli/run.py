@@ -163,6 +163,9 @@ def _limits(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, requir
 def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tuple[float, ...] | None) -> _Run:
     """Close the loop. Raises InputError for settings that cannot be."""
     simulation, period = assemble(scenario, chosen.coupling, lag), None
+    for name in ("integrator", "substeps"):
+        if args.engine == "exact" and getattr(args, name) is not None:
+            raise InputError(f"--{name} with --engine exact: it takes no steps; leave it out")
     if args.engine == "exact" and simulation.friction:
         raise InputError("--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco")
     if scenario.switches:

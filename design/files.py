@@ -87,11 +87,19 @@ def one_command() -> Iterator[None]:
 
 def _places(path: Path) -> set[Any]:
     """What a file is known by; nothing for what is no file, such as a terminal, of which nothing can be destroyed."""
-    place = Path(os.path.realpath(path))
+    place = _target(path)
     if not place.exists():
         return {place}
     status = place.stat()
     return {place, (status.st_dev, status.st_ino)} if place.is_file() else set()
+
+
+def _target(path: Path) -> Path:
+    """A file without the links that lead to it. Raises OSError for links that lead to themselves."""
+    place = Path(os.path.realpath(path))
+    if place.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
+    return place
 
 
 def _met(places: set[Any], known: dict[Any, str]) -> str | None:
@@ -187,7 +195,7 @@ def check_file(option: str, path: Path, expected: str = "a file") -> Path:
             raise InputError(f"{option} {path}: is a folder, expected {expected}")
         if not path.parent.is_dir():
             raise InputError(f"{option} {path}: the folder {path.parent} does not exist")
-        place = Path(os.path.realpath(path))
+        place = _target(path)
         if place.exists() and not place.is_file():
             if not os.access(place, os.W_OK):
                 raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
@@ -242,8 +250,8 @@ def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path
     A link stays a link: the file that it points to is written. Raises InputError where that cannot be, and where the
     command has read the file or has written it for another option.
     """
-    place = Path(os.path.realpath(path))
     try:
+        place = _target(path)
         if place.exists() and not place.is_file():
             with place.open("wb") as device:
                 _fill(device, content)

@@ -22,13 +22,14 @@ from controller.environment import Box, Network, Spring, UncertainSpring, Wall, 
 from controller.loop import DelayRange, Loop
 from design.files import InputError, read_text, toml, write
 from models.device import MOST_DAMPING, Device, passivity_level, require, with_damping
-from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
+from models.human import Cross, Human, Link, Person, Population, Port, Voluntary, check_holds
 
 CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
 LONGEST_DELAY = 1000  # [samples]; every one is a state
+LONGEST_NAME = 200  # characters, that a table and a picture can show
 _Delays = tuple[int, ...]
 
 
@@ -67,6 +68,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     latency: tuple[tuple[float, float], ...] | None = None  # [s] least and most by which a channel's force latches late
 
     def __post_init__(self) -> None:
+        if len(self.name) > LONGEST_NAME:
+            raise ValueError(f"name has {len(self.name)} characters, allowed are {LONGEST_NAME}")
         require("T", self.T, 1e-6, 0.1, "s")
         require("duration", self.duration, self.T, 1e6, "s")
         for name in ("theta", "psi", "device", "human", "lam"):
@@ -248,8 +251,7 @@ def load_humans(path: str | Path, channels: int) -> HumanFile:
     """
     what = "[[human]] tables"
     if Path(path).suffix == ".py":
-        names, what = _run_file(path), "`humans`"
-        people = HumanFile(tuple(names.get("humans", ())), tuple(names.get("persons", ())))
+        people, what = _run_file(path), "`humans`"
     else:
         people = _converted(read_text(path, f"--human {path}"), HumanFile, f"--human {path}")
     if len(people.human) != channels:
@@ -261,12 +263,13 @@ def load_humans(path: str | Path, channels: int) -> HumanFile:
     return people
 
 
-def _run_file(path: str | Path) -> dict[str, Any]:
-    """The names that a Python file defines. Raises InputError where it cannot be read or run."""
+def _run_file(path: str | Path) -> HumanFile:
+    """The people that a Python file defines. Raises InputError where it cannot be read or run, or they hold nothing."""
     read_text(path, f"--human {path}")
     try:
-        return runpy.run_path(str(path))
-    except Exception as error:
+        names = runpy.run_path(str(path))
+        return HumanFile(_kept(tuple(names.get("humans", ()))), tuple(names.get("persons", ())))
+    except (Exception, SystemExit) as error:
         raise InputError(f"--human {path}: {type(error).__name__}: {error}") from None
 
 
@@ -350,7 +353,8 @@ def _kept(value: Any) -> Any:
     for i, human in enumerate(value):
         if not (callable(getattr(human, "port", None)) and callable(getattr(human, "voluntary_force", None))):
             raise ValueError(f"human[{i}] is {human!r}, expected a Human, or what has port() and voluntary_force(t)")
-        human.port()  # raises ValueError where it is not passive
+        if not isinstance(port := human.port(), Port):  # which raises ValueError where it is not passive
+            raise ValueError(f"human[{i}].port() is {port!r}, expected a models.human.Port")
     return tuple(value)
 
 
