@@ -31,6 +31,7 @@ from design.result import CONDITION_NAMES, listed
 CUT = "…"  # what stands in a table for the end of a word that did not fit
 WIDEST = 400  # characters
 STEP = 2
+SHORT_NAME = 24  # characters of a row's name that are never broken
 OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # what opens no tag of our reports: a unit, a name
 
 
@@ -149,9 +150,11 @@ def facts(title: str, rows: Rows, heads: Sequence[str] = (), left: bool = False)
 
 def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = (0,)) -> Table:
     """A table of figures, to the right but for the columns `left`."""
-    table = Table(title=title)
+    table, rows = Table(title=title), list(rows)
+    short = all(len(row[0]) <= SHORT_NAME for row in rows)
     for i, head in enumerate(heads):
-        table.add_column(head, justify="left" if i in left else "right", overflow="fold" if i == 0 else "ellipsis")
+        how: Any = {"no_wrap": short, "overflow": "ellipsis" if short else "fold"} if i == 0 else {}
+        table.add_column(head, justify="left" if i in left else "right", **how)
     for row in rows:
         table.add_row(*row)
     return table
@@ -219,6 +222,20 @@ def transparency_error(part: Mapping[str, Any]) -> str:
 def verdict(word: str | None) -> str:
     """Stable or not."""
     return {"stable": "[green]stable[/]", "unstable": "[red]unstable[/]"}.get(word or "", "not decided")
+
+
+def timing_row(part: Mapping[str, Any] | None) -> tuple[str, str | None]:
+    """Periods and latencies of a run or of a validation that are not even."""
+    if part is None:
+        return "ticks", None
+    period, words = part["period_s"], []
+    if period["least"] < period["largest"]:
+        how = "recorded" if part["recorded"] else "drawn"
+        words.append(f"{1e3 * period['least']:.4g} to {1e3 * period['largest']:.4g} ms long, {how}")
+    if part["latency_s"]:
+        spans = (f"{1e3 * a:.4g} to {1e3 * b:.4g}" if a < b else f"{1e3 * a:.4g}" for a, b in part["latency_s"])
+        words.append(f"forces latch {', '.join(dict.fromkeys(spans))} ms later")
+    return "ticks", "; ".join(words)
 
 
 def delay_rows(part: Mapping[str, Any]) -> Rows:

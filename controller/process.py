@@ -26,8 +26,7 @@ from numpy.typing import ArrayLike
 
 from controller.coupling import Coupling
 from controller.delay import HeldLine, Ticks, delay, packet_delays
-from controller.environment import Network, Wall, walled_environment
-from controller.loop import walled_force_map
+from controller.environment import Network, Wall, walled_environment, walled_force_map
 from controller.lti import Array, Lti, ReadOnly, SingularLoop, frozen, taps
 
 # ----------------------------------------------------------------------------------------------------
@@ -129,7 +128,7 @@ class Contact:
 
 def contact(network: Network, coupling: Coupling, theta: Sequence[int], psi: Sequence[int], T: float) -> Contact:
     """F of (6) with the walls of the network as further ports. Psi and Theta delay what the devices feel of them."""
-    return Contact(walled_force_map(walled_environment(network, T), coupling, theta, psi), network.walls)
+    return Contact(walled_force_map(network, coupling, theta, psi, T), network.walls)
 
 
 @dataclass(frozen=True, eq=False)
@@ -585,7 +584,7 @@ class StepBuffer:
         self._quantised = bool((process.encoder_step > 0).any())
         self._line = None if process.delays is None else HeldLine(process.delays, nsim)
         self.net = process.net(nsim) if process.net else None
-        self._rewound = 0  # ticks before row 0
+        self.first = 0  # the tick of row 0
 
     def tick(self, k: int) -> None:
         """Steps 1, 2, 3 and 5 for row k, whose plant state has been written: f[k] and z[k + 1]."""
@@ -594,9 +593,9 @@ class StepBuffer:
         if self.net is not None:
             self.net.send(seen[-self.process.channels :], self.force[k])
         if self._line is not None:
-            self._line.carry(self._rewound + k, self.force[k])
+            self._line.carry(self.first + k, self.force[k])
         if self.net is not None:
-            self.net.apply(self._rewound + k, self.force[k])
+            self.net.apply(self.first + k, self.force[k])
 
     def seen(self, k: int) -> Array:
         """[z; x] of row k with x as the encoders give it, (order + m, nsim); the plant's own positions stay."""
@@ -615,4 +614,4 @@ class StepBuffer:
         """Start a new stretch where this one stood after `ticks` ticks."""
         self.z[0] = self.z[ticks]
         self.s[0] = self.s[ticks]
-        self._rewound += ticks
+        self.first += ticks
