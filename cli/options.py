@@ -51,9 +51,9 @@ class Parser(argparse.ArgumentParser):
             allow_abbrev=False,
         )
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:  # what parse_args calls
+    def parse_known_args(self, *args: Any, **how: Any) -> Any:  # what parse_args calls
         """As argparse's; an empty word is no name, number or choice, whatever the option is."""
-        found, rest = super().parse_known_args(args, namespace)
+        found, rest = super().parse_known_args(*args, **how)
         for action in self._actions:
             if getattr(found, action.dest, None) == "":
                 raise InputError(f"{action.option_strings[-1] if action.option_strings else action.dest} is empty")

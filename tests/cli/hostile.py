@@ -1,6 +1,7 @@
 """Every way of bad input that we know of, through the commands as a user runs them: one process, forked for each case.
 
     python tests/cli/hostile.py [WORD]     the cases whose name holds WORD; 0: none is answered badly
+    python tests/cli/hostile.py --signals  Ctrl-C and SIGTERM at random moments of a run in their place
 
 A case is answered well where the command ends in time with the expected code and, unless it succeeded, one line on
 standard error in which no character steers the terminal; where every file that was there is as it was; where no half
@@ -866,7 +867,7 @@ def run(case: Case, place: Path, log: Path) -> None:
             changed = {name: digest for name, digest in after.items() if before.get(name) != digest}
         put(f"{log}.changed", json.dumps(changed))
         command, *words = case.words
-        options.execute(import_module(f"cli.{command}").main, words)
+        options.execute(lambda argv: put(f"{log}.begun", "") or import_module(f"cli.{command}").main(argv), words)
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 0
     except BaseException:
@@ -881,6 +882,42 @@ def run(case: Case, place: Path, log: Path) -> None:
         os._exit(code)
 
 
+MOMENTS = 30
+
+
+def signalled(folder: Path, model: Path) -> Iterator[tuple[str, list[str]]]:
+    """MOMENTS of a run in which Ctrl-C comes, half as many for SIGTERM: what came, and what is wrong with its end."""
+    words = ("run", "--no-alternatives", "--duration", "2", "--out", "new")
+    rng, whole, number = np.random.default_rng(7), 0.0, 0
+    signals = [0, *MOMENTS * [signal.SIGINT], *(MOMENTS // 2) * [signal.SIGTERM]]  # the first one measures how long
+    for number, sent in enumerate(signals):
+        place = folder / f"signal-{number}"
+        shutil.copytree(model, place, symlinks=True, ignore=shutil.ignore_patterns("fifo"))
+        log = folder / f"{place.name}.log"
+        if (child := os.fork()) == 0:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            run(Case("signals", words), place, log)
+        while not Path(f"{log}.begun").exists():
+            time.sleep(1e-3)
+        begin, moment = time.perf_counter(), rng.uniform(0, 0.9) * whole
+        if sent:
+            time.sleep(moment)
+            os.kill(child, sent)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        whole = whole or time.perf_counter() - begin
+        err = Path(f"{log}.err").read_text()
+        expected = {
+            0: (0, ("",)),
+            signal.SIGINT: (130, ("", "interrupted\n")),
+            signal.SIGTERM: (143, ("terminated\n",)),
+        }
+        right, lines = expected[sent]
+        early = sent and code == 0 and (place / "new" / "report.json").exists()  # it came after the end
+        wrong = [] if early or (code == right and err in lines) else [f"code {code}, {err[-400:]!r}"]
+        wrong += [f"{path.name} is left" for path in place.rglob(".*.*")]
+        yield f"signal {sent} after {moment:.3f} of {whole:.2f} s", wrong
+
+
 def main() -> int:
     """Run every case whose name holds the word of the command line."""
     word = sys.argv[1] if len(sys.argv) > 1 else ""
@@ -892,6 +929,13 @@ def main() -> int:
         model = Path(folder) / "model"
         model.mkdir()
         furnish(model)
+        if word == "--signals":
+            ends = list(signalled(Path(folder), model))
+            for name, wrong in ends:
+                print(*(f"{name}: {line}" for line in wrong), sep="\n", end="\n" if wrong else "")
+            bad = sum(bool(wrong) for _, wrong in ends)
+            print(f"{len(ends)} cases, {bad} answered badly")
+            return int(bad > 0)
         for case in cases():
             if word not in case.name:
                 continue
