@@ -65,7 +65,7 @@ def furnish(folder: Path) -> None:
     scenario = load()
     loop, data = scenario.loop("I"), SpringDamper((400.0, 300.0), (0.1, 0.1))
     (folder / "s.toml").write_text(TEXT)
-    save(Stored.of(loop, data, prove(loop, data, "theorem4")), folder / "c.json")
+    save(Stored.of(loop, data, prove(loop, data, "any-environment")), folder / "c.json")
     link = "[[human]]\nlinks = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]\n"
     (folder / "h.toml").write_text(2 * link)
     (folder / "p.txt").write_text("1,2\n1,2\n")
@@ -500,8 +500,8 @@ def couplings() -> Iterator[Case]:
         ("certificate.available", [1e9, 1e9]),
         ("certificate.margin", 1e9),
         ("certificate.proof", "magic"),
-        ("certificate.condition", "closed-loop"),
-        ("certificate.promise", "a set"),
+        ("certificate.condition", "this-environment"),
+        ("certificate.guarantee", "a set"),
         ("certificate.seal", "x"),
         ("certificate.scenario", "x"),
         ("certificate.versions", {}),
