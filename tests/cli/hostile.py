@@ -501,7 +501,7 @@ def couplings() -> Iterator[Case]:
         ("certificate.margin", 1e9),
         ("certificate.proof", "magic"),
         ("certificate.condition", "this-environment"),
-        ("certificate.guarantee", "a set"),
+        ("certificate.promise", "a set"),
         ("certificate.seal", "x"),
         ("certificate.scenario", "x"),
         ("certificate.versions", {}),
