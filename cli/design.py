@@ -35,13 +35,13 @@ from design.certificate import (
     switching_requirement,
 )
 from design.designs import KINDS, NO_LONGER, compare_methods, design_by_kind, usual_condition
+from design.files import out_file
 from design.optimal import OBJECTIVES, Optimal, Options, box_around, robustness, spread
 from design.ranges import SAMPLES, SetCheck, check_set, cost_part, price, set_part, set_rows
 from design.result import METHODS, Design, DesignFailed, listed
 from design.spring_damper import STIFFEST
 from design.transparency import BAND_HZ, transparency
 from sim import report
-from sim.files import out_file
 from sim.scenario import InputError, Scenario
 
 
@@ -54,12 +54,22 @@ def main(argv: list[str]) -> int:
     out = out_file(args.out, f"out/design-{args.case}.json", "the file of the coupling")
     scenario = options.scenario_from(args)
     loop = _loop(args, scenario)
+    if args.samples is not None and loop.box is None:
+        raise InputError("--samples without ranges: give --ranges, or a scenario with [box]")
     design = _design(args, loop)
     best = design if isinstance(design, Optimal) else None
     held = best and best.certificate
     requirements = assess(loop, design.coupling, design.phi, held)
     with render.progress("searching the ranges") as move:
-        whole = check_set(loop, design.coupling, args.seed, args.samples, move, best and best.searched, held)
+        whole = check_set(
+            loop,
+            design.coupling,
+            args.seed,
+            SAMPLES if args.samples is None else args.samples,
+            move,
+            best and best.searched,
+            held,
+        )
     certificates = report.certificates_part(requirements)
     limits = Limits(None, "as asked") if args.limiter is False else covered_limits(loop, design.coupling, requirements)
     outcome = {
@@ -113,7 +123,7 @@ def _parser() -> options.Parser:
     optimal = parser.add_argument_group("optimal: the best filter of the environment's forces")
     add_optimal_options(optimal)
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"
-    parser.add_argument("--samples", type=options.whole(0, 10_000), default=SAMPLES, metavar="N", help=samples)
+    parser.add_argument("--samples", type=options.whole(0, 10_000), metavar="N", help=samples)
     ccl.add_argument("--full", action="store_true", help="across channels (default: diagonal)")
     options.add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case>.json)")
     return parser

@@ -17,12 +17,14 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.text import Text
 from matplotlib.ticker import NullFormatter
 
 from controller.lti import Array
-from sim.files import write
+from design.files import printable, write
 from sim.limit_cycles import UNDECIDED
 from sim.stability import MARGINAL
 from sim.trace import Trace
@@ -70,10 +72,22 @@ def _entries(axis: Axes) -> dict[str, Any]:
 
 
 def _save(figure: Figure, path: Path, dpi: int = 130) -> Path:
+    _literal(figure)
     try:
         return write(path, lambda file: figure.savefig(file, format="png", dpi=dpi))
     finally:
         plt.close(figure)
+
+
+def _literal(figure: Figure) -> None:
+    """Names that users gave as they are: no mathematics between dollars, and a mark for what the font cannot show."""
+    glyphs = get_font(findfont(FontProperties())).get_charmap()
+    axes = [axis for panel in figure.axes for axis in (panel.xaxis, panel.yaxis)]
+    ticks = {label for axis in axes for label in (*axis.get_ticklabels(which="both"), axis.get_offset_text())}
+    for text in set(figure.findobj(Text)) - ticks:
+        text.set_parse_math(False)
+        shown = printable(text.get_text())
+        text.set_text("".join(c if ord(c) in glyphs or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in shown))
 
 
 def _plain_numbers(axes: Any) -> None:
