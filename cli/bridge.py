@@ -65,6 +65,7 @@ def main(argv: list[str]) -> int:
     if args.energy_budget and not args.energy_budget[0]:
         raise InputError("--energy-budget is 0 J: encoders are tested by a small force at arming, give it 0.01 or so")
     settings = replace(settings, rereference=not args.no_rereference, energy_budget=args.energy_budget)
+    settings = replace(settings, deadman=args.deadman == "device")
     session = session_for(scenario, settings, **limits_from(args, scenario))
     session.record = recorder = Recorder(scenario.channels)
     out = out_folder(args, "bridge")

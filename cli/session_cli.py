@@ -65,8 +65,8 @@ def add_safety_options(parser: argparse.ArgumentParser) -> None:
     safety.add_argument("--thermal-time", default="10", metavar="SECONDS", help="of the motors' heating (default 10)")
     absolute = "count positions from the encoders' zero, not from where the handles are at arming"
     safety.add_argument("--no-rereference", action="store_true", help=absolute)
-    who = "forces act only while a key is pressed, or FILE is touched, once a second"
-    safety.add_argument("--deadman", metavar="key|FILE", help=who)
+    who = "forces act only while a key is pressed, or FILE is touched, once a second, or the device's own one is held"
+    safety.add_argument("--deadman", metavar="key|device|FILE", help=who)
     safety.add_argument("--no-preflight", action="store_true", help="do not look at this machine for two seconds first")
 
 
@@ -198,7 +198,7 @@ def hold_session(
             show(session)
 
         named = getattr(args, "deadman", None)
-        deadman = None if named is None else touched(named) if named != "key" else lambda: False
+        deadman = None if named in (None, "device") else touched(named) if named != "key" else lambda: False
         auto_arm = args.arm or args.emulate
         live = Live(session, port, plan, auto_arm, seconds, keyboard, glance, float(args.pace), deadman)
         live.run()

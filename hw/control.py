@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from controller.budget import EnergyBudget
+from controller.budget import EPS, EnergyBudget
 from controller.coupling import Coupling
 from controller.environment import environment
 from controller.loop import force_map
@@ -141,7 +141,7 @@ class SentBudget:
         return {
             "start_J": self.plan.start,
             "cap_J": self.plan.cap,
-            "eps": 0.05,
+            "eps": EPS,
             "guarantee": f"no passive hand is given {given} in an arming beyond what the devices dissipate, "
             "whatever computes the forces",
             "ticks": budget.ticks,

@@ -45,6 +45,7 @@ class LinkSettings:
     test_encoders: bool = True  # by a small force at every arming
     energy_budget: tuple[float, float] | None = None  # W0 and cap [J]
     rereference: bool = True  # positions count from where the handles are at arming
+    deadman: bool = False  # forces act only while the deadman at the device is held
 
 
 # the delay, timed at zero force
