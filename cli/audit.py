@@ -6,6 +6,7 @@ import argparse
 import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +15,11 @@ from rich.table import Table
 from cli import options, render
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.loop import DelayRange
-from design.audit import LONGEST_DELAY, PRESETS, Subject, report
+from design.audit import LONGEST_DELAY, Subject, report
 from design.designs import KINDS
 from design.ranges import check_set, set_rows
 from design.result import CONDITION_NAMES, listed
+from models.device import CATALOGUE, Listed, listed_device
 from sim.couplings import check_stored, fitted, read_coupling
 from sim.report import encoder_steps
 from sim.scenario import InputError, Scenario
@@ -25,12 +27,16 @@ from sim.scenario import InputError, Scenario
 EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
   python -m design.audit --rigid --K 5000 --B 0 --T 1e-3 --theta 0 --delta 1.37
   python -m design.audit --case I --K 879,552 --B 0.39,0.52 --jitter 1,2
-  python -m design.audit --preset chai3d-omega3"""
+  python -m design.audit --device falcon --delta 0.5
+  python -m design.audit --devices"""
 
 
 def main(argv: list[str]) -> int:
     """Audit a coupling. 0: safe in this environment and at every vertex of its ranges, 1: not."""
-    args = _with_preset(_parser().parse_args(argv))
+    args = _parser().parse_args(argv)
+    if args.devices:
+        return _list_devices(args)
+    args = _with_device(args)
     scenario = options.scenario_from(args)
     subject = _subject(args, scenario)
     switching = _switching(args, scenario, subject)
@@ -43,7 +49,8 @@ def main(argv: list[str]) -> int:
     outcome = {
         "case": args.case,
         "scenario": None if args.rigid else scenario.name,
-        "preset": args.preset and {"name": args.preset, "source": PRESETS[args.preset].source},
+        "device": args.device and {"name": args.device, **_device_part(CATALOGUE[args.device])},
+        "preset": args.preset and {"name": args.preset, "source": args.source},
         **report(subject, switching, whole),
         "encoder": None if args.rigid else encoder_steps(scenario, args.case, subject.coupling),
         "notes": _notes(args, scenario, switching),
@@ -65,8 +72,10 @@ def _parser() -> options.Parser:
     damping = options.several(float, 0, 1e6, "N s/m")
     coupling.add_argument("--B", type=damping, metavar="B,B,..", help="damping per channel [N s/m]; one is for all")
     coupling.add_argument("--coupling", metavar="FILE.json", help="a stored coupling, in place of --K and --B")
-    preset = "limits that a framework ships; other options go first"
-    coupling.add_argument("--preset", choices=tuple(PRESETS), help=preset)
+    device = "its damping and, where no gains are given, the largest that CHAI3D allows it, on a rigid wall at 1 kHz"
+    coupling.add_argument("--device", metavar="NAME", help=f"of the catalogue: {device}; other options go first")
+    coupling.add_argument("--preset", choices=("chai3d-omega3",), help="as --device omega.3")
+    coupling.add_argument("--devices", action="store_true", help="list the catalogue, with a source for every number")
     options.add_loop_options(parser)
     options.add_rigid_option(parser)
     switching = "also any switching of the forces' delays in this range [samples]; or LO-HI,LO-HI,.. per channel"
@@ -75,16 +84,69 @@ def _parser() -> options.Parser:
     return parser
 
 
-def _with_preset(args: argparse.Namespace) -> argparse.Namespace:
-    """The options, with a preset's numbers where none are given."""
-    if not args.preset:
+def _with_device(args: argparse.Namespace) -> argparse.Namespace:
+    """The options, with a device's numbers where none are given; `source` allows its gains. Raises InputError."""
+    if not args.device and not args.preset:
         return args
-    if args.coupling:
+    if args.device and args.preset:
+        raise InputError("--device with --preset: give one of them")
+    if args.preset and args.coupling:
         raise InputError("--preset with --coupling: give one of them")
-    preset = PRESETS[args.preset]
-    fixed = {"K": (preset.K,), "B": (preset.B,), "T": preset.T, "theta": (0,), "rigid": True}
-    given = {name: value for name, value in vars(args).items() if value is not None and value is not False}
-    return argparse.Namespace(**(vars(args) | fixed | given))
+    try:
+        name, device = listed_device(args.device or "omega.3")
+    except ValueError as error:
+        raise InputError(f"--{error}") from None
+    found: dict[str, Any] = {"device": name, "source": None}
+    if args.delta is None:
+        if device.damping is None:
+            raise InputError(f"--device {name}: nobody publishes its damping: give --delta, as measured by hw.identify")
+        found["delta"] = (device.damping[0].value,)
+    gained = args.coupling or args.case == "none" or (args.K and args.B and not args.preset)
+    if device.stiffness and device.framework_damping and not gained:
+        found["source"] = f"K and B: {device.stiffness.source}; T: the 1 kHz that haptic loops customarily run at"
+        largest = {"K": (device.stiffness.value,), "B": (device.framework_damping.value,)}
+        given = {key: value for key, value in vars(args).items() if value is not None and value is not False}
+        found |= {key: value for key, value in (largest | FRAMEWORK_LOOP).items() if key not in given}
+    return argparse.Namespace(**(vars(args) | found))
+
+
+FRAMEWORK_LOOP: dict[str, Any] = {"T": 1e-3, "theta": (0,), "rigid": True}
+
+UNITS = {"damping": 1.0, "mass": 1e3, "force_limit": 1.0, "encoder_step": 1e6, "friction": 1.0, "stiffness": 1.0}
+
+
+def _device_part(device: Listed) -> dict[str, Any]:
+    """What is known of a device, each number with its source; null is what nobody publishes."""
+    part: dict[str, Any] = {"title": device.title}
+    for name in (*UNITS, "framework_damping"):
+        fact = getattr(device, name)
+        if name == "damping" and fact:
+            part[name] = {"least": fact[0].value, "most": fact[1].value, "source": fact[0].source}
+        else:
+            part[name] = fact and asdict(fact)
+    return part
+
+
+def _list_devices(args: argparse.Namespace) -> int:
+    """Print the catalogue."""
+    parts = {name: _device_part(device) for name, device in CATALOGUE.items()}
+    sources = [part[field]["source"] for part in parts.values() for field in part if field != "title" and part[field]]
+    numbered = {source: i for i, source in enumerate(dict.fromkeys(sources), start=1)}
+
+    def cell(part: dict[str, Any], field: str) -> str:
+        fact = part[field]
+        if fact is None:
+            return "unknown"
+        value = fact["least"] if field == "damping" else fact["value"]
+        return f"{value * UNITS[field]:g}[{numbered[fact['source']]}]"
+
+    heads = ("device", "N s/m", "g", "N", "um", "N", "N/m")
+    rows = [(name, *(cell(part, field) for field in UNITS)) for name, part in parts.items()]
+    title = "damping, mass, force, encoder step, Coulomb friction, and the stiffness that CHAI3D allows"
+    lines = [f"[{i}] {source}" for source, i in numbered.items()]
+    lines.append("What is unknown is given beside `device` in a scenario, or with --delta: hw.identify measures it.")
+    render.publish(args, {"devices": parts}, [render.grid(title, heads, rows)], lines)
+    return options.DONE
 
 
 def _subject(args: argparse.Namespace, scenario: Scenario) -> Subject:
@@ -122,7 +184,7 @@ def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Co
         missing = "B" if gains == ["K"] else "K"
         raise InputError(f"--{gains[0]} without --{missing}: a spring-damper has both (--B 0 is a spring alone)")
     if not gains:
-        raise InputError("nothing to audit: give --K and --B, --coupling FILE.json, --preset NAME or --case none")
+        raise InputError("nothing to audit: give --K and --B, --coupling FILE.json, --device NAME or --case none")
     K, B = (options.per_channel(f"--{name}", getattr(args, name), channels) for name in "KB")
     return SpringDamper(K, B)
 

@@ -14,7 +14,7 @@ from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring
 from controller.lti import Lti
 from design import certificate as store
-from design.audit import MOST_EXTRA_SAMPLES, PRESETS, Subject, edge, remedies, report, stiffest, tolerance
+from design.audit import MOST_EXTRA_SAMPLES, Subject, edge, remedies, report, stiffest, tolerance
 from design.certificate import CAVEATS, promise
 from design.result import CASE_I
 
@@ -202,6 +202,10 @@ def test_edge_takes_the_certified_side():
         (["--preset", "chai3d-omega3"], 1, 32.5),
         (["--preset", "chai3d-omega3", "--B", "0"], 1, 2.5),
         (["--preset", "chai3d-omega3", "--B", "0", "--K", "2000"], 0, 1.0),
+        (["--device", "omega.3"], 1, 32.5),
+        (["--device", "falcon", "--delta", "0.5"], 1, 21.5),
+        (["--device", "omega", "--case", "I", "--K", "2870,2320", "--B", "5.47,5.55"], 1, 1.39871),
+        (["--device", "touch", "--delta", "1.37", "--K", "879,552", "--B", ".39,.52"], 0, 0.714344),
         (["--case", "none"], 1, 1.7229),
         (["--K", "879,552", "--B", ".39,.52"], 0, 0.714344),
         (["--scenario", "three-rigid", "--K", "300", "--B", "0.2"], 0, None),
@@ -227,7 +231,8 @@ def test_the_report_is_kept(run, tmp_path):
 
 def test_a_preset_names_its_source(run):
     outcome = strict(run("--preset", "chai3d-omega3", "--json", "-")[1])
-    assert outcome["preset"] == {"name": "chai3d-omega3", "source": PRESETS["chai3d-omega3"].source}
+    assert outcome["preset"]["name"] == "chai3d-omega3"
+    assert "CDeltaDevices.cpp" in outcome["preset"]["source"]
     assert (outcome["loop"]["T_s"], outcome["loop"]["theta"]) == (1e-3, [0])
 
 
@@ -272,6 +277,10 @@ BAD = [
     ("--rigid --case none", "--rigid with --case none"),
     ("--case none --K 1 --B 1", "--K with --case none"),
     ("--preset chai3d", "invalid choice: 'chai3d'"),
+    ("--device falkon --delta 1", "--device is 'falkon' (did you mean falcon?), the catalogue has omega.3, delta.3"),
+    ("--device falcon", "--device falcon: nobody publishes its damping: give --delta"),
+    ("--device hapkit --delta 1", "nothing to audit"),
+    ("--device falcon --preset chai3d-omega3", "--device with --preset"),
     ("--preset chai3d-omega3 --coupling gains.json", "--preset with --coupling"),
     ("--coupling gains.json --K 1", "--K with --coupling"),
     ("--coupling gains.json --scenario three-rigid", "gains.json couples 2 channels, the loop has 3"),
@@ -299,6 +308,28 @@ def test_bad_calls_get_one_line_and_exit_code_2(run, options, message):
     assert err.startswith("error: ")
     assert message in err
     assert err.count("\n") == 1
+
+
+def test_the_catalogue_has_a_source_for_every_number(run):
+    code, out, err = run("--devices", "--json", "-")
+    devices = strict(out)["devices"]
+    assert code == 0
+    assert set(devices) >= {
+        "omega.3",
+        "delta.3",
+        "falcon",
+        "touch",
+        "phantom-premium",
+        "haply-2diy",
+        "inverse3",
+        "hapkit",
+    }
+    for name, device in devices.items():
+        assert name in err
+        for field, fact in device.items():
+            assert field == "title" or fact is None or fact["source"]
+    assert devices["falcon"]["damping"] is None
+    assert "unknown" in err
 
 
 def test_help_has_an_example(run):
