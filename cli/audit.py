@@ -14,8 +14,8 @@ from rich.table import Table
 
 from cli import options, render
 from controller.coupling import Coupling, NoCoupling, SpringDamper
-from controller.loop import DelayRange
-from design.audit import LONGEST_DELAY, Subject, report
+from controller.loop import DelayRange, Loop
+from design.audit import LONGEST_DELAY, report
 from design.designs import KINDS
 from design.ranges import check_set, set_rows
 from design.result import CONDITION_NAMES, listed
@@ -38,21 +38,25 @@ def main(argv: list[str]) -> int:
         return _list_devices(args)
     args = _with_device(args)
     scenario = options.scenario_from(args)
-    subject = _subject(args, scenario)
-    switching = _switching(args, scenario, subject)
+    loop = options.rigid_loop(args, scenario) if args.rigid else scenario.loop(args.case)
+    coupling = _coupling(args, loop.channels, scenario)
+    switching = _switching(args, loop)
     out = options.out_folder(args, "audit")
 
     begin = time.perf_counter()
     with render.progress("searching the ranges") as move:
-        loop = None if args.rigid else scenario.loop(args.case)
-        whole = loop and check_set(loop, subject.coupling, args.seed, progress=move)
+        whole = check_set(loop, coupling, args.seed, progress=move)
+    try:
+        judged = report(loop, coupling, switching, whole)
+    except ValueError as error:
+        raise InputError(str(error)) from None
     outcome = {
         "case": args.case,
         "scenario": None if args.rigid else scenario.name,
         "device": args.device and {"name": args.device, **_device_part(CATALOGUE[args.device])},
         "preset": args.preset and {"name": args.preset, "source": args.source},
-        **report(subject, switching, whole),
-        "encoder": None if args.rigid else encoder_steps(scenario, args.case, subject.coupling),
+        **judged,
+        "encoder": None if args.rigid else encoder_steps(scenario, args.case, coupling),
         "notes": _notes(args, scenario, switching),
         "wall_s": time.perf_counter() - begin,
     }
@@ -149,21 +153,6 @@ def _list_devices(args: argparse.Namespace) -> int:
     return options.DONE
 
 
-def _subject(args: argparse.Namespace, scenario: Scenario) -> Subject:
-    """The coupling in its loop. Raises InputError."""
-    if args.rigid:
-        loop: dict[str, Any] = {"network": None, "delta": scenario.delta[:1], **options.rigid_loop(args, scenario)}
-    else:
-        delays = {"theta": scenario.theta, "psi": scenario.psi}
-        loop = {"network": scenario.environment, "delta": scenario.delta, **delays}
-    coupling = _coupling(args, len(loop["delta"]), scenario)
-    try:
-        m, late = len(loop["delta"]), scenario.latency
-        return Subject(coupling, T=scenario.T, T_max=scenario.T_max, latency=late and late[:m], **loop)
-    except ValueError as error:
-        raise InputError(str(error)) from None
-
-
 def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Coupling:
     gains = [name for name in ("K", "B") if getattr(args, name) is not None]
     given = [f"--{name}" for name in (*gains, *(["coupling"] if args.coupling else []))]
@@ -189,15 +178,15 @@ def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Co
     return SpringDamper(K, B)
 
 
-def _switching(args: argparse.Namespace, scenario: Scenario, subject: Subject) -> DelayRange | None:
+def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
     """The range of --jitter, or of the scenario, around the constant theta that the other conditions are about.
 
     Raises InputError.
     """
     if args.jitter is None:
-        return None if args.rigid else scenario.loop(args.case).jitter
-    lo, hi = options.ranges_per_channel("--jitter", args.jitter, subject.channels)
-    for i, (least, n, largest) in enumerate(zip(lo, subject.theta, hi, strict=True)):
+        return loop.jitter
+    lo, hi = options.ranges_per_channel("--jitter", args.jitter, loop.channels)
+    for i, (least, n, largest) in enumerate(zip(lo, loop.theta, hi, strict=True)):
         if not 0 <= least <= n <= largest <= LONGEST_DELAY:
             allowed = f"0 <= LO <= theta = {n} <= HI <= {LONGEST_DELAY} samples (--theta gives another)"
             raise InputError(f"--jitter on channel {i + 1} is {least} to {largest}, expected {allowed}")
