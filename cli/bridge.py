@@ -44,6 +44,7 @@ from hw.control import CertifiedCoupling, certified_couplings
 from hw.limits import Stage
 from hw.monitor import Ages
 from hw.recording import Recorder, outcome, save
+from hw.seam import Timing
 from hw.session import session_for
 from sim.couplings import NAMES
 from sim.files import write_json
@@ -70,9 +71,13 @@ def main(argv: list[str]) -> int:
     session.record = recorder = Recorder(scenario.channels)
     out = out_folder(args, "bridge")
 
-    def plan(ages: Ages) -> Sequence[CertifiedCoupling]:
-        link = measured_link(args, ages, scenario.T)
-        programs = certified_couplings(scenario, args.case, args.coupling, args.condition, link)
+    def plan(ages: Ages, timing: Timing | None) -> Sequence[CertifiedCoupling]:
+        if timing:
+            link, judged = 0, timing.judged(scenario, ages, float(args.quantile), 1e6 * float(args.guard))
+            programs = certified_couplings(judged, args.case, args.coupling, args.condition, link, spare=0)
+        else:
+            link = measured_link(args, ages, scenario.T)
+            programs = certified_couplings(scenario, args.case, args.coupling, args.condition, link)
         print_certificate(ages, link, programs, console(args))
         return programs
 
@@ -117,7 +122,8 @@ def print_certificate(ages: Ages, link: int, programs: Sequence[CertifiedCouplin
     at = {p: int(np.percentile(ages.values, p)) for p in (50, 99)}
     console.print(
         f"answers are {at[50]} us old, {at[99]} us at the 99th percentile, {ages.missing} of "
-        f"{len(ages.values) + ages.missing} never arrived: a link of {link} tick{'s' if link > 1 else ''}"
+        f"{len(ages.values) + ages.missing} never arrived: "
+        + (f"a link of {link} tick{'s' if link > 1 else ''}" if link else "the host is the clock")
     )
     table = Table(title="certified for the delay measured, and softer in reserve")
     table.add_column("coupling", min_width=13)

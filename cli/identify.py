@@ -34,6 +34,7 @@ from hw.identify import Estimate, Excitation, capped, chirp, estimate, held
 from hw.limits import Stage
 from hw.monitor import Ages
 from hw.recording import Recorder, outcome, result_of
+from hw.seam import Timing
 from hw.session import Session, session_for
 from models.device import RigidDevice
 from sim.files import write, write_json
@@ -65,8 +66,8 @@ def main(argv: list[str]) -> int:
     session = session_for(asks_nothing, replace(settings, test_encoders=False), cap=force)
     session.record = recorder = Recorder(scenario.channels)
 
-    def plan(ages: Ages) -> Sequence[Excitation]:
-        link = measured_link(args, ages, scenario.T)
+    def plan(ages: Ages, timing: Timing | None) -> Sequence[Excitation]:
+        link = 0 if timing else measured_link(args, ages, scenario.T)
         return [chirp(scenario.channels, scenario.T, link, force, (low, high), seconds)]
 
     played = 2.5 * seconds + 0.1  # from full gain on: the lead has the ramp

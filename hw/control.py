@@ -335,7 +335,11 @@ class CertifiedCoupling:
         }
 
     def remarks(self) -> list[str]:
-        """What a reader should know of the coupling's file."""
+        """What a reader should know of the coupling's file, and of the clock."""
+        if self.scenario.latency and self.scenario.T_max:
+            kept = f"periods up to {1e6 * self.scenario.T_max:.0f} us"
+            kept += f", forces at most {1e6 * max(most for _, most in self.scenario.latency):.0f} us after their sample"
+            return [*self.chosen.notes, f"the host is the clock: certified for {kept}, as measured here"]
         if self.held < 1:
             return list(self.chosen.notes)
         answers = "1 missed answer" if self.held == 1 else f"{self.held} missed answers in a row"
@@ -345,7 +349,7 @@ class CertifiedCoupling:
 def certified_coupling(
     scenario: Scenario, case: str, name: str | None, condition: str | None, link: int, given: Coupling | None = None
 ) -> CertifiedCoupling:
-    """The coupling `name`, or the one that is `given`, for a link of `link` ticks, with its certificates.
+    """The coupling `name`, or the one that is `given`, for a link of `link` ticks (0: the host is the clock).
 
     Raises Fault where no coupling is certified for it, InputError where the request contradicts itself.
     """
@@ -353,11 +357,12 @@ def certified_coupling(
         raise Fault(f"the link takes {link} ticks, the protocol carries at most theta = {MAX_THETA}")
     slower = scenario.replace(theta=tuple(max(n, link) for n in scenario.theta))
     try:
-        chosen = Chosen("given", given, "closed-loop") if given else choose(slower, case, name, condition)
+        by = condition or ("closed-loop" if scenario.latency and name is None else None)  # what latency is derived for
+        chosen = Chosen("given", given, "closed-loop") if given else choose(slower, case, name, by)
     except DesignFailed as error:
         raise Fault(f"no coupling for a link of {link} ticks: {error}") from None
     requirements = assess(slower.loop(case), chosen.coupling, chosen.phi)
-    made = CertifiedCoupling(min(slower.theta), slower, case, chosen, requirements)
+    made = CertifiedCoupling(min(slower.theta) if link else 0, slower, case, chosen, requirements)
     if not made.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"
         raise Fault(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(made)}")

@@ -336,8 +336,8 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for i in range(m):
             require(f"force_step[{i}]", self.force_step[i], 1e-9, 1.0, "N")
             require(f"cap[{i}]", self.cap[i], 1, 0x7FFF, "steps")
-        if not 1 <= self.link_delay <= least:
-            raise ValueError(f"link_delay is {self.link_delay}, allowed are 1 to {least}, the scenario's least theta")
+        if not 0 <= self.link_delay <= least:
+            raise ValueError(f"link_delay is {self.link_delay}, allowed are 0 to {least}, the scenario's least theta")
 
     def controller(self) -> LinearController:
         """F as the host ran it. Raises InputError where nothing can have run."""

@@ -285,7 +285,7 @@ class Session:
 
     def _take(self, index: int, cause: str) -> bytes:
         self.program = self.programs[index]
-        return self._configure(self.program.link, f"{self.program.name}: {cause}")
+        return self._configure(max(1, self.program.link), f"{self.program.name}: {cause}")
 
     # the stream of STATEs
 
