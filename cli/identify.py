@@ -34,11 +34,10 @@ from hw.identify import Estimate, Excitation, capped, chirp, estimate, held
 from hw.limits import Stage
 from hw.monitor import Ages
 from hw.recording import Recorder, outcome, result_of
-from hw.seam import Timing
 from hw.session import Session, session_for
 from models.device import RigidDevice
 from sim.files import write, write_json
-from sim.scenario import InputError, Scenario, require_constant_delay, require_linear
+from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
 LIMITS = (
     "The bound is a statement about this record: the least viscous friction of all laws that fit it, less its scatter "
@@ -56,6 +55,7 @@ def main(argv: list[str]) -> int:
     scenario, seed, settings = scenario_from(args), seed_from(args), check_link(args)
     require_linear(scenario, "hw.identify")
     require_constant_delay(scenario, "hw.identify")
+    require_even_ticks(scenario, "hw.identify")
     force, seconds = number(args, "force", 0.05, 6.0), number(args, "seconds", 0.5, 30.0)
     low, high = numbers("--band", args.band, float, 2)
     if not 0.5 <= low < high <= 0.4 / scenario.T:
@@ -66,8 +66,8 @@ def main(argv: list[str]) -> int:
     session = session_for(asks_nothing, replace(settings, test_encoders=False), cap=force)
     session.record = recorder = Recorder(scenario.channels)
 
-    def plan(ages: Ages, timing: Timing | None) -> Sequence[Excitation]:
-        link = 0 if timing else measured_link(args, ages, scenario.T)
+    def plan(ages: Ages) -> Sequence[Excitation]:
+        link = measured_link(args, ages, scenario.T)
         return [chirp(scenario.channels, scenario.T, link, force, (low, high), seconds)]
 
     played = 2.5 * seconds + 0.1  # from full gain on: the lead has the ramp

@@ -22,7 +22,8 @@ from controller.delay import LOST, Jitter
 from controller.environment import RIGID_WALL
 from controller.loop import Loop
 from controller.lti import SingularLoop
-from design.result import CONDITION_NAMES, DesignFailed
+from controller.timing import Periods
+from design.result import OLDER_NAMES, DesignFailed
 from models.device import MOST_DAMPING
 from sim.files import check_file, folder, nobody_reads
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
@@ -122,12 +123,11 @@ def latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
 
 
 def condition(text: str) -> str:
-    """A condition by its name, or by the name that it had before, as reports and files call it."""
-    known = {name: key for key, name in CONDITION_NAMES.items()} | {key: key for key in CONDITION_NAMES}
-    if text not in known:
-        allowed = ", ".join(CONDITION_NAMES.values())
-        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {allowed}")
-    return known[text]
+    """A condition by its name, or by the name that it had before."""
+    name = OLDER_NAMES.get(text, text)
+    if name not in OLDER_NAMES.values():
+        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(OLDER_NAMES.values())}")
+    return name
 
 
 def _one(kind: Callable[[str], Number], least: float, most: float, unit: str) -> Callable[[str], Number]:
@@ -223,8 +223,8 @@ def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: s
 
 def add_condition_option(parser: argparse._ActionsContainer, what: str = "that the certificate is about") -> None:
     """--condition."""
-    names = ",".join(CONDITION_NAMES.values())
-    help_ = f"{what}: {' or '.join(CONDITION_NAMES.values())} (default: the coupling's own)"
+    names = ",".join(OLDER_NAMES.values())
+    help_ = f"{what}: {' or '.join(OLDER_NAMES.values())} (default: the coupling's own)"
     parser.add_argument("--condition", type=condition, metavar=f"{{{names}}}", help=help_)
 
 
@@ -299,7 +299,7 @@ def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
             theta,
             scenario.delta[:1],
             RIGID_WALL,
-            T_max=scenario.T_max,
+            T_max=scenario.longest_period,
             latency=late and late[:1],
         )
     except ValueError as error:
@@ -314,8 +314,10 @@ DRAWN = ("constant", "random", "bursty", "adversarial")
 
 
 def add_varying_delay_options(parser: argparse.ArgumentParser) -> None:
-    """--jitter, --pattern, --loss and --playout."""
-    group = parser.add_argument_group("delays that vary")
+    """--period, --jitter, --pattern, --loss and --playout."""
+    group = parser.add_argument_group("delays and periods that vary")
+    periods = "periods [s], drawn anew at every tick between two of them, or a file of recorded ones"
+    group.add_argument("--period", metavar="MIN,MAX|FILE", help=periods)
     span = "range of the forces' delays [samples]; or LO-HI,LO-HI,.. per channel"
     group.add_argument("--jitter", type=delay_ranges, metavar="LO,HI", help=span)
     pattern = f"{', '.join(DRAWN)} (default random), or a file of recorded delays, a row per tick"
@@ -326,7 +328,9 @@ def add_varying_delay_options(parser: argparse.ArgumentParser) -> None:
 
 
 def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenario:
-    """The scenario with the delays that the options describe, over those of its file. Raises InputError."""
+    """The scenario with periods and delays that the options describe, over those of its file. Raises InputError."""
+    if args.period is not None:
+        scenario = scenario.replace(period=_periods(args.period))
     changes: dict[str, Any] = {}
     if args.pattern is not None:
         changes |= _pattern(args.pattern, scenario.channels)
@@ -350,6 +354,27 @@ def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenari
         raise InputError(str(error)) from None
     theta = jitter.hi if jitter.playout and args.theta is None else scenario.theta
     return scenario.replace(theta=theta, jitter=jitter)
+
+
+def _periods(text: str) -> Periods:
+    """Of two numbers, or of a file of one column [s]; # begins a comment. Raises InputError."""
+    try:
+        if "," in text and not Path(text).is_file():
+            least, most = numbers("--period", text, float, 2)
+            return Periods(least, most)
+        lines = Path(text).read_text(encoding="utf-8").splitlines()
+        words = [(n, line.split("#")[0].strip()) for n, line in enumerate(lines, start=1)]
+        return Periods(
+            recorded=tuple(numbers(f"--period {text}, line {n}:", word, float, 1)[0] for n, word in words if word)
+        )
+    except OSError as error:
+        raise InputError(f"--period {text}: {error.strerror}; give MIN,MAX in seconds or a file") from None
+    except UnicodeDecodeError:
+        raise InputError(f"--period {text}: not a text file in UTF-8") from None
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"--period: {error}") from None
 
 
 def _pattern(name: str, channels: int) -> dict[str, Any]:

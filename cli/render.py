@@ -21,7 +21,7 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
-from design.result import CONDITION_NAMES, listed
+from design.result import listed
 from sim.files import nobody_reads, write_json
 
 # ----------------------------------------------------------------------------------------------------
@@ -184,7 +184,7 @@ def _formed(value: Any, form: Form) -> str:
 # Phrases that several reports share.
 
 
-ORDER = ("closed-loop", "theorem4")  # of conditions in a table
+ORDER = ("this-environment", "any-environment")  # of conditions in a table
 
 
 def certified(part: Mapping[str, Any]) -> str:
@@ -203,9 +203,9 @@ def needs(part: Mapping[str, Any], digits: int = 6) -> str:
 def certificate_rows(certificates: Mapping[str, dict[str, Any]], digits: int = 6, proof: bool = True) -> Rows:
     """What each condition needs, and whether that is proved exactly, where no other row says it."""
     for name, part in certificates.items():
-        if name in CONDITION_NAMES:
+        if name in ORDER:
             word = certified(part) if proof else certified(part | {"proof": None})
-            yield f"damping, {CONDITION_NAMES[name]}", f"needs {needs(part, digits)}: {word}"
+            yield f"damping, {name}", f"needs {needs(part, digits)}: {word}"
 
 
 def optional(value: float | None, form: str, absent: str = "-") -> str:
@@ -222,6 +222,20 @@ def transparency_error(part: Mapping[str, Any]) -> str:
 def verdict(word: str | None) -> str:
     """Stable or not."""
     return {"stable": "[green]stable[/]", "unstable": "[red]unstable[/]"}.get(word or "", "not decided")
+
+
+def timing_row(part: Mapping[str, Any] | None) -> tuple[str, str | None]:
+    """Periods and latencies of a run or of a validation that are not even."""
+    if part is None:
+        return "ticks", None
+    period, words = part["period_s"], []
+    if period["least"] < period["largest"]:
+        how = "recorded" if part["recorded"] else "drawn"
+        words.append(f"{1e3 * period['least']:.4g} to {1e3 * period['largest']:.4g} ms long, {how}")
+    if part["latency_s"]:
+        spans = (f"{1e3 * a:.4g} to {1e3 * b:.4g}" if a < b else f"{1e3 * a:.4g}" for a, b in part["latency_s"])
+        words.append(f"forces latch {', '.join(dict.fromkeys(spans))} ms later")
+    return "ticks", "; ".join(words)
 
 
 def delay_rows(part: Mapping[str, Any]) -> Rows:

@@ -10,7 +10,7 @@ from typing import Any
 
 from cli import options, render
 from controller.loop import Loop
-from design.certificate import Limits, assess, covered_limits, promise_of
+from design.certificate import Limits, assess, covered_limits, guarantee_of
 from design.designs import usual_condition
 from design.ranges import SetCheck, check_set, set_part, set_rows
 from design.result import listed
@@ -22,7 +22,7 @@ from sim.couplings import NAMES, Chosen, choose
 from sim.engines import INTEGRATORS, default_integrator
 from sim.files import write
 from sim.nets import BASELINES, Classic, EnergyNet, idle, netted
-from sim.run import ENGINES, Simulation, assemble, make_engine, run
+from sim.run import ENGINES, Simulation, assemble, beginnings, make_engine, run
 from sim.scenario import InputError, Scenario, load_humans
 from sim.stability import MARGINAL, stability_part
 from sim.stepping import MOST, check_substeps, default_substeps
@@ -162,7 +162,7 @@ def _limits(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, requir
 
 def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tuple[float, ...] | None) -> _Run:
     """Close the loop. Raises InputError for settings that cannot be."""
-    simulation, period = assemble(scenario, chosen.coupling, lag), None
+    simulation, period = assemble(scenario, chosen.coupling, lag, args.seed), None
     if args.engine == "exact" and simulation.friction:
         raise InputError("--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco")
     if scenario.switches:
@@ -195,7 +195,10 @@ def _net(run: _Run, requirements: dict[str, Any]) -> dict[str, Any]:
     part = run.trace.net.part() if run.trace.net else None
     if part is None or part["guarantee"] is None:
         return {"energy_budget": None, "baseline": part}
-    return {"energy_budget": part | {"idle": idle(run.simulation, requirements["theorem4"], part)}, "baseline": None}
+    return {
+        "energy_budget": part | {"idle": idle(run.simulation, requirements["any-environment"], part)},
+        "baseline": None,
+    }
 
 
 def _steps(args: argparse.Namespace, simulation: Simulation) -> tuple[str | None, int | None, list[str]]:
@@ -237,7 +240,7 @@ def _side_by_side(others: list[Alternative], path: Path) -> Path:
 
 def _panel_title(other: Alternative) -> str:
     kind = ", spring-damper" if other.kind == "spring-damper" else ""
-    guarantee = f"guarantee: {other.promise}" if other.promise else "no guarantee"
+    guarantee = f"guarantee: {other.guarantee}" if other.guarantee else "no guarantee"
     felt = f"grows: {render.optional(other.growth, '{:+.2f} 1/s')}"
     if other.error_percent is not None:
         felt = f"force error {other.error_percent:.2g} %"
@@ -249,7 +252,7 @@ def _certified(chosen: Chosen, requirements: dict[str, Any], loop: Loop, whole: 
     return {
         "certificate": certificates[chosen.condition],
         "certificates": certificates,
-        "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
+        "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
         "set": whole and set_part(whole),
     }
 
@@ -269,18 +272,20 @@ def _unstable(outcome: dict[str, Any]) -> bool | None:
 
 def _settings(args: argparse.Namespace, run: _Run, lam: tuple[int, ...]) -> dict[str, Any]:
     scenario, process, samples = run.simulation.scenario, run.simulation.process, run.trace.t.size
+    duration = float(beginnings(scenario.T, run.simulation.timing, samples, 1)[0])
     return {
         "engine": args.engine,
         "integrator": run.integrator,
         "substeps": run.substeps,
-        "duration_s": samples * scenario.T,
+        "duration_s": duration,
         "samples": samples,
         "wall_s": run.wall_s,
-        "real_time_factor": samples * scenario.T / run.wall_s,
+        "real_time_factor": duration / run.wall_s,
         "theta": list(scenario.theta),
         "psi": list(scenario.psi),
         "lam": list(lam),
         "T_s": scenario.T,
+        "timing": report.timing_part(run.simulation.timing, scenario),
         "seed": args.seed,
         "interrupted": run.trace.interrupted,
         "scenario_digest": scenario.digest,
@@ -343,7 +348,7 @@ def _beside(others: list[Alternative], outcome: dict[str, Any]) -> Any:
         needs = (_share(other.needs(condition), "never") for condition in render.ORDER)
         grows = other.growth is None or other.growth > MARGINAL
         error = "grows" if grows else render.optional(other.error_percent, "{:.3g} %")
-        cells.append((other.name + mark, *needs, other.promise or "none", _share(other.rendered, "-"), error))
+        cells.append((other.name + mark, *needs, other.guarantee or "none", _share(other.rendered, "-"), error))
     heads = ("coupling", "this-env.", "any-env.", "guarantee", "stiffness", "error")
     title = "the same devices with other couplings (*: this run): required damping in % of theirs,"
     return render.grid(f"{title}\nguarantee, rendered stiffness and force error", heads, cells, left=(0, 3))
@@ -359,6 +364,8 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
     gains = coupling["K"] and f"{listed(coupling['K'], 5)} N/m / {listed(coupling['B'], 5)} N s/m"
     rendered = transparent["dc_ratio"] and f"{100 * transparent['dc_ratio']:.1f} %"
     how = "growth, switching" if _unstable(outcome) is not None else "growth, simulated trace"
+    if run["timing"] and "impulse" in stability.get("reason", ""):
+        how = "growth, uneven ticks"
     measured = render.optional(stability["growth_rate_per_s"], "{:+.4f} 1/s")
     engine = run["engine"] + (f" {run['integrator']} x {run['substeps']}" if run["integrator"] else "")
     speed = f"{run['wall_s']:.2f} s for {run['duration_s']:g} s: {run['real_time_factor']:.2g} x real time ({engine})"
@@ -376,20 +383,22 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         *_net_rows(outcome),
         ("growth, eigenvalues", _growth(stability)),
         (how, f"{measured}: {render.verdict(stability['verdict'])}"),
+        render.timing_row(run["timing"]),
         *(render.delay_rows(jitter) if jitter else []),
         *(_contact_rows(contact, run["samples"]) if contact else []),
         ("simulated in", run["environment"] if outcome["set"] else None),
-        ("force limits", _limiter(outcome["limiter"])),
+        ("force limits", _limiter(outcome["limiter"], outcome["promise"])),
         ("limited ticks", f"{stability['clipped_ticks']} of {run['samples']}"),
         ("speed", speed),
         ("position error", position),
     ]
 
 
-def _limiter(part: dict[str, Any]) -> str:
+def _limiter(part: dict[str, Any], guarantee: str | None) -> str:
     limits = f"{listed(part['force_limit'], 4)} N"
     if part["rho"] is None:
-        return f"clipped at {limits}: not covered ({part['reason']})"
+        held = "the guarantee holds while forces stay below the limits" if guarantee else "not covered"
+        return f"clipped at {limits}: {held} ({part['reason']})"
     return f"the guarantee holds also while forces are limited to {limits} ({part['reason']})"
 
 

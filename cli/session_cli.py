@@ -22,7 +22,7 @@ from hw.emulator import nobody as without_hands
 from hw.monitor import Ages, LinkSettings
 from hw.recording import IncidentLog
 from hw.rehearsal import Rehearsal
-from hw.seam import FORCE_DIMENSION, DeviceWire, ForceDimension, Timing
+from hw.seam import FORCE_DIMENSION, DeviceWire, ForceDimension
 from hw.session import Operator, Session
 from hw.transport import Live, SerialPort, Wire, preflight
 from sim.scenario import InputError, Scenario
@@ -175,7 +175,7 @@ class Held:
 def hold_session(
     args: argparse.Namespace,
     session: Session,
-    plan: Callable[[Ages, Timing | None], Sequence[Program]],
+    plan: Callable[[Ages], Sequence[Program]],
     seconds: float,
     seed: int,
     out: Path,
@@ -191,9 +191,8 @@ def hold_session(
         stack.callback(incidents.close)
         incidents.attach(session)
         if args.rehearse:
-            return _rehearsed(args, session, lambda ages: plan(ages, None), seconds, seed, incidents, nobody, coulomb)
+            return _rehearsed(args, session, plan, seconds, seed, incidents, nobody, coulomb)
         port: Wire
-        device = None
         if host_clocked(args):
             axes = args.port.partition(":")[2] or None
             device = stack.enter_context(ForceDimension(session.scenario, axes))
@@ -219,11 +218,10 @@ def hold_session(
         named = getattr(args, "deadman", None)
         deadman = None if named in (None, "device") else touched(named) if named != "key" else lambda: False
         auto_arm = args.arm or args.emulate
-        timing = device and (lambda: device.timing)
         live = Live(
             session,
             port,
-            lambda ages: plan(ages, timing and timing()),
+            plan,
             auto_arm,
             seconds,
             keyboard,

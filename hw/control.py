@@ -2,7 +2,8 @@
 
 The link takes `link` ticks from a sample to the latch of its force, for every axis. Channels whose delay theta_i
 in the scenario is longer wait for the rest, theta_i - link, on the host: the loop has the scenario's delays as long
-as the link is no slower, and longer ones where it is.
+as the link is no slower, and longer ones where it is. Where the device latches a force as soon as it comes, link is 0
+and the scenario's latency is what was measured.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from controller.coupling import Coupling
 from controller.environment import environment
 from controller.loop import force_map
 from controller.lti import Array, Lti
-from design.certificate import assess, certificate_part, promise_of
+from design.certificate import assess, certificate_part, guarantee_of
 from design.conditions import Requirement
 from design.result import DesignFailed
 from hw.limits import Fault, Gain, Heat, Limits, Units, check_jolt, check_jump, check_range, check_speed, shape
@@ -32,7 +33,7 @@ from sim.report import coupling_part
 from sim.scenario import InputError, Scenario
 
 _SPEED_SECONDS = 0.01  # over which a speed is taken: one count of the coarsest encoder is 0.03 m/s
-_FALLBACK = ("spring-damper", "theorem4")  # what softer couplings are where the one asked for cannot be had
+_FALLBACK = ("spring-damper", "any-environment")  # what softer couplings are where the one asked for cannot be had
 
 
 class Controller(Protocol):
@@ -272,6 +273,32 @@ def link_delay(ages: Ages, T_us: float, quantile: float, guard_us: float) -> int
     return max(1, int(-(-needed // T_us)))
 
 
+def timed(
+    scenario: Scenario, ages: Ages, quantile: float, guard_us: float, at_once: bool = False
+) -> tuple[Scenario, int]:
+    """The scenario with what was measured of its ticks, and the ticks that the link takes.
+
+    T_max is the length that a fraction `quantile` of the device's ticks keeps, where it exceeds T. `at_once`: forces
+    latch as they come, link 0, between the least age and the one that a fraction keeps, both with the guard. Raises
+    Fault where those are a period or longer.
+    """
+    T_us = 1e6 * scenario.T
+    longest, known = ages.longest_tick(T_us, quantile), scenario.T_max or scenario.T
+    if longest > 1e6 * known:
+        scenario = scenario.replace(T_max=1e-6 * longest)
+    if not at_once:
+        return scenario, link_delay(ages, T_us, quantile, guard_us)
+    least, most = max(0.0, min(ages.values) - guard_us), ages.quantile(quantile) + guard_us
+    if most >= min((T_us, *ages.ticks)):
+        raise Fault(f"answers come up to {most:.0f} us after their tick, T is {T_us:g} us: latch at ticks")
+    return scenario.replace(latency=((1e-6 * least, 1e-6 * most),) * scenario.channels), 0
+
+
+def overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
+    """[W] what a tick longer than T_max may give a hand, at most, for each second of its length: sum f^2/(4 delta)."""
+    return sum(f * f / (4 * d) for f, d in zip(caps, delta, strict=True))
+
+
 class Program(Protocol):
     """What a session can be armed with."""
 
@@ -288,6 +315,11 @@ class Program(Protocol):
     @property
     def name(self) -> str:
         """For the log."""
+        ...
+
+    @property
+    def margin_us(self) -> float:
+        """How long before its latch, or the end of its tick, a force must come; one that comes later is late [us]."""
         ...
 
     def controller(self) -> Controller:
@@ -311,7 +343,14 @@ class CertifiedCoupling:
 
     @property
     def name(self) -> str:
-        return f"{self.chosen.kind} for theta = {list(self.scenario.theta)}"
+        latency = self.scenario.latency
+        late = f" and {1e6 * latency[0][0]:.0f} to {1e6 * latency[0][1]:.0f} us" if latency else ""
+        return f"{self.chosen.kind} for theta = {list(self.scenario.theta)}{late}"
+
+    @property
+    def margin_us(self) -> float:
+        latency = self.scenario.latency
+        return 1e6 * (self.scenario.T - max(most for _, most in latency)) if latency else 0.0
 
     @property
     def held(self) -> int:
@@ -323,23 +362,26 @@ class CertifiedCoupling:
         return host_controller(self.scenario, self.chosen.coupling, self.link)
 
     def part(self) -> dict[str, Any]:
-        """As plain data: coupling, certificates, promise."""
+        """As plain data: coupling, certificates, guarantee."""
         return {
             "link_delay": self.link,
             "theta": list(self.scenario.theta),
+            "latency_s": self.scenario.latency and [list(span) for span in self.scenario.latency],
+            "T_max_s": self.scenario.T_max,
             "coupling": coupling_part(self.chosen.kind, self.chosen.coupling, self.scenario.T),
             "certificate": certificate_part(self.requirements[self.chosen.condition]),
             "certificates": {name: certificate_part(r) for name, r in self.requirements.items()},
-            "promise": promise_of(self.requirements, self.scenario.loop(self.case)),
+            "promise": guarantee_of(self.requirements, self.scenario.loop(self.case)),
             "remarks": self.remarks(),
         }
 
     def remarks(self) -> list[str]:
         """What a reader should know of the coupling's file, and of the clock."""
-        if self.scenario.latency and self.scenario.T_max:
-            kept = f"periods up to {1e6 * self.scenario.T_max:.0f} us"
-            kept += f", forces at most {1e6 * max(most for _, most in self.scenario.latency):.0f} us after their sample"
-            return [*self.chosen.notes, f"the host is the clock: certified for {kept}, as measured here"]
+        if self.scenario.latency:
+            least, most = (1e6 * t for t in self.scenario.latency[0])
+            kept = f"periods up to {1e6 * (self.scenario.T_max or self.scenario.T):.0f} us"
+            kept += f" and forces that act {least:.0f} to {most:.0f} us after their sample"
+            return [*self.chosen.notes, f"forces act as they come: certified for {kept}, as measured"]
         if self.held < 1:
             return list(self.chosen.notes)
         answers = "1 missed answer" if self.held == 1 else f"{self.held} missed answers in a row"
@@ -355,10 +397,12 @@ def certified_coupling(
     """
     if link > MAX_THETA:
         raise Fault(f"the link takes {link} ticks, the protocol carries at most theta = {MAX_THETA}")
-    slower = scenario.replace(theta=tuple(max(n, link) for n in scenario.theta))
+    delays = tuple(max(n, link) for n in scenario.theta)
+    slower = scenario.replace(theta=delays, latency=None if link else scenario.latency)
     try:
-        by = condition or ("closed-loop" if scenario.latency and name is None else None)  # what latency is derived for
-        chosen = Chosen("given", given, "closed-loop") if given else choose(slower, case, name, by)
+        # a latency is derived for this environment only
+        wanted = condition or ("this-environment" if slower.latency else None)
+        chosen = Chosen("given", given, "this-environment") if given else choose(slower, case, name, wanted)
     except DesignFailed as error:
         raise Fault(f"no coupling for a link of {link} ticks: {error}") from None
     requirements = assess(slower.loop(case), chosen.coupling, chosen.phi)
@@ -375,7 +419,7 @@ def certified_couplings(
     """The coupling for the measured delay and up to `spare` softer ones, each for one tick more.
 
     A softer one is of the same kind or from the same file; where that is not certified for the longer delay, it is
-    the spring-damper by Theorem 4, which promises the most. Raises Fault where the first coupling is not certified;
+    the spring-damper by Theorem 4, which guarantees the most. Raises Fault where the first coupling is not certified;
     where no softer one is, the ladder ends.
     """
     found, wanted = [certified_coupling(scenario, case, name, condition, link)], [(name, condition), _FALLBACK]

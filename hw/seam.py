@@ -2,29 +2,25 @@
 
 Over the serial link (docs/protocol.md) the device's timer is the clock. A device that is driven by its maker's library
 has none: the host reads the position, computes, and writes the force, which acts at once, a fraction of a period after
-the sample. A certificate then is for what the host can keep: periods up to T_max, latencies within [0, t2], both
-measured at zero force. A tick that keeps neither counts as missed.
+the sample (theta = 0). The certificate is for what the host keeps, measured at zero force: periods up to T_max, and
+latencies within [t1, t2].
 """
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import select
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from importlib import import_module
 from typing import Any, Protocol, Self
 
-from hw.device import Device, cap_after, limited
+from hw.device import Device
 from hw.emulator import info_of
-from hw.limits import Fault
-from hw.monitor import Ages
 from hw.protocol import (
+    NO_MARGIN,
     Ack,
-    Command,
     Config,
     Decoder,
     Force,
@@ -145,35 +141,10 @@ def library() -> Library:
         raise InputError(f"--port {FORCE_DIMENSION} needs {what}: {error}") from None
 
 
-@dataclass
-class Timing:
-    """What a host that is the clock has kept [us], and what it must keep once a coupling is certified for it."""
-
-    periods: list[int] = field(default_factory=list)
-    latencies: list[int] = field(default_factory=list)
-    longest: float = math.inf  # T_max [us]
-    latest: float = math.inf  # t2 [us]
-
-    def judged(self, scenario: Scenario, ages: Ages, quantile: float, guard_us: float) -> Scenario:
-        """The scenario with the T_max and the latency that a part `quantile` of the ticks kept, and a guard.
-
-        From now on a tick that does not keep them is missed. Raises Fault where a force takes a whole period.
-        """
-        periods = sorted(self.periods)
-        T_us = 1e6 * scenario.T
-        longest = max(T_us, periods[min(len(periods) - 1, int(quantile * len(periods)))] + guard_us)
-        latest = ages.quantile(quantile) + guard_us
-        if latest >= (shortest := _SHORTEST * T_us):
-            raise Fault(f"a force takes {latest:.0f} us from its sample, at most {shortest:g} us are allowed at this T")
-        self.longest, self.latest = longest, latest
-        return scenario.replace(T_max=1e-6 * longest, latency=((0.0, 1e-6 * latest),) * scenario.channels)
-
-
 class ForceDimension:
     """One axis of each of several Force Dimension devices, clocked by this host.
 
-    The state machine is the firmware's (hw/device.py): armed by ARM, capped, slewed, ramped out. A force is written as
-    soon as it comes, so that STATE k + 1 tells the one that answered STATE k.
+    The state machine is the firmware's (hw/device.py): armed by ARM, capped, slewed, ramped out.
     """
 
     def __init__(
@@ -197,12 +168,9 @@ class ForceDimension:
         name = (self._sdk.getSystemName(ID=first) or "Force Dimension").encode("ascii", "replace").decode()[:16]
         self._info = info_of(scenario)._replace(firmware=name, serial=max(0, self._sdk.getSerialNumber(ID=first)))
         self.guarded = {self._sdk.setWatchdog(_WATCHDOG, ID=ID) for ID in self._ids.values()} == {0}
-        self.timing = Timing()
         self._device, self._decoder = Device(self._info), Decoder()
         self._T = 1e-9 * self._info.period_ns
-        self._due = self._sampled = clock()
-        self._written: tuple[int, ...] | None = None
-        self._late = False
+        self._due = clock()
 
     def info(self) -> Info:
         """What the library does not tell, damping and step of the encoder among it, is the scenario's."""
@@ -217,39 +185,28 @@ class ForceDimension:
             for ID in self._ids.values():
                 self._heeded(self._sdk.enableForce(True, ID=ID))
             self._write(self._device.zero)
-        self.timing = Timing(longest=self.timing.longest, latest=self.timing.latest)
         return Refused(ack.refused)
 
     def exchange(self, force: Force | None) -> State:
-        device, timing = self._device, self.timing
         if force is not None:
-            self._write(self._at_once(force))
-            device.accept(force, self._now())  # its margin is of a force that acts
-            took = round(1e6 * (self._clock() - self._sampled))
-            timing.latencies.append(took)
-            self._late = took > timing.latest
+            self._device.receive(encode(force), came := self._now())
+            self._write(self._device.applied)
+            if self._device.margin != NO_MARGIN:  # of a force that acts: writing it takes time
+                self._device.margin = max(-0x7FFF, self._device.margin - (self._now() - came))
         while (left := self._due - self._clock()) > 0:
             self._sleep(left - _SPIN if left > 2 * _SPIN else 0.0)
-        before, self._sampled = self._sampled, self._clock()
-        period = round(1e6 * (self._sampled - before))
-        timing.periods.append(period)
-        self._due = max(self._due, self._sampled - (1 - _SHORTEST) * self._T) + self._T
-        device.misses += device.config is not None and (self._late or period > timing.longest)
-        self._late = False
-        _, out = device.tick(self._now(), self._counts())
-        if device.applied != self._written or force is None:
-            self._write(device.applied)
+        now = self._clock()
+        self._due = max(self._due, now - (1 - _SHORTEST) * self._T) + self._T
+        before = self._device.applied
+        _, out = self._device.tick(self._now(), self._counts())
+        if self._device.applied != before or force is None:
+            self._write(self._device.applied)
         return next(m for m in self._decoder.feed(out) if isinstance(m, State))
 
     def stop(self, reason: Reason) -> None:
         self._device.receive(encode(Stop(reason)), self._now())
         if self._device.phase == Phase.ESTOP:
             self._write(self._device.zero)
-
-    @property
-    def configured(self) -> bool:
-        """Whether it tells STATEs."""
-        return self._device.config is not None
 
     def __enter__(self) -> Self:
         return self
@@ -263,15 +220,6 @@ class ForceDimension:
 
     def _now(self) -> int:
         return round(1e6 * (self._clock() - self._begun))
-
-    def _at_once(self, force: Force) -> tuple[int, ...]:
-        """What the tick after this one will latch, by the same arithmetic."""
-        device, config = self._device, self._device.config
-        if config is None or force.command != Command.RUN or device.phase not in (Phase.ARMED, Phase.HOLDING):
-            return device.applied
-        run = min(device.run + 1, config.ramp_in)
-        caps = [cap_after(config, cap, run) for cap in config.cap]
-        return tuple(map(limited, force.force, device.applied, caps, config.slew))
 
     def _counts(self) -> tuple[int, ...]:
         places = {index: [0.0, 0.0, 0.0] for index in self._ids}
@@ -287,7 +235,6 @@ class ForceDimension:
         for index, ID in self._ids.items():
             if self._heeded(self._sdk.setForce(forces[index], ID=ID)) == _SATURATED:
                 self._device.fault()
-        self._written = steps
 
     def _heeded(self, code: int) -> int:
         if code < 0:

@@ -160,7 +160,8 @@ class Session:
             return None
         assert self.config
         scenario = self.scenario
-        plan = BudgetPlan.of(*self.settings.energy_budget, scenario.delta, self.units, self.config, scenario.T)
+        longest = max(scenario.T_max or 0.0, 1e-6 * self.measurement.result.longest_tick(1e6 * scenario.T))
+        plan = BudgetPlan.of(*self.settings.energy_budget, scenario.delta, self.units, self.config, longest)
         self.budgets.append(SentBudget(plan))
         return self.budgets[-1]
 
@@ -285,7 +286,8 @@ class Session:
 
     def _take(self, index: int, cause: str) -> bytes:
         self.program = self.programs[index]
-        return self._configure(max(1, self.program.link), f"{self.program.name}: {cause}")
+        self.link.needed = self.program.margin_us
+        return self._configure(self.program.link, f"{self.program.name}: {cause}")
 
     # the stream of STATEs
 

@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, MovingAverage, SpringDamper
 from controller.delay import LOST, Jitter, Ticks, ages
 from controller.lti import Array
+from controller.timing import Timing
 from design.certificate import ANY, CAVEATS, MAKING, assess, certificate_part, encoder_part, finite
 from design.conditions import Requirement
-from design.result import CONDITION_NAMES, PRINTED_TAU_DB, PUBLISHED, listed
+from design.result import OLDER_NAMES, PRINTED_TAU_DB, PUBLISHED, listed
 from design.transparency import Transparency, decibels
 from models.human import Person
 from sim.adversary import Worst
 from sim.couplings import Chosen
 from sim.crowds import MIXED, Findings, Validation
-from sim.engines import ExactBatchEngine, HeldPlant
 from sim.run import Simulation
 from sim.scenario import Scenario, load
-from sim.stability import close, dominant_mode, eigenvalue_part, impulse_growth, unlimited, unstable
+from sim.stability import close, dominant_mode, eigenvalue_part, linear_growth, unstable
 from sim.switching import Period, certified_part
 from sim.trace import Trace
 
@@ -35,7 +35,7 @@ from sim.trace import Trace
 def certificates_part(requirements: Mapping[str, Requirement]) -> dict[str, Any]:
     """Both conditions, each under its name and under the name that it had before: the same objects."""
     parts = {name: certificate_part(requirement) for name, requirement in requirements.items()}
-    return parts | {CONDITION_NAMES[name]: part for name, part in parts.items()}
+    return parts | {older: parts[name] for older, name in OLDER_NAMES.items() if name in parts}
 
 
 def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
@@ -88,14 +88,12 @@ def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> dict[str
 def remarks(outcome: dict[str, Any]) -> list[str]:
     """What a reader must know to read the figures rightly."""
     lines = []
-    certificates = {name: outcome["certificates"][name] for name in ("theorem4", "closed-loop")}
-    name = "theorem4" if outcome["certificate"]["condition"] == "theorem4" else "closed-loop"
+    certificates = {name: outcome["certificates"][name] for name in ("any-environment", "this-environment")}
+    name = "any-environment" if outcome["certificate"]["condition"] == "any-environment" else "this-environment"
     part = certificates[name]
     if not part["certified"] and "reason" not in part:
         worst = max(n / a for n, a in zip(part["required_damping"], part["available_damping"], strict=True))
-        condition = f"the {CONDITION_NAMES[name]} condition" + (
-            " (the paper's Theorem 4)" if name == "theorem4" else ""
-        )
+        condition = f"the {name} condition" + (" (the paper's Theorem 4)" if name == "any-environment" else "")
         what = "The loop without coupling fails" if outcome["coupling"]["kind"] == "none" else "This coupling fails"
         lines.append(f"{what} {condition}: it needs {worst:.3g} times the damping that the devices guarantee.")
     if "contact" in outcome["stability"]:
@@ -107,7 +105,7 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
             lines.append(f"{name}: {outcome[name]['reason']}.")
     for name, part in certificates.items():
         if "reason" in part:
-            lines.append(f"{CONDITION_NAMES[name]}: {part['reason']}.")
+            lines.append(f"{name}: {part['reason']}.")
     if outcome.get("jitter"):
         lines.append(f"Delays that vary: {outcome['jitter']['covers']}.")
     if part := outcome.get("encoder"):
@@ -130,7 +128,7 @@ def beside_the_paper(scenario: Scenario, case: str, outcome: dict[str, Any]) -> 
 def _printed_gains(scenario: Scenario, case: str, outcome: dict[str, Any]) -> list[dict[str, str]]:
     printed, got = PUBLISHED[case], outcome["coupling"]
     need = assess(scenario.loop(case), printed)
-    theorem4, closed_loop = (need[name].required for name in ("theorem4", "closed-loop"))
+    any_environment, this_environment = (need[name].required for name in ("any-environment", "this-environment"))
     here = "none" if got["K"] is None else f"K = {listed(got['K'], 5)}, B = {listed(got['B'], 5)}"
     return [
         {
@@ -142,7 +140,7 @@ def _printed_gains(scenario: Scenario, case: str, outcome: dict[str, Any]) -> li
         {
             "what": "damping that the printed gains need [N s/m]",
             "paper": f"at most {listed(scenario.delta, 5)}",
-            "here": f"{listed(theorem4, 5)} by Theorem 4; {listed(closed_loop, 5)} in this environment",
+            "here": f"{listed(any_environment, 5)} by Theorem 4; {listed(this_environment, 5)} in this environment",
             "why": "Theorem 4 as printed is strictly infeasible (E-hat has a pole at z = 1); mended, it refuses them",
         },
     ]
@@ -206,7 +204,7 @@ def _delays_met(switched: Simulation, period: Period | None, ticks: int) -> dict
     assert delays is not None
     met = ages(delays[:ticks])[..., 0]
     used = met[(met >= 0).all(axis=1)]
-    growth, window = _growth_under_delays(switched, ticks)
+    growth, window = linear_growth(switched, max(4, min(ticks, round(JUDGED / switched.scenario.T))))
     return {
         "age": _age(used),
         "lost_packets": (delays[:ticks] == LOST).sum(axis=(0, 2)).tolist(),
@@ -233,15 +231,17 @@ def _age(used: Ticks) -> dict[str, Any] | None:
     return {name: values.tolist() for name, values in figures.items()}
 
 
-def _growth_under_delays(switched: Simulation, ticks: int) -> tuple[float, float]:
-    """(rate [1/s], window [s]) of the exact linear loop after an impulse, under the run's first delays."""
-    T, plant = switched.scenario.T, switched.plant
-    judged = max(4, min(ticks, round(JUDGED / T)))
-    one = HeldPlant(plant.A[None], plant.B[None], plant.C, T)
-    process = unlimited(switched.process)
-    engine = ExactBatchEngine(one, process.force_limit)
-    rate, _ = impulse_growth(process, engine, switched.scene, plant.A.shape[0], judged)
-    return float(rate[0]), judged * T
+def timing_part(timing: Timing | None, scenario: Scenario) -> dict[str, Any] | None:
+    """What periods a run had and how late its forces latched; None where ticks are even and forces latch at them."""
+    if timing is None:
+        return None
+    period = timing.period
+    return {
+        "period_s": {"least": float(period.min()), "mean": float(period.mean()), "largest": float(period.max())},
+        "recorded": bool(scenario.period and scenario.period.recorded),
+        "T_max_s": scenario.longest_period,
+        "latency_s": scenario.latency and [list(span) for span in scenario.latency],
+    }
 
 
 def switched_stability_part(simulation: Simulation, trace: Trace, jitter: dict[str, Any]) -> dict[str, Any]:
@@ -300,7 +300,7 @@ def validation_part(question: Validation, findings: Findings, certified: bool, w
         "wall_s": wall,
         "simulated_s_per_s": findings.simulated / wall,
     }
-    if certified and question.ticks:
+    if certified and question.ticks and question.scenario.latency is None:  # it knows positions at ticks only
         part["energy_audit"] = _energy(findings)
         part["holds"] = part["holds"] and part["energy_audit"]["holds"]
     if not findings.index.size:
@@ -309,7 +309,7 @@ def validation_part(question: Validation, findings: Findings, certified: bool, w
 
 
 def varying_delays_part(findings: Findings, covered: dict[str, Any]) -> dict[str, Any]:
-    """How many humans grow under delays that vary; it holds unless certificates cover these delays and one grows."""
+    """How many humans grow under delays or ticks that vary; it holds unless certificates cover these and one grows."""
     exact, mujoco = findings.switching, findings.switching_mujoco
     seen = ~np.isnan(exact)
     unstable, also = int((exact > 0).sum()), mujoco[~np.isnan(mujoco)]
