@@ -164,7 +164,7 @@ def test_a_session_with_a_device_that_the_host_clocks(scenario, tmp_path):
 def test_the_certificate_says_what_changes_when_the_host_is_the_clock(scenario):
     """T at most T_max, and a latency of part of a sample where a link of a whole tick is charged otherwise."""
     _, _, (made,) = held_session(scenario, StandIn(scenario), seconds=0.1)
-    part = made.part()
+    part = made.part((12.0, 12.0))
     assert part["theta"] == list(scenario.theta)  # no tick is added for the link
     assert part["link_delay"] == 0
     assert part["certificate"]["certified"]
