@@ -32,7 +32,8 @@ def main(argv: list[str]) -> int:
     if args.duration is not None:
         scenario = scenario.replace(duration=args.duration)
     out = options.out_folder(args, "accuracy")
-    chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter)
+    with render.designing() as heard:
+        chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
     lag = limits_of(scenario, chosen.coupling, limiter=args.limiter).rho
     coupled, uncoupled = assemble(scenario, chosen.coupling, lag), assemble(scenario, NoCoupling())
     default = max(default_substeps(loop, "RK4") for loop in (coupled, uncoupled))

@@ -153,7 +153,8 @@ def _chosen(scenario: Scenario, args: argparse.Namespace, names: list[str]) -> t
     for name in names:
         kind, condition = _named(name)
         try:
-            chosen[name] = choose(scenario, args.case, kind, condition or args.condition)
+            with render.designing() as heard:
+                chosen[name] = choose(scenario, args.case, kind, condition or args.condition, progress=heard)
         except DesignFailed as error:
             failures[name] = error
     if not chosen:

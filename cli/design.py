@@ -94,9 +94,11 @@ def main(argv: list[str]) -> int:
         "robustness": _robustness(loop, design),
     }
     if best:
-        outcome |= _best_figures(args, loop, best)
+        with render.progress("working out the price of ranges and the bound"):
+            outcome |= _best_figures(args, loop, best)
     if args.compare:
-        outcome["comparison"] = [asdict(row) for row in compare_methods(loop)]
+        with render.progress("comparing the methods"):
+            outcome["comparison"] = [asdict(row) for row in compare_methods(loop)]
     render.publish(args, outcome, _tables(scenario, outcome), outcome.get("notes", ()))
     holds = outcome["certificate"]["certified"] and (outcome["promise"] == ANY or not whole or whole.proved)
     switching = outcome["jitter_proof"]
@@ -246,8 +248,8 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
     if loop.jitter and _for_switching(args):
         asked["switching"] = (loop.jitter.lo, loop.jitter.hi)
     try:
-        with render.progress("designing") as move:
-            return design_by_kind(loop, args.coupling, args.condition, lambda what, n, of: move(n, of, what), **asked)
+        with render.designing() as heard:
+            return design_by_kind(loop, args.coupling, args.condition, heard, **asked)
     except DesignFailed:
         raise
     except ValueError as error:

@@ -95,6 +95,13 @@ def progress(description: str) -> Iterator[Move]:
         yield move
 
 
+@contextmanager
+def designing() -> Iterator[Callable[[str, int, int], None]]:
+    """The bar of a design: yields what `choose` and `design_by_kind` take as `progress`."""
+    with progress("designing the coupling") as move:
+        yield lambda what, done, total: move(done, total, what)
+
+
 # ----------------------------------------------------------------------------------------------------
 # A whole report: files, tables, lines below them, JSON.
 

@@ -39,9 +39,8 @@ def main(argv: list[str]) -> int:
     environment, simulated = _environment(args, scenario)
     with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)
-
-    requirements = assess(simulated.loop(args.case), chosen.coupling, chosen.phi)
-    limits = limits_of(simulated, chosen.coupling, requirements, args.limiter)
+        requirements = assess(simulated.loop(args.case), chosen.coupling, chosen.phi)
+        limits = limits_of(simulated, chosen.coupling, requirements, args.limiter)
     done = _run(args, simulated, chosen, limits.rho)
     outcome = {
         "case": args.case,
@@ -101,7 +100,8 @@ def _parser() -> options.Parser:
 def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
     """The coupling; with a baseline there is none, and the note says whose that is. Raises InputError."""
     if args.coupling not in BASELINES:
-        return choose(scenario, args.case, args.coupling, args.condition, args.limiter)
+        with render.designing() as heard:
+            return choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
     if args.energy_budget:
         raise InputError(f"--energy-budget with --coupling {args.coupling}: give one of them")
     note = f"baseline, without a guarantee here: {BASELINES[args.coupling]}; no coupling besides."

@@ -31,12 +31,13 @@ def main(argv: list[str]) -> int:
     """Meet random humans. 0: the claims hold, 1: not, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
-    chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter)
+    with render.designing() as heard:
+        chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
     loop = scenario.loop(args.case)
     with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)
+        requirements = assess(loop, chosen.coupling, chosen.phi)
     environments = _environments(args, whole)
-    requirements = assess(loop, chosen.coupling, chosen.phi)
     proved = bool(whole and whole.proved)
     guarantee = guarantee_of(requirements, loop, proved)
     certified = guarantee is not None and (not environments or guarantee == ANY or proved)

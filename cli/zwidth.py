@@ -418,7 +418,8 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
         return None
     if args.coupling == "optimal" and scenario.environment.walls:
         raise InputError("environment.walls: an optimal coupling holds a linear model, so it cannot face walls")
-    return choose(scenario, args.case, args.coupling, args.condition)
+    with render.designing() as heard:
+        return choose(scenario, args.case, args.coupling, args.condition, progress=heard)
 
 
 def _environment_sweep(scenario: Scenario, chosen: Chosen) -> EnvironmentSweep:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -38,8 +38,11 @@ def choose(
     name: str | None = None,
     condition: str | None = None,
     limiter: bool | None = None,
+    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
 ) -> Chosen:
-    """The coupling of a case; by default the designed spring-damper, see design.designs.design_by_kind for `limiter`.
+    """The coupling of a case; by default the designed spring-damper.
+
+    See design.designs.design_by_kind for `limiter` and `progress`.
 
     Raises InputError where the request contradicts itself, DesignFailed where there is no such coupling.
     """
@@ -57,7 +60,7 @@ def choose(
     if name in KINDS:
         try:
             asked: dict[str, Any] = {"limiter": limiter} if limiter is not None and name == "spring-damper" else {}
-            design = design_by_kind(scenario.loop(case), name, condition, **asked)
+            design = design_by_kind(scenario.loop(case), name, condition, progress, **asked)
         except DesignFailed:
             raise
         except ValueError as error:

@@ -222,6 +222,18 @@ def test_json_on_standard_output_is_only_json(tmp_path):
     assert "growth" in err
 
 
+def test_a_terminal_sees_what_is_being_done(tmp_path, monkeypatch, capsys):
+    """Each stage by its name, the optimal design by what it has reached; standard output is the report alone."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    code, _ = run(tmp_path, "--coupling", "optimal", "--duration", "0.1", "--no-plot", "--no-alternatives")
+    shown, err = capsys.readouterr()
+    assert code == 0
+    stages = ["designing the coupling", "dB after", "judging the coupling", "simulating"]
+    places = [err.index(stage) for stage in stages]
+    assert places == sorted(places)
+    assert not any(stage in shown for stage in stages)
+
+
 def test_interrupting_keeps_what_was_simulated(tmp_path, monkeypatch):
     """Ctrl-C in the third block: the first two are written, and the exit code says so."""
     block, calls = loop.run_block, []
