@@ -32,7 +32,7 @@ def main(argv: list[str]) -> int:
     if args.duration is not None:
         scenario = scenario.replace(duration=args.duration)
     out = options.out_folder(args, "accuracy")
-    with render.designing() as heard:
+    with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
         chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
     lag = limits_of(scenario, chosen.coupling, limiter=args.limiter).rho
     coupled, uncoupled = assemble(scenario, chosen.coupling, lag), assemble(scenario, NoCoupling())

@@ -233,7 +233,7 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
     if loop.jitter and _for_switching(args):
         asked["switching"] = (loop.jitter.lo, loop.jitter.hi)
     try:
-        with render.designing() as heard:
+        with render.designing(loop, args.coupling, args.condition) as heard:
             return design_by_kind(loop, args.coupling, args.condition, heard, **asked)
     except DesignFailed:
         raise

@@ -21,8 +21,9 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
+from controller.loop import Loop
 from design.files import nobody_reads, printable, write_json
-from design.result import listed
+from design.result import DesignFailed, listed
 
 # ----------------------------------------------------------------------------------------------------
 # The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
@@ -76,6 +77,9 @@ def console(args: argparse.Namespace) -> Screen:
     return Screen(stderr=args.json == "-", highlight=False)
 
 
+Heard = Callable[[str, int, int], None]  # (what, steps done, of how many)
+
+
 class Move(Protocol):
     """Moves a progress bar to `done` of `total`, and may say what is being done."""
 
@@ -96,10 +100,21 @@ def progress(description: str) -> Iterator[Move]:
 
 
 @contextmanager
-def designing() -> Iterator[Callable[[str, int, int], None]]:
-    """The bar of a design: yields what `choose` and `design_by_kind` take as `progress`."""
+def designing(loop: Loop | None = None, kind: str | None = None, condition: str | None = None) -> Iterator[Heard]:
+    """The bar of a design: yields what `choose` and `design_by_kind` take as `progress`.
+
+    Where the design of this `kind` (by default the spring-damper) fails for a `loop`, the error names what can be had.
+    """
     with progress("designing the coupling") as move:
-        yield lambda what, done, total: move(done, total, what)
+        try:
+            yield lambda what, done, total: move(done, total, what)
+        except DesignFailed as error:
+            from design.api import instead  # for a failure only
+
+            move(0, 1, "trying other designs")
+            if loop is None or not (others := instead(loop, kind or "spring-damper", condition)):
+                raise
+            raise type(error)(error.problem, error.results, f"{error.advice}; {others}") from error
 
 
 # ----------------------------------------------------------------------------------------------------

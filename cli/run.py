@@ -101,7 +101,7 @@ def _parser() -> options.Parser:
 def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
     """The coupling; with a baseline there is none, and the note says whose that is. Raises InputError."""
     if args.coupling not in BASELINES:
-        with render.designing() as heard:
+        with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
             return choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
     if args.energy_budget:
         raise InputError(f"--energy-budget with --coupling {args.coupling}: give one of them")

@@ -32,7 +32,7 @@ def main(argv: list[str]) -> int:
     """Meet random humans. 0: the claims hold, 1: not, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
-    with render.designing() as heard:
+    with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
         chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
     loop = scenario.loop(args.case)
     with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:

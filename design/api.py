@@ -10,11 +10,11 @@ from typing import Any, Literal, TypedDict, Unpack
 from controller.coupling import Coupling
 from controller.loop import Loop
 from design.certificate import assess, check_set, switching_requirement
-from design.designs import KINDS, NO_LONGER, OPTIONS, RETIRED, design_by_kind
+from design.designs import KINDS, NO_LONGER, OPTIONS, RETIRED, design_by_kind, usual_condition
 from design.guarantee import guarantee_of
 from design.result import Condition, Design, Requirement, bare, known, of_kind, one_of
 from design.stored import Stored
-from design.transparency import BAND_HZ, Transparency, transparency
+from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
 Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]
 
@@ -64,6 +64,35 @@ def design_coupling(
     if kind == "optimal" and (retired := [name for name in RETIRED if asked.pop(name, None) is not None]):
         warnings.warn(NO_LONGER.format(", ".join(retired)), DeprecationWarning, stacklevel=2)
     return design_by_kind(loop, kind, condition, **asked)
+
+
+#: kinds and conditions that are quick to try in the place of something else; of the optimal coupling the first rung
+_QUICK: tuple[tuple[Kind, Condition, Options], ...] = (
+    ("optimal", "this-environment", {"seconds": 0.0}),
+    ("spring-damper", "this-environment", {}),
+    ("spring-damper", "any-environment", {}),
+    ("moving-average", "any-environment", {}),
+)
+
+
+def instead(loop: Loop, kind: str, condition: str | None = None) -> str:
+    """What can be had in the place of a design that failed, in words, least rms mismatch first; "" where nothing is.
+
+    Every other kind and condition is designed here and certified. Nothing is tried for delays that vary.
+    """
+    failed, found = (kind, condition or usual_condition(loop, kind)), []
+    for other, target, options in _QUICK:
+        if (other, target) == failed or loop.jitter:
+            continue
+        try:
+            made = design_coupling(loop, other, target, **options)
+            needs = certify(loop, made)
+        except (ValueError, ArithmeticError):
+            continue
+        if needs[target].certified and guarantee(loop, needs):
+            error = decibels(transparency_of(loop, made).rms_mismatch)
+            found.append((error, f"--coupling {other} --condition {target} ({error:.2f} dB rms)"))
+    return "certified instead: " + ", ".join(words for _, words in sorted(found)) if found else ""
 
 
 def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[str]]:

@@ -516,7 +516,7 @@ class _Search:
             p = self._inner(p, most_sdps) if method == "inner" else self._complementarity(p, most_sdps)
             V = self.family.coupling(p)
         if not self.requirement(V).certified:
-            raise DesignFailed(None, (), f"{method} gave no coupling that Theorem 4 certifies: try another start")
+            raise DesignFailed(None, (), f"{method} gave no coupling that Theorem 4 certifies")
         return V
 
     def _structured(self) -> SpringDamper:

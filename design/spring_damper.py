@@ -579,7 +579,7 @@ def _for_this_environment(
             certifies += " while forces are limited"
         line = (
             f"no spring-damper was found that {certifies} for theta = {loop.theta}, psi = {loop.psi}, "
-            f"delta = {loop.delta}: use more device damping, less delay, or other starts"
+            f"delta = {loop.delta}"
         )
         raise DesignFailed(None, (), line)
     coupling = SpringDamper(coupling.K, np.where(NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B))
@@ -635,9 +635,7 @@ def verified(loop: Loop, coupling: SpringDamper | MovingAverage, phi: Array | No
     requirement = any_environment_with(loop, coupling.compliance(loop.T), phi)
     if not requirement.certified:
         why = requirement.reason or f"it requires {max(requirement.required):.6g} N s/m"
-        raise DesignFailed(
-            None, (), f"the designed coupling is not certified by any_environment: {why}; try another start"
-        )
+        raise DesignFailed(None, (), f"the designed coupling is not certified by any_environment: {why}")
     return requirement
 
 
@@ -672,9 +670,6 @@ def _start(loop: Loop, sigma: Array, start: SpringDamper | None) -> tuple[Array,
     try:
         solve_within(objective, gains, loop.theta, sigma, "the set of gains")
     except Infeasible as error:
-        line = (
-            f"Theorem 4 admits no spring-damper with theta = {loop.theta}, psi = {loop.psi}, delta = {loop.delta}: "
-            "use less psi, a softer environment or more device damping"
-        )
+        line = f"Theorem 4 admits no spring-damper with theta = {loop.theta}, psi = {loop.psi}, delta = {loop.delta}"
         raise Infeasible(error.problem, error.results, line) from error
     return solved(gains), 1

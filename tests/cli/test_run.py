@@ -212,6 +212,7 @@ def test_what_cannot_be_designed_is_exit_code_1(tmp_path):
     _, err = process.communicate()
     assert process.returncode == 1
     assert "Theorem 4 admits no coupling" in err
+    assert "use " not in err  # what was not run is not proposed
     assert err.count("\n") == 1
 
 

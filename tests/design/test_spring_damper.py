@@ -1,5 +1,7 @@
 """The spring-damper designs: known optima, independence of the start, exactness of the set, and refusals."""
 
+import re
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -12,10 +14,13 @@ from controller.delay import delay
 from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.loop import Loop, force_map
 from controller.lti import Lti
+from design.api import instead, transparency_of
 from design.conditions import any_environment, any_environment_delayed, this_environment
+from design.designs import design_by_kind
 from design.lmi import CROSS_CHECK, RESERVE, Shaping, check_passive, solve
 from design.result import DesignFailed, Infeasible
 from design.spring_damper import design, gain_set, solve_within, stiffest
+from design.transparency import decibels
 
 CASES = {"I": (1, 2), "II": (0, 0)}
 WALL = Network(("c",), (Spring(("c", "ground"), 100.0),))
@@ -199,6 +204,21 @@ def test_a_search_that_finds_nothing_does_not_claim_that_there_is_nothing():
     with pytest.raises(DesignFailed, match="no spring-damper was found") as caught:
         design(asked((0, 0), psi=(1, 1), delta=(0.5, 0.5)), "this-environment")
     assert not isinstance(caught.value, Infeasible)
+
+
+def test_what_is_proposed_instead_holds_when_it_is_done():
+    """Each proposal, designed with all its rungs, passes the sweep; best first, and never what was asked for."""
+    loop = asked((0, 0), psi=(1, 1))
+    words = instead(loop, "spring-damper", "any-environment")
+    proposed = re.findall(r"--coupling (\S+) --condition (\S+) \((\S+) dB rms\)", words)
+    assert ("optimal", "this-environment") in [(kind, condition) for kind, condition, _ in proposed]
+    assert ("spring-damper", "any-environment") not in [(kind, condition) for kind, condition, _ in proposed]
+    errors = [float(error) for _, _, error in proposed]
+    assert errors == sorted(errors)
+    for kind, condition, error in proposed:
+        made = design_by_kind(loop, kind, condition)
+        assert made.requirement.certified
+        assert decibels(transparency_of(loop, made).rms_mismatch) < float(error) + 0.01
 
 
 REFUSALS = [
