@@ -15,9 +15,9 @@ from design.certificate import SetCheck, assess, check_set
 from design.conditions import this_environment
 from design.coverage import set_part
 from design.guarantee import ANY, guarantee_of
-from models.human import Human
+from models.human import Human, Population
 from sim import report
-from sim.adversary import Worst, search
+from sim.adversary import Worst, search, search_population
 from sim.couplings import NAMES, Chosen, choose, limits_of
 from sim.crowds import ENGINES, MIXED, Findings, Validation, validate, validate_on_cluster
 from sim.run import assemble
@@ -73,6 +73,9 @@ def main(argv: list[str]) -> int:
         worst = _attack(args, attacked, chosen, outcome)
         if worst:
             _add(outcome, "adversary", report.adversary_part(worst, ratio, certified))
+        own_draws = worst is not None and not isinstance(scenario.population, Population)
+        if own_draws and (own := _attack(args, attacked, chosen, outcome, True)):
+            _add(outcome, "adversary_population", report.adversary_part(own, ratio, certified))
     files = _save(args, out, question, findings, worst, outcome)
     title = f"{scenario.title(args.case)}: coupling {chosen.kind}"
     render.publish(args, outcome, [render.facts(title, _rows(outcome), ("", ""))], _lines(outcome), out, files)
@@ -166,13 +169,19 @@ def _add(outcome: dict[str, Any], name: str, part: dict[str, Any]) -> None:
     outcome["holds"] = outcome["holds"] and part["holds"]
 
 
-def _attack(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, outcome: dict[str, Any]) -> Worst | None:
-    """The worst human, or None where the keyboard ends the search: what was found out before is kept."""
+def _attack(
+    args: argparse.Namespace, scenario: Scenario, chosen: Chosen, outcome: dict[str, Any], drawn: bool = False
+) -> Worst | None:
+    """The worst human, or None where the keyboard ends the search: what was found out before is kept.
+
+    With `drawn` among the hands that the population draws.
+    """
+    seek = search_population if drawn else search
     try:
         with render.progress("searching the worst human") as move:
             frozen = assemble(scenario, chosen.coupling).process.frozen().values()
             F = max(frozen, key=lambda F: this_environment(F, scenario.delta).ratio)  # the contact state that asks most
-            return search(scenario, F, args.seed, args.generations or 150, progress=move)
+            return seek(scenario, F, args.seed, args.generations or 150, progress=move)
     except KeyboardInterrupt:
         outcome["interrupted"] = True
         return None
@@ -217,7 +226,7 @@ def _save(
 def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
     bad, worst, traces = outcome["unstable"], outcome["worst"], outcome["traces"]
     audit, adversary, switching = (outcome.get(name) for name in ("energy_audit", "adversary", "switching"))
-    timing = outcome.get("timing")
+    timing, drawn = outcome.get("timing"), outcome.get("adversary_population")
     mujoco = "" if bad["mujoco"] is None else f", {bad['mujoco']} MuJoCo"
     verdict = {True: "[green]yes[/]", False: "[red]no[/]"}.get(outcome["holds"]) or str(outcome["reason"])
     kept = f"{outcome['humans']} humans that were finished are kept; running batches and searches are not"
@@ -239,6 +248,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         *([*render.delay_rows(switching), _growing("delays", switching)] if switching else []),
         *([render.timing_row(timing), _growing("ticks", timing)] if timing else []),
         ("adversary", adversary and _adversary(adversary)),
+        ("adversary, own population", drawn and _adversary(drawn)),
         ("certified", "yes" if outcome["certified"] else "no"),
         ("holds", verdict),
         ("interrupted", kept if outcome["interrupted"] else None),

@@ -12,7 +12,7 @@ with long delays bind). Closer than that no search has succeeded, and just outsi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -25,8 +25,8 @@ from controller.environment import environment
 from controller.loop import force_map
 from controller.lti import Array, Lti
 from design.conditions import this_environment
-from models.human import Human, Person
-from models.scene import Crowd, variants
+from models.human import Hand, Person
+from models.scene import Crowd, HumanSets, variants
 from sim.run import Progress
 from sim.scenario import Scenario
 from sim.stability import ClosedLoop, dominant_mode, exact_loops
@@ -51,7 +51,7 @@ _CANDIDATES = 120  # sets of humans in a generation
 class Worst:
     """The worst humans that a search found."""
 
-    humans: tuple[Human, ...]
+    humans: tuple[Hand, ...]
     persons: tuple[Person, ...]  # who hold several devices
     spectral_radius: float
     growth: float  # [1/s]
@@ -109,6 +109,47 @@ def search(
     return replace(best, evaluated=evaluated)
 
 
+_ELITE = 12  # sets of hands from which the next generation is bred
+
+
+def search_population(
+    scenario: Scenario,
+    F: Lti,
+    seed: int = 0,
+    generations: int = 150,
+    progress: Progress = lambda done, total: None,
+) -> Worst:
+    """The worst sets of hands that the scenario's population can draw.
+
+    Every generation half of the sets are new draws; the others take each device's hand from one of the worst sets so
+    far, or from a new draw. So each hand is one that the population drew, and no assumption is made of what it is.
+    """
+    rng, m = np.random.default_rng(np.random.SeedSequence((seed, len(_PASSES)))), scenario.channels
+    elite: list[tuple[float, tuple[Hand, ...]]] = []
+    for generation in range(generations):
+        sets = [tuple(scenario.population.draw(rng, m)) for _ in range(_CANDIDATES)]
+        for i in range(_CANDIDATES // 2 if elite else 0):
+            parents = [elite[int(k)][1] for k in rng.integers(len(elite), size=m)]
+            fresh = rng.random(m) < 1 / (m + 1)
+            sets[i] = tuple(sets[i][c] if fresh[c] else parents[c][c] for c in range(m))
+        elite = sorted([*elite, *_ranked(scenario, F, sets)], key=lambda one: -one[0])[:_ELITE]
+        progress(generation + 1, generations)
+    return _worst(scenario, F, HumanSets((elite[0][1],), scenario.person), generations * _CANDIDATES)
+
+
+def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> list[tuple[float, tuple[Hand, ...]]]:
+    """Each set with its growth [1/s]: of the modes above 2 Hz while none grows, since slow ones barely decay."""
+    layouts: dict[object, list[tuple[Hand, ...]]] = {}
+    for hands in sets:
+        layouts.setdefault(tuple(hand.port().layout for hand in hands), []).append(hands)
+    ranked: list[tuple[float, tuple[Hand, ...]]] = []
+    for alike in layouts.values():
+        loops = _loops(scenario, F, HumanSets(tuple(alike), scenario.person))
+        fast, growth = (_growth(loops, least) for least in (_PASSES[0].min_frequency_hz, 0.0))
+        ranked += zip(np.where(growth > DESTABILISED, growth, fast).tolist(), alike, strict=True)
+    return ranked
+
+
 @dataclass(frozen=True)
 class Attempt:
     """A search against a loop placed short of its required damping."""
@@ -156,7 +197,7 @@ def _ladders(x: Array, channels: int, kind: _Pass) -> Crowd:
     return Crowd(links, (tuple(range(1, channels + 1)),), bodies)
 
 
-def _loops(scenario: Scenario, F: Lti, crowd: Crowd) -> ClosedLoop:
+def _loops(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets) -> ClosedLoop:
     """In periods of the longest length, with forces that latch at the latest."""
     late = None if scenario.latency is None else [most for _, most in scenario.latency]
     return exact_loops(variants(scenario.device, crowd), F, scenario.longest_period, late)
@@ -165,12 +206,17 @@ def _loops(scenario: Scenario, F: Lti, crowd: Crowd) -> ClosedLoop:
 def _losses(x: Array, scenario: Scenario, F: Lti, kind: _Pass) -> Array:
     """Minus the largest growth [1/s] among the modes looked at, for every column of x."""
     loops = _loops(scenario, F, _ladders(x.reshape(x.shape[0], -1), scenario.channels, kind))
-    values = np.linalg.eigvals(loops.A)
-    fast = np.abs(np.angle(values)) / (2 * np.pi * F.T) >= kind.min_frequency_hz
-    return -np.log(np.where(fast, np.abs(values), 1e-300).max(axis=1)) / F.T
+    return -_growth(loops, kind.min_frequency_hz)
 
 
-def _worst(scenario: Scenario, F: Lti, crowd: Crowd, evaluated: int) -> Worst:
+def _growth(loops: ClosedLoop, min_frequency_hz: float) -> Array:
+    """Of the modes from this frequency on [1/s], (nsim,)."""
+    values, T = np.linalg.eigvals(loops.A), loops.T
+    fast = np.abs(np.angle(values)) / (2 * np.pi * T) >= min_frequency_hz
+    return np.log(np.where(fast, np.abs(values), 1e-300).max(axis=1)) / T
+
+
+def _worst(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets, evaluated: int) -> Worst:
     mode = dominant_mode(_loops(scenario, F, crowd))
     radius, growth, frequency = (float(a[0]) for a in (mode.spectral_radius, mode.growth, mode.frequency_hz))
     return Worst(crowd.humans(0), crowd.persons(0), radius, growth, frequency, evaluated)

@@ -1,16 +1,20 @@
 """A user's own hand, written in this file, in the whole chain: both engines, verdicts, random draws."""
 
+import json
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from cli.run import main
+from cli.validate import main as validate_command
+from controller.coupling import NoCoupling
 from design import design_coupling
 from design.result import CASE_I
 from models.human import Human, Link, Person, Port, state_space
 from models.scene import variants
 from sim import load, simulate, validate
+from sim.adversary import search_population
 from sim.crowds import Validation
 from sim.engines import hold
 from sim.run import assemble
@@ -128,6 +132,67 @@ def test_a_population_of_such_hands_is_validated_in_both_engines():
     np.testing.assert_array_equal(again.exact, found.exact[:10])
     assert found.mass.shape == (40,)
     assert (found.damping == 0).all()  # the elastic part has none
+
+
+def test_the_adversary_searches_what_the_population_draws():
+    """A worse set than random draws of the same number meet, of hands that were drawn, and its growth is the loop's."""
+    population = Muscles()
+    scenario = SCENARIO.replace(population=population)
+    F = assemble(scenario, NoCoupling()).F
+    worst = search_population(scenario, F, seed=1, generations=8)
+    random = validate(scenario, None, humans=worst.evaluated // 4, seed=1, duration=0.0, engine="exact").exact.max()
+    assert worst.growth > random
+    assert all(isinstance(hand, Muscle) and 0.02 <= hand.mass <= 2.0 for hand in worst.humans)
+    alone = assemble(scenario.replace(human=worst.humans), NoCoupling())
+    assert dominant_mode(close(alone.plant, F)).growth == pytest.approx(worst.growth, rel=1e-9)
+    assert search_population(scenario, F, seed=1, generations=8) == worst
+
+
+class Mixed:
+    """Hands of two kinds, with a body for the tissue and without."""
+
+    def draw(self, rng, n):
+        return [hand for _ in range(n) for hand in Muscles((Muscle, Light)[rng.integers(2)]).draw(rng, 1)]
+
+
+def test_the_adversary_finds_nobody_where_there_is_enough_damping():
+    """The published gains need 1.3987 N s/m."""
+    scenario = SCENARIO.replace(delta=(1.42, 1.42), population=Mixed())
+    worst = search_population(scenario, assemble(scenario, CASE_I).F, generations=5)
+    assert not worst.destabilises
+
+
+def test_the_command_s_adversary_takes_a_population_from_a_file(tmp_path):
+    file, report = tmp_path / "who.py", tmp_path / "r.json"
+    file.write_text(
+        "import numpy as np\nfrom models.human import Port\n"
+        "class Grip:\n"
+        "    def __init__(self, m, k): self.m, self.k = m, k\n"
+        "    def port(self): return Port([self.m], [[-1, 1]], [0.2], [self.k])\n"
+        "    def voluntary_force(self, t): return 0 * t\n"
+        "class Grips:\n"
+        "    def draw(self, rng, n): return [Grip(*np.exp(rng.uniform([-4, 2], [1, 8]))) for _ in range(n)]\n"
+        "population = Grips()\n"
+    )
+    words = [
+        "--case",
+        "none",
+        "--human",
+        str(file),
+        "--humans",
+        "5",
+        "--duration",
+        "0",
+        "--engine",
+        "exact",
+        "--no-plot",
+    ]
+    words += ["--adversary", "--generations", "3", "--out", str(tmp_path / "out"), "--json", str(report)]
+    assert validate_command(words) == 0
+    found = json.loads(report.read_text())["adversary_population"]
+    assert found["found"]
+    assert found["evaluated"] == 360
+    assert [human["class"] for human in found["human"]] == ["Grip", "Grip"]
 
 
 def test_its_verdicts_are_those_of_each_hand_alone():
