@@ -25,7 +25,7 @@ from models.device import MOST_DAMPING
 from sim.files import check_file, folder, nobody_reads
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
 
-DONE, DOES_NOT_HOLD, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 
 Number = TypeVar("Number", int, float)
 OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # of the types below

@@ -13,6 +13,7 @@ from sim.engines import INTEGRATORS
 from sim.nets import EnergyNet, Plugged, netted
 from sim.run import ENGINES, Progress, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, require_linear
+from sim.shards import validate as validate_all
 from sim.stability import stability_part
 from sim.stepping import MOST, settle
 from sim.switching import switching
@@ -119,7 +120,7 @@ def validate(
     if not (duration == 0 or duration >= 4 * scenario.T):
         raise InputError(f"duration is {duration:g}, allowed are 0 and {4 * scenario.T:g} s or more")
     links = getattr(scenario.population, "links", 1)  # of a user's own population there are none
-    return crowds.validate(crowds.Validation(scenario, alone, seed, humans, links, engine, duration), shards, progress)
+    return validate_all(crowds.Validation(scenario, alone, seed, humans, links, engine, duration), shards, progress)
 
 
 def _bare(coupling: Coupling | Design | None) -> Coupling:

@@ -16,11 +16,12 @@ import pytest
 distributed = pytest.importorskip("distributed", reason="Dask is not installed (extra `dask`)")
 
 from design.result import CASE_I  # noqa: E402
-from sim.crowds import BATCH, MIXED, Findings, Validation, validate, validate_on_cluster  # noqa: E402
+from sim.crowds import BATCH, MIXED, Findings, Validation  # noqa: E402
 from sim.scenario import (  # noqa: E402
     InputError,
     load,
 )
+from sim.shards import validate, validate_on_cluster  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
 QUESTION = Validation(load(), CASE_I, 0, 4 * BATCH, MIXED, "both", 0.25)  # 0.25 s: just enough for growth rates
