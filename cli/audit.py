@@ -6,6 +6,7 @@ import argparse
 import math
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,12 @@ from rich.table import Table
 
 from cli import options, render
 from controller.coupling import Coupling, NoCoupling, SpringDamper
-from controller.loop import DelayRange
-from design.audit import LONGEST_DELAY, PRESETS, Subject, report
+from controller.loop import DelayRange, Loop
+from design.audit import LONGEST_DELAY, report
 from design.designs import KINDS
 from design.ranges import check_set, set_rows
 from design.result import CONDITION_NAMES, listed
+from models.device import CATALOGUE, Listed, listed_device
 from sim.couplings import check_stored, fitted, read_coupling
 from sim.report import encoder_steps
 from sim.scenario import InputError, Scenario
@@ -25,27 +27,36 @@ from sim.scenario import InputError, Scenario
 EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
   python -m design.audit --rigid --K 5000 --B 0 --T 1e-3 --theta 0 --delta 1.37
   python -m design.audit --case I --K 879,552 --B 0.39,0.52 --jitter 1,2
-  python -m design.audit --preset chai3d-omega3"""
+  python -m design.audit --device falcon --delta 0.5
+  python -m design.audit --devices"""
 
 
 def main(argv: list[str]) -> int:
     """Audit a coupling. 0: safe in this environment and at every vertex of its ranges, 1: not."""
-    args = _with_preset(_parser().parse_args(argv))
+    args = _parser().parse_args(argv)
+    if args.devices:
+        return _list_devices(args)
+    args = _with_device(args)
     scenario = options.scenario_from(args)
-    subject = _subject(args, scenario)
-    switching = _switching(args, scenario, subject)
+    loop = options.rigid_loop(args, scenario) if args.rigid else scenario.loop(args.case)
+    coupling = _coupling(args, loop.channels, scenario)
+    switching = _switching(args, loop)
     out = options.out_folder(args, "audit")
 
     begin = time.perf_counter()
     with render.progress("searching the ranges") as move:
-        loop = None if args.rigid else scenario.loop(args.case)
-        whole = loop and check_set(loop, subject.coupling, args.seed, progress=move)
+        whole = check_set(loop, coupling, args.seed, progress=move)
+    try:
+        judged = report(loop, coupling, switching, whole)
+    except ValueError as error:
+        raise InputError(str(error)) from None
     outcome = {
         "case": args.case,
         "scenario": None if args.rigid else scenario.name,
-        "preset": args.preset and {"name": args.preset, "source": PRESETS[args.preset].source},
-        **report(subject, switching, whole),
-        "encoder": None if args.rigid else encoder_steps(scenario, args.case, subject.coupling),
+        "device": args.device and {"name": args.device, **_device_part(CATALOGUE[args.device])},
+        "preset": args.preset and {"name": args.preset, "source": args.source},
+        **judged,
+        "encoder": None if args.rigid else encoder_steps(scenario, args.case, coupling),
         "notes": _notes(args, scenario, switching),
         "wall_s": time.perf_counter() - begin,
     }
@@ -65,8 +76,10 @@ def _parser() -> options.Parser:
     damping = options.several(float, 0, 1e6, "N s/m")
     coupling.add_argument("--B", type=damping, metavar="B,B,..", help="damping per channel [N s/m]; one is for all")
     coupling.add_argument("--coupling", metavar="FILE.json", help="a stored coupling, in place of --K and --B")
-    preset = "limits that a framework ships; other options go first"
-    coupling.add_argument("--preset", choices=tuple(PRESETS), help=preset)
+    device = "its damping and, where no gains are given, the largest that CHAI3D allows it, on a rigid wall at 1 kHz"
+    coupling.add_argument("--device", metavar="NAME", help=f"of the catalogue: {device}; other options go first")
+    coupling.add_argument("--preset", choices=("chai3d-omega3",), help="as --device omega.3")
+    coupling.add_argument("--devices", action="store_true", help="list the catalogue, with a source for every number")
     options.add_loop_options(parser)
     options.add_rigid_option(parser)
     switching = "also any switching of the forces' delays in this range [samples]; or LO-HI,LO-HI,.. per channel"
@@ -75,31 +88,69 @@ def _parser() -> options.Parser:
     return parser
 
 
-def _with_preset(args: argparse.Namespace) -> argparse.Namespace:
-    """The options, with a preset's numbers where none are given."""
-    if not args.preset:
+def _with_device(args: argparse.Namespace) -> argparse.Namespace:
+    """The options, with a device's numbers where none are given; `source` allows its gains. Raises InputError."""
+    if not args.device and not args.preset:
         return args
-    if args.coupling:
+    if args.device and args.preset:
+        raise InputError("--device with --preset: give one of them")
+    if args.preset and args.coupling:
         raise InputError("--preset with --coupling: give one of them")
-    preset = PRESETS[args.preset]
-    fixed = {"K": (preset.K,), "B": (preset.B,), "T": preset.T, "theta": (0,), "rigid": True}
-    given = {name: value for name, value in vars(args).items() if value is not None and value is not False}
-    return argparse.Namespace(**(vars(args) | fixed | given))
-
-
-def _subject(args: argparse.Namespace, scenario: Scenario) -> Subject:
-    """The coupling in its loop. Raises InputError."""
-    if args.rigid:
-        loop: dict[str, Any] = {"network": None, "delta": scenario.delta[:1], **options.rigid_loop(args, scenario)}
-    else:
-        delays = {"theta": scenario.theta, "psi": scenario.psi}
-        loop = {"network": scenario.environment, "delta": scenario.delta, **delays}
-    coupling = _coupling(args, len(loop["delta"]), scenario)
     try:
-        m, late = len(loop["delta"]), scenario.latency
-        return Subject(coupling, T=scenario.T, T_max=scenario.T_max, latency=late and late[:m], **loop)
+        name, device = listed_device(args.device or "omega.3")
     except ValueError as error:
-        raise InputError(str(error)) from None
+        raise InputError(f"--{error}") from None
+    found: dict[str, Any] = {"device": name, "source": None}
+    if args.delta is None:
+        if device.damping is None:
+            raise InputError(f"--device {name}: nobody publishes its damping: give --delta, as measured by hw.identify")
+        found["delta"] = (device.damping[0].value,)
+    gained = args.coupling or args.case == "none" or (args.K and args.B and not args.preset)
+    if device.stiffness and device.framework_damping and not gained:
+        found["source"] = f"K and B: {device.stiffness.source}; T: the 1 kHz that haptic loops customarily run at"
+        largest = {"K": (device.stiffness.value,), "B": (device.framework_damping.value,)}
+        given = {key: value for key, value in vars(args).items() if value is not None and value is not False}
+        found |= {key: value for key, value in (largest | FRAMEWORK_LOOP).items() if key not in given}
+    return argparse.Namespace(**(vars(args) | found))
+
+
+FRAMEWORK_LOOP: dict[str, Any] = {"T": 1e-3, "theta": (0,), "rigid": True}
+
+UNITS = {"damping": 1.0, "mass": 1e3, "force_limit": 1.0, "encoder_step": 1e6, "friction": 1.0, "stiffness": 1.0}
+
+
+def _device_part(device: Listed) -> dict[str, Any]:
+    """What is known of a device, each number with its source; null is what nobody publishes."""
+    part: dict[str, Any] = {"title": device.title}
+    for name in (*UNITS, "framework_damping"):
+        fact = getattr(device, name)
+        if name == "damping" and fact:
+            part[name] = {"least": fact[0].value, "most": fact[1].value, "source": fact[0].source}
+        else:
+            part[name] = fact and asdict(fact)
+    return part
+
+
+def _list_devices(args: argparse.Namespace) -> int:
+    """Print the catalogue."""
+    parts = {name: _device_part(device) for name, device in CATALOGUE.items()}
+    sources = [part[field]["source"] for part in parts.values() for field in part if field != "title" and part[field]]
+    numbered = {source: i for i, source in enumerate(dict.fromkeys(sources), start=1)}
+
+    def cell(part: dict[str, Any], field: str) -> str:
+        fact = part[field]
+        if fact is None:
+            return "unknown"
+        value = fact["least"] if field == "damping" else fact["value"]
+        return f"{value * UNITS[field]:g}[{numbered[fact['source']]}]"
+
+    heads = ("device", "N s/m", "g", "N", "um", "N", "N/m")
+    rows = [(name, *(cell(part, field) for field in UNITS)) for name, part in parts.items()]
+    title = "damping, mass, force, encoder step, Coulomb friction, and the stiffness that CHAI3D allows"
+    lines = [f"[{i}] {source}" for source, i in numbered.items()]
+    lines.append("What is unknown is given beside `device` in a scenario, or with --delta: hw.identify measures it.")
+    render.publish(args, {"devices": parts}, [render.grid(title, heads, rows)], lines)
+    return options.DONE
 
 
 def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Coupling:
@@ -122,20 +173,20 @@ def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Co
         missing = "B" if gains == ["K"] else "K"
         raise InputError(f"--{gains[0]} without --{missing}: a spring-damper has both (--B 0 is a spring alone)")
     if not gains:
-        raise InputError("nothing to audit: give --K and --B, --coupling FILE.json, --preset NAME or --case none")
+        raise InputError("nothing to audit: give --K and --B, --coupling FILE.json, --device NAME or --case none")
     K, B = (options.per_channel(f"--{name}", getattr(args, name), channels) for name in "KB")
     return SpringDamper(K, B)
 
 
-def _switching(args: argparse.Namespace, scenario: Scenario, subject: Subject) -> DelayRange | None:
+def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
     """The range of --jitter, or of the scenario, around the constant theta that the other conditions are about.
 
     Raises InputError.
     """
     if args.jitter is None:
-        return None if args.rigid else scenario.loop(args.case).jitter
-    lo, hi = options.ranges_per_channel("--jitter", args.jitter, subject.channels)
-    for i, (least, n, largest) in enumerate(zip(lo, subject.theta, hi, strict=True)):
+        return loop.jitter
+    lo, hi = options.ranges_per_channel("--jitter", args.jitter, loop.channels)
+    for i, (least, n, largest) in enumerate(zip(lo, loop.theta, hi, strict=True)):
         if not 0 <= least <= n <= largest <= LONGEST_DELAY:
             allowed = f"0 <= LO <= theta = {n} <= HI <= {LONGEST_DELAY} samples (--theta gives another)"
             raise InputError(f"--jitter on channel {i + 1} is {least} to {largest}, expected {allowed}")

@@ -19,7 +19,6 @@ from rich.table import Table
 
 from cli import options, render
 from cli.design import RETIRED_WITH_VALUE, add_optimal_options, optimal_options
-from controller.environment import environment
 from controller.loop import Loop
 from controller.lti import Array
 from design import compare
@@ -178,7 +177,7 @@ def _data(loop: Loop, chosen: dict[str, Chosen]) -> dict[str, Any]:
     judged = {name: compare.judge(loop, c.coupling, c.phi) for name, c in chosen.items()}
     hz = compare.grid(loop, list(judged.values()))
     sigma_E, undelayed = compare.ideal(loop, hz)
-    E, parts = environment(loop.environment, loop.T), []
+    E, parts = loop.E(), []
     for name, c in chosen.items():
         at = judged[name]
         shown = {"name": Path(name).name, **report.coupling_part(c.kind, c.coupling, loop.T), "states": at.F.order}

@@ -173,7 +173,7 @@ def _loop(args: argparse.Namespace) -> Loop:
         if loop.box or loop.environment.walls:
             raise InputError(f"--ranges and {'[box]' if loop.box else 'environment.walls'}: give one of them")
         try:
-            loop = msgspec.structs.replace(loop, box=box_around(loop.environment, args.ranges))
+            loop = msgspec.structs.replace(loop, box=box_around(loop.network, args.ranges))
         except ValueError as error:
             raise InputError(f"--ranges {args.ranges:g}: {error}") from None
     args.condition = args.condition or usual_condition(loop, args.coupling)

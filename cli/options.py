@@ -19,6 +19,8 @@ import msgspec
 from threadpoolctl import threadpool_limits
 
 from controller.delay import LOST, Jitter
+from controller.environment import RIGID_WALL
+from controller.loop import Loop
 from controller.lti import SingularLoop
 from design.result import CONDITION_NAMES, DesignFailed
 from models.device import MOST_DAMPING
@@ -284,11 +286,24 @@ def add_rigid_option(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rigid", action="store_true", help=wall)
 
 
-def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> dict[str, tuple[int, ...]]:
-    """theta and psi of the one channel that --rigid is about. Raises InputError where options name more of them."""
+def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
+    """The loop of the one channel that --rigid is about. Raises InputError where options name more of them."""
     for name in ("theta", "psi", "delta"):
         per_channel(f"--rigid is one channel: --{name}", getattr(args, name) or (0,), 1)
-    return {"theta": scenario.theta[:1], "psi": scenario.psi[:1] if args.psi else (0,)}
+    theta, psi, late = scenario.theta[:1], scenario.psi[:1] if args.psi else (0,), scenario.latency
+    try:
+        return Loop(
+            scenario.T,
+            theta,
+            psi,
+            theta,
+            scenario.delta[:1],
+            RIGID_WALL,
+            T_max=scenario.T_max,
+            latency=late and late[:1],
+        )
+    except ValueError as error:
+        raise InputError(str(error)) from None
 
 
 # ----------------------------------------------------------------------------------------------------

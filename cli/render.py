@@ -31,6 +31,7 @@ from sim.files import nobody_reads, write_json
 CUT = "…"  # what stands in a table for the end of a word that did not fit
 WIDEST = 400  # characters
 STEP = 2
+SHORT_NAME = 24  # characters of a row's name that are never broken
 OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # what opens no tag of our reports: a unit, a name
 
 
@@ -149,9 +150,11 @@ def facts(title: str, rows: Rows, heads: Sequence[str] = (), left: bool = False)
 
 def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = (0,)) -> Table:
     """A table of figures, to the right but for the columns `left`."""
-    table = Table(title=title)
+    table, rows = Table(title=title), list(rows)
+    short = all(len(row[0]) <= SHORT_NAME for row in rows)
     for i, head in enumerate(heads):
-        table.add_column(head, justify="left" if i in left else "right", overflow="fold" if i == 0 else "ellipsis")
+        how: Any = {"no_wrap": short, "overflow": "ellipsis" if short else "fold"} if i == 0 else {}
+        table.add_column(head, justify="left" if i in left else "right", **how)
     for row in rows:
         table.add_row(*row)
     return table

@@ -12,10 +12,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from rich.table import Table
 
 from cli import options, render
+from controller.environment import RIGID_WALL
+from controller.loop import Loop
 from controller.lti import Array
 from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, promise_of
 from design.ranges import check_set, set_part
@@ -172,14 +175,14 @@ NOT_REACHED = "not reached before the interruption"
 
 def summary(sweep: Sweep, drawn: Map, plan: Plan, population: dict[str, Any]) -> dict[str, Any]:
     """The whole map. Rows are stiffnesses; null is infinite, or not reached before an interruption."""
-    known = np.isfinite(drawn.growth)
+    known, loop = np.isfinite(drawn.growth), sweep.loop
     unsafe = known & (drawn.growth > MARGINAL)
     part: dict[str, Any] = {
-        "rigid": sweep.network is None,
-        "T": sweep.T,
-        "theta": list(sweep.theta),
-        "psi": list(sweep.psi),
-        "delta": list(sweep.delta),
+        "rigid": loop.environment is RIGID_WALL,
+        "T": loop.T,
+        "theta": list(loop.theta),
+        "psi": list(loop.psi),
+        "delta": list(loop.delta),
         "velocity_filter_hz": sweep.cutoff,
         "one_sided": sweep.walled is not None,
         "conditions": list(drawn.ratio),
@@ -339,7 +342,7 @@ def main(argv: list[str]) -> int:
     marks = _marks(args)
     grid, plan, out = _grid(args, sweep, marks), _plan(args, sweep), options.out_folder(args, "zwidth")
 
-    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.T, args.seed, args.humans)
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, args.seed, args.humans)
     with render.progress("certificates") as move:
         drawn = draw_map(sweep, grid, crowd, plan, lambda stage, k, of: move(k, of, stage))
     outcome = summary(sweep, drawn, plan, {"humans": args.humans, "seed": args.seed})
@@ -425,9 +428,8 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
 
 def _environment_sweep(scenario: Scenario, chosen: Chosen) -> EnvironmentSweep:
     """The loop with that coupling. Raises InputError."""
-    who = scenario.device, scenario.population
     try:
-        return EnvironmentSweep(*who, scenario.environment, scenario.T, scenario.theta, scenario.psi, chosen.coupling)
+        return EnvironmentSweep(scenario.device, scenario.population, _nominal(scenario.loop("I")), chosen.coupling)
     except ValueError as error:
         raise InputError(str(error)) from None
 
@@ -438,7 +440,7 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
     with render.progress("searching the ranges") as move:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)
     requirements = assess(loop, chosen.coupling, chosen.phi)
-    springs = contact_springs(loop.environment)
+    springs = contact_springs(loop.network)
     return {
         "axes": "environment",
         "coupling": report.coupling_part(chosen.kind, chosen.coupling, scenario.T),
@@ -454,17 +456,20 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
 
 def _coupling_sweep(args: argparse.Namespace, scenario: Scenario) -> CouplingSweep:
     """The loop without its coupling. Raises InputError."""
-    loop: dict[str, Any] = {"network": scenario.environment, "theta": scenario.theta, "psi": scenario.psi}
-    devices = scenario.device
+    devices, loop = scenario.device, _nominal(scenario.loop("I"))
     try:
         if args.rigid:
-            loop, devices = {"network": None, **options.rigid_loop(args, scenario)}, devices[:1]
+            loop, devices = _nominal(options.rigid_loop(args, scenario)), devices[:1]
         elif args.wall:
-            loop["network"] = one_sided(scenario.environment)
-        loop |= {"T": scenario.T, "cutoff": args.velocity_filter, "one_sided": args.rigid and args.wall}
-        return CouplingSweep(devices, scenario.population, **loop)
+            loop = loop.at(one_sided(scenario.environment))
+        return CouplingSweep(devices, scenario.population, loop, args.velocity_filter, args.rigid and args.wall)
     except ValueError as error:
         raise error if isinstance(error, InputError) else InputError(str(error)) from None
+
+
+def _nominal(loop: Loop) -> Loop:
+    """With the environment itself, constant delays and even periods: what a map is about."""
+    return msgspec.structs.replace(loop, box=None, jitter=None, T_max=None, latency=None)
 
 
 def _marks(args: argparse.Namespace) -> tuple[Range, ...]:
@@ -483,7 +488,7 @@ def _plan(args: argparse.Namespace, sweep: Sweep) -> Plan:
     effects = Effects(args.quantisation, args.friction, args.saturation)
     coarsest = max(device.encoder_step for device in effects.on(sweep.devices))
     threshold = max(2 * coarsest, FINEST) if args.threshold is None else args.threshold
-    shortest = max(1.5, 1024 * sweep.T)
+    shortest = max(1.5, 1024 * sweep.loop.T)
     if not shortest <= args.duration <= 1e4:
         raise InputError(f"--duration is {args.duration:g}, allowed are {shortest:g} to 10000 s")
     return Plan(effects, args.points, args.trials, args.start, args.press, args.duration, threshold)

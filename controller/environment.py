@@ -7,6 +7,7 @@ to the forces that the devices feel (with a minus sign) is Z_cc - Z_ci Z_ii^-1 Z
 
 from __future__ import annotations
 
+import enum
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.coupling import Coupling
+from controller.delay import delay
 from controller.lti import Array, Complex, Lti, Number, Sampled, inverse, rational
 
 # ----------------------------------------------------------------------------------------------------
@@ -62,7 +65,7 @@ class Member:
     """One environment of a set."""
 
     name: str
-    network: Network
+    network: Any
 
 
 @dataclass(frozen=True)
@@ -100,14 +103,12 @@ class Region:
     at: Callable[[str, Array], Member]  # a name, and a point between low and high
 
 
-def members(network: Network, box: Box | None) -> tuple[Member, ...]:
+def members(network: Network, box: Box) -> tuple[Member, ...]:
     """The environment itself, then the vertices of its box that differ from it.
 
     Raises ValueError naming the field where the box does not fit the network, or has more than MOST_VERTICES vertices.
     """
     nominal = Member("the nominal environment", network)
-    if box is None:
-        return (nominal,)
     parts = _parts(network, box)
     count = prod(len(part.corners) for part in parts)
     if count > MOST_VERTICES:
@@ -314,7 +315,71 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"between joins {self.between[0]!r} to itself; name two different nodes")
 
 
-class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+class Environment:
+    """What a loop asks of its environment. One of your own says its `contacts` and its `E(T)`."""
+
+    __slots__ = ()
+    contacts: Any  # tuple[str, ...], one a channel
+    walls: tuple[Wall, ...] = ()
+    here: Any = "this environment"  # str: how a guarantee names it
+
+    def check(self, psi: Sequence[int], T: float) -> None:
+        """Raises ValueError where no loop with this environment makes sense."""
+        self.E(T)
+
+    def E(self, T: Number) -> Lti:
+        """E(z), contact displacements [m] to forces [N], every wall touching, in the arithmetic of T."""
+        raise NotImplementedError
+
+    def sent(self, coupling: Coupling, psi: Sequence[int], T: Number) -> Lti:
+        """G = (I + Psi E V)^-1 Psi E: the forces that leave through the coupling. Raises SingularLoop."""
+        return coupling.around(delay(psi, T) @ self.E(T))
+
+    def sent_at(self, coupling: Coupling, psi: Sequence[int], z: Complex, T: float) -> Sampled:
+        """The same at points z of the circle."""
+        return coupling.around(Sampled.of(delay(psi, T) @ self.E(T), z))
+
+    def frozen(self) -> Sequence[Environment]:
+        """The linear environments that it is made of, by the walls that touch."""
+        return (self,)
+
+
+class RigidWall(Environment, enum.Enum):
+    """E -> infinity: a wall that does not give, behind a coupling and never left. One channel."""
+
+    RIGID_WALL = "rigid wall"  # as files have it
+
+    @property
+    def contacts(self) -> tuple[str, ...]:
+        return ("tip",)
+
+    @property
+    def here(self) -> str:
+        return "a rigid wall only"
+
+    def check(self, psi: Sequence[int], T: float) -> None:
+        if any(psi):
+            shown = ", ".join(map(str, psi))
+            raise ValueError(f"psi is {shown}: behind a rigid wall no loop with a delayed environment is stable")
+
+    def E(self, T: Number) -> Lti:
+        raise ValueError("a rigid wall has no E(z): its force is whatever the coupling in front of it makes")
+
+    def sent(self, coupling: Coupling, psi: Sequence[int], T: Number) -> Lti:
+        """V^-1. Raises ValueError for a coupling that is no V, SingularLoop where V has no inverse."""
+        V = coupling.compliance(T)
+        if V is None:
+            raise ValueError("a rigid wall needs a spring-damper or another V in front of it")
+        return V.inverse()
+
+    def sent_at(self, coupling: Coupling, psi: Sequence[int], z: Complex, T: float) -> Sampled:
+        return Sampled.of(self.sent(coupling, psi, T), z)
+
+
+RIGID_WALL = RigidWall.RIGID_WALL
+
+
+class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """A passive mechanical network seen at its contacts, in the order of the channels."""
 
     contacts: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
@@ -334,6 +399,15 @@ class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defa
         loose = [n for n in self.contacts if n not in held]
         if loose:
             raise ValueError(f"contact {loose[0]!r} has neither spring nor mass nor wall, so it can render no force")
+
+    def check(self, psi: Sequence[int], T: float) -> None:
+        environment(self, T)
+
+    def E(self, T: Number) -> Lti:
+        return environment(held(self), T)
+
+    def frozen(self) -> Sequence[Network]:
+        return tuple(frozen_states(self).values())
 
     def nodes(self) -> list[str]:
         """Contacts first, then internal nodes in the order of their first mention."""
@@ -522,3 +596,17 @@ def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
     walls = zip(network.walls, touching, strict=True)
     springs = (Spring(w.between, on * w.stiffness, on * w.damping) for w, on in walls)
     return msgspec.structs.replace(network, springs=(*network.springs, *springs), walls=())
+
+
+def walled_force_map(network: Network, coupling: Coupling, theta: Sequence[int], psi: Sequence[int], T: Number) -> Lti:
+    """[x; p] to [f; y]: displacements and wall forces [N] to what the devices feel and the ways into the walls [m].
+
+    Psi and Theta delay what the devices feel of the walls. Raises SingularLoop, and ValueError for a coupling that
+    walls cannot stand behind.
+    """
+    w = len(network.walls)
+
+    def late(steps: Sequence[int]) -> Lti:
+        return Lti.diag(delay(steps, T), Lti.constant(np.eye(w), T))
+
+    return late(theta) @ coupling.around(late(psi) @ walled_environment(network, T), further=w)

@@ -14,12 +14,11 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import msgspec
-import numpy as np
 
 from controller.coupling import Coupling, Strict
 from controller.delay import delay
-from controller.environment import Box, Member, Network, environment, held, members, walled_environment
-from controller.lti import Lti, Number, rational
+from controller.environment import Box, Environment, Member, Network, RigidWall, members, walled_force_map
+from controller.lti import Complex, Lti, Number, Sampled, rational
 
 Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=100)], ...]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -54,7 +53,7 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
     psi: Steps  # (m,) environment delays [samples]
     lam: Steps  # (m,) delays of the reference [samples]; they matter to transparency only
     delta: tuple[Positive, ...]  # (m,) damping that the devices guarantee [N s/m]
-    environment: Network
+    environment: Network | RigidWall  # or a class of one's own, which cannot be stored
     box: Box | None = None  # what else the environment may be
     jitter: DelayRange | None = None  # what else the delays of the forces may be, switching at every tick
     T_max: Positive | None = None  # [s] the longest period there is, where it varies from tick to tick; T if None
@@ -65,11 +64,15 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
         for name in ("theta", "psi", "lam", "delta"):
             if len(getattr(self, name)) != m:
                 raise ValueError(f"{name} has {len(getattr(self, name))} entries, the environment has {m} contacts")
+        for name in ("theta", "psi", "lam"):
+            steps = getattr(self, name)
+            if any(n != int(n) or n < 0 for n in steps):
+                raise ValueError(f"{name} is {list(steps)}, expected whole numbers of samples, zero or more")
         if any(n > t + p for n, t, p in zip(self.lam, self.theta, self.psi, strict=True)):
             raise ValueError(f"lam is {list(self.lam)}, expected at most theta + psi on every channel")
         for member in self.members():
             try:
-                environment(member.network, self.T)  # raises ValueError if nothing holds an internal node
+                member.network.check(self.psi, self.T)  # raises ValueError if nothing holds an internal node
             except ValueError as error:
                 raise ValueError(f"{member.name}: {error}" if self.box else str(error)) from None
         if self.jitter:
@@ -110,30 +113,43 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
 
     def E(self, exact: bool = False) -> Lti:
         """The environment E(z), every wall touching."""
-        return environment(held(self.environment), self.period(exact))
+        return self.environment.E(self.period(exact))
 
     def sent(self, coupling: Coupling, exact: bool = False) -> Lti:
         """G = (I + Psi E V)^-1 Psi E: the forces as they leave for the devices. Raises SingularLoop."""
-        return sent(self.E(exact), coupling, self.psi)
+        return self.environment.sent(coupling, self.psi, self.period(exact))
+
+    def sent_at(self, coupling: Coupling, z: Complex) -> Sampled:
+        """The same at points z of the circle, (n, k) or (1, k)."""
+        return self.environment.sent_at(coupling, self.psi, z, self.T)
 
     def F(self, coupling: Coupling, exact: bool = False) -> Lti:
         """F = Theta G (6): displacements to forces, as the devices see them. Raises SingularLoop."""
-        return force_map(self.E(exact), coupling, self.theta, self.psi)
+        return delay(self.theta, self.period(exact)) @ self.sent(coupling, exact)
 
     def walled(self, coupling: Coupling, exact: bool = False) -> Lti:
         """[x; p] to [f; y]: as F with no wall touching, wall forces [N] put in and the ways into walls [m] out.
 
         Raises SingularLoop, and ValueError for a coupling that walls cannot stand behind.
         """
-        return walled_force_map(
-            walled_environment(self.environment, self.period(exact)), coupling, self.theta, self.psi
-        )
+        return walled_force_map(self.network, coupling, self.theta, self.psi, self.period(exact))
 
     def members(self) -> tuple[Member, ...]:
         """The environment, and the vertices of its box where it has one."""
-        return members(self.environment, self.box)
+        return members(self.network, self.box) if self.box else (Member("the nominal environment", self.environment),)
 
-    def at(self, network: Network) -> Loop:
+    @property
+    def network(self) -> Network:
+        """The environment, of which parameters or walls are asked. Raises ValueError where it is no network."""
+        if not isinstance(self.environment, Network):
+            raise ValueError(f"{self.environment.here} is no network of springs, dampers and masses")
+        return self.environment
+
+    def frozen(self) -> tuple[Loop, ...]:
+        """The loop around each frozen contact state of its environment."""
+        return tuple(self.at(state) for state in self.environment.frozen())
+
+    def at(self, network: Environment) -> Loop:
         """The loop around this environment, known exactly."""
         return msgspec.structs.replace(self, environment=network, box=None)
 
@@ -147,21 +163,6 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
         return self.jitter or DelayRange(self.theta, self.theta)
 
 
-def sent(E: Lti, coupling: Coupling, psi: Sequence[int]) -> Lti:
-    """G = (I + Psi E V)^-1 Psi E."""
-    return coupling.around(delay(psi, E.T) @ E)
-
-
-def walled_force_map(E: Lti, coupling: Coupling, theta: Sequence[int], psi: Sequence[int]) -> Lti:
-    """[x; p] to [f; y] from that of the environment. Psi and Theta delay what the devices feel of the walls."""
-    w = E.inputs - len(theta)
-
-    def late(steps: Sequence[int]) -> Lti:
-        return Lti.diag(delay(steps, E.T), Lti.constant(np.eye(w), E.T))
-
-    return late(theta) @ coupling.around(late(psi) @ E, further=w)
-
-
 def force_map(E: Lti, coupling: Coupling, theta: Sequence[int], psi: Sequence[int]) -> Lti:
     """F = Theta (I + Psi E V)^-1 Psi E (6): displacements to forces, as the devices see them."""
-    return delay(theta, E.T) @ sent(E, coupling, psi)
+    return delay(theta, E.T) @ coupling.around(delay(psi, E.T) @ E)

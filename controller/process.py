@@ -26,8 +26,7 @@ from numpy.typing import ArrayLike
 
 from controller.coupling import Coupling
 from controller.delay import HeldLine, Ticks, delay, packet_delays
-from controller.environment import Network, Wall, walled_environment
-from controller.loop import walled_force_map
+from controller.environment import Network, Wall, walled_environment, walled_force_map
 from controller.lti import Array, Lti, SingularLoop, frozen, taps
 
 # ----------------------------------------------------------------------------------------------------
@@ -129,7 +128,7 @@ class Contact:
 
 def contact(network: Network, coupling: Coupling, theta: Sequence[int], psi: Sequence[int], T: float) -> Contact:
     """F of (6) with the walls of the network as further ports. Psi and Theta delay what the devices feel of them."""
-    return Contact(walled_force_map(walled_environment(network, T), coupling, theta, psi), network.walls)
+    return Contact(walled_force_map(network, coupling, theta, psi, T), network.walls)
 
 
 @dataclass(frozen=True, eq=False)

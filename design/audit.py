@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
-from typing import Any, Self, cast, get_args
+from typing import Any, cast, get_args
 
+import msgspec
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
 from controller.coupling import (
@@ -22,170 +22,75 @@ from controller.coupling import (
     NoCoupling,
     SpringDamper,
 )
-from controller.environment import GROUND, Network, Spring, environment, held
-from controller.loop import DelayRange, Loop, force_map
-from controller.lti import Lti, SingularLoop
+from controller.environment import RIGID_WALL
+from controller.loop import DelayRange, Loop
 from design.certificate import (
     ANY,
     CAVEATS,
     LATE,
     certificate_part,
     closed_loop_of,
-    making_covered,
-    promise,
+    promise_of,
     switching_part,
     switching_requirement,
     theorem4_of,
 )
 from design.conditions import (
     Condition,
-    JitterProof,
     Requirement,
     any_environment,
-    jitter_proof,
-    jitter_refusal,
     refusal,
-    this_environment,
 )
 from design.ranges import SetCheck, set_part
 from design.result import listed
 
 # ----------------------------------------------------------------------------------------------------
-# Limits that public frameworks ship, as data: what an application may ask of a device when it trusts them.
-
-
-@dataclass(frozen=True)
-class Preset:
-    """A spring-damper against a rigid wall, one channel without delay."""
-
-    K: float  # [N/m]
-    B: float  # [N s/m]
-    T: float  # [s]
-    source: str  # of each number
-
-
-PRESETS = {
-    "chai3d-omega3": Preset(
-        K=5000.0,
-        B=30.0,
-        T=1e-3,
-        source="K and B: m_maxLinearStiffness and m_maxLinearDamping of the omega.3 in CHAI3D's "
-        "src/devices/CDeltaDevices.cpp; T: the 1 kHz that haptic loops customarily run at",
-    ),
-}
-
-
-# ----------------------------------------------------------------------------------------------------
-# What an audit is about: a coupling in its loop, judged by either condition and ready to be varied.
+# A coupling in its loop, judged by either condition.
 
 
 #: Beyond this many samples a sweep takes seconds, and no device's damping is enough.
 LONGEST_DELAY = 100
 
 
-@dataclass(frozen=True, eq=False)
-class Subject:
-    """A coupling between devices and an environment. Raises ValueError naming the field that is wrong."""
+def requirement(loop: Loop, coupling: Coupling, condition: Condition) -> Requirement:
+    """The damping that the condition asks of the devices."""
+    ask = closed_loop_of if condition == "closed-loop" else theorem4_of
+    try:
+        return ask(loop, coupling)
+    except ValueError as error:  # no solution of the algebraic loop
+        return refusal(condition, loop.delta, str(error))
 
-    coupling: Coupling
-    network: Network | None  # None is a rigid wall behind the coupling, one channel
-    T: float  # [s]
-    theta: tuple[int, ...]  # (m,) transmission delays [samples]
-    psi: tuple[int, ...]  # (m,) environment delays [samples]
-    delta: tuple[float, ...]  # (m,) damping that the devices guarantee [N s/m]
-    T_max: float | None = None  # [s] the longest period, where it varies
-    latency: tuple[tuple[float, float], ...] | None = None  # (m,) [s] by which forces latch after a tick
 
-    def __post_init__(self) -> None:
-        for name in ("theta", "psi"):
-            if not all(0 <= n <= LONGEST_DELAY for n in getattr(self, name)):
-                raise ValueError(f"{name} is {listed(getattr(self, name))}, allowed are 0 to {LONGEST_DELAY} samples")
-        if not all(0 < d < np.inf for d in self.delta):
-            raise ValueError(f"delta is {listed(self.delta)}, expected positive dampings in N s/m")
-        if self.network is None and not isinstance(self.coupling, SpringDamper):
-            raise ValueError("a rigid wall needs a spring-damper in front of it")
-        if self.network is None and any(self.psi):
-            raise ValueError(
-                f"psi is {listed(self.psi)}: behind a rigid wall no loop with a delayed environment is stable"
-            )
+def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any) -> Requirement:
+    """The same with some of the loop's fields changed; a loop that cannot be is refused."""
+    try:
+        return requirement(msgspec.structs.replace(loop, **changes), coupling, condition)
+    except ValueError as error:  # a latency that is longer than the period
+        return refusal(condition, loop.delta, str(error))
 
-    @property
-    def channels(self) -> int:
-        return len(self.delta)
 
-    @property
-    def walls(self) -> bool:
-        """Whether contact is made and broken."""
-        return self.network is not None and bool(self.network.walls)
+def _at_period(loop: Loop, coupling: Coupling, condition: Condition, T: float) -> Requirement:
+    """The same with the gains, or coefficients, and the delays in samples at another T [s]."""
+    if isinstance(coupling, Compliance):
+        coupling = Compliance(replace(coupling.V, T=T))
+    longest = loop.T_max and loop.T_max * (T / loop.T)  # periods vary in proportion
+    return _varied(loop, coupling, condition, T=T, T_max=longest)
 
-    @property
-    def F(self) -> Lti:
-        """What the devices see (6), walls touching; against a rigid wall (E -> infinity) that is Theta V^-1.
 
-        Raises SingularLoop.
-        """
-        if self.network is not None:
-            return force_map(environment(held(self.network), self.T), self.coupling, self.theta, self.psi)
-        assert isinstance(self.coupling, SpringDamper)
-        (K,), (B,) = self.coupling.K.tolist(), self.coupling.B.tolist()
-        clamped = Network(("contact",), (Spring(("contact", GROUND), K, B),))
-        return force_map(environment(clamped, self.T), NoCoupling(), self.theta, self.psi)
-
-    @property
-    def G(self) -> Lti:
-        """The forces as they leave for the devices: F without Theta. Raises SingularLoop."""
-        return replace(self, theta=(0,) * self.channels).F
-
-    def switching(self, span: DelayRange) -> JitterProof:
-        """The damping that any switching of the forces' delays within this range asks of the devices."""
-        if self.network is not None and not self.walls:
-            return switching_requirement(replace(self, latency=None)._loop(self.network).switching(span), self.coupling)
-        try:
-            return jitter_proof(self.G, span.lo, span.hi, self.delta, T_max=self.T_max)
-        except SingularLoop as error:
-            return jitter_refusal(self.delta, str(error))
-
-    def requirement(self, condition: Condition) -> Requirement:
-        """The damping that the condition asks of the devices."""
-        return self._closed_loop() if condition == "closed-loop" else self._theorem4()
-
-    def with_period(self, T: float) -> Self:
-        """The same gains (of a state-space coupling: the same coefficients) and delays in samples at another T [s]."""
-        coupling = self.coupling
-        if isinstance(coupling, Compliance):
-            coupling = Compliance(replace(coupling.V, T=T))
-        longest = self.T_max and self.T_max * (T / self.T)  # periods vary in proportion
-        return replace(self, coupling=coupling, T=T, T_max=longest)
-
-    def with_gains(self, K: ArrayLike, B: ArrayLike) -> Self:
-        """The same loop with another spring-damper [N/m, N s/m]."""
-        return replace(self, coupling=SpringDamper(K, B))
-
-    def _closed_loop(self) -> Requirement:
-        try:
-            if self.network is None:
-                return this_environment(self.F, self.delta, self.T_max, self.latency)
-            return closed_loop_of(self._loop(self.network), self.coupling)
-        except ValueError as error:  # no solution of the algebraic loop, or a latency that is longer than a period
-            return refusal("closed-loop", self.delta, str(error))
-
-    def _theorem4(self) -> Requirement:
-        # what is behind a wall's coupling does not matter to Theorem 4
-        network = self.network or Network(("contact",), masses={"contact": 1.0})
-        try:
-            return theorem4_of(self._loop(network), self.coupling)
-        except ValueError as error:
-            return refusal("theorem4", self.delta, str(error))
-
-    def _loop(self, network: Network) -> Loop:
-        timing = {"T_max": self.T_max, "latency": self.latency}
-        return Loop(self.T, self.theta, self.psi, self.theta, self.delta, network, **timing)
+def check_loop(loop: Loop) -> None:
+    """Raises ValueError naming the field where a loop asks for no audit."""
+    for name in ("theta", "psi"):
+        steps = getattr(loop, name)
+        if max(steps) > LONGEST_DELAY:
+            raise ValueError(f"{name} is {listed(steps)}, allowed are 0 to {LONGEST_DELAY} samples")
+    if not all(0 < d < np.inf for d in loop.delta):
+        raise ValueError(f"delta is {listed(loop.delta)}, expected positive dampings in N s/m")
 
 
 # ----------------------------------------------------------------------------------------------------
 # How far a coupling is from the edge of its certificate: the stiffest K, and what may be wrong before it is lost.
 #
-# Everything is found by varying a Subject and asking the conditions of design.margin again: no solver. A search goes
+# Everything is found by varying the loop and asking the conditions again: no solver. A search goes
 # outwards in steps and locates the edge between the last two, so a gap narrower than a step can be missed; what is
 # returned is itself certified, and the other side of the edge is not.
 
@@ -217,18 +122,18 @@ class Tolerance:
     reason: str | None = None
 
 
-def stiffest(subject: Subject, condition: Condition) -> Stiffest:
+def stiffest(loop: Loop, coupling: Coupling, condition: Condition) -> Stiffest:
     """any-environment: channel by channel; this-environment: the largest common scale of all K."""
-    unknown = (None,) * subject.channels
-    if not isinstance(subject.coupling, SpringDamper):
+    unknown = (None,) * loop.channels
+    if not isinstance(coupling, SpringDamper):
         return Stiffest(unknown, "only a spring-damper has a K")
     if condition == "theorem4":
-        return _stiffest_for_any_environment(subject, subject.coupling)
-    K, B = subject.coupling.K, subject.coupling.B
+        return _stiffest_for_any_environment(loop, coupling)
+    K, B = coupling.K, coupling.B
 
     @cache
     def ratio(scale: float) -> float:
-        return subject.with_gains(scale * K, B).requirement(condition).ratio
+        return requirement(loop, SpringDamper(scale * K, B), condition).ratio
 
     scale = STIFFEST / K.max()
     if ratio(scale) < 1:
@@ -241,14 +146,14 @@ def stiffest(subject: Subject, condition: Condition) -> Stiffest:
     return Stiffest(unknown, "no scale of K is certified beside this B")
 
 
-def _stiffest_for_any_environment(subject: Subject, coupling: SpringDamper) -> Stiffest:
+def _stiffest_for_any_environment(loop: Loop, coupling: SpringDamper) -> Stiffest:
     """Between 0 and 2 (delta - B)/T, the bound where z^-n = -1; the set of gains is convex and contains K -> 0."""
-    if any(subject.psi):
-        return Stiffest((None,) * subject.channels, "with psi >= 1 each K needs a multiplier of its own: not searched")
-    if subject.latency:
-        return Stiffest((None,) * subject.channels, LATE)
+    if any(loop.psi):
+        return Stiffest((None,) * loop.channels, "with psi >= 1 each K needs a multiplier of its own: not searched")
+    if loop.latency:
+        return Stiffest((None,) * loop.channels, LATE)
     stiffest, reasons = [], []
-    for B, theta, delta in zip(coupling.B.tolist(), subject.theta, subject.delta, strict=True):
+    for B, theta, delta in zip(coupling.B.tolist(), loop.theta, loop.delta, strict=True):
         if delta <= B:
             stiffest.append(None)
             reasons.append(f"B = {B:g} N s/m alone uses up delta = {delta:g} N s/m")
@@ -256,37 +161,36 @@ def _stiffest_for_any_environment(subject: Subject, coupling: SpringDamper) -> S
 
         @cache
         def ratio(K: float, B: float = B, theta: int = theta, delta: float = delta) -> float:
-            V = SpringDamper([K], [B]).compliance(subject.T)
-            return any_environment(V, [theta], [delta], subject.T_max).ratio
+            V = SpringDamper([K], [B]).compliance(loop.T)
+            return any_environment(V, [theta], [delta], loop.T_max).ratio
 
-        bound = 2 * (delta - B) / subject.T
+        bound = 2 * (delta - B) / loop.T
         stiffest.append(edge(ratio, 1e-9 * bound, bound))
     return Stiffest(tuple(stiffest), "; ".join(reasons) or None)
 
 
-def tolerance(subject: Subject, requirement: Requirement) -> Tolerance:
-    """How much error in delta, T and delay the certificate by `requirement.condition` tolerates."""
-    condition = requirement.condition
-    if not requirement.certified:
+def tolerance(loop: Loop, coupling: Coupling, needs: Requirement) -> Tolerance:
+    """How much error in delta, T and delay the certificate by `needs.condition` tolerates."""
+    if not needs.certified:
         return Tolerance(None, None, None, NOT_CERTIFIED)
-    if condition == "theorem4" and any(subject.psi):
+    if needs.condition == "theorem4" and any(loop.psi):
         reason = "with psi >= 1 every T and delay needs a multiplier of its own: not searched"
-        return Tolerance(requirement.required, None, None, reason)
-    largest = _largest_period(subject, condition)
-    extra = _extra_samples(subject, condition)
+        return Tolerance(needs.required, None, None, reason)
+    largest = _largest_period(loop, coupling, needs.condition)
+    extra = _extra_samples(loop, coupling, needs.condition)
     reasons = [
         f"certified up to the largest T tried, {LONGEST_PERIOD:g} s" if largest is None else "",
         f"certified with {MOST_EXTRA_SAMPLES} samples more, the most that were tried" if extra is None else "",
     ]
-    return Tolerance(requirement.required, largest, extra, "; ".join(filter(None, reasons)) or None)
+    return Tolerance(needs.required, largest, extra, "; ".join(filter(None, reasons)) or None)
 
 
-def _largest_period(subject: Subject, condition: Condition) -> float | None:
+def _largest_period(loop: Loop, coupling: Coupling, condition: Condition) -> float | None:
     @cache
     def ratio(T: float) -> float:
-        return subject.with_period(T).requirement(condition).ratio
+        return _at_period(loop, coupling, condition, T).ratio
 
-    inside, step = subject.T, 0.1
+    inside, step = loop.T, 0.1
     while inside < LONGEST_PERIOD:
         outside = min(inside * (1 + step), LONGEST_PERIOD)
         if ratio(outside) >= 1:
@@ -295,10 +199,10 @@ def _largest_period(subject: Subject, condition: Condition) -> float | None:
     return None
 
 
-def _extra_samples(subject: Subject, condition: Condition) -> int | None:
+def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int | None:
     for extra in range(1, MOST_EXTRA_SAMPLES + 1):
-        later = replace(subject, theta=tuple(n + extra for n in subject.theta))
-        if not later.requirement(condition).certified:
+        later = tuple(n + extra for n in loop.theta)
+        if not _varied(loop, coupling, condition, theta=later).certified:
             return extra - 1
     return None
 
@@ -334,60 +238,53 @@ class Remedy:
     requirement: Requirement
 
 
-def remedies(subject: Subject, requirement: Requirement) -> list[Remedy]:
+def remedies(loop: Loop, coupling: Coupling, needs: Requirement) -> list[Remedy]:
     """What certifies, or lowers the required damping by 10 % or more, each change alone; [] where it is certified."""
-    condition = requirement.condition
-    if requirement.certified or (condition == "theorem4" and any(subject.psi)):
+    condition = needs.condition
+    if needs.certified or (condition == "theorem4" and any(loop.psi)):
         return []
-    found = [_fewer_samples(subject, condition, name) for name in ("theta", "psi")]
-    coupling = subject.coupling
+    found = [_fewer_samples(loop, coupling, condition, name) for name in ("theta", "psi")]
     if isinstance(coupling, SpringDamper) and coupling.B.any():
         found.append(
             _smaller(
-                lambda x: subject.with_gains(coupling.K, x * coupling.B),
+                lambda x: requirement(loop, SpringDamper(coupling.K, x * coupling.B), condition),
                 lambda x: f"smaller B: {listed((x * coupling.B).tolist(), 5)} N s/m",
-                condition,
             )
         )
     found.append(
         _smaller(
-            lambda x: subject.with_period(x * subject.T),
-            lambda x: f"faster: T = {1e3 * x * subject.T:.5g} ms",
-            condition,
+            lambda x: _at_period(loop, coupling, condition, x * loop.T),
+            lambda x: f"faster: T = {1e3 * x * loop.T:.5g} ms",
         )
     )
-    least = 0.9 * requirement.ratio
+    least = 0.9 * needs.ratio
     return [r for r in found if r and (r.requirement.certified or r.requirement.ratio < least)]
 
 
-def _fewer_samples(subject: Subject, condition: Condition, name: str) -> Remedy | None:
-    """One sample less at a time, on every channel that has one."""
-    steps, tried = getattr(subject, name), []
+def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> Remedy | None:
+    """One sample less at a time, on every channel that has one; the reference is none later than the loop."""
+    steps, tried = getattr(loop, name), []
     for fewer in range(1, max(steps) + 1):
         less = tuple(max(n - fewer, 0) for n in steps)
-        tried.append(
-            Remedy(f"less delay: {name} = {listed(less, 5)}", replace(subject, **{name: less}).requirement(condition))
-        )
+        needs = _varied(loop, coupling, condition, lam=(0,) * loop.channels, **{name: less})
+        tried.append(Remedy(f"less delay: {name} = {listed(less, 5)}", needs))
         if tried[-1].requirement.certified:
             return tried[-1]
     return min(tried, key=lambda remedy: remedy.requirement.ratio, default=None)
 
 
-def _smaller(vary: Callable[[float], Subject], describe: Callable[[float], str], condition: Condition) -> Remedy:
+def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], str]) -> Remedy:
     """The largest factor that certifies, in steps of 0.001; where none does, the one that needs the least damping."""
 
-    @cache
-    def requirement(factor: float) -> Requirement:
-        return vary(factor).requirement(condition)
-
+    needs = cache(vary)
     for larger, factor in pairwise((1.0, *FACTORS)):
-        if requirement(factor).certified:
-            mildest = edge(lambda x: requirement(x).ratio, factor, larger)
+        if needs(factor).certified:
+            mildest = edge(lambda x: needs(x).ratio, factor, larger)
             printable = max(math.floor(1e3 * mildest - 1e-2) / 1e3, factor)  # certified as rounded for the report
-            mildest = printable if requirement(printable).certified else factor
-            return Remedy(describe(mildest), requirement(mildest))
-    best = min(FACTORS, key=lambda x: requirement(x).ratio)
-    return Remedy(describe(best), requirement(best))
+            mildest = printable if needs(printable).certified else factor
+            return Remedy(describe(mildest), needs(mildest))
+    best = min(FACTORS, key=lambda x: needs(x).ratio)
+    return Remedy(describe(best), needs(best))
 
 
 KINDS = {
@@ -401,72 +298,76 @@ KINDS = {
 
 
 def report(
-    subject: Subject,
+    loop: Loop,
+    coupling: Coupling,
     switching: DelayRange | None = None,
     whole: SetCheck | None = None,
 ) -> dict[str, Any]:
     """Both conditions with what surrounds them; SI units, null with a "reason" where a figure does not exist.
 
-    With a range of delays also the damping that any switching within it asks; `whole` is the same coupling over the
-    box around the environment, if there is one.
+    They are about the loop's own environment and constant delays. With a range of delays also the damping that any
+    switching within it asks; `whole` is the same coupling over the box around the environment, if there is one.
+    Raises ValueError naming the field of the loop that is wrong.
     """
-    requirements = {condition: subject.requirement(condition) for condition in reversed(get_args(Condition))}
-    here, anywhere = requirements["closed-loop"].certified, requirements["theorem4"].certified
+    loop = loop.at(loop.environment).switching(None)
+    check_loop(loop)
+    requirements = {name: requirement(loop, coupling, name) for name in reversed(get_args(Condition))}
+    here = requirements["closed-loop"].certified
     proved = bool(whole and whole.proved)
-    rigid = subject.network is None
-    making = subject.network is not None and making_covered(subject._loop(subject.network))
-    promised = promise(anywhere, here, rigid=rigid, walls=subject.walls, making=making, whole_set=proved)
-    gains = subject.coupling if isinstance(subject.coupling, SpringDamper) else None
+    promised = promise_of(requirements, loop, proved)
+    gains = coupling if isinstance(coupling, SpringDamper) else None
     return {
         "coupling": {
-            "kind": KINDS[type(subject.coupling)],
+            "kind": KINDS[type(coupling)],
             "K": gains.K.tolist() if gains else None,
             "B": gains.B.tolist() if gains else None,
         },
         "loop": {
-            "T_s": subject.T,
-            "T_max_s": subject.T_max,
-            "latency_s": subject.latency,
-            "theta": list(subject.theta),
-            "psi": list(subject.psi),
-            "delta": list(subject.delta),
-            "rigid": subject.network is None,
+            "T_s": loop.T,
+            "T_max_s": loop.T_max,
+            "latency_s": loop.latency,
+            "theta": list(loop.theta),
+            "psi": list(loop.psi),
+            "delta": list(loop.delta),
+            "rigid": loop.environment is RIGID_WALL,
         },
-        **{condition: _condition_part(subject, requirement) for condition, requirement in requirements.items()},
-        "jitter-proof": _switching_part(subject, switching) if switching else None,
+        **{name: _condition_part(loop, coupling, needs) for name, needs in requirements.items()},
+        "jitter-proof": _switching_part(loop, coupling, switching) if switching else None,
         "set": whole and set_part(whole),
         "certified": here and (whole is None or proved or promised == ANY),
         "promise": promised,
-        "helps": _helps(subject, requirements["theorem4" if here else "closed-loop"]),
+        "helps": _helps(loop, coupling, requirements["theorem4" if here else "closed-loop"]),
         "not_covered": CAVEATS,
     }
 
 
-def _condition_part(subject: Subject, requirement: Requirement) -> dict[str, Any]:
-    return certificate_part(requirement) | {
-        "stiffest": _stiffest_part(stiffest(subject, requirement.condition)),
-        "sensitivity": _sensitivity_part(subject, requirement, tolerance(subject, requirement)),
+def _condition_part(loop: Loop, coupling: Coupling, needs: Requirement) -> dict[str, Any]:
+    return certificate_part(needs) | {
+        "stiffest": _stiffest_part(stiffest(loop, coupling, needs.condition)),
+        "sensitivity": _sensitivity_part(loop, needs, tolerance(loop, coupling, needs)),
     }
 
 
-def _switching_part(subject: Subject, span: DelayRange) -> dict[str, Any]:
-    found = subject.switching(span)
+def _switching_part(loop: Loop, coupling: Coupling, span: DelayRange) -> dict[str, Any]:
+    """Of an environment with walls, while all of them touch."""
+    touching = msgspec.structs.replace(loop.at(loop.environment.frozen()[-1]), latency=None).switching(span)
+    found = switching_requirement(touching, coupling)
     if found.requirement.reason:
         return certificate_part(found.requirement) | {"lo": list(span.lo), "hi": list(span.hi)}
-    return switching_part(found, subject.G, span, subject.T_max)
+    return switching_part(found, touching.sent(coupling), span, loop.T_max)
 
 
 def _stiffest_part(found: Stiffest) -> dict[str, Any]:
     return {"K": list(found.K)} | _because(found.reason)
 
 
-def _sensitivity_part(subject: Subject, requirement: Requirement, found: Tolerance) -> dict[str, Any]:
+def _sensitivity_part(loop: Loop, needs: Requirement, found: Tolerance) -> dict[str, Any]:
     """Errors are relative: delta may be 1 - delta_error times and T 1 + T_error times what was given."""
     return {
         "least_delta": None if found.least_delta is None else list(found.least_delta),
-        "delta_error": None if found.least_delta is None else 1 - requirement.ratio,
+        "delta_error": None if found.least_delta is None else 1 - needs.ratio,
         "largest_T_s": found.largest_T,
-        "T_error": None if found.largest_T is None else found.largest_T / subject.T - 1,
+        "T_error": None if found.largest_T is None else found.largest_T / loop.T - 1,
         "extra_samples": found.extra_samples,
     } | _because(found.reason)
 
@@ -475,16 +376,16 @@ def _because(reason: str | None) -> dict[str, str]:
     return {"reason": reason} if reason else {}
 
 
-def _helps(subject: Subject, requirement: Requirement) -> list[dict[str, Any]]:
+def _helps(loop: Loop, coupling: Coupling, needs: Requirement) -> list[dict[str, Any]]:
     """Changes that help the condition that fails first: closed-loop, else any_environment."""
     return [
         {
             "change": remedy.change,
-            "condition": requirement.condition,
+            "condition": needs.condition,
             "required_damping": list(remedy.requirement.required),
             "certified": remedy.requirement.certified,
         }
-        for remedy in remedies(subject, requirement)
+        for remedy in remedies(loop, coupling, needs)
     ]
 
 

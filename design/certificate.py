@@ -29,7 +29,7 @@ from controller.coupling import (
     require_channels,
 )
 from controller.delay import delay
-from controller.environment import Member, frozen_states
+from controller.environment import Member
 from controller.loop import DelayRange, Loop
 from controller.lti import Array, Lti, SingularLoop, rational
 from design.conditions import (
@@ -216,7 +216,7 @@ def save(stored: Stored, path: str | Path) -> None:
 # What may be said of a coupling: required against available damping, for which environments, and what is left out.
 
 
-ANY, SET, HERE, WALL = "any passive environment", "a set", "this environment", "a rigid wall only"
+ANY, SET, HERE = "any passive environment", "a set", "this environment"
 FROZEN = "each frozen contact state of this environment (contact that makes and breaks is not covered)"
 
 MAKING = "this environment, with walls up to their stiffness that make and break contact"
@@ -250,39 +250,26 @@ def certificate_part(requirement: Requirement) -> dict[str, Any]:
     return part | ({"reason": requirement.reason} if requirement.reason else {})
 
 
-def promise(
-    theorem4: bool,
-    closed_loop: bool,
-    *,
-    rigid: bool = False,
-    walls: bool = False,
-    making: bool = False,
-    whole_set: bool = False,
-) -> str | None:
-    """For which environments a coupling is certified, given which conditions hold.
-
-    `rigid` if E is a rigid wall that is never left, `walls` if contact is made and broken, `making` if closed-loop is
-    about that and not about frozen contact states, `whole_set` if closed-loop
-    is proved at every vertex of a box around E and a search has found no violation between them.
-    """
-    if theorem4:
-        return ANY
-    if whole_set:
-        return SET
-    return (WALL if rigid else MAKING if making else FROZEN if walls else HERE) if closed_loop else None
-
-
 def switching_promise(span: DelayRange) -> str:
     """Which delays of the forces a coupling is certified for that bears switching, in the environment of its loop."""
     return f"delays switching within {span}"
 
 
 def promise_of(requirements: Mapping[str, Requirement], loop: Loop, whole_set: bool = False) -> str | None:
-    """The promise of a coupling by its requirements; the multiplier that psi >= 1 takes is of one environment."""
-    held = {name: requirement.certified for name, requirement in requirements.items()}
-    walls = bool(loop.environment.walls)
-    anything = held["theorem4"] and not any(loop.psi)
-    return promise(anything, any(held.values()), walls=walls, making=making_covered(loop), whole_set=whole_set)
+    """For which environments a coupling is certified, by its requirements; None for none.
+
+    The multiplier that any-environment takes for psi >= 1 is of one environment. `whole_set`: this-environment is
+    proved at every vertex of the loop's box, and a search has found no violation between them.
+    """
+    if requirements["theorem4"].certified and not any(loop.psi):
+        return ANY
+    if whole_set:
+        return SET
+    if not any(requirement.certified for requirement in requirements.values()):
+        return None
+    if loop.environment.walls:
+        return MAKING if making_covered(loop) else FROZEN
+    return loop.environment.here
 
 
 def encoder_part(
@@ -1026,8 +1013,8 @@ def closed_loop_of(loop: Loop, coupling: Coupling) -> Requirement:
             return walls_of(loop, coupling).requirement
         except NotProved as error:
             return refusal("closed-loop", loop.delta, str(error))
-    states = (loop.at(state) for state in frozen_states(loop.environment).values())
-    requirements = [this_environment(state.F(coupling), loop.delta, loop.T_max, loop.latency) for state in states]
+    maps = (state.F(coupling) for state in loop.frozen())
+    requirements = [this_environment(F, loop.delta, loop.T_max, loop.latency) for F in maps]
     return max(requirements, key=lambda requirement: requirement.ratio)
 
 

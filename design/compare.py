@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from controller.coupling import Coupling, NoCoupling
 from controller.delay import delay
-from controller.environment import environment
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.bound import bound
@@ -95,7 +94,7 @@ def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Judged:
 def grid(loop: Loop, couplings: Sequence[Judged], low_hz: float = LOWEST_HZ) -> Array:
     """Frequencies [Hz] up to Nyquist's, dense around every pole, with FEEL_HZ and where conditions bind."""
     per_hz = 2 * np.pi * loop.T
-    systems = (environment(loop.environment, loop.T), *(judged.F for judged in couplings))
+    systems = (loop.E(), *(judged.F for judged in couplings))
     even = frequencies(*systems, low=low_hz * per_hz, high=np.pi, points=200) / per_hz
     binding = [r.frequency_hz for judged in couplings for r in judged.requirements.values()]
     wanted = (*FEEL_HZ, *(hz for hz in binding if hz is not None))
@@ -106,7 +105,7 @@ def curves(loop: Loop, judged: Judged, hz: Array) -> Curves:
     """The curves of one coupling at `hz` (k,)."""
     w = 2 * np.pi * hz * loop.T
     z = on_circle(w)
-    E = environment(loop.environment, loop.T)
+    E = loop.E()
     target = (delay(loop.lam, loop.T) @ E).at(z)
     F = judged.F.at(z)
     demands = {name: None if demand is None else demand(w) for name, demand in judged.demands.items()}
@@ -115,7 +114,7 @@ def curves(loop: Loop, judged: Judged, hz: Array) -> Curves:
 
 def ideal(loop: Loop, hz: Array) -> tuple[Array, Perceived]:
     """Singular values of E (k, m) [N/m] and its effective impedance: what an undelayed loop without coupling gives."""
-    E = environment(loop.environment, loop.T).at(on_circle(2 * np.pi * hz * loop.T))
+    E = loop.E().at(on_circle(2 * np.pi * hz * loop.T))
     return singular_values(E), perceived(E, hz)
 
 

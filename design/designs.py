@@ -85,17 +85,15 @@ def design_by_kind(
         raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(KINDS[kind])}")
     from design import fixed_order as ccl  # cvxpy takes a second to import
     from design import spring_damper
-    from design.lmi import Specification
 
     def made(loop: Loop) -> Design:
         if kind == "optimal":
             return _optimal(loop, progress, **options)
-        spec = Specification.of(loop)
         if kind == "ccl":
-            return ccl.design(spec, **options)
+            return ccl.design(loop, **options)
         if kind == "moving-average":
-            return spring_damper.moving_average(spec)
-        return spring_damper.design(spec, condition, **options)
+            return spring_damper.moving_average(loop)
+        return spring_damper.design(loop, condition, **options)
 
     if loop.latency is None:
         return made(loop)
@@ -149,11 +147,10 @@ def _optimal(
 
 
 def compare_methods(loop: Loop) -> tuple[Row, ...]:
-    """Every method on the same specification: norm, convex problems, seconds."""
+    """Every method for the same loop: norm, convex problems, seconds."""
     from design import fixed_order as ccl
-    from design.lmi import Specification
 
-    return ccl.compare(Specification.of(loop))
+    return ccl.compare(loop)
 
 
 Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from controller.environment import environment
-from controller.loop import Loop, force_map
+from controller.delay import delay
+from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.certificate import Stored
 
@@ -76,8 +76,9 @@ def process_block(stored: Stored, with_theta: bool = True) -> Block:
     """F(z) (6), device displacements to forces; Theta is left out where the link to the devices is the delay."""
     loop = stored.loop
     theta = loop.theta if with_theta else (0,) * len(loop.theta)
-    E = environment(loop.environment, loop.T)
-    F = force_map(E, stored.coupling.build(loop.T), theta, loop.psi)
+    if loop.environment.walls:
+        raise NothingToExport("environment.walls: contact that makes and breaks is not a linear block")
+    F = delay(theta, loop.T) @ loop.sent(stored.built())
     about = (
         "f = F x: the whole discrete process; the devices get -f, held for T. Forces are not limited here.",
         _delays(loop, with_theta),

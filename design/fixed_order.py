@@ -12,31 +12,31 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
 
 import cvxpy as cp
+import msgspec
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.optimize import minimize
 
 from controller.coupling import Compliance, SpringDamper
+from controller.loop import Loop
 from controller.lti import Array, Lti
 from design import spring_damper
-from design.conditions import Requirement, any_environment, any_environment_delayed
+from design.conditions import Requirement
 from design.frequency import on_circle
 from design.lmi import (
     Ports,
     Shaping,
-    Specification,
     affine,
     affine_lmis,
     gain_lmi,
+    least_phi,
     lemma1,
     lemma2,
     lemma3,
     packed,
     reachability_scaled,
-    shortage,
     solve,
     solved,
     symmetric,
@@ -64,19 +64,19 @@ class FixedOrder:
     Everything is in units T = 1 and usable damping = I. `sigma` (N,) is Delta_V^-1 there, inf where psi = 0.
     """
 
-    def __init__(self, spec: Specification, sigma: Array, order: int = 1, diagonal: bool = True) -> None:
+    def __init__(self, shaping: Shaping, sigma: Array, order: int = 1, diagonal: bool = True) -> None:
         if order < 1:
             raise ValueError(f"order is {order}, expected one state per channel or more")
-        self.spec, self.sigma, self.order, self.diagonal = spec, sigma, order, diagonal
-        N = spec.channels
+        self.loop, self.usable, self.sigma, self.order = shaping.loop, shaping.usable, sigma, order
+        N = self.loop.channels
         self.states = N * order
         one, row = np.eye(N), np.eye(order)[:1]
         self.F = np.kron(one, row)  # reads the first state of every channel
         masks = [np.kron(one, np.ones((order, order))), np.kron(one, np.ones((order, 1))), one]
         masks = masks if diagonal else [np.ones_like(mask) for mask in masks]
         self._free = [np.nonzero(mask) for mask in (*masks[:2], np.triu(masks[2]))]
-        self.plant = _plant(spec)
-        self.window = theta_hat(spec.theta)
+        self.plant = _plant(shaping)
+        self.window = theta_hat(self.loop.theta)
 
     @property
     def unknowns(self) -> int:
@@ -84,7 +84,7 @@ class FixedOrder:
 
     def matrices(self, p: Array) -> tuple[Array, Array, Array]:
         """A, B and V1 from their free entries."""
-        N = self.spec.channels
+        N = self.loop.channels
         found = [np.zeros(shape) for shape in ((self.states, self.states), (self.states, N), (N, N))]
         ends = np.cumsum([rows.size for rows, _ in self._free])[:-1]
         for matrix, free, values in zip(found, self._free, np.split(p, ends), strict=True):
@@ -99,13 +99,12 @@ class FixedOrder:
 
     def coupling(self, p: Array) -> Lti:
         """V in SI units [m/N]."""
-        V, root, T = self.unit_coupling(p), 1 / np.sqrt(self.spec.usable), self.spec.T
+        V, root, T = self.unit_coupling(p), 1 / np.sqrt(self.usable), self.loop.T
         return Lti(V.A, V.B * root, T * root[:, None] * V.C, T * root[:, None] * V.D * root, T)
 
     def start(self, gains: SpringDamper) -> Array:
         """p of a spring-damper; further states are driven by nothing yet, but are seen."""
-        usable = self.spec.usable
-        k, b = gains.K * self.spec.T / usable, gains.B / usable
+        k, b = gains.K * self.loop.T / self.usable, gains.B / self.usable
         pole = b / (k + b)
         A = np.kron(np.diag(pole), np.diag(np.eye(self.order)[0]))
         spare = np.diag(np.r_[0.0, SPARE_POLE ** np.arange(1, self.order)]) + np.eye(self.order, k=1)
@@ -126,9 +125,9 @@ class FixedOrder:
         C2, D2 = np.hstack([self.F, -quotient]), (V1 - G.dc()) / 2
         return Ports(block_diag(A, G.A), np.vstack([B, G.B]), C2, D2, C1, D1)
 
-    def loop(self, p: Array) -> tuple[Array, Array, Array, Array]:
+    def weighted_loop(self, p: Array) -> tuple[Array, Array, Array, Array]:
         """A, B, C, D of W1 L W2: the plant with V closed between its output u and its input v."""
-        V, (G, r) = self.unit_coupling(p), (self.plant, self.spec.channels)
+        V, (G, r) = self.unit_coupling(p), (self.plant, self.loop.channels)
         Br, Bv = G.B[:, :r], G.B[:, r:]
         y = G.outputs - V.inputs
         Cy, Cu = G.C[:y], G.C[y:]
@@ -138,10 +137,10 @@ class FixedOrder:
         return A, B, np.hstack([Cy + Dyv @ V.D @ Cu, Dyv @ V.C]), Dyr + Dyv @ V.D @ Dur
 
 
-def _plant(spec: Specification) -> Lti:
+def _plant(shaping: Shaping) -> Lti:
     """[y; u] from [r; v]: y = W1 ((I - Psi Lambda^-1 Theta) W2 r + Psi E v), u = W2 r, with v and u in unit scale."""
-    N, T, shaping = spec.channels, spec.T, Shaping(spec)
-    root, one, zero = 1 / np.sqrt(spec.usable), np.eye(N), np.zeros((N, N))
+    N, T = shaping.loop.channels, shaping.loop.T
+    root, one, zero = 1 / np.sqrt(shaping.usable), np.eye(N), np.zeros((N, N))
 
     def constant(D: Array) -> Lti:
         return Lti.constant(D, T)
@@ -166,7 +165,7 @@ def passivity_storage(family: FixedOrder, p: Array) -> Array:
 
 def gain_storage(family: FixedOrder, p: Array, mu: float) -> Array:
     """U = X^-1 > 0 of Lemma 3, ||W1 L W2||_inf < mu, with the most room in coordinates of unit reachability."""
-    A, B, C, D = family.loop(p)
+    A, B, C, D = family.weighted_loop(p)
     S = reachability_scaled(Lti(A, B, C, D, 1.0))
     A, B, C, D = np.linalg.solve(S, A @ S), np.linalg.solve(S, B), C @ S / mu, D / mu
     m = B.shape[1]
@@ -233,7 +232,7 @@ def _step(family: FixedOrder, at: Array, Q0: Array, U0: Array, norm: float) -> t
 
     def gain(v: Array) -> Array:
         p, _, U, t = split(v)
-        A, B, C, D = family.loop(p)
+        A, B, C, D = family.weighted_loop(p)
         A, B, C = np.linalg.solve(LU, A @ LU), np.linalg.solve(LU, B), C @ LU / norm
         return lemma3(A, B, C, D / norm, 2 * np.eye(nu) - U, U, t)
 
@@ -326,7 +325,7 @@ class _Relaxed:
 
         def gain(v: Array) -> Array:
             p, (_, _, U, X) = self.split(v)
-            A, B, C, D = self.family.loop(p)
+            A, B, C, D = self.family.weighted_loop(p)
             A, B, C = np.linalg.solve(self.LU, A @ self.LU), np.linalg.solve(self.LU, B), C @ self.LU / self.norm
             return lemma3(A, B, C, D / self.norm, X, U, (mu / self.norm) ** 2)
 
@@ -350,10 +349,10 @@ MOST_CUTS = 20
 
 
 class FixedPoles:
-    """The problem for one specification; frequencies that were binding are kept from one set of poles to the next."""
+    """The problem for one loop; frequencies that were binding are kept from one set of poles to the next."""
 
-    def __init__(self, spec: Specification, sigma: Array) -> None:
-        self.spec, self.sigma, self.shaping = spec, sigma, Shaping(spec)
+    def __init__(self, shaping: Shaping, sigma: Array) -> None:
+        self.loop, self.sigma, self.shaping = shaping.loop, sigma, shaping
         self.frequencies = [0.0]
         self.sdps = 0
 
@@ -388,8 +387,8 @@ class FixedPoles:
         return self.best([[a] for a in np.tanh(found.x)])
 
     def _solve(self, poles: Sequence[Sequence[float]]) -> tuple[Lti, float]:
-        spec, N = self.spec, self.spec.channels
-        states = sum(map(len, poles)) + sum(spec.theta)
+        N = self.loop.channels
+        states = sum(map(len, poles)) + sum(self.loop.theta)
         gains, storage, t = cp.Variable(N + sum(map(len, poles))), cp.Variable(packed(states)), cp.Variable()
         x = cp.hstack([gains, storage])
 
@@ -414,13 +413,13 @@ class FixedPoles:
         return Lti(A, B, F - F @ A, V1 - F @ B, 1.0), F, V1
 
     def _coupling(self, poles: Sequence[Sequence[float]], gains: Array) -> Lti:
-        V, root, T = self._unit(poles, gains)[0], 1 / np.sqrt(self.spec.usable), self.spec.T
+        V, root, T = self._unit(poles, gains)[0], 1 / np.sqrt(self.shaping.usable), self.loop.T
         return Lti(V.A, V.B * root, T * root[:, None] * V.C, T * root[:, None] * V.D * root, T)
 
     def _passivity(self, poles: Sequence[Sequence[float]], gains: Array, P: Array) -> Array:
         """The remedied (2) with the excess term by a Schur complement, so that it is linear in (gains, P)."""
         V, F, V1 = self._unit(poles, gains)
-        G = theta_hat(self.spec.theta)
+        G = theta_hat(self.loop.theta)
         C2 = np.hstack([F, G.quotient_at_one().C])
         C1, D1 = np.hstack([V.C, -G.C]), V.D - G.D
         ports = Ports(block_diag(V.A, G.A), np.vstack([V.B, G.B]), C2, (V1 - G.dc()) / 2, C1, D1)
@@ -450,7 +449,7 @@ SETTLED = 1e-4
 
 
 def design(
-    spec: Specification,
+    loop: Loop,
     order: int = 1,
     diagonal: bool = True,
     method: str = "inner",
@@ -467,7 +466,7 @@ def design(
     if method == "fixed-poles" and (order, diagonal) != (1, True):
         raise ValueError("method 'fixed-poles' is for one state per channel, diagonal")
     started = time.perf_counter()
-    search = _Search(spec, order, diagonal, start)
+    search = _Search(loop, order, diagonal, start)
     V = search.run(method, most_sdps)
     return Design(
         coupling=Compliance(V),
@@ -481,14 +480,14 @@ def design(
     )
 
 
-def compare(spec: Specification, methods: Iterable[str] = METHODS, most_sdps: int = 100) -> tuple[Row, ...]:
-    """Every method on the same specification, one state per channel, diagonal; the first row is their common start."""
-    first = spring_damper.design(spec)
+def compare(loop: Loop, methods: Iterable[str] = METHODS, most_sdps: int = 100) -> tuple[Row, ...]:
+    """Every method on the same loop, one state per channel, diagonal; the first row is their common start."""
+    first = spring_damper.design(loop)
     rows = [Row("spring-damper", first.objective, first.sdps, first.wall_s)]
     for method in methods:
         started = time.perf_counter()
         try:
-            found = design(spec, method=method, most_sdps=most_sdps)
+            found = design(loop, method=method, most_sdps=most_sdps)
             rows.append(Row(method, found.objective, found.sdps, found.wall_s))
         except DesignFailed as error:
             rows.append(Row(method, None, len(error.results), time.perf_counter() - started, str(error)))
@@ -498,18 +497,15 @@ def compare(spec: Specification, methods: Iterable[str] = METHODS, most_sdps: in
 class _Search:
     """One run: the family of couplings, the judge, and the count of problems solved."""
 
-    def __init__(self, spec: Specification, order: int, diagonal: bool, start: SpringDamper | None) -> None:
-        self.spec, self.shaping, self.sdps = spec, Shaping(spec), 0
-        self.phi = shortage(spec)
-        self.sigma = spring_damper.excess_limits(spec, self.phi)
-        self.family = FixedOrder(spec, self.sigma, order, diagonal)
+    def __init__(self, loop: Loop, order: int, diagonal: bool, start: SpringDamper | None) -> None:
+        self.loop, self.shaping, self.sdps = loop, Shaping(loop), 0
+        self.phi = least_phi(loop)
+        self.sigma = spring_damper.excess_limits(loop, self.phi)
+        self.family = FixedOrder(self.shaping, self.sigma, order, diagonal)
         self.gains = start or self._structured()
 
     def requirement(self, V: Lti) -> Requirement:
-        spec = self.spec
-        if self.phi is None:
-            return any_environment(V, spec.theta, spec.delta)
-        return any_environment_delayed(V, spec.environment, spec.theta, spec.psi, spec.delta, self.phi)
+        return spring_damper.any_environment_with(self.loop, V, self.phi)
 
     def run(self, method: str, most_sdps: int) -> Lti:
         """The coupling found, certified."""
@@ -524,7 +520,7 @@ class _Search:
         return V
 
     def _structured(self) -> SpringDamper:
-        reserved = replace(self.spec, delta=tuple((1 - START_ROOM) * d for d in self.spec.delta))
+        reserved = msgspec.structs.replace(self.loop, delta=tuple((1 - START_ROOM) * d for d in self.loop.delta))
         found = spring_damper.design(reserved)
         self.sdps += found.sdps
         assert isinstance(found.coupling, SpringDamper)
@@ -553,8 +549,8 @@ class _Search:
         return p
 
     def _fixed_poles(self, most_sdps: int) -> Lti:
-        problem = FixedPoles(self.spec, self.sigma)
-        rate = self.gains.B / (self.gains.B + self.gains.K * self.spec.T)
+        problem = FixedPoles(self.shaping, self.sigma)
+        rate = self.gains.B / (self.gains.B + self.gains.K * self.loop.T)
         V, _ = problem.search(rate.tolist(), lambda V: self.requirement(V).certified, evaluations=most_sdps)
         self.sdps += problem.sdps
         return V

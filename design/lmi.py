@@ -25,10 +25,9 @@ from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_discrete_lyapunov, svd
 
 from controller.delay import delay
-from controller.environment import Region, environment, members, regions, shrunk
 from controller.loop import Loop
 from controller.lti import Array, Lti
-from design.conditions import dampings, even_damping, regular_part, uncovered
+from design.conditions import even_damping, regular_part, uncovered
 from design.frequency import frequencies, hermitian, on_circle, supremum
 from design.result import Attempt, DesignFailed, Infeasible
 
@@ -36,78 +35,11 @@ from design.result import Attempt, DesignFailed, Infeasible
 RESERVE = 1e-4
 
 
-@dataclass(frozen=True, eq=False)
-class Specification:
-    """N channels in, N channels out. Raises ValueError naming the field that is wrong."""
-
-    environment: Lti  # E(z), N x N, passive
-    theta: tuple[int, ...]  # (N,) transmission delays [samples]
-    psi: tuple[int, ...]  # (N,) environment delays [samples]
-    lam: tuple[int, ...]  # (N,) delays of the reference Lambda (7) [samples], 0 <= lam <= theta + psi
-    delta: tuple[float, ...]  # (N,) device dampings [N s/m]
-    W1: Lti | None = None  # weight on the left of (22); the identity if None
-    W2: Lti | None = None  # diagonal weight on its right; low_pass if None
-    others: Mapping[str, Lti] = field(default_factory=dict)  # by name: what else the environment may be, for `optimal`
-    regions: tuple[Region, ...] = ()  # the box of the others, in which the design is searched for violations
-    shrunk: Callable[[float], Mapping[str, Lti]] | None = None  # the others of a box with ranges so many times as wide
-
-    def __post_init__(self) -> None:
-        E = self.environment
-        if E.inputs != E.outputs:
-            raise ValueError(f"environment is {E.outputs} x {E.inputs}, expected one force per contact")
-        for name in ("theta", "psi", "lam"):
-            object.__setattr__(self, name, _delays(name, getattr(self, name), E.inputs))
-        object.__setattr__(self, "delta", dampings(self.delta, E.inputs))
-        if min(self.delta) == 0:
-            raise ValueError(f"delta is {list(self.delta)}, expected positive dampings in N s/m")
-        ahead = [i for i, spare in enumerate(self.advance) if spare < 0]
-        if ahead:
-            i = ahead[0]
-            limit = self.theta[i] + self.psi[i]
-            raise ValueError(f"lam[{i}] is {self.lam[i]}, expected at most theta + psi = {limit} samples (7)")
-        W1 = self.W1 or Lti.constant(np.eye(E.inputs), E.T)
-        W2 = self.W2 or low_pass(E.inputs, E.T)
-        object.__setattr__(self, "W1", W1)
-        object.__setattr__(self, "W2", W2)
-        _check_weights(W1, W2, E)
-        check_passive(E)
-
-    @classmethod
-    def of(cls, loop: Loop) -> Specification:
-        """The loop as a request for a design, every wall touching. Raises ValueError naming the field that is wrong."""
-        box, usable = loop.box, tuple(even_damping(loop.delta, loop.T, loop.T_max).tolist())
-        if box is None:
-            return cls(loop.E(), loop.theta, loop.psi, loop.lam, usable)
-
-        def others(factor: float = 1.0) -> dict[str, Lti]:
-            _, *vertices = members(loop.environment, box if factor == 1 else shrunk(loop.environment, box, factor))
-            return {vertex.name: environment(vertex.network, loop.T) for vertex in vertices}
-
-        delays, parts = (loop.theta, loop.psi, loop.lam), regions(loop.environment, box)
-        return cls(loop.E(), *delays, usable, others=others(), regions=parts, shrunk=others)
-
-    @property
-    def channels(self) -> int:
-        return self.environment.inputs
-
-    @property
-    def T(self) -> float:
-        return self.environment.T
-
-    @property
-    def advance(self) -> tuple[int, ...]:
-        """(N,) samples by which the round trip is later than the reference: the exponent of Psi Lambda^-1 Theta."""
-        return tuple(t + p - n for t, p, n in zip(self.theta, self.psi, self.lam, strict=True))
-
-    @property
-    def delayed_environment(self) -> Lti:
-        """Psi E."""
-        return delay(self.psi, self.T) @ self.environment
-
-    @property
-    def usable(self) -> Array:
-        """(N,) the damping that a design may spend [N s/m]."""
-        return (1 - RESERVE) * np.asarray(self.delta)
+def usable(loop: Loop) -> Array:
+    """(m,) the damping that a design may spend [N s/m], where periods are even. Raises ValueError where it is none."""
+    if min(loop.delta) <= 0:
+        raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
+    return (1 - RESERVE) * even_damping(loop.delta, loop.T, loop.T_max)
 
 
 def low_pass(channels: int, T: float, f0: float = 80.0) -> Lti:
@@ -138,29 +70,16 @@ def check_passive(E: Lti, tolerance: float = 1e-9) -> None:
         raise ValueError(f"environment is not passive: it produces energy at {w / (2 * np.pi * E.T):.4g} Hz")
 
 
-def _delays(name: str, steps: Sequence[int], channels: int) -> tuple[int, ...]:
-    if len(steps) != channels:
-        raise ValueError(f"{name} has {len(steps)} entries for {channels} channels")
-    if any(n != int(n) or n < 0 for n in steps):
-        raise ValueError(f"{name} is {list(steps)}, expected whole numbers of samples, zero or more")
-    return tuple(int(n) for n in steps)
-
-
-def _check_weights(W1: Lti, W2: Lti, E: Lti) -> None:
-    if W1.inputs != E.outputs or (W2.inputs, W2.outputs) != (E.inputs, E.inputs):
-        raise ValueError(f"W1 and W2 must fit the {E.inputs} channels on the inside, W2 also on the outside")
+def _check_weights(W1: Lti, W2: Lti, channels: int) -> None:
+    if W1.inputs != channels or (W2.inputs, W2.outputs) != (channels, channels):
+        raise ValueError(f"W1 and W2 must fit the {channels} channels on the inside, W2 also on the outside")
     for name, W in (("W1", W1), ("W2", W2)):
         if not W.is_stable():
             raise ValueError(f"{name} has a pole on or outside the unit circle, so no norm is finite")
     z = on_circle(np.array([0.1, 1.0, 3.0]))
     response = W2.at(z)
-    if np.abs(response - response * np.eye(E.inputs)).max() > 1e-9 * np.abs(response).max():
+    if np.abs(response - response * np.eye(channels)).max() > 1e-9 * np.abs(response).max():
         raise ValueError("W2 must be diagonal: the convex-concave step divides by it channel by channel")
-
-
-def least_phi(loop: Loop) -> Array | None:
-    """The multiplier that any-environment takes where psi >= 1; see `shortage`."""
-    return shortage(Specification.of(loop))
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -278,15 +197,22 @@ Complex = NDArray[np.complex128]
 
 
 class Shaping:
-    """L (22) for one specification, evaluated fast for many couplings."""
+    """L (22) of a loop, evaluated fast for many couplings.
 
-    def __init__(self, spec: Specification) -> None:
-        assert spec.W1 is not None  # the identity and a low-pass filter, where none were given
-        assert spec.W2 is not None
-        self.spec, self.W1, self.W2 = spec, spec.W1, spec.W2
-        one = Lti.constant(np.eye(spec.channels), spec.T)
-        self.late = one - delay(spec.advance, spec.T)  # I - Psi Lambda^-1 Theta
-        self.environment = spec.delayed_environment
+    W1 and W2, diagonal, weigh it from the left and from the right; the identity and `low_pass` if they are None. Raises
+    ValueError for weights that do not fit, and for an environment that is active.
+    """
+
+    def __init__(self, loop: Loop, W1: Lti | None = None, W2: Lti | None = None) -> None:
+        N, T, E = loop.channels, loop.T, loop.E()
+        one = Lti.constant(np.eye(N), T)
+        self.loop, self.usable = loop, usable(loop)
+        self.W1, self.W2 = W1 or one, W2 or low_pass(N, T)
+        _check_weights(self.W1, self.W2, N)
+        check_passive(E)
+        advance = [t + p - n for t, p, n in zip(loop.theta, loop.psi, loop.lam, strict=True)]
+        self.late = one - delay(advance, T)  # I - Psi Lambda^-1 Theta
+        self.environment = delay(loop.psi, T) @ E  # Psi E
 
     def parts(self, w: Array) -> tuple[Complex, Complex, Complex]:
         """W1 Psi E, W2 and W1 (I - Psi Lambda^-1 Theta) at exp(jw), each (k, ., .)."""
@@ -339,7 +265,7 @@ def symmetric_from(vector: Array, n: int) -> Array:
 # State coordinates and units in which matrix inequalities are well scaled.
 
 
-def unit_environment(E: Lti, delta: Sequence[float]) -> Lti:
+def unit_environment(E: Lti, delta: Sequence[float] | Array) -> Lti:
     """E in units where T = 1 and Delta_D = I: T Delta_D^-1/2 E Delta_D^-1/2."""
     root = 1 / np.sqrt(np.asarray(delta))
     return _scaled(E, E.T * root, root)
@@ -445,37 +371,37 @@ def gain_lmi(
 ROOM = 1e-6
 
 
-def shortage(spec: Specification) -> Array | None:
+def least_phi(loop: Loop) -> Array | None:
     """`least_multiplier`, verified on a refined sweep; None where psi = 0, since a passive environment needs none."""
-    if not any(spec.psi):
+    if not any(loop.psi):
         return None
-    phi = least_multiplier(spec) + ROOM * np.asarray(spec.delta)
-    short = uncovered(spec.environment, spec.psi, np.diag(phi))
+    phi = least_multiplier(loop) + ROOM * even_damping(loop.delta, loop.T, loop.T_max)
+    short = uncovered(loop.E(), loop.psi, np.diag(phi))
     if short > 0:
         raise DesignFailed(None, (), f"the multiplier Phi = {phi.tolist()} leaves {short:.2e} N s/m uncovered")
     return phi
 
 
-def least_multiplier(spec: Specification) -> Array:
+def least_multiplier(loop: Loop) -> Array:
     """Diagonal Phi of least trace [N s/m], shape (N,), with E-hat + Phi passive and Phi < Delta_D.
 
     Raises Infeasible, with the damping that would be needed, where even a full Phi is not below Delta_D.
     """
-    regular = balanced(e_hat_regular(unit_environment(spec.environment, spec.delta), spec.psi))
-    N = spec.channels
+    delta, N = even_damping(loop.delta, loop.T, loop.T_max), loop.channels
+    regular = balanced(e_hat_regular(unit_environment(loop.E(), delta), loop.psi))
     full, s = cp.Variable((N, N), symmetric=True), cp.Variable()
     _minimise(s, full, regular, [full << s * np.eye(N)])
     least = float(solved(s))
     if least >= 1:
-        raise Infeasible(None, (), _needs(spec, least))
+        raise Infeasible(None, (), _needs(loop.psi, delta, least))
     phi = cp.Variable(N)
     _minimise(s, cp.diag(phi), regular, [phi <= s])
     least = float(solved(s))
     if least >= 1:
-        raise Infeasible(None, (), _needs(spec, least))
+        raise Infeasible(None, (), _needs(loop.psi, delta, least))
     # halfway between the least largest entry and Delta_D: least trace alone may touch Delta_D
     _minimise(cast(cp.Expression, cp.sum(phi)), cp.diag(phi), regular, [phi <= (1 + least) / 2])
-    return np.maximum(solved(phi), 0.0) * np.asarray(spec.delta)
+    return np.maximum(solved(phi), 0.0) * delta
 
 
 def _minimise(objective: cp.Expression, Phi: cp.Expression, regular, constraints: list[cp.Constraint]) -> None:
@@ -485,11 +411,11 @@ def _minimise(objective: cp.Expression, Phi: cp.Expression, regular, constraints
     solve(problem, "the multiplier Phi of the environment")
 
 
-def _needs(spec: Specification, least: float) -> str:
-    required = ", ".join(f"{least * d:.4g}" for d in spec.delta)
+def _needs(psi: Sequence[int], delta: Array, least: float) -> str:
+    required = ", ".join(f"{least * d:.4g}" for d in delta)
     return (
-        f"Theorem 4 admits no coupling: with psi = {spec.psi} the environment alone uses up {required} N s/m of device "
-        f"damping and delta is {spec.delta}; use less psi, a softer environment or more device damping"
+        f"Theorem 4 admits no coupling: with psi = {psi} the environment alone uses up {required} N s/m of device "
+        f"damping and delta is {tuple(delta.tolist())}; use less psi, a softer environment or more device damping"
     )
 
 

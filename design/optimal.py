@@ -686,10 +686,9 @@ class _Climb:
         if len(self.cases) > 1 or self.constrained:
             return None
         from design import spring_damper  # its solvers load slowly, and most designs end before
-        from design.lmi import Specification
 
         try:
-            gains = spring_damper.design(Specification.of(self.loop), "closed-loop").coupling
+            gains = spring_damper.design(self.loop, "closed-loop").coupling
             return self._proved(self._assessed(gains, np.nan))
         except (DesignFailed, ValueError):
             return None
@@ -789,7 +788,7 @@ def vertices(network: Network, percent: float = 10.0) -> dict[str, Network]:
 def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> Robustness:
     """The worst need of a coupling over `vertices`, by the refined sweep."""
     worst, where = 0.0, "nominal"
-    for name, network in {"nominal": loop.environment, **vertices(loop.environment, percent)}.items():
+    for name, network in {"nominal": loop.environment, **vertices(loop.network, percent)}.items():
         there = _at(loop, network)
         if isinstance(coupling, ForceFilter):
             ratio = Case(there, there.E()).need(coupling)

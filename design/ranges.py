@@ -236,7 +236,7 @@ def check_set(
     if loop.box is None:
         return None
     searched = searched or search_box(loop, coupling, progress)
-    members, drawn = loop.members(), inside(loop.environment, loop.box, samples, seed)
+    members, drawn = loop.members(), inside(loop.network, loop.box, samples, seed)
     try:
         certificate, reason = certificate or prove(loop, coupling, "closed-loop"), None
     except NotProved as error:
@@ -255,7 +255,7 @@ def check_set(
 def search_box(loop: Loop, coupling: Coupling, progress: Progress = lambda done, total: None) -> Searched:
     """The worst environments of the loop's box that the search of design.box.worst_member finds."""
     assert loop.box
-    parts = regions(loop.environment, loop.box)
+    parts = regions(loop.network, loop.box)
     return search(parts, lambda member: in_each(loop, coupling, [member])[0].ratio, progress)
 
 

@@ -16,8 +16,8 @@ from scipy.optimize import OptimizeResult, minimize
 
 from controller.coupling import MovingAverage, SpringDamper
 from controller.delay import delay
-from controller.loop import force_map
-from controller.lti import Array, Sampled
+from controller.loop import Loop, force_map
+from controller.lti import Array, Lti, Sampled
 from design.conditions import (
     BETA,
     Lags,
@@ -25,6 +25,7 @@ from design.conditions import (
     Requirement,
     any_environment,
     any_environment_delayed,
+    even_damping,
     half_widths,
     jitter_proof,
     limiter_demand,
@@ -34,7 +35,7 @@ from design.conditions import (
 )
 from design.conditions import limiter as limiter_proof
 from design.frequency import frequencies, hermitian, on_circle, peaks
-from design.lmi import RESERVE, Complex, Shaping, Specification, affine_lmis, gain_lmi, shortage, solve, solved
+from design.lmi import RESERVE, Complex, Shaping, affine_lmis, gain_lmi, least_phi, solve, solved, usable
 from design.result import Design, DesignFailed, Infeasible
 from design.transparency import BAND_HZ, transparency
 
@@ -170,26 +171,26 @@ def _parts(values: Array) -> tuple[Array, Array]:
 # keeps what the one before achieved, and mu^2 enters linearly: no bisection.
 
 
-def step(spec: Specification, sigma: Array, shaping: Shaping, at: Array, norm: float, w: Array) -> tuple[Array, float]:
+def step(shaping: Shaping, sigma: Array, at: Array, norm: float, w: Array) -> tuple[Array, float]:
     """(gains, bound on the norm at the frequencies w) of one convex-concave step from the gains `at`."""
-    N = spec.channels
-    gains, t = cp.Variable(2 * N), cp.Variable()
-    constant, slopes = _tangent(spec, shaping, at, norm, w)
+    loop = shaping.loop
+    gains, t = cp.Variable(2 * loop.channels), cp.Variable()
+    constant, slopes = _tangent(shaping, at, norm, w)
     cuts = affine_lmis(constant, slopes, cp.hstack([gains, t]))
-    solve_within(cp.Minimize(t), gains, spec.theta, sigma, "a step of the convex sequence", cuts)
+    solve_within(cp.Minimize(t), gains, loop.theta, sigma, "a step of the convex sequence", cuts)
     return solved(gains), norm * float(np.sqrt(solved(t)))
 
 
-def _tangent(spec: Specification, shaping: Shaping, at: Array, norm: float, w: Array) -> tuple[Complex, Complex]:
+def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> tuple[Complex, Complex]:
     """[[g0* g + g* g0 - g0* g0, (W1 L g W2)*], [W1 L g W2, t norm^2]], scaled to order one; t is the last variable."""
-    N = spec.channels
+    N = shaping.loop.channels
     left, right, late = shaping.parts(w)
     difference = 1 - np.exp(-1j * w)
     basis = np.eye(N)[:, None, :] * np.ones((w.size, 1))  # (N, k, N): e_i at every frequency
     g = np.concatenate([basis, basis * difference[:, None]])  # (2N, k, N): diagonals of g by variable
     g0 = np.tensordot(at, g, axes=1)  # (k, N)
     scale = 1 / np.abs(g0)  # columns are divided by |g0|, rows by the norm
-    rows = (left * (spec.T / spec.usable)) @ right * scale[:, None, :] / norm
+    rows = (left * (shaping.loop.T / shaping.usable)) @ right * scale[:, None, :] / norm
     row_slopes = (late * g[:, :, None, :]) @ right * scale[:, None, :] / norm
     tangent = 2 * (np.conj(g0) * g).real * scale**2
     diagonal = np.eye(N)
@@ -217,40 +218,42 @@ MOST_ROUNDS_FROZEN_ENVIRONMENT = 8
 class SampledLoop:
     """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta), shape (2N,)."""
 
-    def __init__(self, spec: Specification) -> None:
-        self.spec = spec
-        per_hz = 2 * np.pi * spec.T
+    def __init__(self, loop: Loop) -> None:
+        self.loop, self.E = loop, loop.E()
+        per_hz = 2 * np.pi * loop.T
         low, high = (per_hz * f for f in BAND_HZ)
-        self.band = frequencies(spec.environment, low=low, high=min(high, np.pi), points=80)
-        self.conditions = frequencies(spec.environment, low=1e-3, points=80)
-        self.loop_in_band, self.loop_at_conditions = self._loop(self.band), self._loop(self.conditions)
-        E = spec.environment.at(on_circle(self.band))
+        self.band = frequencies(self.E, low=low, high=min(high, np.pi), points=80)
+        self.conditions = frequencies(self.E, low=1e-3, points=80)
+        self.loop_in_band, self.loop_at_conditions = self._responses(self.band), self._responses(self.conditions)
+        E = self.E.at(on_circle(self.band))
         self.size2 = (np.abs(E) ** 2).sum(axis=(1, 2))
-        self.target = delay(spec.lam, spec.T).at(on_circle(self.band)) @ E
-        self.root = np.sqrt(spec.T / np.asarray(spec.delta))
+        self.target = delay(loop.lam, loop.T).at(on_circle(self.band)) @ E
+        self.delta = even_damping(loop.delta, loop.T, loop.T_max)
+        self.root = np.sqrt(loop.T / self.delta)
 
     def coupling(self, x: Array) -> SpringDamper:
         log_k, b = np.split(x, 2)
-        return SpringDamper(np.exp(log_k), np.maximum(b, 0.0) * self.spec.delta)
+        return SpringDamper(np.exp(log_k), np.maximum(b, 0.0) * self.delta)
 
     def point(self, coupling: SpringDamper) -> Array:
-        return np.concatenate([np.log(coupling.K), coupling.B / self.spec.delta])
+        return np.concatenate([np.log(coupling.K), coupling.B / self.delta])
 
     def add(self, w: float) -> None:
         """Impose the condition at the frequency w [rad/sample] too."""
         self.conditions = np.append(self.conditions, w)
-        self.loop_at_conditions = self._loop(self.conditions)
+        self.loop_at_conditions = self._responses(self.conditions)
 
-    def _loop(self, w: Array) -> tuple[Complex, Complex, Complex]:
+    def _responses(self, w: Array) -> tuple[Complex, Complex, Complex]:
         """(z-1)/(Tz), Psi E and Theta at exp(jw)."""
-        spec, z = self.spec, on_circle(w)
-        return (z - 1) / (spec.T * z), spec.delayed_environment.at(z), delay(spec.theta, spec.T).at(z)
+        loop, z = self.loop, on_circle(w)
+        delayed = delay(loop.psi, loop.T).at(z) @ self.E.at(z)
+        return (z - 1) / (loop.T * z), delayed, delay(loop.theta, loop.T).at(z)
 
-    def force(self, x: Array, loop: tuple[Complex, Complex, Complex]) -> Complex:
+    def force(self, x: Array, responses: tuple[Complex, Complex, Complex]) -> Complex:
         """F = Theta G (G + Psi E)^-1 Psi E with G = V^-1, (k, N, N)."""
-        D, E, theta = loop
+        D, E, theta = responses
         log_k, b = np.split(x, 2)
-        G = (np.exp(log_k) + D[:, None] * (b * self.spec.delta))[:, :, None] * np.eye(self.spec.channels)
+        G = (np.exp(log_k) + D[:, None] * (b * self.delta))[:, :, None] * np.eye(self.loop.channels)
         return theta @ G @ np.linalg.solve(G + E, E)
 
     def square_mismatch(self, x: Array) -> float:
@@ -269,11 +272,11 @@ class SampledLoop:
         ratio = self.force(x, self.loop_at_conditions) / (on_circle(self.conditions) - 1)[:, None, None]
         need = -hermitian(self.root[:, None] * ratio * self.root)
         room = 1 - SAMPLED_RESERVE - np.linalg.eigvalsh(need)[:, -1]
-        return np.append(room, self.stability(x)) if any(self.spec.psi) else room
+        return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
     def stability(self, x: Array) -> float:
         """By how much more than CLOSEST_POLE the poles keep away from the circle."""
-        F = force_map(self.spec.environment, self.coupling(x), self.spec.theta, self.spec.psi)
+        F = force_map(self.E, self.coupling(x), self.loop.theta, self.loop.psi)
         return float(1 - CLOSEST_POLE - np.abs(F.poles()).max(initial=0.0))
 
     def search(self, x: Array) -> OptimizeResult:
@@ -281,7 +284,7 @@ class SampledLoop:
 
     def minimised(self, x: Array, more: list[tuple[float, float]]) -> OptimizeResult:
         """The local optimum from x; `more` bounds the unknowns behind the gains."""
-        N = self.spec.channels
+        N = self.loop.channels
         bounds = [(np.log(SOFTEST), np.log(STIFFEST))] * N + [(0.0, 20.0)] * N + more
         condition = {"type": "ineq", "fun": self.room}
         options = {"maxiter": 100, "ftol": 1e-7}
@@ -292,40 +295,39 @@ Optimum = Callable[[SpringDamper], tuple[SpringDamper | None, int]]  # start -> 
 
 
 def least_rms(
-    spec: Specification, starts: Iterable[SpringDamper], optimum: Optimum | None = None
+    loop: Loop, starts: Iterable[SpringDamper], optimum: Optimum | None = None
 ) -> tuple[SpringDamper | None, float, int]:
     """(gains, rms mismatch as a ratio, searches) of the best local optimum; gains None if none was found.
 
     `optimum` searches from one start; the default finds what closed-loop certifies.
     """
-    optimum = optimum or partial(_certified_optimum, spec)
-    best, least, searches = None, np.inf, 0
+    optimum = optimum or partial(_certified_optimum, loop)
+    E, best, least, searches = loop.E(), None, np.inf, 0
     for start in starts:
         coupling, runs = optimum(start)
         searches += runs
         if coupling is None:
             continue
-        F = force_map(spec.environment, coupling, spec.theta, spec.psi)
-        rms = transparency(F, spec.environment, spec.lam).rms_mismatch
+        rms = transparency(loop.F(coupling), E, loop.lam).rms_mismatch
         if rms < least:
             best, least = coupling, rms
     return best, least, searches
 
 
-def _certified_optimum(spec: Specification, start: SpringDamper) -> tuple[SpringDamper | None, int]:
+def _certified_optimum(loop: Loop, start: SpringDamper) -> tuple[SpringDamper | None, int]:
     """(a local optimum that passes the refined sweep or None, searches), adding the frequencies where one fails."""
-    sampled = SampledLoop(spec)
+    sampled = SampledLoop(loop)
     x = sampled.point(start)
     for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
         coupling = sampled.coupling(x)
-        requirement = this_environment(force_map(spec.environment, coupling, spec.theta, spec.psi), spec.delta)
+        requirement = this_environment(loop.F(coupling), loop.delta, loop.T_max)
         if requirement.ratio <= 1 - RESERVE:
             return coupling, searches
         stuck = sampled.room(x).min() < -STUCK
         if stuck or requirement.frequency_hz is None:  # None: unstable, so there is no frequency to add
             return None, searches
-        binding = 2 * np.pi * spec.T * requirement.frequency_hz
+        binding = 2 * np.pi * loop.T * requirement.frequency_hz
         sampled.add(max(binding, 1e-6))
     return None, MOST_ROUNDS_FROZEN_ENVIRONMENT
 
@@ -344,67 +346,64 @@ MULTIPLIERS = (1e-4, 10.0)  # ... and its bounds
 class SwitchingLoop(SampledLoop):
     """As SampledLoop, with x = (log K, B/delta, log alpha T/delta of the channels whose delay varies)."""
 
-    def __init__(self, spec: Specification, lo: Sequence[int], hi: Sequence[int]) -> None:
+    def __init__(self, loop: Loop, lo: Sequence[int], hi: Sequence[int]) -> None:
         self.range, self.h = (lo, hi), half_widths(lo, hi)
         self.active = np.flatnonzero(self.h)
-        super().__init__(spec)
+        super().__init__(loop)
 
     def coupling(self, x: Array) -> SpringDamper:
         return super().coupling(self._gains(x))
 
     def point(self, coupling: SpringDamper) -> Array:
         """The gains with their best multiplier."""
-        spec = self.spec
-        found = jitter_proof(
-            force_map(spec.environment, coupling, (0,) * spec.channels, spec.psi), *self.range, spec.delta
-        )
-        a = np.array(found.alpha)[self.active] * spec.T / np.array(spec.delta)[self.active]
+        loop = self.loop
+        found = jitter_proof(loop.sent(coupling), *self.range, loop.delta, T_max=loop.T_max)
+        a = np.array(found.alpha)[self.active] * loop.T / self.delta[self.active]
         a = np.clip(np.where(np.isfinite(a), a, FIRST), *MULTIPLIERS)
         return np.concatenate([super().point(coupling), np.log(a)])
 
-    def force(self, x: Array, loop: tuple[Complex, Complex, Complex]) -> Complex:
-        return super().force(self._gains(x), loop)
+    def force(self, x: Array, responses: tuple[Complex, Complex, Complex]) -> Complex:
+        return super().force(self._gains(x), responses)
 
     def room(self, x: Array) -> Array:
         """1 - SAMPLED_RESERVE less the damping ratio at each sampled frequency, with the multiplier in x."""
-        m, alpha = self.spec.channels, np.zeros(self.spec.channels)
-        alpha[self.active] = np.exp(x[2 * m :]) * (np.asarray(self.spec.delta) / self.spec.T)[self.active]
+        loop, m, alpha = self.loop, self.loop.channels, np.zeros(self.loop.channels)
+        alpha[self.active] = np.exp(x[2 * m :]) * (self.delta / loop.T)[self.active]
         D, E, _ = self.loop_at_conditions
         now = np.broadcast_to(np.eye(m, dtype=complex), E.shape)
-        G = Sampled(on_circle(self.conditions)[None], self.force(x, (D, E, now))[None], self.spec.T)
-        block = hermitian(switching_block(G, *self.range, self.spec.delta, alpha)[0].G[0])
+        G = Sampled(on_circle(self.conditions)[None], self.force(x, (D, E, now))[None], loop.T)
+        block = hermitian(switching_block(G, *self.range, loop.delta, alpha, loop.T_max)[0].G[0])
         error = block[:, m:, :m]
         schur = block[:, :m, :m] - np.conj(np.swapaxes(error, 1, 2)) @ (error / (2 * alpha[self.active])[:, None])
         room = (np.linalg.eigvalsh(self.root[:, None] * schur * self.root)[:, 0] - SAMPLED_RESERVE).astype(float)
-        return np.append(room, self.stability(x)) if any(self.spec.psi) else room
+        return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
     def search(self, x: Array) -> OptimizeResult:
         return self.minimised(x, [(np.log(MULTIPLIERS[0]), np.log(MULTIPLIERS[1]))] * self.active.size)
 
     def _gains(self, x: Array) -> Array:
-        return x[: 2 * self.spec.channels]
+        return x[: 2 * self.loop.channels]
 
 
 def least_rms_switching(
-    spec: Specification, lo: Sequence[int], hi: Sequence[int], starts: Iterable[SpringDamper]
+    loop: Loop, lo: Sequence[int], hi: Sequence[int], starts: Iterable[SpringDamper]
 ) -> tuple[SpringDamper | None, float, int]:
     """(gains, rms mismatch as a ratio, searches) of the best local optimum that is safe under any switching."""
-    return least_rms(spec, starts, lambda start: _safe_optimum(SwitchingLoop(spec, lo, hi), start))
+    return least_rms(loop, starts, lambda start: _safe_optimum(SwitchingLoop(loop, lo, hi), start))
 
 
 def _safe_optimum(sampled: SwitchingLoop, start: SpringDamper) -> tuple[SpringDamper | None, int]:
     """(a local optimum that passes the refined sweep or None, searches)."""
-    spec, x = sampled.spec, sampled.point(start)
+    loop, x = sampled.loop, sampled.point(start)
     for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
         coupling = sampled.coupling(x)
-        G = force_map(spec.environment, coupling, (0,) * spec.channels, spec.psi)
-        requirement = jitter_proof(G, *sampled.range, spec.delta).requirement
+        requirement = jitter_proof(loop.sent(coupling), *sampled.range, loop.delta, T_max=loop.T_max).requirement
         if requirement.ratio <= 1 - RESERVE:
             return coupling, searches
         if sampled.room(x).min() < -STUCK or requirement.frequency_hz is None:
             return None, searches
-        sampled.add(max(2 * np.pi * spec.T * requirement.frequency_hz, 1e-6))
+        sampled.add(max(2 * np.pi * loop.T * requirement.frequency_hz, 1e-6))
     return None, MOST_ROUNDS_FROZEN_ENVIRONMENT
 
 
@@ -416,9 +415,9 @@ def _safe_optimum(sampled: SwitchingLoop, start: SpringDamper) -> tuple[SpringDa
 class LimiterLoop(SampledLoop):
     """As Sampled, with x = (log K, B/delta, c) and one weight c per channel, of the lag 1."""
 
-    def __init__(self, spec: Specification) -> None:
-        self.rho = limiter_lag(spec.delta, spec.T, BETA)
-        super().__init__(spec)
+    def __init__(self, loop: Loop) -> None:
+        self.rho = limiter_lag(loop.delta, loop.T, BETA)
+        super().__init__(loop)
 
     def coupling(self, x: Array) -> SpringDamper:
         return super().coupling(self._gains(x))
@@ -430,38 +429,37 @@ class LimiterLoop(SampledLoop):
 
     def proof(self, coupling: SpringDamper, c: Lags | None = None) -> LimiterProof:
         """What the limiter asks at the multiplier `c` or the best one, by the refined sweep."""
-        spec = self.spec
-        G = force_map(spec.environment, coupling, (0,) * spec.channels, spec.psi)
-        return limiter_proof(G, spec.theta, spec.delta, self.rho, c)
+        loop = self.loop
+        return limiter_proof(loop.sent(coupling), loop.theta, loop.delta, self.rho, c, T_max=loop.T_max)
 
-    def force(self, x: Array, loop: tuple[Complex, Complex, Complex]) -> Complex:
-        return super().force(self._gains(x), loop)
+    def force(self, x: Array, responses: tuple[Complex, Complex, Complex]) -> Complex:
+        return super().force(self._gains(x), responses)
 
     def room(self, x: Array) -> Array:
         """The least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency."""
-        spec, (D, E, _) = self.spec, self.loop_at_conditions
-        now = np.broadcast_to(np.eye(spec.channels, dtype=complex), E.shape)
-        G = Sampled(on_circle(self.conditions)[None], self.force(x, (D, E, now))[None], spec.T)
-        demand = limiter_demand(G, spec.theta, spec.delta, self.rho, self.weights(x))
+        loop, (D, E, _) = self.loop, self.loop_at_conditions
+        now = np.broadcast_to(np.eye(loop.channels, dtype=complex), E.shape)
+        G = Sampled(on_circle(self.conditions)[None], self.force(x, (D, E, now))[None], loop.T)
+        demand = limiter_demand(G, loop.theta, loop.delta, self.rho, self.weights(x), loop.T_max)
         block = hermitian(demand.free.G[0] + (1 - SAMPLED_RESERVE) * demand.gain.G[0])
         root = np.tile(self.root, 2)
         room = np.linalg.eigvalsh(root[:, None] * block * root)[:, 0].astype(float)
-        return np.append(room, self.stability(x)) if any(spec.psi) else room
+        return np.append(room, self.stability(x)) if any(loop.psi) else room
 
     def search(self, x: Array) -> OptimizeResult:
-        return self.minimised(x, [(0.0, MOST_WEIGHT)] * self.spec.channels)
+        return self.minimised(x, [(0.0, MOST_WEIGHT)] * self.loop.channels)
 
     def weights(self, x: Array) -> list[list[float]]:
         """c, a row of one lag per channel."""
-        return np.maximum(x[2 * self.spec.channels :, None], 0.0).tolist()
+        return np.maximum(x[2 * self.loop.channels :, None], 0.0).tolist()
 
     def _gains(self, x: Array) -> Array:
-        return x[: 2 * self.spec.channels]
+        return x[: 2 * self.loop.channels]
 
 
-def _limited_optimum(spec: Specification, start: SpringDamper) -> tuple[SpringDamper | None, int]:
+def _limited_optimum(loop: Loop, start: SpringDamper) -> tuple[SpringDamper | None, int]:
     """(a local optimum that passes the limiter's refined sweep or None, searches)."""
-    sampled = LimiterLoop(spec)
+    sampled = LimiterLoop(loop)
     x = sampled.point(start)
     for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
@@ -471,7 +469,7 @@ def _limited_optimum(spec: Specification, start: SpringDamper) -> tuple[SpringDa
             return coupling, searches
         if sampled.room(x).min() < -STUCK or requirement.frequency_hz is None:
             return None, searches
-        sampled.add(max(2 * np.pi * spec.T * requirement.frequency_hz, 1e-6))
+        sampled.add(max(2 * np.pi * loop.T * requirement.frequency_hz, 1e-6))
     return None, MOST_ROUNDS_FROZEN_ENVIRONMENT
 
 
@@ -483,11 +481,13 @@ NEGLIGIBLE = 1e-6
 
 
 def design(
-    spec: Specification,
+    loop: Loop,
     condition: str = "theorem4",
     starts: Sequence[SpringDamper] = (),
     switching: tuple[Sequence[int], Sequence[int]] | None = None,
     limiter: bool = False,
+    W1: Lti | None = None,
+    W2: Lti | None = None,
 ) -> Design:
     """The best spring-damper under `condition`; by default the starts are chosen, a start need not be feasible.
 
@@ -498,46 +498,45 @@ def design(
     Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for closed-loop.
     """
     if condition == "theorem4" and switching is None:
-        return _for_any_environment(spec, starts[0] if starts else None)
+        return _for_any_environment(Shaping(loop, W1, W2), starts[0] if starts else None)
     if condition == "closed-loop":
         if switching and limiter:
             raise ValueError("limiter and switching: limited forces are proved for constant delays, ask for one")
-        return _for_this_environment(spec, starts, switching, limiter)
+        return _for_this_environment(loop, starts, switching, limiter)
     if switching:
         raise ValueError("delays that vary are designed for by the closed-loop condition only")
     raise ValueError(f"condition is {condition!r}, expected 'any_environment' or 'closed-loop'")
 
 
-def _for_any_environment(spec: Specification, start: SpringDamper | None) -> Design:
-    started = time.perf_counter()
-    phi = shortage(spec)
-    sigma = excess_limits(spec, phi)
-    shaping = Shaping(spec)
-    gains, sdps = _start(spec, sigma, start)
-    norm, peak = shaping.norm(_coupling(spec, gains).compliance(spec.T))
+def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design:
+    started, loop = time.perf_counter(), shaping.loop
+    phi = least_phi(loop)
+    sigma = excess_limits(loop, phi)
+    gains, sdps = _start(loop, sigma, start)
+    norm, peak = shaping.norm(_coupling(loop, gains).compliance(loop.T))
     frequencies = [peak]
     for _ in range(MOST_STEPS):
-        gains, bound = step(spec, sigma, shaping, gains, norm, np.array(frequencies))
+        gains, bound = step(shaping, sigma, gains, norm, np.array(frequencies))
         sdps += 1
-        before, (norm, peak) = norm, shaping.norm(_coupling(spec, gains).compliance(spec.T))
+        before, (norm, peak) = norm, shaping.norm(_coupling(loop, gains).compliance(loop.T))
         frequencies.append(peak)
         if abs(before - norm) < SETTLED * norm and norm < (1 + SETTLED) * bound:
             break
-    coupling = _coupling(spec, gains)
-    requirement = verified(spec, coupling, phi)
+    coupling = _coupling(loop, gains)
+    requirement = verified(loop, coupling, phi)
     return Design(coupling, "theorem4", "loop-norm", norm, requirement, sdps, time.perf_counter() - started, phi)
 
 
 def _for_this_environment(
-    spec: Specification,
+    loop: Loop,
     starts: Sequence[SpringDamper],
     switching: tuple[Sequence[int], Sequence[int]] | None,
     limiter: bool,
 ) -> Design:
-    started, starts = time.perf_counter(), starts or _default_starts(spec)
-    search = partial(least_rms_switching, spec, *switching) if switching else partial(least_rms, spec)
+    started, starts = time.perf_counter(), starts or _default_starts(loop)
+    search = partial(least_rms_switching, loop, *switching) if switching else partial(least_rms, loop)
     if limiter:
-        search = partial(least_rms, spec, optimum=partial(_limited_optimum, spec))
+        search = partial(least_rms, loop, optimum=partial(_limited_optimum, loop))
     coupling, rms, searches = search(starts)
     if coupling is None:
         certifies = "the closed-loop condition certifies"
@@ -546,65 +545,59 @@ def _for_this_environment(
         if limiter:
             certifies += " while forces are limited"
         line = (
-            f"no spring-damper was found that {certifies} for theta = {spec.theta}, psi = {spec.psi}, "
-            f"delta = {spec.delta}: use more device damping, less delay, or other starts"
+            f"no spring-damper was found that {certifies} for theta = {loop.theta}, psi = {loop.psi}, "
+            f"delta = {loop.delta}: use more device damping, less delay, or other starts"
         )
         raise DesignFailed(None, (), line)
-    coupling = SpringDamper(coupling.K, np.where(NEGLIGIBLE * spec.usable > coupling.B, 0.0, coupling.B))
-    F = force_map(spec.environment, coupling, spec.theta, spec.psi)
-    requirement = this_environment(F, spec.delta)
+    coupling = SpringDamper(coupling.K, np.where(NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B))
+    requirement = this_environment(loop.F(coupling), loop.delta, loop.T_max)
     return Design(coupling, "closed-loop", "rms", rms, requirement, searches, time.perf_counter() - started)
 
 
-def _default_starts(spec: Specification) -> list[SpringDamper]:
+def _default_starts(loop: Loop) -> list[SpringDamper]:
     """Around 2 d/(n T), the stiffness that no linear coupling exceeds for any passive environment.
 
     With delay in the environment a loop is stable if the coupling is the stiffer of the two at every frequency,
     which the last start takes from the environment's stiffness at half the sampling rate.
     """
-    usable = spec.usable
-    K = usable / (spec.T * (np.asarray(spec.theta) + np.asarray(spec.psi) + 1))
-    starts = [SpringDamper(factor * K, share * usable) for factor, share in ((0.3, 0.1), (1.0, 0.3), (8.0, 1.0))]
-    if any(spec.psi):
-        highest = np.linalg.norm(spec.environment.at(-1.0), 2)
-        starts.append(SpringDamper(K, np.full(spec.channels, spec.T * highest)))
+    spend = usable(loop)
+    K = spend / (loop.T * (np.asarray(loop.theta) + np.asarray(loop.psi) + 1))
+    starts = [SpringDamper(factor * K, share * spend) for factor, share in ((0.3, 0.1), (1.0, 0.3), (8.0, 1.0))]
+    if any(loop.psi):
+        highest = np.linalg.norm(loop.E().at(-1.0), 2)
+        starts.append(SpringDamper(K, np.full(loop.channels, loop.T * highest)))
     return starts
 
 
-def stiffest(spec: Specification) -> Design:
+def stiffest(loop: Loop) -> Design:
     """The gains of largest total stiffness (each channel's own largest) that satisfy Theorem 4; objective in N/m."""
     started = time.perf_counter()
-    phi = shortage(spec)
-    gains, sdps = _start(spec, excess_limits(spec, phi), None)
-    coupling = _coupling(spec, gains)
-    requirement = verified(spec, coupling, phi)
+    phi = least_phi(loop)
+    gains, sdps = _start(loop, excess_limits(loop, phi), None)
+    coupling = _coupling(loop, gains)
+    requirement = verified(loop, coupling, phi)
     total = float(coupling.K.sum())
     return Design(coupling, "theorem4", "stiffness", total, requirement, sdps, time.perf_counter() - started, phi)
 
 
-def moving_average(spec: Specification) -> Design:
+def moving_average(loop: Loop) -> Design:
     """The stiffest linear coupling that Theorem 4 admits; objective in N/m, of all channels together.
 
     V = T/(2 delta) (1 + ... + z^-theta) needs exactly delta at every frequency. With the constant e n^2 T/(2 delta)
     beside it, n = theta + 1, it needs delta/(1 + e) where the sum is largest, and less elsewhere.
     """
     started = time.perf_counter()
-    phi = shortage(spec)
-    weight, terms = spec.T / (2 * np.asarray(spec.delta)), np.array(spec.theta) + 1
+    phi = least_phi(loop)
+    weight, terms = loop.T / (2 * even_damping(loop.delta, loop.T, loop.T_max)), np.array(loop.theta) + 1
     coupling = MovingAverage(weight, terms.tolist(), RESERVE / (1 - RESERVE) * terms**2 * weight)
-    requirement = verified(spec, coupling, phi)
+    requirement = verified(loop, coupling, phi)
     total = float(coupling.stiffness.sum())
     return Design(coupling, "theorem4", "stiffness", total, requirement, 0, time.perf_counter() - started, phi)
 
 
-def verified(spec: Specification, coupling: SpringDamper | MovingAverage, phi: Array | None) -> Requirement:
+def verified(loop: Loop, coupling: SpringDamper | MovingAverage, phi: Array | None) -> Requirement:
     """Theorem 4's requirement from the coupling alone; raises DesignFailed unless it is certified."""
-    V = coupling.compliance(spec.T)
-    requirement = (
-        any_environment(V, spec.theta, spec.delta)
-        if phi is None
-        else any_environment_delayed(V, spec.environment, spec.theta, spec.psi, spec.delta, phi)
-    )
+    requirement = any_environment_with(loop, coupling.compliance(loop.T), phi)
     if not requirement.certified:
         why = requirement.reason or f"it requires {max(requirement.required):.6g} N s/m"
         raise DesignFailed(
@@ -613,32 +606,39 @@ def verified(spec: Specification, coupling: SpringDamper | MovingAverage, phi: A
     return requirement
 
 
-def excess_limits(spec: Specification, phi: Array | None) -> Array:
+def any_environment_with(loop: Loop, V: Lti, phi: Array | None) -> Requirement:
+    """Theorem 4's requirement of V with the multiplier phi (m,) [N s/m], None without delay in the environment."""
+    if phi is None:
+        return any_environment(V, loop.theta, loop.delta, loop.T_max)
+    return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, phi, loop.T_max)
+
+
+def excess_limits(loop: Loop, phi: Array | None) -> Array:
     """(N,) Sigma = Delta_V^-1 = Phi^-1 - Delta_D^-1 in units of the usable damping; inf without a multiplier."""
     if phi is None:
-        return np.full(spec.channels, np.inf)
+        return np.full(loop.channels, np.inf)
     with np.errstate(divide="ignore"):
-        return spec.usable / phi - 1
+        return usable(loop) / phi - 1
 
 
-def _coupling(spec: Specification, gains: Array) -> SpringDamper:
-    k, b = np.split(np.maximum(gains, 0.0), 2)
-    return SpringDamper(k * spec.usable / spec.T, np.where(b < NEGLIGIBLE, 0.0, b) * spec.usable)
+def _coupling(loop: Loop, gains: Array) -> SpringDamper:
+    (k, b), spend = np.split(np.maximum(gains, 0.0), 2), usable(loop)
+    return SpringDamper(k * spend / loop.T, np.where(b < NEGLIGIBLE, 0.0, b) * spend)
 
 
-def _start(spec: Specification, sigma: Array, start: SpringDamper | None) -> tuple[Array, int]:
+def _start(loop: Loop, sigma: Array, start: SpringDamper | None) -> tuple[Array, int]:
     """The gains of the set nearest to `start`, or the stiffest of the set; and the number of SDPs, one."""
-    N = spec.channels
+    N = loop.channels
     gains = cp.Variable(2 * N)
     objective = cp.Maximize(cp.sum(gains[:N]))
     if start is not None:
-        wanted = np.concatenate([start.K * spec.T, start.B]) / np.tile(spec.usable, 2)
+        wanted = np.concatenate([start.K * loop.T, start.B]) / np.tile(usable(loop), 2)
         objective = cp.Minimize(cp.norm(gains - wanted))
     try:
-        solve_within(objective, gains, spec.theta, sigma, "the set of gains")
+        solve_within(objective, gains, loop.theta, sigma, "the set of gains")
     except Infeasible as error:
         line = (
-            f"Theorem 4 admits no spring-damper with theta = {spec.theta}, psi = {spec.psi}, delta = {spec.delta}: "
+            f"Theorem 4 admits no spring-damper with theta = {loop.theta}, psi = {loop.psi}, delta = {loop.delta}: "
             "use less psi, a softer environment or more device damping"
         )
         raise Infeasible(error.problem, error.results, line) from error

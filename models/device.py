@@ -1,8 +1,12 @@
-"""Force-feedback devices clamped to one axis, and the guaranteed damping that all certificates rest on."""
+"""Force-feedback devices clamped to one axis, the damping that certificates rest on, and a catalogue of real ones."""
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass
 from numbers import Real
+from typing import Any
 
 import msgspec
 
@@ -96,3 +100,121 @@ def _check_common(device: Device, masses: tuple[str, ...]) -> None:
     require("credible_speed", device.credible_speed, 1e-3, 1e3, "m/s")
     if device.delta is not None and not 0 < device.delta <= device.damping:
         raise ValueError(f"delta is {device.delta:g} N s/m, allowed are values in (0, damping = {device.damping:g}]")
+
+
+# ----------------------------------------------------------------------------------------------------
+# Devices that can be bought or built: what is published of each, and by whom. No certificate rests on a number that is
+# not known: a scenario that names a device gives those itself, measured by `python -m hw.identify` for example.
+
+
+@dataclass(frozen=True)
+class Known:
+    """A number that somebody has published."""
+
+    value: float
+    source: str
+
+
+_CHAI3D = "CHAI3D's device table, src/devices/{}.cpp"
+_DELTA, _FALCON, _PHANTOM = (
+    _CHAI3D.format(f"C{name}Device{s}") for name, s in (("Delta", "s"), ("Falcon", ""), ("Phantom", "s"))
+)
+_SHEET = "the maker's data sheet of the {}, quoted and not re-read here"
+_OMNI, _PREMIUM = _SHEET.format("Phantom Omni"), _SHEET.format("Phantom Premium 1.5")
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A real device along one axis; None is what nobody publishes, or what we found no source for."""
+
+    title: str
+    damping: tuple[Known, Known] | None = None  # [N s/m] least and most over the workspace
+    mass: Known | None = None  # [kg] felt at the handle
+    force_limit: Known | None = None  # [N]
+    encoder_step: Known | None = None  # [m] at the handle
+    friction: Known | None = None  # [N] Coulomb, at most
+    stiffness: Known | None = None  # [N/m] the most that a framework lets a programmer ask for
+    framework_damping: Known | None = None  # [N s/m] likewise
+
+    @property
+    def known(self) -> dict[str, Known]:
+        """The fields of a RigidDevice that are published; friction is an upper bound, and no guarantee: left out."""
+        least = self.damping[0] if self.damping else None
+        fields = {"damping": least, "mass": self.mass, "force_limit": self.force_limit}
+        fields["encoder_step"] = self.encoder_step
+        return {name: fact for name, fact in fields.items() if fact}
+
+
+_IDENTIFIED = Known(1.37, "section 6 of the paper: a first-order model identified on an Omega")
+
+CATALOGUE: Mapping[str, Listed] = {
+    "omega.3": Listed(
+        "Force Dimension omega.3",
+        damping=(_IDENTIFIED, _IDENTIFIED),
+        force_limit=Known(12.0, _DELTA),
+        stiffness=Known(5000.0, _DELTA),
+        framework_damping=Known(30.0, _DELTA),
+    ),
+    "delta.3": Listed(
+        "Force Dimension delta.3",
+        force_limit=Known(20.0, _DELTA),
+        stiffness=Known(5000.0, _DELTA),
+        framework_damping=Known(30.0, _DELTA),
+    ),
+    "falcon": Listed(
+        "Novint Falcon",
+        force_limit=Known(8.0, _FALCON),
+        encoder_step=Known(63.5e-6, "more than 400 dpi, H3D API's page of the Falcon"),
+        stiffness=Known(3000.0, _FALCON),
+        framework_damping=Known(20.0, _FALCON),
+    ),
+    "touch": Listed(
+        "3D Systems Touch (SensAble Phantom Omni)",
+        mass=Known(0.045, _OMNI),
+        force_limit=Known(3.3, _OMNI),
+        encoder_step=Known(55e-6, _OMNI),
+        friction=Known(0.26, _OMNI),
+        stiffness=Known(700.0, _PHANTOM),
+        framework_damping=Known(5.0, _PHANTOM),
+    ),
+    "phantom-premium": Listed(
+        "SensAble Phantom Premium 1.5",
+        mass=Known(0.075, _PREMIUM),
+        force_limit=Known(8.5, _PREMIUM),
+        encoder_step=Known(30e-6, _PREMIUM),
+        friction=Known(0.04, _PREMIUM),
+        stiffness=Known(800.0, _PHANTOM + " (1.5 6DOF)"),
+        framework_damping=Known(5.0, _PHANTOM + " (1.5 6DOF)"),
+    ),
+    "haply-2diy": Listed("Haply 2DIY"),
+    "inverse3": Listed("Haply Inverse3"),
+    "hapkit": Listed("Hapkit"),
+}
+OTHER_NAMES = {"omni": "touch", "omega": "omega.3", "delta": "delta.3", "2diy": "haply-2diy"}
+NEEDED = ("damping", "force_limit")  # of a simulated device; for mass and encoder a RigidDevice has an assumption
+
+
+def listed_device(name: str) -> tuple[str, Listed]:
+    """The device of a name, and its name in the catalogue. Raises ValueError with those that there are."""
+    key = OTHER_NAMES.get(name.lower(), name.lower())
+    if key not in CATALOGUE:
+        close = difflib.get_close_matches(key, CATALOGUE, n=1)
+        hint = f" (did you mean {close[0]}?)" if close else ""
+        raise ValueError(f"device is {name[:80]!r}{hint}, the catalogue has {', '.join(CATALOGUE)}")
+    return key, CATALOGUE[key]
+
+
+def fields_of(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """A device of the catalogue as the fields of a scenario's [[device]], with what is given in place of what is known.
+
+    Raises ValueError for a name that is none, and for a number that nobody publishes and that is not given.
+    """
+    key, device = listed_device(name)
+    fields: dict[str, Any] = {"kind": "rigid"} | {field: fact.value for field, fact in device.known.items()}
+    if given.get("kind") == "compliant":  # its mass is divided between motor and handle
+        fields.pop("mass", None)
+    fields |= given
+    if missing := [field for field in NEEDED if field not in fields]:
+        unknown = " and ".join(f"{field} [{'N' if field == 'force_limit' else 'N s/m'}]" for field in missing)
+        raise ValueError(f"nobody publishes {unknown} of {key}: give it beside `device`, as measured by hw.identify")
+    return fields

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
@@ -20,7 +23,11 @@ from models.human import Cross, Hand, Human, Impedance, Link, Person, Port, body
 # The only place that knows joint names. Every body slides along x. Joints come in the order motors, handles (of
 # compliant devices), further masses of the humans, bodies, so that the first m positions are the encoders':
 #
-#     actuator (-f) -> motor_i ==transmission== handle_i (with the human's first mass) ==link== human_i_2 == ...
+#     actuator (-f) -> motor ==transmission== handle (with the human's first mass) ==link== human_i_2 == ...
+#
+# Motor, handle and transmission come from compliant.xml or rigid.xml, which open in a viewer by themselves; those of
+# device i are called device_i/motor and so on. Their numbers are the scenario's. What is drawn is kept in the scene's
+# XML only, so that nothing is computed for it.
 #
 # The last link of a human ends on ground, or on the body of a person who holds several devices (the last joints).
 # Gravity, contacts and constraints are off, but for the Coulomb friction of devices that have some. Inputs are MuJoCo
@@ -37,6 +44,12 @@ Array = NDArray[np.floating[Any]]
 #: MuJoCo's friction constraint creeps while it sticks; this hard it stops a 0.25 kg device within 1.5e-6 m of where
 #: Coulomb's law does, and creeps at 1e-7 m/s under half its force (MuJoCo's defaults: 7e-5 m and 6e-4 m/s)
 STICK, HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
+FILES = Path(__file__).parent  # of the devices
+APART, STEP, HEIGHT = 0.11, 0.09, 0.03  # [m] between devices, between the bodies of one, and above the rail
+DRAWN = "drawn transmission"
+_GREY = {"rgb1": [0.93] * 3, "rgb2": [0.93] * 3, "builtin": mujoco.mjtBuiltin.mjBUILTIN_FLAT}
+SKY: dict[str, Any] = {"name": "sky", "type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "width": 32, "height": 192, **_GREY}
+EMPTY_CLASSES = re.compile(r" *<default>\s*(<default class=\"[^\"]*\"/>\s*)*</default>\s*\n")  # of attached files
 _IMPEDANCE = "impedance_"  # custom numbers: joint of the handle, joint of the base or -1, then A, B, C, D row by row
 
 
@@ -212,7 +225,8 @@ def tendon_jacobian(model: mujoco.MjModel) -> Array:
     for t in range(model.ntendon):
         first, count = int(model.tendon_adr[t]), int(model.tendon_num[t])
         for wrap in range(first, first + count):
-            rows[t, model.wrap_objid[wrap]] += model.wrap_prm[wrap]
+            if model.wrap_type[wrap] == mujoco.mjtWrap.mjWRAP_JOINT:  # not of a tendon that is only drawn
+                rows[t, model.wrap_objid[wrap]] += model.wrap_prm[wrap]
     return rows
 
 
@@ -238,7 +252,7 @@ def _only_what_the_loop_needs(spec: mujoco.MjSpec, friction: bool) -> None:
 
 
 def _handle(i: int, device: Device) -> str:
-    return f"handle_{i}" if isinstance(device, CompliantDevice) else f"motor_{i}"
+    return f"device_{i}/handle" if isinstance(device, CompliantDevice) else f"device_{i}/motor"
 
 
 class _Placed(NamedTuple):
@@ -302,13 +316,14 @@ def _amounts(devices: Sequence[Device], placed: Sequence[_Placed]) -> _Amounts:
     stiffness: dict[str, Any] = {}
     for i, device in enumerate(devices, start=1):
         compliant = isinstance(device, CompliantDevice)
-        mass[f"motor_{i}"] = device.motor_mass if compliant else device.mass
-        damping[f"motor_{i}"], stiffness[f"motor_{i}"] = device.damping, 0.0
+        motor = f"device_{i}/motor"
+        mass[motor] = device.motor_mass if compliant else device.mass
+        damping[motor], stiffness[motor] = device.damping, 0.0
     for i, device in enumerate(devices, start=1):
         if isinstance(device, CompliantDevice):
-            mass[f"handle_{i}"] = device.handle_mass
-            damping[f"transmission_{i}"] = device.transmission_damping
-            stiffness[f"transmission_{i}"] = device.transmission_stiffness
+            mass[f"device_{i}/handle"] = device.handle_mass
+            damping[f"device_{i}/transmission"] = device.transmission_damping
+            stiffness[f"device_{i}/transmission"] = device.transmission_stiffness
     for port, joints, _, springs in placed:
         for k, joint in enumerate(joints):
             mass[joint] = mass.get(joint, 0.0) + port.mass[..., k]
@@ -322,24 +337,30 @@ def _amounts(devices: Sequence[Device], placed: Sequence[_Placed]) -> _Amounts:
 def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
     spec = mujoco.MjSpec()
     spec.modelname = "haptic loop"
+    spec.add_texture(**SKY)
+    spec.visual.headlight.ambient = [0.5, 0.5, 0.5]
     _only_what_the_loop_needs(spec, friction=any(device.friction for device in devices))
     mass, damping, stiffness = _amounts(devices, placed)
-    rubbing = {f"motor_{i}": device.friction for i, device in enumerate(devices, start=1)}
     own = [joint for part in placed for joint in part.joints[part.port.handles :]]
     order = [name for name in mass if name not in own] + own
+    _attach_devices(spec, devices)
+    row = {joint: -APART * min(i, len(devices) - 1) for i, part in enumerate(placed) for joint in part.joints}
+    for step, name in enumerate(own, start=1):
+        body = spec.worldbody.add_body(name=name, pos=[STEP * (1 + step), row[name], HEIGHT])
+        body.ipos, body.inertia, body.explicitinertial = [0, 0, 0], [1e-3] * 3, True
+        body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02] * 3, mass=0, contype=0, conaffinity=0)
     for name in order:
-        body = spec.worldbody.add_body(
-            name=name, mass=float(mass[name]), ipos=[0, 0, 0], inertia=[1e-3] * 3, explicitinertial=True
-        )
-        joint = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
+        spec.body(name).mass, joint = float(mass[name]), spec.joint(name)
         joint.damping[0], joint.stiffness[0] = float(damping.get(name, 0.0)), float(stiffness.get(name, 0.0))
-        if rubbing.get(name):
-            joint.frictionloss = rubbing[name]
-            joint.solref_friction, joint.solimp_friction = STICK, HARD
     for i, device in enumerate(devices, start=1):
+        if device.friction:
+            joint = spec.joint(f"device_{i}/motor")
+            joint.frictionloss = device.friction
+            joint.solref_friction, joint.solimp_friction = STICK, HARD
         if isinstance(device, CompliantDevice):
-            amounts = device.transmission_stiffness, device.transmission_damping
-            _add_spring(spec, f"transmission_{i}", {f"handle_{i}": 1.0, f"motor_{i}": -1.0}, *amounts)
+            tendon = spec.tendon(f"device_{i}/transmission")
+            tendon.stiffness[0], tendon.damping[0] = device.transmission_stiffness, device.transmission_damping
         _add_springs(spec, placed[i - 1], damping, stiffness)
     for part in placed[len(devices) :]:
         _add_springs(spec, part, damping, stiffness)
@@ -351,22 +372,46 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
     for name, gear in reached:
         _add_motor(spec, f"push_{name}", name, gear, joint=name in mass)
     for i, device in enumerate(devices, start=1):
-        _add_motor(spec, f"force_{i}", f"motor_{i}", gear=-1.0, limit=device.force_limit)
+        _add_motor(spec, f"device_{i}/force", f"device_{i}/motor", gear=-1.0, limit=device.force_limit)
     number = {name: j for j, name in enumerate(order)}
     for i, (port, joints, base, _) in enumerate(channels, start=1):
         if z := port.impedance:
             numbers = np.block([[z.A, z.B], [z.C, z.D]]).ravel()
             places = [number[joints[0]], number[base] if base else -1]
             spec.add_numeric(name=f"{_IMPEDANCE}{i}", data=[*places, *numbers], size=len(numbers) + 2)
+    spec.compile()
+    xml = EMPTY_CLASSES.sub("", spec.to_xml())
+    for part in [*(tendon for tendon in spec.tendons if tendon.name.endswith(DRAWN)), *spec.sites]:
+        spec.delete(part)
+    spec.compiler.discardvisual = True
     model = spec.compile()
     return Scene(
         model=model,
-        xml=spec.to_xml(),
+        xml=xml,
         handles=tuple(model.joint(name).id for name in handles),
         pushed=tuple(reached.index(end) for end in ends),
         tapped=tuple(reached.index((name, 1.0)) for name in handles),
         points=tuple(tuple(model.joint(name).id for name in part.joints) for part in placed),
     )
+
+
+def _attach_devices(spec: mujoco.MjSpec, devices: Sequence[Device]) -> None:
+    """Motors and handles of the devices' own files, side by side: first all motors, then all handles."""
+    parts = [_file("compliant" if isinstance(device, CompliantDevice) else "rigid").copy() for device in devices]
+    for name in ("motor", "handle"):
+        for i, part in enumerate(parts, start=1):
+            if part.body(name):
+                frame = spec.worldbody.add_frame(pos=[0.0, -APART * (i - 1), 0.0])
+                frame.attach_body(part.body(name), prefix=f"device_{i}/")
+
+
+@cache
+def _file(name: str) -> mujoco.MjSpec:
+    """A device's file as the scene takes it: without actuators, which have an order there."""
+    spec = mujoco.MjSpec.from_file(str(FILES / f"{name}.xml"))
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    return spec
 
 
 def _pulled(part: _Placed) -> tuple[str, float]:
@@ -408,7 +453,7 @@ def _add_motor(
 
 
 def _motors(model: mujoco.MjModel) -> int:
-    return sum(model.actuator(a).name.startswith("force_") for a in range(model.nu))
+    return sum(model.actuator(a).name.endswith("force") for a in range(model.nu))
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ import numpy as np
 from controller.delay import Jitter
 from controller.environment import Box, Network, Spring, UncertainSpring, Wall, environment
 from controller.loop import DelayRange, Loop
-from models.device import MOST_DAMPING, Device, passivity_level, require, with_damping
+from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
 from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
 from sim.files import InputError, write
 
@@ -308,11 +308,31 @@ def _converted(text: str, kind: Any, source: str) -> Any:
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{source}: not valid TOML: {error}") from None
     try:
-        return msgspec.convert(raw, kind)
+        return msgspec.convert(_with_catalogue(raw), kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_located(str(error), raw)}") from None
     except ValueError as error:
         raise InputError(f"{source}: {error}") from None
+
+
+def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
+    """The file with devices of the catalogue, by their names or as `device` of a [[device]], written out."""
+    devices = raw.get("device")
+    if isinstance(devices, str):
+        contacts = raw.get("environment", {}).get("contacts", [])
+        devices = [devices] * (len(contacts) if isinstance(contacts, list) else 1)
+    if not isinstance(devices, list):
+        return raw
+    made = []
+    for i, one in enumerate(devices):
+        given = {"device": one} if isinstance(one, str) else one
+        if isinstance(given, dict) and isinstance(name := given.get("device"), str):
+            try:
+                given = fields_of(name, {key: value for key, value in given.items() if key != "device"})
+            except ValueError as error:
+                raise InputError(f"device[{i}]: {error}") from None
+        made.append(given)
+    return raw | {"device": made}
 
 
 class _Damping(msgspec.Struct, frozen=True):
@@ -327,7 +347,7 @@ def _strictly(fields: dict[str, Any], kind: Any) -> Any:
     """The fields as `kind`, by the rules of a file. Raises InputError."""
     raw = {name: _plain(name, value) for name, value in fields.items()}
     try:
-        return msgspec.convert(raw, kind)
+        return msgspec.convert(_with_catalogue(raw), kind)
     except msgspec.ValidationError as error:
         raise InputError(_located(str(error), raw)) from None
 

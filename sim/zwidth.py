@@ -20,36 +20,33 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import Compliance, Coupling, InternalModel, SpringDamper
+from controller.coupling import Compliance, Coupling, InternalModel, NoCoupling, SpringDamper
 from controller.delay import delay
 from controller.environment import (
     GROUND,
+    RIGID_WALL,
     Matrices,
     Network,
     Spring,
     Wall,
-    environment,
     environment_of,
-    frozen_states,
     sampled_environment,
 )
 from controller.loop import Loop, force_map
 from controller.lti import Array, Complex, Lti, Sampled, SingularLoop, as_like
 from controller.process import Process, contact
-from design.audit import LONGEST_DELAY, edge
+from design.audit import check_loop, edge
 from design.certificate import CONDITIONS, theorem4_of
 from design.conditions import (
     Requirement,
-    any_environment_delayed,
-    any_environment_per_channel,
     any_environment_ratios,
     refusal,
     this_environment,
     this_environment_ratios,
 )
 from design.lmi import least_phi
-from design.result import DesignFailed, listed
-from models.device import Device, passivity_level
+from design.result import DesignFailed
+from models.device import Device
 from models.human import Population
 from sim.limit_cycles import Cells, HeldDevices, Plan, Points, Progress, simulate_cells
 from sim.scenario import InputError
@@ -70,33 +67,18 @@ class _Sweep:
 
     devices: tuple[Device, ...]  # (m,)
     population: Population
-    network: Network | None  # None is a rigid wall behind the coupling, one channel
-    T: float  # [s]
-    theta: tuple[int, ...]  # (m,) [samples]
-    psi: tuple[int, ...]  # (m,) [samples]
-
-    @property
-    def channels(self) -> int:
-        return len(self.devices)
-
-    @property
-    def delta(self) -> tuple[float, ...]:
-        """(m,) guaranteed dampings [N s/m]"""
-        return tuple(passivity_level(device) for device in self.devices)
-
-    def _loop(self, network: Network) -> Loop:
-        return Loop(self.T, self.theta, self.psi, self.theta, self.delta, network)
+    loop: Loop  # without ranges and with constant delays
 
     def _ratios(self, F: Lti, sent: Callable[[Complex], Sampled]) -> Array:
         """this-environment's ratios, (n,), of the force maps F, whose responses without Theta are `sent`."""
-        theta = delay(self.theta, self.T)
+        theta = delay(self.loop.theta, self.loop.T)
 
         def at(z: Complex) -> Sampled:
             G = sent(z)
             return as_like(G, theta) @ G
 
-        longest = max(n + p for n, p in zip(self.theta, self.psi, strict=True))
-        return this_environment_ratios(at, F.poles(), self.delta, longest)
+        longest = max(n + p for n, p in zip(self.loop.theta, self.loop.psi, strict=True))
+        return this_environment_ratios(at, F.poles(), self.loop.delta, longest)
 
     def _limits(self, devices: Sequence[Device]) -> tuple[Array, Array]:
         """Force limits [N] and encoder steps [m], (m,) each."""
@@ -111,31 +93,24 @@ class CouplingSweep(_Sweep):
     one_sided: bool = False  # whether a rigid wall only pushes; the walls of a network do in any case
 
     def __post_init__(self) -> None:
-        for name in ("theta", "psi"):
-            if not all(0 <= n <= LONGEST_DELAY for n in getattr(self, name)):
-                raise ValueError(f"{name} is {listed(getattr(self, name))}, allowed are 0 to {LONGEST_DELAY} samples")
-        if not all(d > 0 for d in self.delta):
-            raise ValueError(f"delta is {listed(self.delta)}, expected positive dampings in N s/m")
-        if self.network is None and any(self.psi):
-            loop = "behind a rigid wall no loop with a delayed environment is stable"
-            raise ValueError(f"psi is {listed(self.psi)}: {loop}")
+        check_loop(self.loop)
 
     @property
     def walled(self) -> Network | None:
         """The network whose contact is made and broken in the simulated loop, if there is one."""
-        if self.network is None:
-            return _HARD_WALL if self.one_sided else None
-        return self.network if self.network.walls else None
+        if self.one_sided:
+            return _HARD_WALL
+        return self.loop.network if self.loop.environment.walls else None
 
     @property
     def usual_scale(self) -> str:
         """Against a rigid wall couplings are all of one size; against an environment far stiffer ones can be safe."""
-        return "linear" if self.network is None else "log"
+        return "linear" if self.loop.environment is RIGID_WALL else "log"
 
     @property
     def stiffness_scale(self) -> float:
         """[N/m] 2 delta/((theta + 1) T): the stiffest that a linear law may be against every passive environment."""
-        return max(2 * d / ((n + 1) * self.T) for d, n in zip(self.delta, self.theta, strict=True))
+        return max(2 * d / ((n + 1) * self.loop.T) for d, n in zip(self.loop.delta, self.loop.theta, strict=True))
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -151,12 +126,10 @@ class CouplingSweep(_Sweep):
     @cached_property
     def multiplier(self) -> tuple[Array | None, str | None]:
         """Phi of Theorem 4 [N s/m], (m,), which only delay in the environment needs; or why there is none."""
-        if not any(self.psi) or self.network is None:
-            return None, None
-        if self.network.walls:
+        if any(self.loop.psi) and self.loop.environment.walls:
             return None, "with delay in the environment its multiplier is of a linear one: no walls"
         try:
-            return least_phi(self._loop(self.network)), None
+            return least_phi(self.loop), None
         except (ValueError, DesignFailed) as error:
             return None, " ".join(str(error).split())
 
@@ -165,7 +138,7 @@ class CouplingSweep(_Sweep):
 
         Off a rigid wall the device is free, which is safe by itself.
         """
-        return tuple(self._force_map(E, self._couplings(K, B)) for E in self._environments)
+        return tuple(state.F(self._couplings(K, B)) for state in self._states)
 
     def processes(self, K: Array, B: Array, devices: Sequence[Device]) -> list[Process]:
         """What the computer does every T with each coupling; limits and encoder steps are those of `devices`."""
@@ -173,70 +146,54 @@ class CouplingSweep(_Sweep):
         if self.walled is None:
             F = self.force_maps(K, B)[0]
             return [Process(F[i], *limits) for i in range(K.size)]
-        V = self._couplings(K, B).compliance(self.T)
-        walls = [contact(self.walled, Compliance(V[i]), self.theta, self.psi, self.T) for i in range(K.size)]
+        V = self._couplings(K, B).compliance(self.loop.T)
+        timing = self.loop.theta, self.loop.psi, self.loop.T
+        walls = [contact(self.walled, Compliance(V[i]), *timing) for i in range(K.size)]
         return [Process(each.open, *limits, each) for each in walls]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Required over available damping, (n,); inf where no damping is enough. Of walls, in the worst state."""
         if condition == "closed-loop":
             couplings = self._couplings(K, B)
-            return np.max([self._closed_loop_ratios(E, couplings) for E in self._environments], axis=0)
+            return np.max([self._closed_loop_ratios(state, couplings) for state in self._states], axis=0)
         phi, reason = self.multiplier
         if reason:
             return np.full(K.size, np.inf)
-        one, none = self._couplings(K, B, 1), [None] * self.channels
-        channels = set(zip(self.theta, self.delta, none if phi is None else phi.tolist(), strict=True))
+        one, none = self._couplings(K, B, 1), [None] * self.loop.channels
+        channels = set(zip(self.loop.theta, self.loop.delta, none if phi is None else phi.tolist(), strict=True))
         each = [
-            any_environment_ratios(lambda z: one.sampled(z, self.T), K.size, [n], [d], None if p is None else [p])
+            any_environment_ratios(lambda z: one.sampled(z, self.loop.T), K.size, [n], [d], None if p is None else [p])
             for n, d, p in channels
         ]
         return np.max(each, axis=0)
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """The same of one coupling by a sweep of its own, which a map is checked against."""
-        coupling = SpringDamper([K] * self.channels, [B] * self.channels, self.cutoff)
+        loop = self.loop
+        coupling = SpringDamper([K] * loop.channels, [B] * loop.channels, self.cutoff)
         if condition == "closed-loop":
-            states = [this_environment(self._force_map(E, coupling), self.delta) for E in self._environments]
+            states = [this_environment(state.F(coupling), loop.delta) for state in self._states]
             return max(states, key=lambda requirement: requirement.ratio)
         phi, reason = self.multiplier
-        if reason:
-            return refusal("theorem4", self.delta, reason)
-        E = self._environments[0]
-        if phi is None or E is None:
-            return any_environment_per_channel(coupling.channels(self.T), self.theta, self.delta)
-        return any_environment_delayed(coupling.compliance(self.T), E, self.theta, self.psi, self.delta, phi)
+        return refusal("theorem4", loop.delta, reason) if reason else theorem4_of(loop, coupling, phi)
 
     def _couplings(self, K: Array, B: Array, channels: int | None = None) -> SpringDamper:
-        m = channels or self.channels
+        m = channels or self.loop.channels
         each = np.ones(m)
         return SpringDamper(np.multiply.outer(K, each), np.multiply.outer(B, each), self.cutoff)
 
     @cached_property
-    def _environments(self) -> tuple[Lti | None, ...]:
-        """One for each frozen contact state; None is a rigid wall."""
-        if self.network is None:
-            return (None,)
-        return tuple(environment(state, self.T) for state in reversed(list(frozen_states(self.network).values())))
+    def _states(self) -> tuple[Loop, ...]:
+        """The loop in each frozen contact state, all walls touching first."""
+        return self.loop.frozen()[::-1]
 
-    def _force_map(self, E: Lti | None, coupling: SpringDamper) -> Lti:
-        """F, against a rigid wall Theta V^-1."""
-        if E is None:
-            return delay(self.theta, self.T) @ coupling.compliance(self.T).inverse()
-        return force_map(E, coupling, self.theta, self.psi)
-
-    def _closed_loop_ratios(self, E: Lti | None, couplings: SpringDamper) -> Array:
-        delayed = E and delay(self.psi, self.T) @ E
-
-        def sent(z: Complex) -> Sampled:
-            return couplings.around(Sampled.of(delayed, z)) if delayed else couplings.sampled(z, self.T).inverse()
-
-        return self._ratios(self._force_map(E, couplings), sent)
+    def _closed_loop_ratios(self, loop: Loop, couplings: SpringDamper) -> Array:
+        return self._ratios(loop.F(couplings), lambda z: loop.sent_at(couplings, z))
 
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentSweep(_Sweep):
-    """K and B are those of every spring at a contact; `network` is what the coupling, which is fixed, was designed for.
+    """K and B are those of every spring at a contact; the loop is what the coupling, which is fixed, was designed for.
 
     An optimal coupling is the pair of a fixed Q and a model of the environment, and where that is another one than the
     model was of, two things may happen:
@@ -248,22 +205,21 @@ class EnvironmentSweep(_Sweep):
     ValueError where the network has no spring at a contact, or walls.
     """
 
-    network: Network
     coupling: Coupling
 
     cutoff = walled = None  # a velocity filter and contact made and broken belong to the other sweep
     usual_scale = "log"
 
     def __post_init__(self) -> None:
-        if self.network.walls:
+        if self.loop.environment.walls:
             raise ValueError("environment.walls: with --coupling the map is over linear environments; take them out")
-        if not contact_springs(self.network):
+        if not contact_springs(self.loop.network):
             raise ValueError("environment: no spring or damper ends at a contact, so there is no K and B to vary")
 
     @property
     def stiffness_scale(self) -> float:
         """What the middle of the map is about [N/m]: the geometric mean of these springs."""
-        stiff = [s.stiffness for s in contact_springs(self.network) if s.stiffness > 0]
+        stiff = [s.stiffness for s in contact_springs(self.loop.network) if s.stiffness > 0]
         return float(np.exp(np.mean(np.log(stiff)))) if stiff else 1000.0
 
     @property
@@ -274,7 +230,7 @@ class EnvironmentSweep(_Sweep):
     @property
     def refusals(self) -> dict[str, str]:
         """Conditions that say nothing of any cell, and why."""
-        if any(self.psi):
+        if any(self.loop.psi):
             why = "with delay in the environment it takes a multiplier for each: ask design.audit about single ones"
             return {"theorem4": why}
         reason = self._any_environment.reason
@@ -293,10 +249,10 @@ class EnvironmentSweep(_Sweep):
         """Required over available damping, (n,); inf where no damping is enough."""
         if condition == "theorem4":
             return np.full(K.size, self._any_environment.ratio)
-        matrices, coupling, psi = self._matrices(K, B), self._facing(condition), delay(self.psi, self.T)
+        matrices, coupling, psi = self._matrices(K, B), self._facing(condition), delay(self.loop.psi, self.loop.T)
 
         def sent(z: Complex) -> Sampled:
-            E = sampled_environment(matrices, self.channels, z, self.T)
+            E = sampled_environment(matrices, self.loop.channels, z, self.loop.T)
             return coupling.around(as_like(E, psi) @ E)
 
         return self._ratios(self._force_map(matrices, coupling), sent)
@@ -307,16 +263,16 @@ class EnvironmentSweep(_Sweep):
             return self._any_environment
         try:
             F = self._force_map(self._matrices(np.array([K]), np.array([B])), self._facing(condition))[0]
-            return this_environment(F, self.delta)
+            return this_environment(F, self.loop.delta)
         except SingularLoop as error:
-            return refusal("closed-loop", self.delta, str(error))
+            return refusal("closed-loop", self.loop.delta, str(error))
 
     @cached_property
     def _any_environment(self) -> Requirement:
         """theorem4's requirement, which no spring of the environment changes."""
-        if any(self.psi):
-            return refusal("theorem4", self.delta, "not asked")
-        return theorem4_of(self._loop(self.network), self.coupling)
+        if any(self.loop.psi):
+            return refusal("theorem4", self.loop.delta, "not asked")
+        return theorem4_of(self.loop, self.coupling)
 
     def _facing(self, condition: str) -> Coupling:
         """The coupling; for MODEL_KEPT as the V whose model stays that of the scenario's environment."""
@@ -325,18 +281,20 @@ class EnvironmentSweep(_Sweep):
     @cached_property
     def _kept(self) -> Coupling:
         assert isinstance(self.coupling, InternalModel)
-        model = delay(self.psi, self.T) @ environment(self.network, self.T)
-        return Compliance(self.coupling.parameter(self.T).feedback(-model))
+        model = self.loop.sent(NoCoupling())
+        return Compliance(self.coupling.parameter(self.loop.T).feedback(-model))
 
     def _force_map(self, matrices: Matrices, coupling: Coupling) -> Lti:
-        return force_map(environment_of(matrices, self.channels, self.T), coupling, self.theta, self.psi)
+        loop = self.loop
+        return force_map(environment_of(matrices, loop.channels, loop.T), coupling, loop.theta, loop.psi)
 
     def _matrices(self, K: Array, B: Array) -> Matrices:
         """Mass, damping and stiffness of every network, (n, nodes, nodes)."""
-        M, D, S = self.network.matrices()
-        varied = contact_springs(self.network)
+        network = self.loop.network
+        M, D, S = network.matrices()
+        varied = contact_springs(network)
         pattern = np.zeros_like(M)
-        for spring, across in zip(varied, self.network.across(varied), strict=True):
+        for spring, across in zip(varied, network.across(varied), strict=True):
             one = np.outer(across, across)
             pattern, D, S = pattern + one, D - spring.damping * one, S - spring.stiffness * one
         vary = lambda fixed, value: fixed + np.asarray(value)[:, None, None] * pattern  # noqa: E731
@@ -416,7 +374,7 @@ def make_grid(
     2.5 times these, a logarithmic one from far below to far above. Raises InputError.
     """
     scale = scale or sweep.usual_scale
-    stiff, most = sweep.stiffness_scale, max(sweep.delta)
+    stiff, most = sweep.stiffness_scale, max(sweep.loop.delta)
     if scale == "linear":
         wide = (2.5 * stiff / n, 2.5 * stiff), (0.0, 2.5 * most)
     else:
@@ -509,7 +467,7 @@ def draw_map(sweep: Sweep, grid: Grid, held: HeldDevices, plan: Plan, progress: 
     if not stopped and plan.points:
         begin = time.perf_counter()
         cells = grid.subset(plan.points)
-        press = plan.press * _press_directions(sweep.walled, sweep.channels)
+        press = plan.press * _press_directions(sweep.walled, sweep.loop.channels)
         points, stopped = simulate_cells(cells, loops, held, plan, press, lambda k, of: progress("MuJoCo", k, of))
         seconds["simulation"] = time.perf_counter() - begin
     return Map(grid, ratio, growth, unstable, points, seconds, stopped)

@@ -13,7 +13,7 @@ import numpy as np
 
 from controller.lti import Array
 from design.conditions import Requirement
-from models.scene import Scene
+from models.scene import APART, DRAWN, STEP, Scene
 from sim.view.events import GIVEN, KEYS, Couple, words
 from sim.view.session import HISTORY, Frame, Grip
 
@@ -32,8 +32,6 @@ PALETTE: tuple[Colour, ...] = (
 GREY: Colour = (0.55, 0.55, 0.58)
 ALARM: Colour = (1.0, 0.15, 0.15)  # a force at its limit
 
-_APART = 0.11  # [m] between devices, across their motion
-STEP = 0.09  # [m] between the bodies of one device at rest, along their motion
 LONGEST = 0.12  # [m] arrow of a force at its limit
 SIZE = (640, 640)  # pixels of a video
 WORDS = 0.40  # share of a video's height, at its top, that is left to words
@@ -204,26 +202,32 @@ class Stage:
 def dressed(scene: Scene, size: tuple[int, int] = SIZE) -> mujoco.MjModel:
     """The scene's model with shapes, places, a camera's distance and colours, but the same dynamics."""
     spec = mujoco.MjSpec.from_string(scene.xml)
+    _undress(spec)
     spec.visual.global_.offwidth, spec.visual.global_.offheight = size
-    sky = {"type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "builtin": mujoco.mjtBuiltin.mjBUILTIN_FLAT}
-    spec.add_texture(name="sky", width=32, height=192, rgb1=[0.93, 0.93, 0.93], rgb2=[0.93, 0.93, 0.93], **sky)
     spec.visual.headlight.ambient = [0.5, 0.5, 0.5]
     where = places(scene)
     for joint, (place, channel) in enumerate(zip(where, channels(scene), strict=True)):
         body = spec.body(scene.model.joint(joint).name)
-        body.pos = [place * STEP, channel * -_APART, 0.03]
+        body.pos = [place * STEP, channel * -APART, 0.03]
         if place == 0:
             body.add_geom(type=_SPHERE, size=[0.024] * 3, rgba=(*colour(channel), 1.0), **_MASSLESS)
         else:
             body.add_geom(type=_BOX, size=[0.022, 0.026, 0.022], rgba=(*GREY, 1.0), **_MASSLESS)
     deepest = max(1, *where)
-    middle = [(deepest - 1) * STEP / 2, -_APART * (scene.channels - 1) / 2, 0.03]
+    middle = [(deepest - 1) * STEP / 2, -APART * (scene.channels - 1) / 2, 0.03]
     for channel in range(scene.channels):
-        at, rail = [middle[0], -_APART * channel, 0.0], [0.5 * STEP * (deepest + 1) + 0.06, 0.012, 0.004]
+        at, rail = [middle[0], -APART * channel, 0.0], [0.5 * STEP * (deepest + 1) + 0.06, 0.012, 0.004]
         spec.worldbody.add_geom(type=_BOX, pos=at, size=rail, rgba=[0.8, 0.8, 0.8, 1], **_MASSLESS)
     spec.stat.center = middle
-    spec.stat.extent = 0.24 + 0.5 * STEP * deepest + 0.5 * _APART * (scene.channels - 1)
+    spec.stat.extent = 0.24 + 0.5 * STEP * deepest + 0.5 * APART * (scene.channels - 1)
     return spec.compile()
+
+
+def _undress(spec: mujoco.MjSpec) -> None:
+    """Take out what a viewer shows of the scene's own file: this stage has its own shapes and colours."""
+    drawn = [tendon for tendon in spec.tendons if tendon.name.endswith(DRAWN)]
+    for part in [*drawn, *spec.geoms, *spec.sites]:
+        spec.delete(part)
 
 
 def _figure(channel: int, low: Array, high: Array, top: float) -> mujoco.MjvFigure:

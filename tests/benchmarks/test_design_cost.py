@@ -7,9 +7,8 @@ import pytest
 
 from design import fixed_order as ccl
 from design import optimal, spring_damper
-from design.audit import Subject, report
+from design.audit import report
 from design.certificate import Stored, assess, prove, verify
-from design.lmi import Specification
 from design.optimal import LADDER, Options
 from design.result import CASE_I
 from design.transparency import decibels
@@ -21,7 +20,7 @@ ASKED = {"one rung": Options(ladder=LADDER[:1]), "the whole ladder": Options()}
 
 
 def test_spring_damper(benchmark):
-    design = benchmark.pedantic(lambda: spring_damper.design(Specification.of(LOOP)), rounds=5, warmup_rounds=1)
+    design = benchmark.pedantic(lambda: spring_damper.design(LOOP), rounds=5, warmup_rounds=1)
     need, seconds = design.requirement.ratio, benchmark.stats.stats.median
     work = f"{design.sdps} convex problems, {seconds:.2f} s"
     print(f"\ncase I, spring-damper, theorem4: norm {design.objective:.4f} in {work}; needs {need:.6f} delta")
@@ -29,7 +28,7 @@ def test_spring_damper(benchmark):
 
 
 def test_inner_convex_approximation(benchmark):
-    design = benchmark.pedantic(lambda: ccl.design(Specification.of(LOOP)), rounds=1)
+    design = benchmark.pedantic(lambda: ccl.design(LOOP), rounds=1)
     print(f"\nccl, order one per channel: norm {design.objective:.4f} in {design.sdps} SDPs")
     assert design.objective < 9.8
 
@@ -47,14 +46,14 @@ def test_optimal(benchmark, case, name):
 
 
 def test_both_margins_and_their_proofs(benchmark):
-    coupling = spring_damper.design(Specification.of(LOOP)).coupling
+    coupling = spring_damper.design(LOOP).coupling
     requirements = benchmark.pedantic(lambda: assess(LOOP, coupling), rounds=5, warmup_rounds=1)
     print(f"\nboth conditions, swept and proved: {[r.proof for r in requirements.values()]}")
     assert all(r.proof == "rational" for r in requirements.values())
 
 
 def test_a_stored_proof_is_checked_again(benchmark):
-    coupling = spring_damper.design(Specification.of(LOOP)).coupling
+    coupling = spring_damper.design(LOOP).coupling
     stored = Stored.of(LOOP, coupling, prove(LOOP, coupling, "theorem4"))
     verdict = benchmark.pedantic(lambda: verify(stored), rounds=5, warmup_rounds=1)
     assert verdict.proved
@@ -67,8 +66,6 @@ def test_a_refusal(benchmark):
 
 
 def test_audit(benchmark):
-    scenario = load()
-    subject = Subject(CASE_I, scenario.environment, scenario.T, scenario.theta, scenario.psi, scenario.delta)
-    outcome = benchmark.pedantic(lambda: report(subject), rounds=5, warmup_rounds=1)
+    outcome = benchmark.pedantic(lambda: report(LOOP, CASE_I), rounds=5, warmup_rounds=1)
     print(f"\naudit of (27): closed-loop needs {outcome['closed-loop']['required_damping'][0]:.6f} N s/m")
     assert abs(outcome["closed-loop"]["required_damping"][0] - 1.39871) < 1e-5

@@ -16,7 +16,7 @@ from controller.environment import FIGURE_4, GROUND, Network, Wall, environment,
 from controller.loop import force_map
 from controller.lti import SingularLoop
 from controller.process import Complementarity, Process, StepBuffer, contact
-from design.audit import Subject, report
+from design.audit import report, requirement
 from design.certificate import FROZEN, NotProved, assess, prove
 from design.conditions import this_environment
 from models.device import CompliantDevice
@@ -251,13 +251,11 @@ def test_closed_loop_is_asked_of_every_frozen_state():
 
 def test_a_stiffer_coupling_is_promised_for_frozen_states_only():
     """K = 1772 N/m behind one sample of delay: closed-loop asks 1.3699 of 1.37 with the wall, theorem4 2.38."""
-    s = load("one-wall")
-    subject = Subject(SpringDamper([1772.0], [0.453]), s.environment, s.T, s.theta, s.psi, s.delta)
-    assert subject.requirement("closed-loop").certified
-    assert not subject.requirement("theorem4").certified
-    assert report(subject)["promise"] == FROZEN
-    open_only = Subject(subject.coupling, held(s.environment, [False]), s.T, s.theta, s.psi, s.delta)
-    assert open_only.requirement("closed-loop").ratio == 0
+    loop, coupling = load("one-wall").loop("I"), SpringDamper([1772.0], [0.453])
+    assert requirement(loop, coupling, "closed-loop").certified
+    assert not requirement(loop, coupling, "theorem4").certified
+    assert report(loop, coupling)["promise"] == FROZEN
+    assert requirement(loop.at(held(loop.network, [False])), coupling, "closed-loop").ratio == 0
 
 
 def test_a_coupling_with_a_model_of_its_own_cannot_face_walls():

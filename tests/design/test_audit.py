@@ -3,19 +3,21 @@
 import json
 import subprocess
 import sys
-from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
 from cli.audit import main
 from cli.options import execute
-from controller.coupling import Compliance, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Network, Spring
+from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
+from controller.environment import FIGURE_4, GROUND, RIGID_WALL, Box, Network, Spring
+from controller.loop import Loop
 from controller.lti import Lti
 from design import certificate as store
-from design.audit import MOST_EXTRA_SAMPLES, PRESETS, Subject, edge, remedies, report, stiffest, tolerance
-from design.certificate import CAVEATS, promise
+from design.audit import MOST_EXTRA_SAMPLES, edge, remedies, report, requirement, stiffest, tolerance
+from design.certificate import ANY, CAVEATS, promise_of
+from design.designs import certify
 from design.result import CASE_I
 
 CONDITIONS = ("closed-loop", "theorem4")
@@ -23,14 +25,14 @@ T = 1.2e-3
 SAFE = SpringDamper([870.0, 545.0], [0.38, 0.52])
 
 
-def pair(coupling, **changes) -> Subject:
+def pair(coupling, **changes) -> tuple[Loop, Coupling]:
     """A coupling in the default scenario's loop."""
-    loop = {"network": FIGURE_4, "T": T, "theta": (1, 2), "psi": (0, 0), "delta": (1.37, 1.37)}
-    return Subject(coupling, **(loop | changes))
+    loop = {"T": T, "theta": (1, 2), "psi": (0, 0), "delta": (1.37, 1.37), "environment": FIGURE_4} | changes
+    return Loop(lam=loop["theta"], **loop), coupling
 
 
-def wall(K: float, B: float, theta: int = 0, delta: float = 1.37, T: float = 1e-3) -> Subject:
-    return Subject(SpringDamper([K], [B]), None, T, (theta,), (0,), (delta,))
+def wall(K: float, B: float, theta: int = 0, delta: float = 1.37, T: float = 1e-3) -> tuple[Loop, Coupling]:
+    return Loop(T, (theta,), (0,), (theta,), (delta,), RIGID_WALL), SpringDamper([K], [B])
 
 
 @pytest.fixture
@@ -63,32 +65,57 @@ def strict(text: str) -> dict:
 def test_closed_forms_of_a_rigid_wall(K, B, theta, closed_loop, theorem4):
     """K T/2 + B without delay, 3 K T/2 with one sample; Theorem 4 asks (theta + 1)^2 K T/2 of a spring."""
     subject = wall(K, B, theta)
-    assert subject.requirement("closed-loop").required[0] == pytest.approx(closed_loop, rel=1e-9)
-    assert subject.requirement("theorem4").required[0] == pytest.approx(theorem4, rel=1e-9)
+    assert requirement(*subject, "closed-loop").required[0] == pytest.approx(closed_loop, rel=1e-9)
+    assert requirement(*subject, "theorem4").required[0] == pytest.approx(theorem4, rel=1e-9)
+
+
+@pytest.mark.parametrize(("theta", "proved"), [(0, True), (1, True), (1, False)])
+def test_a_coupling_before_a_rigid_wall_is_proved_and_stored_like_any_other(theta, proved, tmp_path):
+    """It needs 500 and 1500 N/m times T; a wall that is never left, so that nothing else is promised."""
+    loop, coupling = wall(1000, 0, theta, delta=1.51 if proved else 1.49)
+    needs = certify(loop, coupling)
+    assert needs["closed-loop"].required[0] == pytest.approx((theta + 0.5) * 1000 * 1e-3)
+    assert needs["closed-loop"].proof == ("rational" if proved else "sampled")
+    assert promise_of(needs, loop) == ((ANY if theta == 0 else "a rigid wall only") if proved else None)
+    if proved:
+        store.save(store.Stored.of(loop, coupling, store.prove(loop, coupling, "closed-loop")), tmp_path / "wall.json")
+        again = store.load(tmp_path / "wall.json")
+        assert again.loop == loop
+        assert store.verify(again).proved
+
+
+def test_what_a_rigid_wall_cannot_have():
+    loop, _ = wall(1000, 0)
+    with pytest.raises(ValueError, match="no loop with a delayed environment is stable"):
+        msgspec.structs.replace(loop, psi=(1,))
+    with pytest.raises(ValueError, match="needs a spring-damper or another V"):
+        loop.F(NoCoupling())
+    with pytest.raises(ValueError, match="is no network of springs"):
+        msgspec.structs.replace(loop, box=Box(masses={"tip": (1.0, 2.0)}))
 
 
 def test_a_wall_is_the_limit_of_a_stiff_environment():
     ground = Network(("a",), (Spring(("a", GROUND), 1e9),))
-    soft, rigid = replace(wall(2000, 0.4, 1), network=ground), wall(2000, 0.4, 1)
-    ratio = soft.requirement("closed-loop").ratio
-    assert ratio == pytest.approx(rigid.requirement("closed-loop").ratio, rel=1e-5)
+    loop, coupling = wall(2000, 0.4, 1)
+    ratio = requirement(loop.at(ground), coupling, "closed-loop").ratio
+    assert ratio == pytest.approx(requirement(loop, coupling, "closed-loop").ratio, rel=1e-5)
 
 
 @pytest.mark.parametrize(("condition", "theta", "K"), [("closed-loop", 0, 2340), ("theorem4", 0, 2340)])
 def test_the_stiffest_spring_before_a_wall_is_colgates(condition, theta, K):
     """2 (delta - B)/T."""
-    assert stiffest(wall(100, 0.2, theta), condition).K[0] == pytest.approx(K, rel=1e-6)
+    assert stiffest(*wall(100, 0.2, theta), condition).K[0] == pytest.approx(K, rel=1e-6)
 
 
 def test_the_largest_period_before_a_wall_is_colgates():
     subject = wall(1000, 0.37)
     for condition in CONDITIONS:
-        found = tolerance(subject, subject.requirement(condition))
+        found = tolerance(*subject, requirement(*subject, condition))
         assert found.largest_T == pytest.approx(2 * (1.37 - 0.37) / 1000, rel=1e-6)
 
 
 def test_the_papers_gains_and_their_figures():
-    outcome = report(pair(CASE_I))
+    outcome = report(*pair(CASE_I))
     assert outcome["closed-loop"]["required_damping"] == pytest.approx([1.39871] * 2, rel=1e-5)
     assert outcome["theorem4"]["required_damping"] == pytest.approx([7.63, 7.84], abs=0.005)
     assert not outcome["certified"]
@@ -99,7 +126,7 @@ def test_the_papers_gains_and_their_figures():
 
 def test_the_theorem4_gains_as_the_literature_rounds_them():
     """(879, 552) / (.39, .52) are 0.02 % beyond Theorem 4, and far inside the closed-loop condition."""
-    outcome = report(pair(SpringDamper([879.0, 552.0], [0.39, 0.52])))
+    outcome = report(*pair(SpringDamper([879.0, 552.0], [0.39, 0.52])))
     assert outcome["closed-loop"]["required_damping"] == pytest.approx([0.714344] * 2, rel=1e-6)
     assert outcome["theorem4"]["required_damping"] == pytest.approx([1.37026, 1.37015], abs=1e-5)
     assert outcome["promise"] == "this environment"
@@ -110,80 +137,80 @@ def test_the_theorem4_gains_as_the_literature_rounds_them():
     "subject", [pair(SAFE), wall(900, 0.3, 1), wall(300, 0.1, 2)], ids=["pair", "wall", "late wall"]
 )
 def test_just_inside_is_certified_and_just_outside_is_not(subject, condition):
-    requirement = subject.requirement(condition)
-    assert requirement.certified
-    found, coupling = tolerance(subject, requirement), subject.coupling
-    K = np.array(stiffest(subject, condition).K)
-    least = np.array(found.least_delta)
+    loop, coupling = subject
+    needs = requirement(loop, coupling, condition)
+    assert needs.certified
+    found = tolerance(loop, coupling, needs)
+    K = np.array(stiffest(loop, coupling, condition).K)
+    least, T = np.array(found.least_delta), found.largest_T
+    change, later = msgspec.structs.replace, [n + found.extra_samples for n in loop.theta]
     inside = [
-        subject.with_gains(K, coupling.B),
-        subject.with_period(found.largest_T),
-        replace(subject, theta=tuple(n + found.extra_samples for n in subject.theta)),
-        replace(subject, delta=tuple(least * (1 + 1e-6))),
+        (loop, SpringDamper(K, coupling.B)),
+        (change(loop, T=T), coupling),
+        (change(loop, theta=later), coupling),
+        (change(loop, delta=tuple(least * (1 + 1e-6))), coupling),
     ]
     outside = [
-        subject.with_gains(K * (1 + 1e-5), coupling.B),
-        subject.with_period(found.largest_T * (1 + 1e-5)),
-        replace(subject, theta=tuple(n + found.extra_samples + 1 for n in subject.theta)),
-        replace(subject, delta=tuple(least * (1 - 1e-6))),
+        (loop, SpringDamper(K * (1 + 1e-5), coupling.B)),
+        (change(loop, T=T * (1 + 1e-5)), coupling),
+        (change(loop, theta=[n + 1 for n in later]), coupling),
+        (change(loop, delta=tuple(least * (1 - 1e-6))), coupling),
     ]
-    assert [s.requirement(condition).certified for s in inside] == [True] * 4
-    assert [s.requirement(condition).certified for s in outside] == [False] * 4
+    assert [requirement(*s, condition).certified for s in inside] == [True] * 4
+    assert [requirement(*s, condition).certified for s in outside] == [False] * 4
 
 
 def test_figures_that_do_not_exist_say_why():
     spring = wall(0.01, 0.0, delta=1.0)
-    found = tolerance(spring, spring.requirement("closed-loop"))
+    found = tolerance(*spring, requirement(*spring, "closed-loop"))
     assert (found.largest_T, found.extra_samples) == (None, None)
     assert f"{MOST_EXTRA_SAMPLES} samples more" in found.reason
     assert "largest T tried" in found.reason
-    assert "no scale of K" in stiffest(wall(5000, 30), "closed-loop").reason
-    assert "stiffest K tried" in stiffest(pair(SAFE, delta=(3.0, 3.0)), "closed-loop").reason
-    assert "nothing to lose" in tolerance(pair(CASE_I), pair(CASE_I).requirement("closed-loop")).reason
+    assert "no scale of K" in stiffest(*wall(5000, 30), "closed-loop").reason
+    assert "stiffest K tried" in stiffest(*pair(SAFE, delta=(3.0, 3.0)), "closed-loop").reason
+    assert "nothing to lose" in tolerance(*pair(CASE_I), requirement(*pair(CASE_I), "closed-loop")).reason
 
 
 def test_remedies_are_tried_and_mild():
     subject = wall(5000, 0.5, 1)
-    requirement = subject.requirement("closed-loop")
-    changes = {r.change.split(":")[0]: r for r in remedies(subject, requirement)}
+    changes = {r.change.split(":")[0]: r for r in remedies(*subject, requirement(*subject, "closed-loop"))}
     assert changes["less delay"].requirement.required[0] == pytest.approx(3.0)
     assert not changes["less delay"].requirement.certified
     assert changes["faster"].requirement.certified
     assert changes["faster"].requirement.required[0] > 0.98 * 1.37
-    assert remedies(wall(500, 0), wall(500, 0).requirement("closed-loop")) == []
-    assert {helping["condition"] for helping in report(wall(5000, 0))["helps"]} == {"closed-loop"}
+    assert remedies(*wall(500, 0), requirement(*wall(500, 0), "closed-loop")) == []
+    assert {helping["condition"] for helping in report(*wall(5000, 0))["helps"]} == {"closed-loop"}
 
 
 def test_a_delayed_environment_needs_a_multiplier_that_the_default_scenario_has_not():
-    requirement = pair(SAFE, psi=(1, 1)).requirement("theorem4")
-    assert not requirement.certified
-    assert "the environment alone uses up" in requirement.reason
+    needs = requirement(*pair(SAFE, psi=(1, 1)), "theorem4")
+    assert not needs.certified
+    assert "the environment alone uses up" in needs.reason
     softer = Network(("a",), (Spring(("a", GROUND), 100.0, 0.2),))
-    subject = Subject(SpringDamper([200.0], [0.2]), softer, T, (0,), (1,), (1.37,))
-    assert subject.requirement("theorem4").certified
-    assert "multiplier" in stiffest(subject, "theorem4").reason
+    subject = Loop(T, (0,), (1,), (0,), (1.37,), softer), SpringDamper([200.0], [0.2])
+    assert requirement(*subject, "theorem4").certified
+    assert "multiplier" in stiffest(*subject, "theorem4").reason
 
 
 def test_any_coupling_can_be_audited():
     V = SAFE.compliance(T)
-    general, structured = report(pair(Compliance(V))), report(pair(SAFE))
+    general, structured = report(*pair(Compliance(V))), report(*pair(SAFE))
     assert general["closed-loop"]["required_damping"] == pytest.approx(structured["closed-loop"]["required_damping"])
     assert general["theorem4"]["margin"] == pytest.approx(structured["theorem4"]["margin"], rel=1e-6)
     assert general["coupling"]["kind"] == "compliance"
     assert "only a spring-damper" in general["theorem4"]["stiffest"]["reason"]
-    nothing = report(pair(NoCoupling()))
+    nothing = report(*pair(NoCoupling()))
     assert nothing["closed-loop"]["required_damping"] == pytest.approx([1.7229] * 2, rel=3e-5)
     assert nothing["theorem4"]["required_damping"] == [None, None]
     assert "without a coupling" in nothing["theorem4"]["reason"]
 
 
 def test_promises():
-    assert promise(True, True) == "any passive environment"
-    assert promise(False, True) == "this environment"
-    assert promise(False, True, rigid=True) == "a rigid wall only"
-    assert promise(False, False) is None
-    assert report(wall(900, 0.2, 1))["promise"] == "any passive environment"
-    assert report(wall(900, 0, 1))["promise"] == "a rigid wall only"
+    assert report(*pair(SAFE))["promise"] == "any passive environment"
+    assert report(*pair(SpringDamper([2000.0, 2000.0], [0.2, 0.2])))["promise"] == "this environment"
+    assert report(*wall(5000, 0))["promise"] is None
+    assert report(*wall(900, 0.2, 1))["promise"] == "any passive environment"
+    assert report(*wall(900, 0, 1))["promise"] == "a rigid wall only"
 
 
 def test_edge_takes_the_certified_side():
@@ -202,6 +229,10 @@ def test_edge_takes_the_certified_side():
         (["--preset", "chai3d-omega3"], 1, 32.5),
         (["--preset", "chai3d-omega3", "--B", "0"], 1, 2.5),
         (["--preset", "chai3d-omega3", "--B", "0", "--K", "2000"], 0, 1.0),
+        (["--device", "omega.3"], 1, 32.5),
+        (["--device", "falcon", "--delta", "0.5"], 1, 21.5),
+        (["--device", "omega", "--case", "I", "--K", "2870,2320", "--B", "5.47,5.55"], 1, 1.39871),
+        (["--device", "touch", "--delta", "1.37", "--K", "879,552", "--B", ".39,.52"], 0, 0.714344),
         (["--case", "none"], 1, 1.7229),
         (["--K", "879,552", "--B", ".39,.52"], 0, 0.714344),
         (["--scenario", "three-rigid", "--K", "300", "--B", "0.2"], 0, None),
@@ -227,14 +258,15 @@ def test_the_report_is_kept(run, tmp_path):
 
 def test_a_preset_names_its_source(run):
     outcome = strict(run("--preset", "chai3d-omega3", "--json", "-")[1])
-    assert outcome["preset"] == {"name": "chai3d-omega3", "source": PRESETS["chai3d-omega3"].source}
+    assert outcome["preset"]["name"] == "chai3d-omega3"
+    assert "CDeltaDevices.cpp" in outcome["preset"]["source"]
     assert (outcome["loop"]["T_s"], outcome["loop"]["theta"]) == (1e-3, [0])
 
 
 @pytest.fixture
 def files(tmp_path):
     """A spring-damper for the default scenario, the same as a state space, and a file that is none."""
-    loop = store.Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
+    loop = Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
     store.save(store.Stored.of(loop, SAFE), tmp_path / "gains.json")
     store.save(store.Stored(loop, Compliance(SAFE.compliance(T)).form()), tmp_path / "space.json")
     unstable = Compliance(Lti(1.1 * np.eye(2), np.eye(2), np.eye(2), np.eye(2), T))
@@ -272,6 +304,10 @@ BAD = [
     ("--rigid --case none", "--rigid with --case none"),
     ("--case none --K 1 --B 1", "--K with --case none"),
     ("--preset chai3d", "invalid choice: 'chai3d'"),
+    ("--device falkon --delta 1", "--device is 'falkon' (did you mean falcon?), the catalogue has omega.3, delta.3"),
+    ("--device falcon", "--device falcon: nobody publishes its damping: give --delta"),
+    ("--device hapkit --delta 1", "nothing to audit"),
+    ("--device falcon --preset chai3d-omega3", "--device with --preset"),
     ("--preset chai3d-omega3 --coupling gains.json", "--preset with --coupling"),
     ("--coupling gains.json --K 1", "--K with --coupling"),
     ("--coupling gains.json --scenario three-rigid", "gains.json couples 2 channels, the loop has 3"),
@@ -299,6 +335,28 @@ def test_bad_calls_get_one_line_and_exit_code_2(run, options, message):
     assert err.startswith("error: ")
     assert message in err
     assert err.count("\n") == 1
+
+
+def test_the_catalogue_has_a_source_for_every_number(run):
+    code, out, err = run("--devices", "--json", "-")
+    devices = strict(out)["devices"]
+    assert code == 0
+    assert set(devices) >= {
+        "omega.3",
+        "delta.3",
+        "falcon",
+        "touch",
+        "phantom-premium",
+        "haply-2diy",
+        "inverse3",
+        "hapkit",
+    }
+    for name, device in devices.items():
+        assert name in err
+        for field, fact in device.items():
+            assert field == "title" or fact is None or fact["source"]
+    assert devices["falcon"]["damping"] is None
+    assert "unknown" in err
 
 
 def test_help_has_an_example(run):

@@ -6,38 +6,38 @@ import pytest
 from worlds import DELTA, SOFT_NETWORK, T
 
 from controller.coupling import SpringDamper
-from controller.environment import FIGURE_4, environment
-from controller.loop import force_map
+from controller.environment import FIGURE_4
+from controller.loop import Loop, force_map
 from controller.lti import Lti
 from design import fixed_order as ccl
 from design import spring_damper
 from design.conditions import any_environment, this_environment
 from design.fixed_order import FixedOrder, FixedPoles, descend
-from design.lmi import RESERVE, Shaping, Specification, affine, symmetric_from, v_hat_regular
+from design.lmi import RESERVE, Shaping, affine, symmetric_from, v_hat_regular
 
 Z = np.exp(1j * np.array([0.01, 0.3, 1.0, 2.0, 3.1]))
 NO_MULTIPLIER = np.full(2, np.inf)
 
 
-def specification(lam=(1, 2), network=FIGURE_4, psi=(0, 0), delta=DELTA):
-    return Specification(environment(network, T), (1, 2), psi, lam, delta)
+def asked(lam=(1, 2), network=FIGURE_4, psi=(0, 0), delta=DELTA) -> Loop:
+    return Loop(T, (1, 2), psi, lam, delta, network)
 
 
 @pytest.fixture(scope="module")
 def structured():
-    return spring_damper.design(specification())
+    return spring_damper.design(asked())
 
 
 @pytest.fixture(scope="module")
 def inner():
-    return ccl.design(specification())
+    return ccl.design(asked())
 
 
 @pytest.mark.parametrize(("order", "diagonal"), [(1, True), (2, True), (1, False), (2, False)])
 def test_a_spring_damper_is_a_member_of_every_family(order, diagonal):
     gains = SpringDamper([500.0, 900.0], [0.4, 1.0])
-    spec = specification(delta=(2.0, 0.8))
-    family = FixedOrder(spec, NO_MULTIPLIER, order, diagonal)
+    loop = asked(delta=(2.0, 0.8))
+    family = FixedOrder(Shaping(loop), NO_MULTIPLIER, order, diagonal)
     p = family.start(gains)
     assert p.shape == (family.unknowns,)
     np.testing.assert_allclose(family.coupling(p).at(Z), gains.compliance(T).at(Z), atol=1e-15)
@@ -46,26 +46,26 @@ def test_a_spring_damper_is_a_member_of_every_family(order, diagonal):
 @pytest.mark.parametrize(("order", "diagonal"), [(1, True), (2, False)])
 @pytest.mark.parametrize("case", [(1, 2), (0, 0)])
 def test_the_affine_realisations_are_the_transfer_matrices(order, diagonal, case):
-    spec = specification(case, delta=(2.0, 0.8))
-    family = FixedOrder(spec, NO_MULTIPLIER, order, diagonal)
+    loop = asked(case, delta=(2.0, 0.8))
+    family = FixedOrder(Shaping(loop), NO_MULTIPLIER, order, diagonal)
     p = family.start(SpringDamper([500.0, 900.0], [0.4, 1.0]))
     p = p + 0.05 * np.random.default_rng(0).normal(size=p.size)
-    left, right, late = Shaping(spec).parts(np.angle(Z))
+    left, right, late = Shaping(loop).parts(np.angle(Z))
     expected = (left @ family.coupling(p).at(Z) + late) @ right
-    np.testing.assert_allclose(Lti(*family.loop(p), T).at(Z), expected, atol=1e-9 * np.abs(expected).max())
-    found, wanted = family.ports(p), v_hat_regular(family.unit_coupling(p), spec.theta)
+    np.testing.assert_allclose(Lti(*family.weighted_loop(p), T).at(Z), expected, atol=1e-9 * np.abs(expected).max())
+    found, wanted = family.ports(p), v_hat_regular(family.unit_coupling(p), loop.theta)
     y2 = Lti(found.A, found.B, found.C2, found.D2, 1.0).at(Z)
     np.testing.assert_allclose(y2, Lti(wanted.A, wanted.B, wanted.C2, wanted.D2, 1.0).at(Z), atol=1e-9)
 
 
 @pytest.mark.parametrize("diagonal", [True, False])
 def test_the_inequalities_are_affine_in_the_unknowns(diagonal):
-    family = FixedOrder(specification((0, 0)), np.array([2.0, 3.0]), 2, diagonal)
+    family = FixedOrder(Shaping(asked((0, 0))), np.array([2.0, 3.0]), 2, diagonal)
     rng = np.random.default_rng(1)
     one, two = rng.normal(size=(2, family.unknowns))
 
     def everything(p):
-        return np.concatenate([np.ravel(M) for M in (*family.loop(p), *family.ports(p))])
+        return np.concatenate([np.ravel(M) for M in (*family.weighted_loop(p), *family.ports(p))])
 
     middle = (everything(one) + everything(two)) / 2
     np.testing.assert_allclose(everything((one + two) / 2), middle, atol=1e-9 * np.abs(middle).max())
@@ -82,38 +82,38 @@ def test_the_inner_approximation_reaches_the_optimum_of_its_order(inner, structu
 
 
 def test_what_is_returned_is_certified_from_the_coupling_alone(inner):
-    spec = specification()
+    loop = asked()
     V = inner.coupling.V
     assert V.order == 2
-    assert any_environment(V, spec.theta, DELTA).ratio <= 1 - RESERVE + 1e-6
-    assert Shaping(spec).norm(V)[0] == pytest.approx(inner.objective, rel=1e-9)
-    F = force_map(spec.environment, inner.coupling, spec.theta, spec.psi)
+    assert any_environment(V, loop.theta, DELTA).ratio <= 1 - RESERVE + 1e-6
+    assert Shaping(loop).norm(V)[0] == pytest.approx(inner.objective, rel=1e-9)
+    F = force_map(loop.E(), inner.coupling, loop.theta, loop.psi)
     assert F.is_stable()
     assert this_environment(F, DELTA).certified
 
 
 def test_every_step_of_the_descent_is_feasible_and_better():
-    spec = specification((0, 0))
-    family = FixedOrder(spec, NO_MULTIPLIER)
-    gains = spring_damper.design(specification((0, 0), delta=(1.36, 1.36))).coupling
+    loop = asked((0, 0))
+    family = FixedOrder(Shaping(loop), NO_MULTIPLIER)
+    gains = spring_damper.design(asked((0, 0), delta=(1.36, 1.36))).coupling
     p = family.start(gains)
-    norm = Shaping(spec).norm(gains.compliance(T))[0]
+    norm = Shaping(loop).norm(gains.compliance(T))[0]
     for _, step in zip(range(6), descend(family, p, norm), strict=False):
         V = family.coupling(step)
-        before, norm = norm, Shaping(spec).norm(V)[0]
-        assert any_environment(V, spec.theta, DELTA).certified
+        before, norm = norm, Shaping(loop).norm(V)[0]
+        assert any_environment(V, loop.theta, DELTA).certified
         assert norm < before
 
 
 def test_the_fixed_pole_reference_agrees(inner):
-    reference = ccl.design(specification(), method="fixed-poles", most_sdps=40)
+    reference = ccl.design(asked(), method="fixed-poles", most_sdps=40)
     assert reference.objective == pytest.approx(9.745, abs=0.01)
     assert inner.objective >= reference.objective * (1 - 1e-3)
     assert reference.requirement.certified
 
 
 def test_more_poles_never_hurt_and_the_structured_poles_are_beaten(structured):
-    problem = FixedPoles(specification(), NO_MULTIPLIER)
+    problem = FixedPoles(Shaping(asked()), NO_MULTIPLIER)
     gains = structured.coupling
     rate = gains.B / (gains.B + gains.K * T)
     _, one = problem.best([[rate[0]], [rate[1]]])
@@ -124,21 +124,21 @@ def test_more_poles_never_hurt_and_the_structured_poles_are_beaten(structured):
 
 @pytest.mark.parametrize(("order", "diagonal"), [(1, False), (2, True)])
 def test_richer_families_start_no_worse(order, diagonal, structured):
-    found = ccl.design(specification(), order, diagonal, most_sdps=3)
+    found = ccl.design(asked(), order, diagonal, most_sdps=3)
     assert found.objective < structured.objective
     assert found.requirement.certified
 
 
 def test_delay_in_the_environment_is_paid_for():
-    spec = specification((0, 0), SOFT_NETWORK, psi=(1, 1))
-    found = ccl.design(spec, most_sdps=3)
+    loop = asked((0, 0), SOFT_NETWORK, psi=(1, 1))
+    found = ccl.design(loop, most_sdps=3)
     assert found.requirement.certified
     assert found.phi is not None
-    assert found.objective < spring_damper.design(spec).objective
+    assert found.objective < spring_damper.design(loop).objective
 
 
 def test_the_comparison_names_every_method():
-    rows = ccl.compare(specification(), most_sdps=3)
+    rows = ccl.compare(asked(), most_sdps=3)
     assert [row.method for row in rows] == ["spring-damper", *ccl.METHODS]
     assert all(row.sdps > 0 and row.wall_s > 0 for row in rows)
     norms = {row.method: row.norm for row in rows}
@@ -156,4 +156,4 @@ def test_the_comparison_names_every_method():
 )
 def test_a_bad_request_gets_one_line(options, message):
     with pytest.raises(ValueError, match=message):
-        ccl.design(specification(), **options)
+        ccl.design(asked(), **options)

@@ -30,7 +30,6 @@ from design.certificate import (
 )
 from design.conditions import from_ratio, this_environment
 from design.frequency import frequencies, on_circle, rounding
-from design.lmi import Specification
 from design.result import PUBLISHED
 
 DEFAULT = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
@@ -47,7 +46,7 @@ def wall(stiffness: float, damping: float, delta: float, T: float = 1e-3) -> Loo
 def test_delay_inside_the_environment_is_proved_with_its_multiplier(psi):
     """Theorem 4 with psi >= 1: the design's Phi is stored, and only for this environment is anything promised."""
     loop = change(DEFAULT, psi=psi, environment=SOFT_NETWORK)
-    found = spring_damper.design(Specification.of(loop))
+    found = spring_damper.design(loop)
     stored = Stored.of(loop, found.coupling, prove(loop, found.coupling, "theorem4", found.phi))
     assert stored.certificate.promise == "this environment"
     assert set(stored.certificate.matrices) == {"P", "P_E", "Phi"}

@@ -15,11 +15,11 @@ from worlds import SOFT, STIFF
 
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
-from controller.loop import force_map
+from controller.loop import Loop, force_map
 from controller.lti import Lti
 from controller.process import limited
 from design.conditions import any_environment, limiter_lag, this_environment
-from design.lmi import Infeasible, Shaping, Specification, least_multiplier
+from design.lmi import Infeasible, Shaping, least_multiplier
 from design.result import CASE_I, CASE_II, PRINTED_TAU_DB
 from design.spring_damper import step
 from models.device import RigidDevice
@@ -420,20 +420,19 @@ def test_one_sample_inside_the_environment_already_needs_more_than_the_devices_h
     least = -np.linalg.eigvalsh((hat + np.conj(np.swapaxes(hat, 1, 2))) / 2)[:, 0]
     assert least.max() == pytest.approx(1.479, abs=5e-4)
     with pytest.raises(Infeasible, match=r"1\.479"):
-        least_multiplier(Specification(environment(FIGURE_4, T), (0, 0), (1, 1), (0, 0), (DELTA, DELTA)))
+        least_multiplier(Loop(T, (0, 0), (1, 1), (0, 0), (DELTA, DELTA), FIGURE_4))
 
 
 def test_every_step_of_the_convex_sequence_improves():
     """The tangent lies below g*g, so a step keeps what the one before achieved; on fixed frequencies."""
-    spec = Specification(environment(FIGURE_4, T), THETA, (0, 0), (1, 2), (DELTA, DELTA))
-    shaping = Shaping(spec)
+    shaping = Shaping(Loop(T, THETA, (0, 0), (1, 2), (DELTA, DELTA), FIGURE_4))
     w = np.concatenate([np.geomspace(1e-3, 3, 20), [0.0465]])
     gains = np.array([0.1, 0.1, 0.4, 0.4])
     norms = []
     for _ in range(5):
-        k, b = np.split(np.maximum(gains, 0) * np.tile(spec.usable, 2), 2)
+        k, b = np.split(np.maximum(gains, 0) * np.tile(shaping.usable, 2), 2)
         norms.append(shaping.gain(SpringDamper(k / T, b).compliance(T), w).max())
-        gains, bound = step(spec, np.full(2, np.inf), shaping, gains, norms[-1], w)
+        gains, bound = step(shaping, np.full(2, np.inf), gains, norms[-1], w)
         assert bound <= norms[-1] * (1 + 1e-6)
     assert all(after <= before * (1 + 1e-6) for before, after in itertools.pairwise(norms))
     assert norms[-1] < 0.8 * norms[0]

@@ -12,7 +12,6 @@ from controller.environment import FIGURE_4, Network, Spring
 from controller.loop import DelayRange, Loop
 from design.certificate import Stored, assess, digest, prove, required_damping, swept, verify
 from design.conditions import any_environment, any_environment_demand, even_damping, this_environment_demand
-from design.lmi import Specification
 from design.spring_damper import design
 
 T, LONG = 1e-3, 1.6e-3
@@ -38,7 +37,7 @@ def test_so_it_does_with_delays_that_switch_and_with_the_multiplier_of_a_delayed
     )
     delayed = change(LOOP, psi=(1, 0), environment=soft)
     longer = change(delayed, T_max=LONG, delta=tuple(1.6 * d for d in LOOP.delta))
-    found = design(Specification.of(delayed))
+    found = design(delayed)
     asked = [required_damping(one, found.coupling, "theorem4", found.phi) for one in (delayed, longer)]
     assert asked[1].ratio == pytest.approx(asked[0].ratio, rel=1e-7)
     assert verify(Stored.of(longer, found.coupling, prove(longer, found.coupling, "theorem4", found.phi))).proved
@@ -76,7 +75,7 @@ def test_a_certificate_of_uneven_periods_is_proved_stored_and_verified(condition
 
 def test_a_design_for_uneven_periods_is_certified_for_them():
     loop = change(LOOP, T_max=LONG)
-    found = design(Specification.of(loop), "closed-loop")
+    found = design(loop, "closed-loop")
     requirement = assess(loop, found.coupling)["closed-loop"]
     assert requirement.certified
     assert requirement.proof == "rational"

@@ -8,11 +8,9 @@ import pytest
 from cli.design import main
 from controller.coupling import SpringDamper
 from controller.delay import Jitter
-from controller.loop import force_map
 from design.certificate import load as load_stored
 from design.conditions import jitter_proof
 from design.designs import design_coupling
-from design.lmi import Specification
 from design.result import DesignFailed
 from design.spring_damper import design
 from models.scene import Crowd, variants
@@ -34,8 +32,8 @@ def made(tmp_path_factory):
 
 def test_the_designed_gains_are_proved_for_any_switching(made):
     report, coupling = made
-    spec = Specification.of(load().loop("I"))
-    swept = jitter_proof(force_map(spec.environment, coupling, (0, 0), (0, 0)), *RANGE, spec.delta)
+    loop = load().loop("I")
+    swept = jitter_proof(loop.sent(coupling), *RANGE, loop.delta)
     assert swept.requirement.certified
     assert swept.requirement.ratio > 0.999  # all of the damping is spent
     assert report["jitter_proof"]["proof"] == "rational"
@@ -62,10 +60,10 @@ def test_no_lossless_human_grows_under_the_worst_switching(made):
 
 
 def test_a_range_that_is_too_wide_says_so():
-    spec = Specification.of(load().replace(theta=(3, 3), delta=(0.02, 0.02)).loop("I"))
+    loop = load().replace(theta=(3, 3), delta=(0.02, 0.02)).loop("I")
     starts = [SpringDamper([2e4, 2e4], [0.5, 0.5])]
     with pytest.raises(DesignFailed, match=r"under any switching from \(0, 0\) to \(9, 9\) samples"):
-        design(spec, "closed-loop", starts, switching=((0, 0), (9, 9)))
+        design(loop, "closed-loop", starts, switching=((0, 0), (9, 9)))
 
 
 @pytest.mark.parametrize(
@@ -83,15 +81,15 @@ def test_requests_that_make_no_sense_are_refused(options, tmp_path):
 
 def test_theorem4_is_not_designed_for_delays_that_vary():
     with pytest.raises(ValueError, match="closed-loop condition only"):
-        design(Specification.of(load().loop("I")), "theorem4", switching=RANGE)
+        design(load().loop("I"), "theorem4", switching=RANGE)
 
 
 def test_an_optimal_coupling_for_switching_delays():
     """Swept, proved, and met by lossless hands under the worst switching."""
-    spec = Specification.of(load().loop("I"))
-    made = design_coupling(load().loop("I"), "optimal", switching=RANGE)
+    asked = load().loop("I")
+    made = design_coupling(asked, "optimal", switching=RANGE)
     assert made.proved
-    swept = jitter_proof(force_map(spec.environment, made.coupling, (0, 0), (0, 0)), *RANGE, spec.delta)
+    swept = jitter_proof(asked.sent(made.coupling), *RANGE, asked.delta)
     assert swept.requirement.ratio == pytest.approx(0.998, abs=1e-3)  # the margin, nearly all else is spent
     # found: -13.3 dB, against -3.4 dB of the best spring-damper
     assert 20 * np.log10(made.objective) < -12.8

@@ -7,7 +7,7 @@ from scipy.linalg import expm
 
 from models.device import CompliantDevice, RigidDevice, passivity_level, with_damping
 from models.human import Cross, Human, Link, Person, Population, Voluntary
-from models.scene import build, plant
+from models.scene import FILES, build, plant
 
 HAND = Human((Link(0.3, 3.0, 200.0),))
 ARM = Human((Link(0.1, 5.0, 800.0), Link(1.0, 8.0, 150.0)))
@@ -42,10 +42,17 @@ def test_several_channels_do_not_touch_each_other():
     scene = build(devices, humans)
     together = plant(scene.model)
     names = [scene.model.joint(j).name for j in range(scene.model.njnt)]
-    assert names == ["motor_1", "motor_2", "motor_3", "handle_1", "handle_3", "human_2_2"]
+    assert names == [
+        "device_1/motor",
+        "device_2/motor",
+        "device_3/motor",
+        "device_1/handle",
+        "device_3/handle",
+        "human_2_2",
+    ]
     n = len(names)
     for i, (device, human) in enumerate(zip(devices, humans, strict=True), start=1):
-        mine = [j for j, name in enumerate(names) if name.split("_")[1] == str(i)]
+        mine = [j for j, name in enumerate(names) if f"_{i}" in name[:8]]
         alone = plant(build([device], [human]).model)
         rows = [*mine, *(n + j for j in mine)]
         np.testing.assert_allclose(together.A[np.ix_(rows, rows)], alone.A, rtol=1e-12)
@@ -61,7 +68,7 @@ def test_a_person_in_both_hands_is_two_arms_on_one_body():
     d, (one,), (near, far), p = RigidDevice(), HAND.links, ARM.links, TWO_HANDS
     scene = build([d, d], [HAND, ARM], [p])
     got = plant(scene.model)
-    assert [scene.model.joint(j).name for j in range(4)] == ["motor_1", "motor_2", "human_2_2", "body_1"]
+    assert [scene.model.joint(j).name for j in range(4)] == ["device_1/motor", "device_2/motor", "human_2_2", "body_1"]
     M = np.diag([d.mass + one.mass, d.mass + near.mass, far.mass, p.mass])
 
     def springs(a, b, c, body, cross):
@@ -220,3 +227,33 @@ def test_voluntary_motion_is_smooth_and_its_velocity_its_derivative():
 def test_impossible_bodies_cannot_be_built(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+@pytest.mark.parametrize(("name", "device"), [("compliant", CompliantDevice()), ("rigid", RigidDevice())])
+def test_the_file_of_a_device_is_the_scene_that_is_assembled_from_it(name, device):
+    """What a viewer opens has the matrices, the limit and the names of one device with an everyday hand."""
+    drawn = mujoco.MjModel.from_xml_path(str(FILES / f"{name}.xml"))
+    assembled = build([device], [Human((Link(0.3, 3.0, 200.0),))])
+    ours, theirs = plant(assembled.model), plant(drawn)
+    np.testing.assert_array_equal(theirs.A, ours.A)
+    np.testing.assert_array_equal(theirs.B, ours.B)
+    assert drawn.actuator("force").ctrlrange.tolist() == [-device.force_limit, device.force_limit]
+    parts = {drawn.geom(g).name for g in range(drawn.ngeom)}
+    assert parts >= {"motor", "handle", "hand"}
+    assert {drawn.tendon(t).name for t in range(drawn.ntendon)} == (
+        {"transmission", "drawn transmission"} if name == "compliant" else set()
+    )
+    assert not drawn.opt.gravity.any()
+    assert drawn.opt.disableflags == assembled.model.opt.disableflags
+
+
+def test_the_xml_of_a_scene_opens_with_shapes_and_the_same_matrices():
+    scene = build([CompliantDevice(damping=2.0), RigidDevice(mass=0.4)], [ARM, HAND], [TWO_HANDS])
+    opened = mujoco.MjModel.from_xml_string(scene.xml)
+    np.testing.assert_allclose(plant(opened).A, plant(scene.model).A, rtol=1e-14)
+    np.testing.assert_allclose(plant(opened).B, plant(scene.model).B, rtol=1e-14)
+    assert scene.model.ngeom == 0
+    shown = {opened.body(int(b)).name for b in opened.geom_bodyid}
+    assert shown == {scene.model.body(b).name for b in range(1, scene.model.nbody)}
+    assert not opened.geom_contype.any()
+    assert "<default" not in scene.xml

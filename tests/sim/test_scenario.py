@@ -143,3 +143,54 @@ def test_the_digest_knows_every_number():
     scenario = load()
     assert scenario.digest == load().digest
     assert scenario.digest != scenario.replace(theta=(1, 3)).digest
+
+
+FALCON = """
+name = "mine"
+T = 1e-3
+theta = [0, 0]
+psi = [0, 0]
+device = {device}
+human = [
+    {{ links = [{{ mass = 0.3, damping = 3.0, stiffness = 200.0 }}] }},
+    {{ links = [{{ mass = 0.3, damping = 3.0, stiffness = 200.0 }}] }},
+]
+[environment]
+contacts = ["a", "b"]
+springs = [{{ between = ["a", "b"], stiffness = 100.0 }}]
+"""
+
+
+def test_a_device_of_the_catalogue_with_overrides():
+    """What is published is taken, what is given goes first, and what is neither is the class's assumption."""
+    both = parse(FALCON.format(device='[{ device = "falcon", damping = 0.5 }, "omega.3"]'))
+    falcon, omega = both.device
+    assert (falcon.damping, falcon.force_limit, falcon.encoder_step, falcon.mass) == (0.5, 8.0, 63.5e-6, 0.25)
+    assert (omega.damping, omega.force_limit) == (1.37, 12.0)
+    soft = parse(
+        FALCON.format(device='[{ device = "falcon", damping = 0.5, delta = 0.4, force_limit = 3.0 }, "omega"]')
+    )
+    assert soft.delta == (0.4, 1.37)
+    assert soft.device[0].force_limit == 3.0
+    assert parse(FALCON.format(device='"omega.3"')).delta == (1.37, 1.37)
+    flexible = parse(FALCON.format(device='[{ device = "touch", kind = "compliant", damping = 0.5 }, "omega"]')).device[
+        0
+    ]
+    assert (type(flexible).__name__, flexible.handle_mass, flexible.force_limit) == ("CompliantDevice", 0.19, 3.3)
+    assert load().replace(device=[{"device": "falcon", "damping": 0.5}] * 2).delta == (0.5, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [
+        ('"falcon"', "device[0]: nobody publishes damping [N s/m] of falcon: give it beside `device`"),
+        ('["omega.3", "inverse3"]', "device[1]: nobody publishes damping [N s/m] and force_limit [N] of inverse3"),
+        ('["omega.3", "falkon"]', "device[1]: device is 'falkon' (did you mean falcon?), the catalogue has omega.3"),
+        ('[{ device = "falcon", damping = -1.0 }, "omega"]', "device[0]: damping is -1"),
+        ('[{ device = "falcon", damping = 1.0, mas = 1.0 }, "omega"]', "unknown field `mas` (did you mean `mass`?)"),
+    ],
+)
+def test_a_device_that_is_not_known_well_enough(device, message):
+    with pytest.raises(InputError) as caught:
+        parse(FALCON.format(device=device))
+    assert message in str(caught.value)

@@ -24,15 +24,7 @@ WALL = Network(("tip",), (Spring(("tip", GROUND), 2000.0, 0.2),))
 
 
 def around(scenario, coupling):
-    return EnvironmentSweep(
-        scenario.device,
-        scenario.population,
-        scenario.environment,
-        scenario.T,
-        scenario.theta,
-        scenario.psi,
-        coupling,
-    )
+    return EnvironmentSweep(scenario.device, scenario.population, scenario.loop("I"), coupling)
 
 
 @pytest.fixture(scope="module")
@@ -44,16 +36,17 @@ def densely(sweep, coupling_force, K, B):
     """Required over available damping at 60000 frequencies, from the network's equations alone."""
     w = np.linspace(1e-5, np.pi, 60_000)
     z = on_circle(w)
-    T, (M, D, S) = sweep.T, sweep.network.matrices()
-    for spring, row in zip(sweep.network.springs, sweep.network.across(sweep.network.springs), strict=True):
-        if set(spring.between) & set(sweep.network.contacts):
+    T, (M, D, S) = sweep.loop.T, sweep.loop.network.matrices()
+    network = sweep.loop.network
+    for spring, row in zip(network.springs, network.across(network.springs), strict=True):
+        if set(spring.between) & set(network.contacts):
             pattern = np.outer(row, row)
             D, S = D + (B - spring.damping) * pattern, S + (K - spring.stiffness) * pattern
-    m, s = sweep.channels, ((z - 1) / (T * z))[:, None, None]
+    m, s = sweep.loop.channels, ((z - 1) / (T * z))[:, None, None]
     E = np.linalg.inv(np.linalg.inv(M * s**2 + D * s + S)[:, :m, :m])
-    G = coupling_force(z, z[:, None, None] ** -np.array(sweep.psi)[:, None] * E)
-    F = z[:, None, None] ** -np.array(sweep.theta)[:, None] * G / (z - 1)[:, None, None]
-    root = np.sqrt(T / np.array(sweep.delta))
+    G = coupling_force(z, z[:, None, None] ** -np.array(sweep.loop.psi)[:, None] * E)
+    F = z[:, None, None] ** -np.array(sweep.loop.theta)[:, None] * G / (z - 1)[:, None, None]
+    root = np.sqrt(T / np.array(sweep.loop.delta))
     return np.linalg.eigvalsh(-(root[:, None] * root) * (F + np.conj(np.swapaxes(F, 1, 2))) / 2)[:, -1].max()
 
 
@@ -96,7 +89,7 @@ def test_a_wall_without_coupling_and_delay_needs_half_the_stiffness_times_T_plus
     scenario = load("one-wall").replace(environment=WALL, theta=(0,))
     sweep = around(scenario, NoCoupling())
     K, B = np.array([100.0, 900.0, 3000.0]), np.array([0.1, 0.9, 0.0])
-    needed = sweep.ratios("closed-loop", K, B) * sweep.delta[0]
+    needed = sweep.ratios("closed-loop", K, B) * sweep.loop.delta[0]
     # near w = 0, at 1e-5 rad/sample, 1e-16 of rounding is 1e-11 of F/(z-1), and that is K T/w large
     np.testing.assert_allclose(needed, K * scenario.T / 2 + B, rtol=1e-6)
 
@@ -111,7 +104,7 @@ def test_what_no_environment_changes_is_the_same_in_all():
 def test_the_population_meets_the_filter_in_the_environment_of_the_cell(optimal):
     """Eigenvalues of the loops one by one, with the force map that `sim.run` closes."""
     sweep = around(PAIR, optimal["omega-pair"])
-    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.T, 1, 12, 1)
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 1, 12, 1)
     F = sweep.force_maps(np.array([300.0, 3000.0]), np.array([0.5, 0.5]))[0]
     for i, stable in ((0, True), (1, False)):
         growth = crowd.growth(F[i])[0]

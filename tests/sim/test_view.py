@@ -266,7 +266,7 @@ def test_the_viewer_s_selection_is_a_grip(none):
     stage.show(q)
     perturb = mujoco.MjvPerturb()
     assert stage.grip(perturb) is None
-    motor, handle = stage.model.body("motor_2").id, none.assembly.scene.handles[1]
+    motor, handle = stage.model.body("device_2/motor").id, none.assembly.scene.handles[1]
     perturb.select, perturb.active = motor, int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
     perturb.refselpos[:] = stage.data.xpos[motor] + (0.02, 0.5, 0.1)  # dragged 20 mm along the device
     assert stage.grip(perturb) == Grip(1, pytest.approx(q[handle] + 0.02))
@@ -298,10 +298,10 @@ def test_every_body_has_its_place():
     names = [scene.model.joint(j).name for j in range(scene.model.njnt)]
     found = dict(zip(names, zip(channels(scene), places(scene), strict=True), strict=True))
     assert found == {
-        "motor_1": (0, -1),
-        "motor_2": (1, -1),
-        "handle_1": (0, 0),
-        "handle_2": (1, 0),
+        "device_1/motor": (0, -1),
+        "device_2/motor": (1, -1),
+        "device_1/handle": (0, 0),
+        "device_2/handle": (1, 0),
         "human_1_2": (0, 1),
     }
 
@@ -388,7 +388,7 @@ def test_the_window_s_loop_without_the_window(none):
         assert 0 <= seconds <= 1 / 60
         time[0] += 1 / 60
         if time[0] > 100.3:
-            window.perturb.select = stage.model.body("handle_1").id
+            window.perturb.select = stage.model.body("device_1/handle").id
             window.perturb.active = int(mujoco.mjtPertBit.mjPERT_TRANSLATE)
             window.perturb.refselpos[:] = stage.data.xpos[window.perturb.select] + (0.05, 0, 0)
 

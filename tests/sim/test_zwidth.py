@@ -10,8 +10,8 @@ import pytest
 from cli import zwidth
 from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
 from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import GROUND, Network, Spring, Wall, environment
-from controller.loop import force_map
+from controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall, environment
+from controller.loop import Loop, force_map
 from controller.process import Process, StepBuffer, contact
 from design.frequency import on_circle, suprema
 from models.device import CompliantDevice, RigidDevice
@@ -32,13 +32,15 @@ PAIR, STAR = load("omega-pair"), load("three-rigid")
 
 
 def rigid(theta=0, **changes):
-    return CouplingSweep(PAIR.device[:1], PAIR.population, None, T, (theta,), (0,), **changes)
+    loop = Loop(T, (theta,), (0,), (theta,), PAIR.delta[:1], RIGID_WALL)
+    return CouplingSweep(PAIR.device[:1], PAIR.population, loop, **changes)
 
 
 def of(scenario, theta, psi=None, network=None, **changes):
     psi = psi or (0,) * scenario.channels
     network = network or scenario.environment
-    return CouplingSweep(scenario.device, scenario.population, network, scenario.T, theta, psi, **changes)
+    loop = Loop(scenario.T, theta, psi, theta, scenario.delta, network)
+    return CouplingSweep(scenario.device, scenario.population, loop, **changes)
 
 
 def softer(network, share):
@@ -49,7 +51,7 @@ def softer(network, share):
 def wall(theta, K, B):
     """Force maps and both conditions' damping [N s/m] against a rigid wall, this-environment first."""
     sweep = rigid(theta)
-    assert sweep.delta == (DELTA,)
+    assert sweep.loop.delta == (DELTA,)
     return [DELTA * sweep.ratios(name, np.array(K), np.array(B)) for name in ("closed-loop", "theorem4")]
 
 
@@ -182,7 +184,7 @@ def test_the_grid_says_what_is_wrong_with_it():
 def test_the_population_is_decided_as_one_by_one(links):
     """The same eigenvalues from sim.verdicts, human by human; 1e-7 1/s is rounding of eigenvalues over T."""
     sweep = rigid(1)
-    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.T, 3, 30, links)
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 3, 30, links)
     F = sweep.force_maps(np.array([1500.0]), np.array([0.4]))[0][0]
     growth, audible = crowd.growth(F)
     for index, some in crowds(sweep.population, 1, 3, range(30), links):
@@ -198,7 +200,7 @@ def test_the_population_is_decided_as_one_by_one(links):
 def test_a_cell_that_the_leading_humans_leave_stable_is_asked_of_all():
     """One unstable human outside the leading ones must still be found."""
     sweep = rigid(1)
-    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.T, 0, 40, 1)
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 0, 40, 1)
     F = sweep.force_maps(np.array([1300.0]), np.array([0.0]))[0][0]
     growth, _ = crowd.growth(F)
     unstable = growth > 0
@@ -288,7 +290,7 @@ def points(sweep, K, B, effects=None, **changes):
     """The simulated points of a 2 x 2 map whose corners they are."""
     settings = {"points": 2, "trials": 1, "start": 1e-3, "press": 3.0, "duration": 2.0, "threshold": 2e-5} | changes
     grid = Grid(np.array(K), np.array(B), "linear")
-    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.T, 0, 40, 1)
+    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, 0, 40, 1)
     return draw_map(sweep, grid, crowd, Plan(effects or Effects(), **settings), lambda *stage: None).points
 
 
