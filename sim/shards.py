@@ -134,7 +134,7 @@ def _in_processes(question: Validation, table: Table, shards: int, progress: Pro
         if done < len(missing):
             tries = tries - 1 if not done else _AGAIN
             if not tries:
-                return f"worker processes were killed {_AGAIN} times in a row"
+                return f"worker processes died {_AGAIN} times in a row"
     return ""
 
 
@@ -229,7 +229,7 @@ def _on_workers(question: Validation, table: Table, client: Client, address: str
         numbers[task.key] = number
         return task
 
-    ahead = _AHEAD * max(1, sum(client.nthreads().values()))
+    ahead = _AHEAD * max(1, len(client.scheduler_info()["workers"]))
     queue = as_completed([task for _ in range(ahead) if (task := submit())], loop=client.loop)
     try:
         for task in queue:

@@ -64,7 +64,7 @@ def test_workers_that_die_again_and_again_leave_what_is_done(tmp_path, monkeypat
     table.put(1, shards.examine(QUESTION, QUESTION.batches()[1]))
     monkeypatch.setattr(shards, "_as_worker", die)
     found = validate(QUESTION, 2, table=table)
-    assert found.lost == "worker processes were killed 3 times in a row"
+    assert found.lost == "worker processes died 3 times in a row"
     np.testing.assert_array_equal(found.index, np.arange(BATCH, 2 * BATCH))
     monkeypatch.undo()
     again, examined = Table(QUESTION, tmp_path, resume=True), []
@@ -96,7 +96,7 @@ def test_the_command_says_what_is_missing(tmp_path, monkeypatch, capsys):
     monkeypatch.undo()
     assert main([*OPTIONS, "--out", str(tmp_path), "--resume"]) == 0
     assert json.loads((tmp_path / "report.json").read_text())["humans"] == 3 * BATCH
-    with pytest.raises(InputError, match="--resume: .* holds nothing unfinished of these humans and this loop"):
+    with pytest.raises(InputError, match=r"--resume: .* holds nothing unfinished of these humans and this loop"):
         main([*OPTIONS, "--out", str(tmp_path), "--resume"])
 
 
