@@ -62,7 +62,9 @@ def main(argv: list[str]) -> int:
     outcome["ideal_force"] = alike.part()
     outcome |= _net(done, requirements)
     outcome["engines"] = [choice.part() for choice in done.choices] or None
-    outcome["cross_check"] = cross_check(done.ran, done.trace, done.integrator) if args.cross_check else None
+    outcome["cross_check"] = (
+        cross_check(done.ran, done.trace, done.integrator, done.substeps) if args.cross_check else None
+    )
     others = _alternatives(args, scenario, done)
     outcome["alternatives"] = [other.part() for other in others]
     outcome["remarks"] = [*done.warnings, *chosen.notes, *report.remarks(outcome)]
