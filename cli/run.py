@@ -61,10 +61,6 @@ def main(argv: list[str]) -> int:
     alike = force_error(done.ran, done.trace, loop.lam)
     outcome["ideal_force"] = alike.part()
     outcome |= _net(done, requirements)
-    outcome["engines"] = [choice.part() for choice in done.choices] or None
-    outcome["cross_check"] = (
-        cross_check(done.ran, done.trace, done.integrator, done.substeps) if args.cross_check else None
-    )
     others = _alternatives(args, scenario, done)
     outcome["alternatives"] = [other.part() for other in others]
     outcome["remarks"] = [*done.warnings, *chosen.notes, *report.remarks(outcome)]
@@ -308,6 +304,8 @@ def _settings(args: argparse.Namespace, run: _Run, lam: tuple[int, ...]) -> dict
         "lam": list(lam),
         "T_s": scenario.T,
         "seed": args.seed,
+        "engines": [choice.part() for choice in run.choices] or None,
+        "cross_check": cross_check(run.ran, run.trace, run.integrator, run.substeps) if args.cross_check else None,
         "interrupted": run.trace.interrupted,
         "scenario_digest": scenario.digest,
         "encoder_step_m": process.encoder_step.tolist(),
@@ -348,8 +346,8 @@ def _title(args: argparse.Namespace, outcome: dict[str, Any]) -> str:
 def _tables(outcome: dict[str, Any], others: list[Alternative]) -> list[Any]:
     title = f"case {outcome['case']} · {outcome['scenario']} · coupling {outcome['coupling']['kind']}"
     shown = [render.facts(title, _rows(outcome), ("", ""))]
-    if outcome["engines"]:
-        shown.append(_speed_against_error(outcome["engines"], outcome["run"]))
+    if outcome["run"]["engines"]:
+        shown.append(_speed_against_error(outcome["run"]))
     if others:
         shown.append(_beside(others, outcome))
     if rows := outcome["reproducibility"]:
@@ -359,10 +357,10 @@ def _tables(outcome: dict[str, Any], others: list[Alternative]) -> list[Any]:
     return shown
 
 
-def _speed_against_error(engines: list[dict[str, Any]], run: dict[str, Any]) -> Any:
+def _speed_against_error(run: dict[str, Any]) -> Any:
     """Every engine and step on this scene; the one that ran is marked."""
     cells = []
-    for row in engines:
+    for row in run["engines"]:
         mark = " *" if (row["integrator"], row["substeps"]) == (run["integrator"], run["substeps"]) else ""
         error = render.optional(row["position_relative_rms"], "{:.1e}")
         right = "right" if row["verdict_correct"] else "[red]WRONG[/]"
@@ -424,7 +422,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("limited ticks", f"{stability['clipped_ticks']} of {run['samples']}"),
         ("speed", speed),
         ("position error", position),
-        ("cross-check", outcome["cross_check"] and _crossed(outcome["cross_check"])),
+        ("cross-check", run["cross_check"] and _crossed(run["cross_check"])),
     ]
 
 

@@ -68,13 +68,11 @@ def compare_engines(simulation: Simulation, error: float, ticks: int | None = No
         truth, missed = _refined(simulation, error, ticks, runs)
         settings = [*runs, *((name, n) for name, n in _CANDIDATES if name != "RK4")]
     choices = []
-    for name, substeps in settings:
-        if name != EXPONENTIAL and step_radius(simulation.smooth, name, substeps) > 1 + NEUTRAL:
+    for name, n in settings:
+        if name != EXPONENTIAL and step_radius(simulation.smooth, name, n) > 1 + NEUTRAL:
             continue
-        own, cost = runs.get((name, substeps)) or _timed(simulation, ticks, "mujoco", name, substeps)
-        choices.append(
-            EngineChoice(name, substeps, _apart(own, truth) + missed, _right(simulation, name, substeps), cost)
-        )
+        own, cost = runs.get((name, n)) or _timed(simulation, ticks, "mujoco", name, n)
+        choices.append(EngineChoice(name, n, _apart(own, truth) + missed, _right(simulation, name, n), cost))
     return tuple(sorted(choices, key=lambda choice: choice.cpu_s))
 
 
@@ -92,7 +90,8 @@ def cross_check(
 ) -> dict[str, Any]:
     """The run again by RK4, which shares no matrix with the exponential and the exact engine; by it, if RK4 ran.
 
-    `simulation` is what ran, with its net; integrator and substeps None are the exact engine's. Positions are compared as far as neither ended before its time.
+    `simulation` is what ran, with its net; integrator and substeps are None for the exact engine. Positions are
+    compared as far as neither ended before its time.
     """
     other = EXPONENTIAL if integrator == "RK4" else "RK4"
     linear = simulation.smooth
