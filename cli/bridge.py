@@ -36,18 +36,17 @@ from cli.session_cli import (
     check_link,
     hold_session,
     limits_from,
-    measured_link,
     number,
 )
 from design.certificate import CAVEATS, CONDITIONS
-from hw.control import CertifiedCoupling, certified_couplings
+from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages
 from hw.recording import Recorder, outcome, save
 from hw.session import session_for
 from sim.couplings import NAMES
 from sim.files import write_json
-from sim.scenario import InputError, require_constant_delay, require_linear
+from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 from sim.trace import format_growth
 
 LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
@@ -59,9 +58,12 @@ def main(argv: list[str]) -> int:
     scenario, seed, settings = scenario_from(args), seed_from(args), check_link(args)
     require_linear(scenario, "hw.bridge")
     require_constant_delay(scenario, "hw.bridge")
+    require_even_ticks(scenario, "hw.bridge")
     seconds = number(args, "duration", 0.1, LONGEST, scenario.duration)
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
+    if args.energy_budget and args.latch == "arrival":
+        raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
     if args.energy_budget and not args.energy_budget[0]:
         raise InputError("--energy-budget is 0 J: encoders are tested by a small force at arming, give it 0.01 or so")
     settings = replace(settings, rereference=not args.no_rereference, energy_budget=args.energy_budget)
@@ -70,9 +72,9 @@ def main(argv: list[str]) -> int:
     out = out_folder(args, "bridge")
 
     def plan(ages: Ages) -> Sequence[CertifiedCoupling]:
-        link = measured_link(args, ages, scenario.T)
-        programs = certified_couplings(scenario, args.case, args.coupling, args.condition, link)
-        print_certificate(ages, link, programs, console(args))
+        met, link = timed(scenario, ages, float(args.quantile), 1e6 * float(args.guard), args.latch == "arrival")
+        programs = certified_couplings(met, args.case, args.coupling, args.condition, link)
+        print_certificate(ages, link, programs, session.limits.cap, console(args))
         return programs
 
     live = hold_session(args, session, plan, seconds, seed, out)
@@ -104,6 +106,8 @@ def _parser() -> argparse.ArgumentParser:
     names = ", ".join(NAMES)
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
     parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
+    latch = "when forces act: at whole ticks (default), or as soon as they arrive, certified for the latency measured"
+    parser.add_argument("--latch", choices=("tick", "arrival"), default="tick", help=latch)
     add_energy_budget_option(parser)
     parser.add_argument("--duration", metavar="SECONDS", help="of forces at full gain (default: the scenario's)")
     parser.add_argument("--no-plot", action="store_true", help="write no picture")
@@ -111,13 +115,16 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def print_certificate(ages: Ages, link: int, programs: Sequence[CertifiedCoupling], console: Console) -> None:
+def print_certificate(
+    ages: Ages, link: int, programs: Sequence[CertifiedCoupling], caps: Sequence[float], console: Console
+) -> None:
     """What was measured, and what is certified for it: printed before anything is armed."""
     at = {p: int(np.percentile(ages.values, p)) for p in (50, 99)}
     console.print(
         f"answers are {at[50]} us old, {at[99]} us at the 99th percentile, {ages.missing} of "
-        f"{len(ages.values) + ages.missing} never arrived: a link of {link} tick{'s' if link > 1 else ''}"
+        f"{len(ages.values) + ages.missing} never arrived: {_link(link, programs[0].scenario)}"
     )
+    console.print(_ticks(ages, programs[0].scenario, caps), highlight=False)
     table = Table(title="certified for the delay measured, and softer in reserve")
     table.add_column("coupling", min_width=13)
     for column in ("K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "promise"):
@@ -139,6 +146,24 @@ def print_certificate(ages: Ages, link: int, programs: Sequence[CertifiedCouplin
             console.print(f"[dim]·[/] theta = {list(program.scenario.theta)}: {remark}", highlight=False)
     if len(programs) == 1:
         console.print("no reserve: nothing softer is certified, so late answers end the session")
+
+
+def _link(link: int, scenario: Scenario) -> str:
+    if link or not scenario.latency:
+        return f"a link of {link} tick{'s' if link > 1 else ''}"
+    least, most = scenario.latency[0]
+    return f"forces act {1e6 * least:.0f} to {1e6 * most:.0f} us after their tick"
+
+
+def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
+    """How long ticks are, and what one longer than the certificate counts with may cost."""
+    least, most = (1e-3 * side(ages.ticks, default=1e6 * scenario.T) for side in (min, max))
+    longest = 1e3 * (scenario.T_max or scenario.T)
+    cost = overlong_tick(caps, scenario.delta)
+    return (
+        f"ticks of the device last {least:.4g} to {most:.4g} ms, certified are up to {longest:.4g} ms; one longer tick "
+        f"may give a hand at most {cost:.3g} mJ for every ms that it lasts (at the force cap)"
+    )
 
 
 def print_session(report: dict[str, Any], console: Console) -> None:

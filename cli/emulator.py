@@ -13,7 +13,7 @@ from typing import Any
 from cli.options import DONE, INTERRUPTED, Parser, add_loop_options, numbers, scenario_from, seed_from
 from cli.session_cli import pace_from
 from hw.emulator import AXIS, DEVICE, LINE, Emulator, FaultInjection, Line, RealTimeEmulator, Terminal, nobody
-from sim.scenario import InputError, require_constant_delay, require_linear
+from sim.scenario import InputError, require_constant_delay, require_even_ticks, require_linear
 
 
 def main(argv: list[str]) -> int:
@@ -22,6 +22,7 @@ def main(argv: list[str]) -> int:
     scenario, seed = scenario_from(args), seed_from(args)
     require_linear(scenario, "hw.emulator")
     require_constant_delay(scenario, "hw.emulator")
+    require_even_ticks(scenario, "hw.emulator")
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
     seconds = numbers("--duration", args.duration, float, 1)[0]
     if not 0 < seconds <= 1e6:

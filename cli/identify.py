@@ -37,7 +37,7 @@ from hw.recording import Recorder, outcome, result_of
 from hw.session import Session, session_for
 from models.device import RigidDevice
 from sim.files import write, write_json
-from sim.scenario import InputError, Scenario, require_constant_delay, require_linear
+from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
 LIMITS = (
     "The bound is a statement about this record: the least viscous friction of all laws that fit it, less its scatter "
@@ -55,6 +55,7 @@ def main(argv: list[str]) -> int:
     scenario, seed, settings = scenario_from(args), seed_from(args), check_link(args)
     require_linear(scenario, "hw.identify")
     require_constant_delay(scenario, "hw.identify")
+    require_even_ticks(scenario, "hw.identify")
     force, seconds = number(args, "force", 0.05, 6.0), number(args, "seconds", 0.5, 30.0)
     low, high = numbers("--band", args.band, float, 2)
     if not 0.5 <= low < high <= 0.4 / scenario.T:

@@ -22,6 +22,7 @@ from controller.delay import LOST, Jitter
 from controller.environment import RIGID_WALL
 from controller.loop import Loop
 from controller.lti import SingularLoop
+from controller.timing import Periods
 from design.result import CONDITION_NAMES, DesignFailed
 from models.device import MOST_DAMPING
 from sim.files import check_file, folder, nobody_reads
@@ -299,7 +300,7 @@ def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
             theta,
             scenario.delta[:1],
             RIGID_WALL,
-            T_max=scenario.T_max,
+            T_max=scenario.longest_period,
             latency=late and late[:1],
         )
     except ValueError as error:
@@ -314,8 +315,10 @@ DRAWN = ("constant", "random", "bursty", "adversarial")
 
 
 def add_varying_delay_options(parser: argparse.ArgumentParser) -> None:
-    """--jitter, --pattern, --loss and --playout."""
-    group = parser.add_argument_group("delays that vary")
+    """--period, --jitter, --pattern, --loss and --playout."""
+    group = parser.add_argument_group("delays and periods that vary")
+    periods = "periods [s], drawn anew at every tick between two of them, or a file of recorded ones"
+    group.add_argument("--period", metavar="MIN,MAX|FILE", help=periods)
     span = "range of the forces' delays [samples]; or LO-HI,LO-HI,.. per channel"
     group.add_argument("--jitter", type=delay_ranges, metavar="LO,HI", help=span)
     pattern = f"{', '.join(DRAWN)} (default random), or a file of recorded delays, a row per tick"
@@ -326,7 +329,9 @@ def add_varying_delay_options(parser: argparse.ArgumentParser) -> None:
 
 
 def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenario:
-    """The scenario with the delays that the options describe, over those of its file. Raises InputError."""
+    """The scenario with periods and delays that the options describe, over those of its file. Raises InputError."""
+    if args.period is not None:
+        scenario = scenario.replace(period=_periods(args.period))
     changes: dict[str, Any] = {}
     if args.pattern is not None:
         changes |= _pattern(args.pattern, scenario.channels)
@@ -350,6 +355,27 @@ def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenari
         raise InputError(str(error)) from None
     theta = jitter.hi if jitter.playout and args.theta is None else scenario.theta
     return scenario.replace(theta=theta, jitter=jitter)
+
+
+def _periods(text: str) -> Periods:
+    """Of two numbers, or of a file of one column [s]; # begins a comment. Raises InputError."""
+    try:
+        if "," in text and not Path(text).is_file():
+            least, most = numbers("--period", text, float, 2)
+            return Periods(least, most)
+        lines = Path(text).read_text(encoding="utf-8").splitlines()
+        words = [(n, line.split("#")[0].strip()) for n, line in enumerate(lines, start=1)]
+        return Periods(
+            recorded=tuple(numbers(f"--period {text}, line {n}:", word, float, 1)[0] for n, word in words if word)
+        )
+    except OSError as error:
+        raise InputError(f"--period {text}: {error.strerror}; give MIN,MAX in seconds or a file") from None
+    except UnicodeDecodeError:
+        raise InputError(f"--period {text}: not a text file in UTF-8") from None
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"--period: {error}") from None
 
 
 def _pattern(name: str, channels: int) -> dict[str, Any]:

@@ -224,6 +224,20 @@ def verdict(word: str | None) -> str:
     return {"stable": "[green]stable[/]", "unstable": "[red]unstable[/]"}.get(word or "", "not decided")
 
 
+def timing_row(part: Mapping[str, Any] | None) -> tuple[str, str | None]:
+    """Periods and latencies of a run or of a validation that are not even."""
+    if part is None:
+        return "ticks", None
+    period, words = part["period_s"], []
+    if period["least"] < period["largest"]:
+        how = "recorded" if part["recorded"] else "drawn"
+        words.append(f"{1e3 * period['least']:.4g} to {1e3 * period['largest']:.4g} ms long, {how}")
+    if part["latency_s"]:
+        spans = (f"{1e3 * a:.4g} to {1e3 * b:.4g}" if a < b else f"{1e3 * a:.4g}" for a, b in part["latency_s"])
+        words.append(f"forces latch {', '.join(dict.fromkeys(spans))} ms later")
+    return "ticks", "; ".join(words)
+
+
 def delay_rows(part: Mapping[str, Any]) -> Rows:
     """Delays that vary, of a run or of a validation."""
     spans = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))

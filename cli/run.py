@@ -23,7 +23,7 @@ from sim.engine_choice import EngineChoice, compare_engines, cross_check, pick
 from sim.engines import INTEGRATORS, default_integrator
 from sim.files import write
 from sim.nets import BASELINES, Classic, EnergyNet, idle, netted
-from sim.run import ENGINES, Simulation, assemble, make_engine, run
+from sim.run import ENGINES, Simulation, assemble, beginnings, make_engine, run
 from sim.scenario import InputError, Scenario, load_humans
 from sim.stability import MARGINAL, stability_part
 from sim.stepping import MOST, check_substeps, default_substeps
@@ -170,7 +170,7 @@ def _limits(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, requir
 
 def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tuple[float, ...] | None) -> _Run:
     """Close the loop. Raises InputError for settings that cannot be."""
-    simulation, period = assemble(scenario, chosen.coupling, lag), None
+    simulation, period = assemble(scenario, chosen.coupling, lag, args.seed), None
     if args.engine == "exact" and simulation.friction:
         raise InputError("--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco")
     if scenario.switches:
@@ -291,18 +291,20 @@ def _unstable(outcome: dict[str, Any]) -> bool | None:
 
 def _settings(args: argparse.Namespace, run: _Run, lam: tuple[int, ...]) -> dict[str, Any]:
     scenario, process, samples = run.simulation.scenario, run.simulation.process, run.trace.t.size
+    duration = float(beginnings(scenario.T, run.simulation.timing, samples, 1)[0])
     return {
         "engine": args.engine,
         "integrator": run.integrator,
         "substeps": run.substeps,
-        "duration_s": samples * scenario.T,
+        "duration_s": duration,
         "samples": samples,
         "wall_s": run.wall_s,
-        "real_time_factor": samples * scenario.T / run.wall_s,
+        "real_time_factor": duration / run.wall_s,
         "theta": list(scenario.theta),
         "psi": list(scenario.psi),
         "lam": list(lam),
         "T_s": scenario.T,
+        "timing": report.timing_part(run.simulation.timing, scenario),
         "seed": args.seed,
         "engines": [choice.part() for choice in run.choices] or None,
         "cross_check": cross_check(run.ran, run.trace, run.integrator, run.substeps) if args.cross_check else None,
@@ -398,6 +400,8 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
     gains = coupling["K"] and f"{listed(coupling['K'], 5)} N/m / {listed(coupling['B'], 5)} N s/m"
     rendered = transparent["dc_ratio"] and f"{100 * transparent['dc_ratio']:.1f} %"
     how = "growth, switching" if _unstable(outcome) is not None else "growth, simulated trace"
+    if run["timing"] and "impulse" in stability.get("reason", ""):
+        how = "growth, uneven ticks"
     measured = render.optional(stability["growth_rate_per_s"], "{:+.4f} 1/s")
     engine = run["engine"] + (f" {run['integrator']} x {run['substeps']}" if run["integrator"] else "")
     speed = f"{run['wall_s']:.2f} s for {run['duration_s']:g} s: {run['real_time_factor']:.2g} x real time ({engine})"
@@ -415,10 +419,11 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         *_net_rows(outcome),
         ("growth, eigenvalues", _growth(stability)),
         (how, f"{measured}: {render.verdict(stability['verdict'])}"),
+        render.timing_row(run["timing"]),
         *(render.delay_rows(jitter) if jitter else []),
         *(_contact_rows(contact, run["samples"]) if contact else []),
         ("simulated in", run["environment"] if outcome["set"] else None),
-        ("force limits", _limiter(outcome["limiter"])),
+        ("force limits", _limiter(outcome["limiter"], outcome["promise"])),
         ("limited ticks", f"{stability['clipped_ticks']} of {run['samples']}"),
         ("speed", speed),
         ("position error", position),
@@ -433,10 +438,11 @@ def _crossed(part: dict[str, Any]) -> str:
     return f"{part['integrator']} x {part['substeps']}: {apart}, {growth}: {verdict}"
 
 
-def _limiter(part: dict[str, Any]) -> str:
+def _limiter(part: dict[str, Any], promise: str | None) -> str:
     limits = f"{listed(part['force_limit'], 4)} N"
     if part["rho"] is None:
-        return f"clipped at {limits}: not covered ({part['reason']})"
+        held = "the guarantee holds while forces stay below the limits" if promise else "not covered"
+        return f"clipped at {limits}: {held} ({part['reason']})"
     return f"the guarantee holds also while forces are limited to {limits} ({part['reason']})"
 
 

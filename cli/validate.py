@@ -58,6 +58,9 @@ def main(argv: list[str]) -> int:
     if scenario.jitter:
         covered = report.delay_range_part(scenario.jitter) | certified_part(scenario, chosen, certified)
         _add(outcome, "switching", report.varying_delays_part(findings, covered))
+    if scenario.uneven:
+        met = report.timing_part(scenario.timing(args.seed, max(1, question.ticks)), scenario) or {}
+        _add(outcome, "timing", report.varying_delays_part(findings, met | {"covered": certified}))
     worst = None
     if args.adversary and not (findings.interrupted or findings.lost):
         attacked, ratio = scenario, requirements["closed-loop"].ratio
@@ -202,6 +205,7 @@ def _save(
 def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
     bad, worst, traces = outcome["unstable"], outcome["worst"], outcome["traces"]
     audit, adversary, switching = (outcome.get(name) for name in ("energy_audit", "adversary", "switching"))
+    timing = outcome.get("timing")
     mujoco = "" if bad["mujoco"] is None else f", {bad['mujoco']} MuJoCo"
     verdict = {True: "[green]yes[/]", False: "[red]no[/]"}.get(outcome["holds"]) or str(outcome["reason"])
     kept = f"{outcome['humans']} humans that were finished are kept, --resume does the others; searches are not kept"
@@ -218,7 +222,8 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("traces", traces and f"{traces['duration_s']:g} s each, {traces['clipped_runs']} clipped"),
         ("handles come to rest", traces and _settled(traces)),
         ("energy audit W >= 0", audit and _audited(audit)),
-        *(_switching_rows(switching) if switching else []),
+        *([*render.delay_rows(switching), _growing("delays", switching)] if switching else []),
+        *([render.timing_row(timing), _growing("ticks", timing)] if timing else []),
         ("adversary", adversary and _adversary(adversary)),
         ("certified", "yes" if outcome["certified"] else "no"),
         ("holds", verdict),
@@ -254,12 +259,12 @@ def _audited(audit: dict[str, Any]) -> str:
     return f"{audit['audited'] - audit['violated']} of {audit['audited']}, {audit['clipped']} clipped left out"
 
 
-def _switching_rows(switching: dict[str, Any]) -> list[tuple[str, str | None]]:
+def _growing(what: str, switching: dict[str, Any]) -> tuple[str, str | None]:
     mujoco, growth = switching["unstable"]["mujoco"], switching["largest_growth_per_s"]
     also = "" if mujoco is None else f", MuJoCo {mujoco} of {switching['mujoco_unclipped']} unclipped"
     worst = "" if growth is None else f"; worst {growth:+.4g} 1/s (index {switching['worst_index']})"
     grow = f"{switching['unstable']['exact']} of {switching['humans']} exact{also}{worst}"
-    return [*render.delay_rows(switching), ("grow while delays vary", grow if switching["humans"] else None)]
+    return f"grow while {what} vary", grow if switching["humans"] else None
 
 
 def _adversary(part: dict[str, Any]) -> str:

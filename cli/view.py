@@ -12,7 +12,7 @@ from typing import Any
 from cli import options, render
 from design.result import CONDITION_NAMES
 from sim.files import write_json
-from sim.scenario import InputError
+from sim.scenario import InputError, require_even_ticks
 from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, Script, first_loop, parse_script
 from sim.view.film import Picture, check_film, painter, save_film
 from sim.view.session import LONGEST_LAG, Session, session_report
@@ -29,6 +29,7 @@ def main(argv: list[str]) -> int:
     """Show the loop until the window is closed or the film is full. 0: shown; 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
+    require_even_ticks(scenario, "sim.view")
     options.check_json(args)
     if args.video:
         check_film(Path(args.video))

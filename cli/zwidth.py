@@ -27,7 +27,7 @@ from sim import report
 from sim.couplings import NAMES, Chosen, choose
 from sim.files import write
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
-from sim.scenario import InputError, Scenario, require_constant_delay, require_forces_at_ticks
+from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks
 from sim.stability import MARGINAL
 from sim.trace import SUSTAINED, slowest_seen
 from sim.zwidth import (
@@ -333,7 +333,7 @@ def main(argv: list[str]) -> int:
     args.press = (3.0 if of_coupling else 0.0) if args.press is None else args.press
     scenario = options.scenario_from(args)
     require_constant_delay(scenario, "sim.zwidth")
-    require_forces_at_ticks(scenario, "sim.zwidth")
+    require_even_ticks(scenario, "sim.zwidth")
     if scenario.T_max is not None:
         raise InputError("T_max: a map is of even periods; scale --delta by T/T_max instead")
     _check_case(args)

@@ -584,7 +584,7 @@ class StepBuffer:
         self._quantised = bool((process.encoder_step > 0).any())
         self._line = None if process.delays is None else HeldLine(process.delays, nsim)
         self.net = process.net(nsim) if process.net else None
-        self._rewound = 0  # ticks before row 0
+        self.first = 0  # the tick of row 0
 
     def tick(self, k: int) -> None:
         """Steps 1, 2, 3 and 5 for row k, whose plant state has been written: f[k] and z[k + 1]."""
@@ -593,9 +593,9 @@ class StepBuffer:
         if self.net is not None:
             self.net.send(seen[-self.process.channels :], self.force[k])
         if self._line is not None:
-            self._line.carry(self._rewound + k, self.force[k])
+            self._line.carry(self.first + k, self.force[k])
         if self.net is not None:
-            self.net.apply(self._rewound + k, self.force[k])
+            self.net.apply(self.first + k, self.force[k])
 
     def seen(self, k: int) -> Array:
         """[z; x] of row k with x as the encoders give it, (order + m, nsim); the plant's own positions stay."""
@@ -614,4 +614,4 @@ class StepBuffer:
         """Start a new stretch where this one stood after `ticks` ticks."""
         self.z[0] = self.z[ticks]
         self.s[0] = self.s[ticks]
-        self._rewound += ticks
+        self.first += ticks

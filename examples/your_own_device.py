@@ -18,12 +18,13 @@ SECONDS = 2.0
 
 def main() -> None:
     device = RigidDevice(**MINE)
-    session = rehearse(load("omega-pair").replace(T=1e-3, theta=(1, 1), device=(device, device)), seconds=SECONDS)
+    scenario = load("omega-pair").replace(T=1e-3, theta=(0, 0), device=(device, device))
+    session = rehearse(scenario, seconds=SECONDS, latch_on_arrival=True)  # False: forces wait for the next tick
     if session.result is None or session.zero_after is None:
         raise InputError(f"no force was ever felt: the session was {session.stage}, {session.cause}")
-    found = session.requirements["theorem4"]
-    delay, theta = 1e6 * (session.delay or 0.0), list(session.theta or ())
-    print(f"measured: {delay:.0f} us from sample to force; spring-damper for theta = {theta}")
+    found = session.requirements["closed-loop"]
+    delay, late = 1e6 * (session.delay or 0.0), [1e6 * tau for tau in session.latency or ()]
+    print(f"measured: {delay:.0f} us from sample to force; spring-damper for {late[0]:.0f} to {late[1]:.0f} us")
     print(f"needs {max(found.required):.4f} of {min(found.available):.2f} N s/m: certified = {found.certified}")
     moved = np.abs(session.result.x).max()
     print(f"{len(session.result.t)} ticks, ended {session.stage}; handles moved up to {1e3 * moved:.1f} mm")

@@ -2,7 +2,8 @@
 
 The link takes `link` ticks from a sample to the latch of its force, for every axis. Channels whose delay theta_i
 in the scenario is longer wait for the rest, theta_i - link, on the host: the loop has the scenario's delays as long
-as the link is no slower, and longer ones where it is.
+as the link is no slower, and longer ones where it is. Where the device latches a force as soon as it comes, link is 0
+and the scenario's latency is what was measured.
 """
 
 from __future__ import annotations
@@ -272,6 +273,32 @@ def link_delay(ages: Ages, T_us: float, quantile: float, guard_us: float) -> int
     return max(1, int(-(-needed // T_us)))
 
 
+def timed(
+    scenario: Scenario, ages: Ages, quantile: float, guard_us: float, at_once: bool = False
+) -> tuple[Scenario, int]:
+    """The scenario with what was measured of its ticks, and the ticks that the link takes.
+
+    T_max is the length that a fraction `quantile` of the device's ticks keeps, where it exceeds T. `at_once`: forces
+    latch as they come, link 0, between the least age and the one that a fraction keeps, both with the guard. Raises
+    Fault where those are a period or longer.
+    """
+    T_us = 1e6 * scenario.T
+    longest, known = ages.longest_tick(T_us, quantile), scenario.T_max or scenario.T
+    if longest > 1e6 * known:
+        scenario = scenario.replace(T_max=1e-6 * longest)
+    if not at_once:
+        return scenario, link_delay(ages, T_us, quantile, guard_us)
+    least, most = max(0.0, min(ages.values) - guard_us), ages.quantile(quantile) + guard_us
+    if most >= min((T_us, *ages.ticks)):
+        raise Fault(f"answers come up to {most:.0f} us after their tick, T is {T_us:g} us: latch at ticks")
+    return scenario.replace(latency=((1e-6 * least, 1e-6 * most),) * scenario.channels), 0
+
+
+def overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
+    """[W] what a tick longer than T_max may give a hand, at most, for each second of its length: sum f^2/(4 delta)."""
+    return sum(f * f / (4 * d) for f, d in zip(caps, delta, strict=True))
+
+
 class Program(Protocol):
     """What a session can be armed with."""
 
@@ -311,7 +338,9 @@ class CertifiedCoupling:
 
     @property
     def name(self) -> str:
-        return f"{self.chosen.kind} for theta = {list(self.scenario.theta)}"
+        latency = self.scenario.latency
+        late = f" and {1e6 * latency[0][0]:.0f} to {1e6 * latency[0][1]:.0f} us" if latency else ""
+        return f"{self.chosen.kind} for theta = {list(self.scenario.theta)}{late}"
 
     @property
     def held(self) -> int:
@@ -327,6 +356,8 @@ class CertifiedCoupling:
         return {
             "link_delay": self.link,
             "theta": list(self.scenario.theta),
+            "latency_s": self.scenario.latency and [list(span) for span in self.scenario.latency],
+            "T_max_s": self.scenario.T_max,
             "coupling": coupling_part(self.chosen.kind, self.chosen.coupling, self.scenario.T),
             "certificate": certificate_part(self.requirements[self.chosen.condition]),
             "certificates": {name: certificate_part(r) for name, r in self.requirements.items()},
@@ -351,13 +382,16 @@ def certified_coupling(
     """
     if link > MAX_THETA:
         raise Fault(f"the link takes {link} ticks, the protocol carries at most theta = {MAX_THETA}")
-    slower = scenario.replace(theta=tuple(max(n, link) for n in scenario.theta))
+    delays = tuple(max(n, link) for n in scenario.theta)
+    slower = scenario.replace(theta=delays, latency=None if link else scenario.latency)
     try:
-        chosen = Chosen("given", given, "closed-loop") if given else choose(slower, case, name, condition)
+        # a latency is derived for this environment only
+        wanted = condition or ("closed-loop" if slower.latency else None)
+        chosen = Chosen("given", given, "closed-loop") if given else choose(slower, case, name, wanted)
     except DesignFailed as error:
         raise Fault(f"no coupling for a link of {link} ticks: {error}") from None
     requirements = assess(slower.loop(case), chosen.coupling, chosen.phi)
-    made = CertifiedCoupling(min(slower.theta), slower, case, chosen, requirements)
+    made = CertifiedCoupling(min(slower.theta) if link else 0, slower, case, chosen, requirements)
     if not made.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"
         raise Fault(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(made)}")

@@ -1,5 +1,7 @@
 """The device's side of the link: safety states, and forces latched at tick k + theta; no clock and no port of its own.
 
+With theta = 0 a force is latched as soon as it comes, within the tick that it answers: the motors then carry `applied`.
+
 The same machine as hw/firmware/haptic_link.h, integer for integer and byte for byte (tests/hw/test_firmware.py). Its
 rules are in docs/protocol.md. Forces are in steps, per axis, as tuples.
 """
@@ -62,16 +64,23 @@ class Device:
     def tick(self, now_us: int, counts: tuple[int, ...]) -> tuple[tuple[int, ...], bytes]:
         """A period begins: the forces that act from now on, and the bytes to send. `counts` was sampled just before."""
         self.k, self.now = (self.k + 1) & 0xFFFF, now_us & 0xFFFFFFFF
-        frame, self.slots[self.k % _SLOTS] = self.slots[self.k % _SLOTS], None
+        at_once = self.config is not None and not self.config.theta
+        slot = (self.k - at_once) % _SLOTS  # what came during the tick before has been latched, if anything came
+        frame, self.slots[slot] = self.slots[slot], None
         if self.phase in (Phase.DISARMED, Phase.ARMED, Phase.HOLDING):
             self.misses += frame is None
-            if self.phase != Phase.DISARMED:
-                self.latch(frame)
-            elif frame is not None and frame.command == Command.ARM:
-                self.phase = Phase.ARMED
+            if not at_once or (frame is None and self.phase != Phase.DISARMED):
+                self.take(frame)
         if self.phase == Phase.RAMP:
             self._ramp_down()
         return self.applied, self._speak(counts)
+
+    def take(self, frame: Force | None) -> None:
+        """The force for this tick, if there is one, may act from now on."""
+        if self.phase in (Phase.ARMED, Phase.HOLDING):
+            self.latch(frame)
+        elif self.phase == Phase.DISARMED and frame is not None and frame.command == Command.ARM:
+            self.phase = Phase.ARMED
 
     def latch(self, frame: Force | None) -> None:
         """The force for this tick, or without one the last one held, for `hold` ticks."""
@@ -154,14 +163,17 @@ class Device:
             return
         if self.config is None or distance(frame.apply_at, frame.source) != self.config.theta:
             return
-        ahead, slot = distance(frame.apply_at, self.k), frame.apply_at % _SLOTS
-        if ahead > self.config.theta or (ahead > 0 and self.slots[slot] is not None):
+        at_once = not self.config.theta
+        ahead, slot = distance(frame.apply_at, self.k) + at_once, frame.apply_at % _SLOTS  # ticks until it is late
+        if ahead > self.config.due or (ahead > 0 and self.slots[slot] is not None):
             return
         since = (now_us - self.now) & 0xFFFFFFFF
         margin = _scaled(ahead, self.info.period_ns, 1000) - since
         self.echo, self.margin = frame.source, max(-0x7FFF, min(0x7FFF, margin))
         if ahead > 0:
             self.slots[slot] = frame
+            if at_once:
+                self.take(frame)
 
     def configure(self, config: Config) -> None:
         refused = self._refuse(config)
@@ -177,7 +189,7 @@ class Device:
             (self.phase == Phase.ESTOP, Refused.ESTOP),
             (self.phase in RUNNING, Refused.RUNNING),
             (config.axes != self.info.axes, Refused.AXES),
-            (not 1 <= config.theta <= MAX_THETA, Refused.THETA),
+            (not 0 <= config.theta <= MAX_THETA, Refused.THETA),
             (config.ramp == 0 or release > MAX_RELEASE_NS, Refused.RELEASE),
             (any(not 1 <= c <= most for c, most in zip(config.cap, self.info.hard_limit, strict=False)), Refused.CAP),
             (0 in config.slew, Refused.SLEW),

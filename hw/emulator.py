@@ -26,6 +26,7 @@ import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import count
 from typing import Self
 
@@ -194,9 +195,10 @@ class EmulatedPlant:
         self.coulomb, self._substeps = coulomb, _SUBSTEPS if coulomb else 1
         self.scenario, self.encoder_step = scenario, encoder_step
         self.scene = build(scenario.device, scenario.human, scenario.person)
-        held = hold(plant(self.scene.model), scenario.T / self._substeps)
-        self._product = np.hstack([held.A, held.B])
-        self.s = np.zeros(held.A.shape[0])
+        self._plant = plant(self.scene.model)
+        self._held = lru_cache(256)(self._hold)
+        self.s = np.zeros(len(self._plant.A))
+        self._w = np.zeros(self.scene.outside)
         self._limit = np.array([device.force_limit for device in scenario.device])
         self._outside, self._first, self.tick = np.zeros((0, self.scene.outside)), 0, None
 
@@ -212,13 +214,21 @@ class EmulatedPlant:
         """What the encoders show [counts]."""
         return tuple(int(n) for n in np.round(self.s[: self.channels] / self.encoder_step))
 
-    def advance(self, f: Array) -> None:
-        """Hold the forces f (m,) [N] for one period; the device feels -f."""
-        w = np.zeros(self.scene.outside) if self.tick is None else self._next_outside()
+    def advance(self, f: Array, share: float = 1.0, begins: bool = True) -> None:
+        """Hold the forces f (m,) [N] for a share of a period; the device feels -f.
+
+        What acts from outside is that of the tick, which `begins` or goes on.
+        """
+        if begins and self.tick is not None:
+            self._w = self._next_outside()
         f, m, n = np.clip(f, -self._limit, self._limit), self.channels, self.scene.model.nq
         for _ in range(self._substeps):
             friction = self.coulomb * np.tanh(self.s[n : n + m] / _SLIP) if self.coulomb else 0.0
-            self.s = self._product @ np.concatenate([self.s, w, f + friction])
+            self.s = self._held(share) @ np.concatenate([self.s, self._w, f + friction])
+
+    def _hold(self, share: float) -> Array:
+        held = hold(self._plant, share * self.scenario.T / self._substeps)
+        return np.hstack([held.A, held.B])
 
     def _next_outside(self) -> Array:
         assert self.tick is not None
@@ -271,6 +281,7 @@ class Emulator:
         self.stalled_until = 0  # [us]
         self.stretch = 1.0  # length of a tick in T
         self.applied: Array = np.zeros(scenario.channels)  # [N] by the motors
+        self._begun, self._rest, self._at_tick = 0, 0.0, False  # [us] of the tick; the share of it that is to come
         self._offset = [0] * scenario.channels  # [counts] of an encoder that jumped
         self._encoder: dict[int, Callable[[int], int]] = {}  # by axis: what a broken encoder makes of its count
         for fault in faults:
@@ -287,16 +298,34 @@ class Emulator:
 
     def receive(self, data: bytes, now: int) -> None:
         """Bytes from the host; a device without a cable, or frozen, hears nothing."""
-        if not self.unplugged and now >= self.stalled_until:
-            self.device.receive(data, now)
+        if self.unplugged or now < self.stalled_until:
+            return
+        before = self.device.applied
+        self.device.receive(data, now)
+        if self._rest and self.device.applied != before:
+            self._move(now)
+            self.applied = np.array(self.device.applied) * self.force_step
+
+    def _move(self, now: float) -> None:
+        """The plant moves on up to `now` [us], within the tick."""
+        period = 1e-3 * self.info.period_ns * self.stretch
+        done = min(1.0, (now - self._begun) / period)
+        share = min(self._rest, max(0.0, done - (1.0 - self._rest)))
+        if share:
+            self.plant.advance(-self.applied, share, self._at_tick)
+            self._rest, self._at_tick = self._rest - share, False
 
     def tick(self, now: int) -> bytes:
         """A period begins: sample, latch, answer. `now` is the device's clock [us]; advance() goes with every tick."""
+        if self._rest:  # what is left of the tick before
+            self.plant.advance(-self.applied, self._rest, self._at_tick)
+            self._rest = 0.0
         self._misbehave(now)
         counts = tuple(
             max(-_FARTHEST, min(_FARTHEST, self._encoder.get(i, int)(n + o)))
             for i, (n, o) in enumerate(zip(self.plant.counts(), self._offset, strict=True))
         )
+        self._begun = now
         steps, data = self.device.tick(now, counts)
         if self.device.phase in RUNNING and self.armed_at is None:
             self.armed_at = now
@@ -305,8 +334,11 @@ class Emulator:
         return b"" if self.unplugged else data
 
     def advance(self) -> None:
-        """The plant moves on by a period, while the answer is on its way."""
-        self.plant.advance(-self.applied)
+        """The plant moves on by a period, while the answer is on its way; piece by piece where that acts at once."""
+        if self.device.config is not None and not self.device.config.theta:
+            self._rest, self._at_tick = 1.0, True
+        else:
+            self.plant.advance(-self.applied)
 
     def _in_counts(self, fault: FaultInjection) -> int:
         return round(1e-3 * fault.value / (1e-12 * self.info.encoder_step[fault.axis]))

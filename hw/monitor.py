@@ -23,6 +23,7 @@ _MEASURED_TOLERANCE = 0.01  # of the device's clock against T, over the measurem
 _UNTOLD = 0.9  # part of STATEs without a margin above which nobody can judge the link; a USB frame may carry several
 _DEVICE_TOLERANCE, _HOST_TOLERANCE = 0.01, 0.1  # of a clock over a block; a busy host and its buffers blur the second
 BLOCK = 200  # ticks over which a clock is compared
+_CLOCK_US = 1.5  # [us] by which two stamps of the device's clock may err together
 _REMEMBERED = 64  # forces on their way, of which at most theta matter
 _ROUNDING = 1  # [steps] for a firmware that rounds otherwise
 PATIENCE = 5  # ticks in a row
@@ -56,6 +57,13 @@ class Ages:
 
     values: tuple[int, ...]
     missing: int = 0
+    ticks: tuple[int, ...] = ()  # [us] how long ticks of the device lasted, by its own clock
+
+    def longest_tick(self, T_us: float, q: float = 1.0) -> float:
+        """The length [us] that a fraction q of the ticks does not exceed; T where their clock tells no difference."""
+        ordered = sorted(self.ticks)
+        longest = ordered[min(len(ordered) - 1, int(q * len(ordered)))] if ordered else T_us
+        return float(longest) if longest > T_us + _CLOCK_US else T_us
 
     def quantile(self, q: float) -> int:
         """The least age that a fraction q of all forces does not exceed. Raises Fault where so many never arrive."""
@@ -80,11 +88,16 @@ class Measurement:
         self._missed = 0
         self._needed, self._theta, self._T_us, self._most_missing = needed, theta, 1e6 * T, most_missing
         self._first: State | None = None
+        self._last: State | None = None
+        self._ticks: list[int] = []  # [us]
         self._states = 0
 
     def note(self, state: State, margin: int | None, missed: int) -> bool:
         """Take in a STATE; whether that was the last one. Raises Fault where the link cannot be used."""
         self._first = self._first or state
+        if self._last and distance(state.tick, self._last.tick) == 1:
+            self._ticks.append((state.t_us - self._last.t_us) & 0xFFFFFFFF)
+        self._last = state
         self._states += 1
         counted = self._states - 2 * self._theta  # before, the device misses answers to ticks that nobody saw
         if counted <= 0:
@@ -109,7 +122,7 @@ class Measurement:
 
     @property
     def result(self) -> Ages:
-        return Ages(tuple(self.ages), self.missing)
+        return Ages(tuple(self.ages), self.missing, tuple(self._ticks))
 
     def _check_clock(self, state: State) -> None:
         assert self._first is not None
@@ -307,7 +320,7 @@ class CommandMonitor:
 
     def tell(self, tick: int, steps: tuple[int, ...]) -> None:
         """`steps` answer `tick`."""
-        self._forces[(tick + self._config.theta) & 0xFFFF] = steps
+        self._forces[(tick + self._config.due) & 0xFFFF] = steps
         if len(self._forces) > _REMEMBERED:
             self._forces.pop(next(iter(self._forces)))
 

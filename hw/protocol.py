@@ -107,7 +107,7 @@ class Info(NamedTuple):
 class Config(NamedTuple):
     """Host to device: how to run. Tuples have one entry per axis."""
 
-    theta: int  # a force answers tick k and is latched at tick k + theta
+    theta: int  # a force answers tick k and is latched at tick k + theta; 0: as soon as it comes, within tick k
     hold: int  # ticks that the last force is held for when frames are missing
     ramp: int  # ticks from there to zero
     ramp_in: int  # ticks over which the cap grows from zero after arming; 0: at once
@@ -117,6 +117,11 @@ class Config(NamedTuple):
     @property
     def axes(self) -> int:
         return len(self.cap)
+
+    @property
+    def due(self) -> int:
+        """Ticks after its sample until which a force may come, and after which a STATE shows it."""
+        return max(1, self.theta)
 
 
 class Ack(NamedTuple):
@@ -196,7 +201,7 @@ LAYOUTS: dict[type, _Layout] = {
         "IIIHi",
         (_U8, (0, _TEXT), _U32, (100_000, 100_000_000), _U32, (1, _U32[1]), (1, _U32[1]), (1, _I16[1]), (1, _I32[1])),
     ),
-    Config: _Layout(3, "BBBH", "HH", ((1, MAX_THETA), _U8, (1, 0xFF), _U16, (1, _I16[1]), (1, _U16[1]))),
+    Config: _Layout(3, "BBBH", "HH", ((0, MAX_THETA), _U8, (1, 0xFF), _U16, (1, _I16[1]), (1, _U16[1]))),
     Ack: _Layout(4, "IB", "", (_U32, _U8)),
     State: _Layout(5, "BHHhBBI", "ih", (_U8, _U16, _U16, _I16, _U8, _U8, _U32, _I32, _I16)),
     Force: _Layout(6, "BHH", "h", (_U8, _U16, _U16, _I16)),

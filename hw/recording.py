@@ -262,6 +262,7 @@ def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
     part: dict[str, Any] = {
         "measured_age_us": _percentiles(np.array(measured.ages)),
         "measured_missing": measured.missing,
+        "measured_tick_us": _percentiles(np.array(measured.result.ticks)),
         "age_us": None,
         "rate_hz": None,
         "missed_percent": None,
@@ -270,7 +271,7 @@ def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
     if len(recorder) and session.config:
         arrays = recorder.link()
         margins = arrays["margin_us"][arrays["received"] & (arrays["margin_us"] != NO_MARGIN)]
-        part["age_us"] = _percentiles(session.config.theta * 1e6 * session.scenario.T - margins)
+        part["age_us"] = _percentiles(session.config.due * 1e6 * session.scenario.T - margins)
         part["rate_hz"] = float(arrays["received"].mean() / session.scenario.T)
         answered = arrays["received"].sum()
         part["missed_percent"] = 100 * session.missed_while_driving / answered if answered else None
@@ -336,8 +337,10 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for i in range(m):
             require(f"force_step[{i}]", self.force_step[i], 1e-9, 1.0, "N")
             require(f"cap[{i}]", self.cap[i], 1, 0x7FFF, "steps")
-        if not 1 <= self.link_delay <= least:
-            raise ValueError(f"link_delay is {self.link_delay}, allowed are 1 to {least}, the scenario's least theta")
+        soonest = 0 if self.scenario.latency else 1
+        if not soonest <= self.link_delay <= least:
+            allowed = f"{soonest} to {least}, the scenario's least theta"
+            raise ValueError(f"link_delay is {self.link_delay}, allowed are {allowed}")
 
     def controller(self) -> LinearController:
         """F as the host ran it. Raises InputError where nothing can have run."""

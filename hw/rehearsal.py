@@ -18,14 +18,14 @@ from controller.lti import Array
 from design.certificate import promise_of
 from design.conditions import Requirement
 from design.result import COUPLING, Design, bare, number, of_kind, whole
-from hw.control import CertifiedCoupling, Program, certified_coupling, certified_couplings, link_delay
+from hw.control import CertifiedCoupling, Program, certified_coupling, certified_couplings, timed
 from hw.emulator import Emulator, FaultInjection, Line
 from hw.limits import ENDED, Fault, Stage
 from hw.monitor import Ages, LinkSettings
 from hw.protocol import Phase
 from hw.recording import Recorder, result_of
 from hw.session import Operator, Session, session_for
-from sim.scenario import InputError, Scenario, require_constant_delay, require_linear
+from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 from sim.trace import Trace
 
 _MEASURE = 200  # answers that are timed: virtual time does not scatter
@@ -202,6 +202,7 @@ class Rehearsed:
     cause: str  # of the end
     delay: float | None  # median from a sample to its force [s]; None where it was not measured
     theta: tuple[int, ...] | None  # delays that the coupling is certified for [samples]; None where there is none
+    latency: tuple[float, float] | None  # [s] between which forces latch after their tick; None where at ticks
     coupling: Coupling | None  # that the device was armed with, or would have been
     requirements: dict[str, Requirement]  # of that coupling by both conditions, as `certify` gives them
     promise: str | None  # for which environments they hold
@@ -215,11 +216,14 @@ def rehearse(
     case: str = "I",
     seconds: float = 2.0,
     seed: int = 0,
+    latch_on_arrival: bool = False,
 ) -> Rehearsed:
     """A session with the scenario's devices behind the real protocol, without a device, a port or waiting.
 
     Handshake, delay measured, coupling designed for it (or `coupling`, judged for it), certified, armed, run for
-    `seconds`, ramped out. The scenario's theta is the least delay; a slower link makes it longer. A session that is
+    `seconds`, ramped out. The scenario's theta is the least delay; a slower link makes it longer. With
+    `latch_on_arrival` the device applies a force as soon as it comes, and the loop has the measured latency in place of
+    a whole tick (`latency`), beside the scenario's theta, which may then be 0. A session that is
     refused, because nothing is certified for its delay, is a result too: see `stage` and `cause`.
 
     Raises InputError for a scenario that cannot stand behind a serial link, TypeError for an argument of another type.
@@ -233,6 +237,7 @@ def rehearse(
         raise InputError(f"seconds is {seconds:g}, allowed are 0.1 to 3600")
     require_linear(scenario, "rehearse")
     require_constant_delay(scenario, "rehearse")
+    require_even_ticks(scenario, "rehearse")
     if min(scenario.delta) <= 0:
         raise InputError(f"delta is {list(scenario.delta)}: a device without damping can promise no human anything")
     session = session_for(scenario, LinkSettings(measure=_MEASURE))
@@ -242,11 +247,11 @@ def rehearse(
 
     def plan(ages: Ages) -> list[CertifiedCoupling]:
         delays.append(1e-6 * ages.median)
-        link = link_delay(ages, 1e6 * scenario.T, _QUANTILE, _GUARD_US)
+        met, link = timed(scenario, ages, _QUANTILE, _GUARD_US, latch_on_arrival)
         if alone is None:
-            programs.extend(certified_couplings(scenario, case, None, None, link))
+            programs.extend(certified_couplings(met, case, None, None, link))
         else:
-            programs.append(certified_coupling(scenario, case, None, None, link, alone))
+            programs.append(certified_coupling(met, case, None, None, link, alone))
         return programs
 
     stopped: list[float] = []  # [s] after arming
@@ -279,6 +284,7 @@ def _outcome(
         cause=session.cause,
         delay=delays[0] if delays else None,
         theta=first and first.scenario.theta,
+        latency=first.scenario.latency[0] if first and first.scenario.latency else None,
         coupling=first and first.chosen.coupling,
         requirements=first.requirements if first else {},
         promise=promise_of(first.requirements, first.scenario.loop(first.case)) if first else None,

@@ -153,7 +153,8 @@ class Session:
             return None
         assert self.config
         scenario = self.scenario
-        plan = BudgetPlan.of(*self.settings.energy_budget, scenario.delta, self.units, self.config, scenario.T)
+        longest = max(scenario.T_max or 0.0, 1e-6 * self.measurement.result.longest_tick(1e6 * scenario.T))
+        plan = BudgetPlan.of(*self.settings.energy_budget, scenario.delta, self.units, self.config, longest)
         self.budgets.append(SentBudget(plan))
         return self.budgets[-1]
 

@@ -29,7 +29,7 @@ from models.human import Human, Person
 from models.scene import Crowd, variants
 from sim.run import Progress
 from sim.scenario import Scenario
-from sim.stability import dominant_mode, exact_loops
+from sim.stability import ClosedLoop, dominant_mode, exact_loops
 
 _MASS, _STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
 DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9
@@ -133,7 +133,7 @@ def attempts(
     rows = []
     for name, (scenario, coupling) in loops.items():
         F = force_map(environment(scenario.environment, scenario.T), coupling, scenario.theta, scenario.psi)
-        required = np.array(this_environment(F, scenario.delta).required)
+        required = np.array(this_environment(F, scenario.delta, scenario.longest_period, scenario.latency).required)
         for short in shortages:
             placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
             rows.append(Attempt(name, float(short), search(placed, F, seed, generations=generations, first=True)))
@@ -156,15 +156,21 @@ def _ladders(x: Array, channels: int, kind: _Pass) -> Crowd:
     return Crowd(links, (tuple(range(1, channels + 1)),), bodies)
 
 
+def _loops(scenario: Scenario, F: Lti, crowd: Crowd) -> ClosedLoop:
+    """In periods of the longest length, with forces that latch at the latest."""
+    late = None if scenario.latency is None else [most for _, most in scenario.latency]
+    return exact_loops(variants(scenario.device, crowd), F, scenario.longest_period, late)
+
+
 def _losses(x: Array, scenario: Scenario, F: Lti, kind: _Pass) -> Array:
     """Minus the largest growth [1/s] among the modes looked at, for every column of x."""
-    loops = exact_loops(variants(scenario.device, _ladders(x.reshape(x.shape[0], -1), scenario.channels, kind)), F)
+    loops = _loops(scenario, F, _ladders(x.reshape(x.shape[0], -1), scenario.channels, kind))
     values = np.linalg.eigvals(loops.A)
     fast = np.abs(np.angle(values)) / (2 * np.pi * F.T) >= kind.min_frequency_hz
     return -np.log(np.where(fast, np.abs(values), 1e-300).max(axis=1)) / F.T
 
 
 def _worst(scenario: Scenario, F: Lti, crowd: Crowd, evaluated: int) -> Worst:
-    mode = dominant_mode(exact_loops(variants(scenario.device, crowd), F))
+    mode = dominant_mode(_loops(scenario, F, crowd))
     radius, growth, frequency = (float(a[0]) for a in (mode.spectral_radius, mode.growth, mode.frequency_hz))
     return Worst(crowd.humans(0), crowd.persons(0), radius, growth, frequency, evaluated)

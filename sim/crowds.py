@@ -22,6 +22,7 @@ from threadpoolctl import threadpool_limits
 from controller.coupling import Coupling
 from controller.environment import Member
 from controller.lti import Array
+from controller.timing import Timing
 from models.human import Population
 from models.scene import Crowd, HumanSets, Variants, variants
 from sim.engines import EXPONENTIAL, ExactBatchEngine, MujocoBatchEngine, hold
@@ -169,7 +170,7 @@ class Findings:
     settling: Array  # (n,) rms speed of the handles, last quarter over second quarter, exact trace
     mass: Array  # (n,) [kg] per set: geometric mean over channels of all mass
     damping: Array  # (n,) [N s/m] likewise of the least damping
-    switching: Array  # (n,) [1/s] growth of the linear loop under delays that vary; nan where they do not
+    switching: Array  # (n,) [1/s] growth of the linear loop under delays or ticks that vary; nan where they do not
     switching_mujoco: Array  # (n,) [1/s] the same on MuJoCo's trace; nan also where that was clipped
     simulated: float  # [s] in all traces
     interrupted: bool = False
@@ -220,13 +221,14 @@ def _group(
 ) -> Findings:
     scenario, nowhere = validation.scenario, np.full(len(crowd), np.nan)
     held_by = variants(scenario.device, crowd)
-    loops = exact_loops(held_by, simulation.F)
+    late = scenario.usual_latency
+    loops = exact_loops(held_by, simulation.F, late=late)
     mode, mujoco = dominant_mode(loops), nowhere
     if validation.engine != "exact":
-        mujoco = dominant_mode(mujoco_loops(held_by, simulation.process, nthread=validation.threads)).growth
+        mujoco = dominant_mode(mujoco_loops(held_by, simulation.process, nthread=validation.threads, late=late)).growth
     exact, last = _tests(validation, simulation, held_by, loops, ticked) if validation.ticks else (None, None)
     switched = Switched(nowhere, nowhere)
-    if scenario.switches:
+    if scenario.switches or scenario.uneven:
         with_mujoco = validation.engine != "exact" and validation.ticks > 0
         arguments = (held_by, index, validation.seed, validation.duration, with_mujoco, validation.threads)
         switched = switched_crowd(simulation, validation.coupling, *arguments)
@@ -262,12 +264,17 @@ def _tests(
     loops: ClosedLoop,
     ticked: Callable[[int], None],
 ) -> tuple[ImpulseTest, ImpulseTest]:
-    """The exact engine's impulse test, which costs next to nothing, and MuJoCo's, or again the first."""
+    """The exact engine's impulse test, which costs next to nothing, and MuJoCo's, or again the first.
+
+    In even periods, with forces that latch in the middle of their range: what their spread does is `switched_crowd`'s.
+    """
     process, T = simulation.process, validation.scenario.T
     settings = held_by.scene, loops, np.array(validation.scenario.delta), validation.ticks
-    exact = impulse_test(process, ExactBatchEngine(hold(held_by.plants(), T), process.force_limit), *settings)
+    late = validation.scenario.usual_latency
+    exact = impulse_test(process, ExactBatchEngine(hold(held_by.plants(), T, late), process.force_limit), *settings)
     if validation.engine == "exact":
         return exact, exact
     threads, n = validation.threads, len(held_by)
-    engine = MujocoBatchEngine(held_by.scene, T, EXPONENTIAL, 1, n, threads, held_by.fields)
+    timing = Timing(np.array([T]), np.array([late])) if late else None
+    engine = MujocoBatchEngine(held_by.scene, T, EXPONENTIAL, 1, n, threads, held_by.fields, timing)
     return exact, impulse_test(process, engine, *settings, ticked)

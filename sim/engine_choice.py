@@ -69,7 +69,7 @@ def compare_engines(simulation: Simulation, error: float, ticks: int | None = No
         settings = [*runs, *((name, n) for name, n in _CANDIDATES if name != "RK4")]
     choices = []
     for name, n in settings:
-        if name != EXPONENTIAL and step_radius(simulation.smooth, name, n) > 1 + NEUTRAL:
+        if name != EXPONENTIAL and step_radius(simulation.smooth.even, name, n) > 1 + NEUTRAL:
             continue
         own, cost = runs.get((name, n)) or _timed(simulation, ticks, "mujoco", name, n)
         choices.append(EngineChoice(name, n, _apart(own, truth) + missed, _right(simulation, name, n), cost))
@@ -94,7 +94,7 @@ def cross_check(
     compared as far as neither ended before its time.
     """
     other = EXPONENTIAL if integrator == "RK4" else "RK4"
-    linear = simulation.smooth
+    linear = simulation.smooth.even
     substeps = default_substeps(linear, other)
     beside = run(simulation, make_engine(simulation, "mujoco", other, substeps), ticks=trace.t.size)
     ticks, m = min(trace.t.size, beside.t.size), simulation.process.channels
@@ -127,7 +127,7 @@ def _refined(
 
 
 def _right(simulation: Simulation, integrator: str, substeps: int) -> bool:
-    linear = simulation.smooth
+    linear = simulation.smooth.even
     return not disagree(exact_growth(linear), simulated_growth(linear, integrator, substeps))
 
 

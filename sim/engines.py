@@ -5,9 +5,10 @@
                   J from the compiled model's matrices; exact on a linear scene, whatever its stiffness and the step
     RK4, ..       steps of MuJoCo's own integrators, whose number per period sim.stepping decides
 
-All of them read their inputs from the rows of a step buffer and write the next row, with no copy in between. The
-exponential engine shares J with the exact one, so it checks forces and assembly, not the stepping in time: for that
-there is RK4.
+All of them read their inputs from the rows of a step buffer and write the next row, with no copy in between. With a
+timing (controller.timing) every tick has a length of its own, and forces that latch late act from within it; then the
+forces that the actuators hold are the last entries of the plant's state. The exponential engine shares J with the exact
+one, so it checks forces and assembly, not the stepping in time: for that there is RK4.
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ import ctypes
 import glob
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, lru_cache, partial
+from itertools import pairwise
 from typing import Protocol
 
 import mujoco
@@ -32,6 +34,7 @@ from scipy.sparse.csgraph import connected_components
 
 from controller.lti import Array
 from controller.process import StepBuffer
+from controller.timing import Timing
 from models.scene import Plant, Scene, Variants, impeded, plant
 from sim.files import InputError
 
@@ -47,6 +50,9 @@ INTEGRATORS = {
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
     "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
 }
+
+_MOST_MAPS = 256  # of ticks that differ, kept by an engine
+_WHOLE = 1e-9  # of a step: rounding, where a number of steps is counted
 
 LEAST = 4  # steps per period of MuJoCo's own integrators
 
@@ -89,8 +95,14 @@ class HeldPlant:
     T: float  # [s]
 
 
-def hold(plant: Plant, T: float) -> HeldPlant:
-    """Sample a continuous plant, or many of them, with the input held for T."""
+def hold(plant: Plant, T: float, late: Sequence[float] | None = None) -> HeldPlant:
+    """Sample a continuous plant, or many of them, with the input held for T.
+
+    Where forces latch `late` (m,) [s] after the tick, the state is [s; forces that the actuators hold]: until then
+    the last ones act, s+ = A(T) s + B(T) [w; held] + B(T - late) (f - held).
+    """
+    if late is not None:
+        return _latched(partial(hold, plant), T, late)
     *many, n, inputs = plant.B.shape
     generator = np.zeros((*many, n + inputs, n + inputs))
     generator[..., :n, :n], generator[..., :n, n:] = plant.A, plant.B
@@ -99,6 +111,19 @@ def hold(plant: Plant, T: float) -> HeldPlant:
     else:
         step = expm(generator * T)
     return HeldPlant(step[..., :n, :n], step[..., :n, n:], plant.C, T)
+
+
+def _latched(held: Callable[[float], HeldPlant], T: float, late: Sequence[float]) -> HeldPlant:
+    """As hold with `late`, from the plant held for the times that are asked for."""
+    whole, m = held(T), len(late)
+    *many, n, inputs = whole.B.shape
+    w = inputs - m
+    A, B = np.zeros((*many, n + m, n + m)), np.zeros((*many, n + m, inputs))
+    A[..., :n, :n], B[..., :n, :w], B[..., n:, w:] = whole.A, whole.B[..., :w], np.eye(m)
+    for i, tau in enumerate(late):
+        B[..., :n, w + i] = held(T - tau).B[..., w + i]
+    A[..., :n, n:] = whole.B[..., w:] - B[..., :n, w:]
+    return HeldPlant(A, B, np.pad(whole.C, ((0, 0), (0, m))), T)
 
 
 class ExactEngine:
@@ -117,6 +142,37 @@ class ExactEngine:
         np.minimum(force, self._high, out=force)
         np.maximum(force, self._low, out=force)
         self._product(self._rows[k], self._states[k + 1])
+
+    def troubled(self) -> bool:
+        return False
+
+
+class ExactTimedEngine:
+    """A tick of a timing moves the plant, or simulation j plant j of many, exactly, after the actuators' limits."""
+
+    def __init__(self, plant: Plant, timing: Timing, force_limit: Array) -> None:
+        held, kinds = lru_cache(_MOST_MAPS)(partial(hold, plant)), timing.kinds
+
+        @lru_cache(_MOST_MAPS)
+        def product(kind: int) -> _Product:
+            T, late = kinds[kind]
+            step = held(T) if late is None else _latched(held, T, late)
+            both = np.concatenate([step.A, step.B], axis=-1)
+            return _each_by_its_own(both) if both.ndim == 3 else np.ascontiguousarray(both).dot
+
+        self._product, self._which = product, timing.which
+        self._high = force_limit[:, None]
+        self._low = -self._high
+
+    def start(self, buffer: StepBuffer) -> None:
+        self._buffer = buffer
+
+    def advance(self, k: int, /) -> None:
+        buffer, which = self._buffer, self._which
+        force = buffer.force[k]
+        np.minimum(force, self._high, out=force)
+        np.maximum(force, self._low, out=force)
+        self._product(which[(buffer.first + k) % len(which)])(buffer.plant_row[k], buffer.plant_state[k + 1])
 
     def troubled(self) -> bool:
         return False
@@ -242,20 +298,65 @@ def _filled(lists: list[_Which]) -> _Which:
 _MECHANICAL = ("body_mass", "jnt_stiffness", "dof_damping", "tendon_stiffness", "tendon_damping")
 
 
+def _segments(late: tuple[float, ...] | None, T: float) -> list[tuple[float, NDArray[np.bool_]]]:
+    """(seconds, channels whose last force still acts) between the latch times of a tick, (m,) or (0,) each."""
+    taus = np.array(late or ())
+    ends = np.unique(np.concatenate([[0.0], taus, [T]]))
+    return [(float(b - a), taus > a) for a, b in pairwise(ends)]
+
+
+class _TimedTicks:
+    """What MuJoCo's engines share where ticks have a timing: from latch to latch, and the forces that are held."""
+
+    def __init__(self, timing: Timing, move: Callable[[float], None], ctrl: Array) -> None:
+        """`move` advances the plant by so many seconds, `ctrl` (inputs, ..) is what it holds meanwhile."""
+        kinds = [_segments(late, T) for T, late in timing.kinds]
+        self._segments, self._which = kinds, timing.which
+        self._move, self._ctrl = move, ctrl
+        self._late = 0 if timing.late is None else timing.late.shape[1]
+
+    def start(self, buffer: StepBuffer) -> None:
+        self._buffer = buffer
+        self._limit = buffer.process.force_limit[:, None]
+
+    def advance(self, k: int, states: int) -> None:
+        """Tick k from the row of the buffer; of the next row the forces that are held, behind so many states."""
+        buffer, which, m = self._buffer, self._which, self._late
+        inputs = buffer.plant_input[k].reshape(-1, *self._ctrl.shape[1:])
+        held, force = buffer.plant_state[k][states:].reshape(m, *self._ctrl.shape[1:]), inputs[len(inputs) - m :]
+        self._ctrl[...] = inputs
+        for seconds, waiting in self._segments[which[(buffer.first + k) % len(which)]]:
+            self._ctrl[len(inputs) - m :] = force
+            self._ctrl[len(inputs) - m :][waiting] = held[waiting]
+            self._move(seconds)
+        if m:
+            np.clip(buffer.force[k], -self._limit, self._limit, out=buffer.plant_state[k + 1][states:])
+
+
 class MujocoEngine:
     """One simulation in one MjData, which a viewer can show; inputs are held by MuJoCo's ctrl."""
 
-    def __init__(self, scene: Scene, T: float, integrator: str = "RK4", substeps: int = 4) -> None:
+    def __init__(
+        self, scene: Scene, T: float, integrator: str = "RK4", substeps: int = 4, timing: Timing | None = None
+    ) -> None:
         self.model = discretised(scene, T, integrator, substeps)
         self.data = mujoco.MjData(self.model)
         self.substeps = substeps
         self._forward = partial(mujoco.mj_forward, self.model, self.data)
         self._step = partial(mujoco.mj_step, self.model, self.data, substeps)
         self._sight = np.zeros(self.model.nq + 2 * self.model.nv)  # [q; v; qacc]
+        self._start_ticks: Callable[[StepBuffer], None] = lambda buffer: None
         self.advance: Callable[[int], None] = self._by_steps
         if integrator == EXPONENTIAL:
             (move,) = _rosenbrock(_rates(scene, None), T / substeps)
             self._move, self.advance = move.dot, self._by_exponentials
+        if timing:
+            rates = _rates(scene, None)
+            self._moves = cache(lambda h: _rosenbrock(rates, h)[0].dot)
+            by = self._exponentials_for if integrator == EXPONENTIAL else partial(self._steps_for, T)
+            self._timed = _TimedTicks(timing, by, self.data.ctrl)
+            self.advance = self._by_ticks
+            self._start_ticks = self._timed.start
 
     def start(self, buffer: StepBuffer) -> None:
         n, nv = self.model.nq, self.model.nq + self.model.nv
@@ -265,7 +366,27 @@ class MujocoEngine:
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
         self._qpos[...], self._qvel[...] = self._q[0], self._v[0]
         self._qacc, self._qacc_seen, self._seen = self.data.qacc, self._sight[nv:], self._sight[:nv]
-        self._seen[...] = self._s[0]
+        self._seen[...] = self._s[0][:nv]
+        self._start_ticks(buffer)
+
+    def _by_ticks(self, k: int, /) -> None:
+        states = self._seen.size
+        self._timed.advance(k, states)
+        after = self._s[k + 1][:states]
+        after[: self._qpos.size], after[self._qpos.size :] = self._qpos, self._qvel
+
+    def _steps_for(self, T: float, seconds: float) -> None:
+        count = math.ceil(self.substeps * seconds / T - _WHOLE)
+        self.model.opt.timestep = seconds / count
+        mujoco.mj_step(self.model, self.data, count)
+
+    def _exponentials_for(self, seconds: float) -> None:
+        move, n = self._moves(seconds / self.substeps), self._qpos.size
+        for _ in range(self.substeps):
+            self._forward()
+            self._qacc_seen[...] = self._qacc
+            self._seen[...] = move(self._sight)
+            self._qpos[...], self._qvel[...] = self._seen[:n], self._seen[n:]
 
     def _by_steps(self, k: int, /) -> None:
         self._ctrl[...] = self._inputs[k]
@@ -303,6 +424,7 @@ class MujocoBatchEngine:
         nsim: int = 1,
         nthread: int = 0,
         fields: Mapping[str, Array] | None = None,
+        timing: Timing | None = None,
     ) -> None:
         """`fields` gives fields of the model a row per simulation, such as masses: (nsim, ...)."""
         model = discretised(scene, T, integrator, substeps)
@@ -323,10 +445,39 @@ class MujocoBatchEngine:
             moves = _rosenbrock(_rates(scene, fields), T / substeps)
             self._move: _Product = _each_by_its_own(moves) if fields else moves[0].dot
             self._qacc, self._way = self.batch.bind("qacc").T, MujocoBatchEngine._by_exponentials
+        self._start_ticks: Callable[[StepBuffer], None] = lambda buffer: None
+        if timing:
+            rates = _rates(scene, fields)
+            self._next, self._timestep = np.zeros_like(self._seen), self.batch.expand("opt.timestep")
+            self._moves: Callable[[float], _Product] = cache(
+                lambda h: _each_by_its_own(_rosenbrock(rates, h)) if fields else _rosenbrock(rates, h)[0].dot
+            )
+            by = self._exponentials_for if integrator == EXPONENTIAL else partial(self._steps_for, T)
+            self._timed = _TimedTicks(timing, by, self._ctrl)
+            self._way, self._start_ticks = MujocoBatchEngine._by_ticks, self._timed.start
 
     def start(self, buffer: StepBuffer) -> None:
-        self._state[...] = self._seen[...] = buffer.s[0]
+        self._state[...] = self._seen[...] = buffer.s[0][: len(self._seen)]
         self._inputs, self._states = buffer.plant_input, buffer.plant_state
+        self._start_ticks(buffer)
+
+    def _by_ticks(self, k: int, /) -> None:
+        states = len(self._seen)
+        self._timed.advance(k, states)
+        self._states[k + 1][:states] = self._state
+
+    def _steps_for(self, T: float, seconds: float) -> None:
+        count = math.ceil(self.substeps * seconds / T - _WHOLE)
+        self._timestep[...] = seconds / count
+        self.batch.step(nstep=count)
+
+    def _exponentials_for(self, seconds: float) -> None:
+        move = self._moves(seconds / self.substeps)
+        for _ in range(self.substeps):
+            self.batch.forward()
+            self._qacc_seen[...] = self._qacc
+            move(self._sight, self._next)
+            self._seen[...] = self._state[...] = self._next
 
     def advance(self, k: int, /) -> None:
         self._way(self, k)

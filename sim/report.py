@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, MovingAverage, SpringDamper
 from controller.delay import LOST, Jitter, Ticks, ages
 from controller.lti import Array
+from controller.timing import Timing
 from design.certificate import ANY, CAVEATS, MAKING, assess, certificate_part, encoder_part, finite
 from design.conditions import Requirement
 from design.result import CONDITION_NAMES, PRINTED_TAU_DB, PUBLISHED, listed
@@ -21,10 +22,9 @@ from models.human import Person
 from sim.adversary import Worst
 from sim.couplings import Chosen
 from sim.crowds import MIXED, Findings, Validation
-from sim.engines import ExactBatchEngine, HeldPlant
 from sim.run import Simulation
 from sim.scenario import Scenario, load
-from sim.stability import close, dominant_mode, eigenvalue_part, impulse_growth, unlimited, unstable
+from sim.stability import close, dominant_mode, eigenvalue_part, linear_growth, unstable
 from sim.switching import Period, certified_part
 from sim.trace import Trace
 
@@ -206,7 +206,7 @@ def _delays_met(switched: Simulation, period: Period | None, ticks: int) -> dict
     assert delays is not None
     met = ages(delays[:ticks])[..., 0]
     used = met[(met >= 0).all(axis=1)]
-    growth, window = _growth_under_delays(switched, ticks)
+    growth, window = linear_growth(switched, max(4, min(ticks, round(JUDGED / switched.scenario.T))))
     return {
         "age": _age(used),
         "lost_packets": (delays[:ticks] == LOST).sum(axis=(0, 2)).tolist(),
@@ -233,15 +233,17 @@ def _age(used: Ticks) -> dict[str, Any] | None:
     return {name: values.tolist() for name, values in figures.items()}
 
 
-def _growth_under_delays(switched: Simulation, ticks: int) -> tuple[float, float]:
-    """(rate [1/s], window [s]) of the exact linear loop after an impulse, under the run's first delays."""
-    T, plant = switched.scenario.T, switched.plant
-    judged = max(4, min(ticks, round(JUDGED / T)))
-    one = HeldPlant(plant.A[None], plant.B[None], plant.C, T)
-    process = unlimited(switched.process)
-    engine = ExactBatchEngine(one, process.force_limit)
-    rate, _ = impulse_growth(process, engine, switched.scene, plant.A.shape[0], judged)
-    return float(rate[0]), judged * T
+def timing_part(timing: Timing | None, scenario: Scenario) -> dict[str, Any] | None:
+    """What periods a run had and how late its forces latched; None where ticks are even and forces latch at them."""
+    if timing is None:
+        return None
+    period = timing.period
+    return {
+        "period_s": {"least": float(period.min()), "mean": float(period.mean()), "largest": float(period.max())},
+        "recorded": bool(scenario.period and scenario.period.recorded),
+        "T_max_s": scenario.longest_period,
+        "latency_s": scenario.latency and [list(span) for span in scenario.latency],
+    }
 
 
 def switched_stability_part(simulation: Simulation, trace: Trace, jitter: dict[str, Any]) -> dict[str, Any]:
@@ -301,7 +303,7 @@ def validation_part(question: Validation, findings: Findings, certified: bool, w
         "wall_s": wall,
         "simulated_s_per_s": findings.simulated / wall,
     }
-    if certified and question.ticks:
+    if certified and question.ticks and question.scenario.latency is None:  # it knows positions at ticks only
         part["energy_audit"] = _energy(findings)
         part["holds"] = part["holds"] and part["energy_audit"]["holds"]
     if not findings.index.size:
@@ -310,7 +312,7 @@ def validation_part(question: Validation, findings: Findings, certified: bool, w
 
 
 def varying_delays_part(findings: Findings, covered: dict[str, Any]) -> dict[str, Any]:
-    """How many humans grow under delays that vary; it holds unless certificates cover these delays and one grows."""
+    """How many humans grow under delays or ticks that vary; it holds unless certificates cover these and one grows."""
     exact, mujoco = findings.switching, findings.switching_mujoco
     seen = ~np.isnan(exact)
     unstable, also = int((exact > 0).sum()), mujoco[~np.isnan(mujoco)]

@@ -20,12 +20,14 @@ from controller.environment import environment, held
 from controller.loop import force_map
 from controller.lti import Array, Lti
 from controller.process import Net, Process, StepBuffer, contact, limited
+from controller.timing import Timing
 from models.scene import Scene, build, plant
 from sim.engines import (
     EXPONENTIAL,
     LEAST,
     Engine,
     ExactEngine,
+    ExactTimedEngine,
     HeldPlant,
     MujocoEngine,
     default_integrator,
@@ -33,7 +35,7 @@ from sim.engines import (
     profiler_off,
     quiet_warnings,
 )
-from sim.scenario import InputError, Scenario, require_forces_at_ticks
+from sim.scenario import InputError, Scenario
 from sim.trace import Trace
 
 ENGINES = ("mujoco", "exact")
@@ -54,7 +56,8 @@ class Simulation:
     F: Lti  # what the devices feel while no wall touches
     process: Process
     scene: Scene
-    plant: HeldPlant
+    plant: HeldPlant  # for periods T, and forces that latch in the middle of their range
+    timing: Timing | None = None  # of the ticks of a run, where they are not all alike
 
     @property
     def friction(self) -> bool:
@@ -71,18 +74,25 @@ class Simulation:
         return replace(self, scenario=scenario, scene=build(devices, scenario.human, scenario.person))
 
     @property
+    def even(self) -> Simulation:
+        """The same in periods T, with forces that latch at ticks: what integrators and their steps are judged on."""
+        if self.timing is None:
+            return self
+        return replace(self, plant=hold(plant(self.scene.model), self.scenario.T), timing=None)
+
+    @property
     def felt(self) -> Lti:
         """What the devices feel of E: F with every wall touching."""
         return list(self.process.frozen().values())[-1] if self.process.contact else self.F
 
 
-def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None = None) -> Simulation:
+def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None = None, seed: int = 0) -> Simulation:
     """Build both sides of the loop; with `lag`, rho (m,) [N/m], forces leave through a limiter and are not clipped.
 
+    `seed` draws periods and latencies where they vary.
     Raises SingularLoop where the algebraic loop of environment and coupling has no solution, InputError for walls that
     no compliance V stands before.
     """
-    require_forces_at_ticks(scenario, "a simulation")
     network, delays = scenario.environment, (scenario.theta, scenario.psi)
     if network.walls and not isinstance(coupling, NoCoupling | SpringDamper | MovingAverage | Compliance):
         raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
@@ -94,7 +104,9 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
         walled = contact(network, coupling, *delays, scenario.T) if network.walls else None
     F = walled.open if walled else force_map(E, coupling, *delays)
     scene = build(scenario.device, scenario.human, scenario.person)
-    return Simulation(scenario, E, F, Process(F, limits, steps, walled), scene, hold(plant(scene.model), scenario.T))
+    usual = hold(plant(scene.model), scenario.T, scenario.usual_latency)
+    timing = scenario.timing(seed, scenario.samples)
+    return Simulation(scenario, E, F, Process(F, limits, steps, walled), scene, usual, timing)
 
 
 def run(
@@ -113,7 +125,7 @@ def run(
     """
     process, scenario = simulation.process, simulation.scenario
     engine = make_engine(simulation, engine) if isinstance(engine, str) else engine
-    outside = outside or partial(outside_forces, scenario, simulation.scene)
+    outside = outside or partial(outside_forces, scenario, simulation.scene, timing=simulation.timing)
     ticks = scenario.samples if ticks is None else ticks
     start = np.zeros((simulation.plant.A.shape[0], 1)) if start is None else start
     blocks: list[tuple[Array, ...]] = []
@@ -139,7 +151,7 @@ def run(
     nothing = [np.empty((0, width)) for width in (process.F.order, len(start), simulation.scene.outside, m)]
     z, s, w, f = (np.concatenate(rows) for rows in zip(nothing, *blocks, strict=True))
     return Trace(
-        t=np.arange(len(s)) * scenario.T,
+        t=beginnings(scenario.T, simulation.timing, 0, len(s)),
         x=process.measured(s[:, :m]),
         f=f,
         x_handle=s[:, handles],
@@ -182,18 +194,25 @@ def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
         advance(k)  # limit f, hold -f on the actuators for T, move the plant
 
 
-def outside_forces(scenario: Scenario, scene: Scene, first: int, ticks: int, voluntary: bool = True) -> Array:
-    """Outside forces [N] at ticks first .. first + ticks - 1, sampled at kT, shape (ticks, outside).
+def beginnings(T: float, timing: Timing | None, first: int, ticks: int) -> Array:
+    """[s] when ticks first .. first + ticks - 1 begin, (ticks,)."""
+    return timing.times(first, ticks) if timing else np.arange(first, first + ticks) * T
+
+
+def outside_forces(
+    scenario: Scenario, scene: Scene, first: int, ticks: int, voluntary: bool = True, timing: Timing | None = None
+) -> Array:
+    """Outside forces [N] at ticks first .. first + ticks - 1, sampled as they begin, shape (ticks, outside).
 
     The voluntary motion reaches the end of each human, the tap reaches one handle.
     """
-    k = np.arange(first, first + ticks)
+    t = beginnings(scenario.T, timing, first, ticks)
     w = np.zeros((ticks, scene.outside))
     if voluntary:
         for human, column in zip(scenario.human, scene.pushed, strict=True):
-            w[:, column] += human.voluntary_force(k * scenario.T)
+            w[:, column] += human.voluntary_force(t)
     if tap := scenario.tap:
-        begin, end = (round(t / scenario.T, 9) for t in (tap.start, tap.start + tap.duration))
+        k, begin, end = (np.round(time / scenario.T, 9) for time in (t, tap.start, tap.start + tap.duration))
         w[(k >= begin) & (k < end), scene.tapped[tap.channel - 1]] += tap.force
     return w
 
@@ -215,10 +234,15 @@ def make_engine(
     if engine == "exact":
         if simulation.friction:
             raise ValueError("the devices have Coulomb friction, which the exact engine, being linear, does not model")
-        return ExactEngine(simulation.plant, simulation.process.force_limit)
+        limit = simulation.process.force_limit
+        if simulation.timing and T is None:
+            return ExactTimedEngine(plant(simulation.scene.model), simulation.timing, limit)
+        return ExactEngine(simulation.plant, limit)
     integrator = integrator or default_integrator(simulation.scene)
     count = substeps if substeps is not None else 1 if integrator == EXPONENTIAL else LEAST
-    return MujocoEngine(simulation.scene, simulation.scenario.T if T is None else T, integrator, count)
+    if T is not None:
+        return MujocoEngine(simulation.scene, T, integrator, count)
+    return MujocoEngine(simulation.scene, simulation.scenario.T, integrator, count, simulation.timing)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ import numpy as np
 from controller.delay import Jitter
 from controller.environment import Box, Network, Spring, UncertainSpring, Wall, environment
 from controller.loop import DelayRange, Loop
+from controller.timing import Periods, Timing, drawn
 from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
 from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
 from sim.files import InputError, write
@@ -30,6 +31,7 @@ SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
 LONGEST_DELAY = 1000  # [samples]; every one is a state
+_TIMING_STREAM = 6  # keeps these draws apart from those of the humans with the same seed
 _Delays = tuple[int, ...]
 
 
@@ -65,6 +67,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     population: Population = Population()  # who `validate` draws
     jitter: Jitter | None = None  # how the delays of the forces vary around theta; None where they do not
     T_max: float | None = None  # [s] the longest period, where it varies from tick to tick; certificates are for it
+    period: Periods | None = None  # the periods that are simulated; T is what the computer's filters are made for
     latency: tuple[tuple[float, float], ...] | None = None  # [s] least and most by which a channel's force latches late
 
     def __post_init__(self) -> None:
@@ -86,9 +89,18 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             self._check_jitter(self.jitter)
         if self.box and self.environment.walls:
             raise ValueError("box and environment.walls: a set is of linear environments; give one of them")
+        self._check_timing()
         self.loop("I")  # raises ValueError where the box does not fit the environment
         if self.tap and not 1 <= self.tap.channel <= self.channels:
             raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
+
+    def _check_timing(self) -> None:
+        if self.period and self.T_max is not None and self.period.longest > self.T_max:
+            raise ValueError(f"period is up to {self.period.longest:g} s, above T_max = {self.T_max:g} s")
+        shortest = self.period.shortest if self.period else self.T
+        for i, (_, most) in enumerate(self.latency or ()):
+            if most >= shortest:
+                raise ValueError(f"latency[{i}] is up to {most:g} s, expected less than every period, {shortest:g} s")
 
     def _check_jitter(self, jitter: Jitter) -> None:
         if jitter.channels != self.channels:
@@ -124,12 +136,34 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def samples(self) -> int:
-        return max(1, round(self.duration / self.T))
+        return max(1, round(self.duration / (self.period.mean if self.period else self.T)))
+
+    @property
+    def longest_period(self) -> float | None:
+        """What certificates are for: T_max, or the longest of the periods that are simulated; None where all are T."""
+        if self.T_max is not None or self.period is None:
+            return self.T_max
+        return max(self.period.longest, self.T)
+
+    @property
+    def usual_latency(self) -> list[float] | None:
+        """The middle of each channel's range [s]; None where forces latch at ticks."""
+        return None if self.latency is None else [sum(span) / 2 for span in self.latency]
+
+    @property
+    def uneven(self) -> bool:
+        """Whether ticks differ: in length, or in when forces latch."""
+        return self.period is not None or any(least < most for least, most in self.latency or ())
+
+    def timing(self, seed: int, ticks: int) -> Timing | None:
+        """When the ticks of a run begin and its forces latch, of the seed only; None where both are at k T."""
+        rng = np.random.default_rng(np.random.SeedSequence((seed, _TIMING_STREAM)))
+        return drawn(self.T, self.period, self.latency, ticks, rng)
 
     @property
     def digest(self) -> str:
         """SHA-256 over the scenario's contents."""
-        newer = {"T_max", "latency"}  # left out where they are not given, so that a scenario keeps the digest it had
+        newer = {"T_max", "latency", "period"}  # left out where they are not given: scenarios keep their digest
         contents = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in newer or value}
         return hashlib.sha256(msgspec.json.encode(contents, order="sorted", enc_hook=_contents)).hexdigest()
 
@@ -151,9 +185,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         span = self.delay_range
         jitter = span if self.switches and span.lo != span.hi else None
         delays = (self.theta, self.psi, self.reference_delays(case))
-        return Loop(
-            self.T, *delays, self.delta, self.environment, self.box, jitter, T_max=self.T_max, latency=self.latency
-        )
+        rest = (self.delta, self.environment, self.box, jitter)
+        return Loop(self.T, *delays, *rest, T_max=self.longest_period, latency=self.latency)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
         """The scenario with some fields changed; `delta` gives the devices another, fully guaranteed, damping [N s/m].
@@ -224,11 +257,11 @@ def require_constant_delay(scenario: Scenario, what: str) -> None:
         raise InputError(f"jitter: {what} takes the delays that its link has; take the table out, {instead}")
 
 
-def require_forces_at_ticks(scenario: Scenario, what: str) -> None:
-    """Raises InputError where forces latch between ticks, for what would let them act from the tick on."""
-    if scenario.latency is not None:
-        instead = "designs, audits and certificates take it; without it, count a whole sample of theta"
-        raise InputError(f"latency: {what} lets forces act from the tick on; {instead}")
+def require_even_ticks(scenario: Scenario, what: str) -> None:
+    """Raises InputError where periods are drawn or forces latch between ticks, for what would do neither."""
+    for name in ("period", "latency"):
+        if getattr(scenario, name) is not None:
+            raise InputError(f"{name}: {what} takes the ticks that it has; take the key out, sim.run simulates it")
 
 
 # ---- humans in a file of their own

@@ -5,7 +5,7 @@ Everything is for one loop or for a stack of loops, one for each set of humans: 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -14,16 +14,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from controller.lti import Array, Lti
-from controller.process import Process, State, StepBuffer
+from controller.process import Limiter, Process, State, StepBuffer
+from controller.timing import Timing
 from design.certificate import finite
 from models.scene import Scene, Variants
 from sim.engines import Engine, HeldPlant, MujocoBatchEngine, hold, profiler_off, quiet_warnings
-from sim.run import Simulation, run_blocks
+from sim.run import Simulation, beginnings, make_engine, run_blocks
 from sim.trace import Trace
 
 #: growth rates up to this [1/s] count as stable: eigenvalues at 1 (a free loop that drifts) come out at 1e-12
 MARGINAL = 1e-9
 _CLEAR = 1e-3  # [1/s]: slower than this, a loop is too close to the margin for engines to disagree about
+_JUDGED = 4.0  # [s] of a loop whose ticks vary
+_DOUBTFUL, _LONGER = 1.0, 5  # [1/s]: slower growth is judged again, over so many times as long
 _SHORTEST_TRACE = 200  # ticks below which a growth rate is not read from a trace
 
 
@@ -107,28 +110,36 @@ def left_eigenvector(loop: ClosedLoop) -> NDArray[np.complex128]:
     return np.take_along_axis(vectors, largest, axis=-1)[..., 0].conj()
 
 
-def exact_loops(variants: Variants, F: Lti) -> ClosedLoop:
-    """The exact closed loop with every set of humans, stacked."""
-    return close(hold(variants.plants(), F.T), F)
+def exact_loops(variants: Variants, F: Lti, T: float | None = None, late: Sequence[float] | None = None) -> ClosedLoop:
+    """The exact closed loop with every set of humans, stacked, in periods T [s] (F's); forces latch `late` (m,) [s]."""
+    return close(hold(variants.plants(), F.T if T is None else T, late), F)
 
 
 def mujoco_loops(
-    variants: Variants, process: Process, integrator: str = "RK4", substeps: int = 4, nthread: int = 0
+    variants: Variants,
+    process: Process,
+    integrator: str = "RK4",
+    substeps: int = 4,
+    nthread: int = 0,
+    late: Sequence[float] | None = None,
 ) -> ClosedLoop:
     """The closed loops that MuJoCo itself simulates: its map over one period, joined with the process block.
 
     The plant is linear, so its map is known from one period from each basis state and with each force alone:
-    2n + m simulations for every set of humans, stepped in one batch.
+    2n + m simulations for every set of humans, stepped in one batch; with `late` (m,) [s], as in `hold`, m more.
     """
-    n, m, nsim = 2 * variants.scene.model.nv, process.channels, len(variants)
+    m, nsim, T = process.channels, len(variants), process.F.T
+    n = 2 * variants.scene.model.nv + (m if late else 0)
+    timing = Timing(np.array([T]), np.array([late])) if late else None
     # within the actuators' limits, so that these do not clip
     unit = np.concatenate([np.ones(n), np.minimum(1.0, process.force_limit / 2)])
+    unit[n - m : n] = unit[n:] if late else 1.0
     buffer = StepBuffer(process, 1, n, variants.scene.outside, nsim * (n + m))
     basis = np.tile(np.diag(unit), (1, nsim))
     buffer.s[0], buffer.f[0] = basis[:n], basis[n:]
     with profiler_off(), quiet_warnings():
         fields = variants.repeated(n + m)
-        engine = MujocoBatchEngine(variants.scene, process.F.T, integrator, substeps, nsim * (n + m), nthread, fields)
+        engine = MujocoBatchEngine(variants.scene, T, integrator, substeps, nsim * (n + m), nthread, fields, timing)
         engine.start(buffer)
         engine.advance(0)
     columns = buffer.s[1].reshape(n, nsim, n + m).transpose(1, 0, 2) / unit
@@ -187,6 +198,8 @@ def stability_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
         growth, reason = None, "with Coulomb friction there is no growth rate; the eigenvalues are those without it"
     elif trace.net:
         growth, reason = None, "a net stands between forces and devices; the eigenvalues are those of the loop without"
+    elif simulation.timing and not simulation.timing.steady:
+        growth, reason = _timed_growth(simulation)
     else:
         loop = close(simulation.plant, simulation.F)
         ahead = max(simulation.scenario.theta) if simulation.process.limiter else 0
@@ -307,7 +320,28 @@ def impulse_growth(
 
 def unlimited(process: Process) -> Process:
     """The linear process: without force limits and encoder steps."""
-    return replace(process, force_limit=np.full(process.channels, np.inf), encoder_step=np.zeros(process.channels))
+    endless, contact = np.full(process.channels, np.inf), process.contact
+    if isinstance(contact, Limiter):
+        contact = replace(contact, limit=endless)
+    return replace(process, force_limit=endless, encoder_step=np.zeros(process.channels), contact=contact)
+
+
+def linear_growth(simulation: Simulation, ticks: int) -> tuple[float, float]:
+    """(rate [1/s], window [s]) of the exact linear loop after an impulse, with its timing and its delays."""
+    free = replace(simulation.smooth, process=unlimited(simulation.process))
+    T, states = simulation.scenario.T, simulation.plant.A.shape[0]
+    rate, _ = impulse_growth(free.process, make_engine(free, "exact"), free.scene, states, ticks)
+    window = float(beginnings(T, simulation.timing, ticks, 1)[0])
+    return float(rate[0]) * ticks * T / window, window
+
+
+def _timed_growth(simulation: Simulation) -> tuple[float, str]:
+    """The growth [1/s] under a timing that varies, and how it was found; a slow one may be modes that beat."""
+    growth, window = linear_growth(simulation, round(_JUDGED / simulation.scenario.T))
+    if 0 < growth < _DOUBTFUL:
+        growth, window = linear_growth(simulation, round(_LONGER * _JUDGED / simulation.scenario.T))
+    how = f"growth of the linear loop after an impulse, over {window:.3g} s of periods and latencies as in the run"
+    return growth, f"{how}; the eigenvalues are those of even periods and the middle of the latency"
 
 
 class _Speeds:

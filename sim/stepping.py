@@ -83,7 +83,7 @@ def default_substeps(simulation: Simulation, integrator: str = "RK4") -> int:
         return 1
     if integrator == "discrete":  # it remembers more than position and velocity, so no map of those can vouch for it
         raise InputError(f"--integrator discrete gives no verdict to rely on: {_MODE_LOST}; use RK4 or give --substeps")
-    simulation = simulation.smooth
+    simulation = simulation.smooth.even
     speed, T = pace(plant(simulation.scene.model).A), simulation.scenario.T
     count = needed = speed.substeps(T)
     while count <= MOST and not _agrees(simulation, integrator, count):
@@ -100,7 +100,7 @@ def check_substeps(simulation: Simulation, integrator: str, substeps: int) -> li
     if integrator == EXPONENTIAL:
         first_order = f"{EXPONENTIAL} x {substeps}: of first order where devices rub, RK4 is nearer at equal cost."
         return [] if default_integrator(simulation.scene) == EXPONENTIAL else [first_order]
-    simulation = simulation.smooth
+    simulation = simulation.smooth.even
     speed, h = pace(plant(simulation.scene.model).A), simulation.scenario.T / substeps
     radius = step_radius(simulation, integrator, substeps)
     what = f"{integrator} x {substeps}: {speed.hardest(h)}"
@@ -148,7 +148,7 @@ def measured_hold(
     Closed with the force map it gives the growth rate that this engine simulates, without a trace. `T` [s] is
     the scenario's period where it is not given.
     """
-    period = simulation.scenario.T if T is None else T
+    period, simulation = simulation.scenario.T if T is None else T, simulation.even
     stepped = make_engine(simulation, engine, integrator, substeps, period)
     states, inputs = simulation.plant.B.shape
     buffer = StepBuffer(simulation.process, 1, states, inputs - simulation.process.channels)

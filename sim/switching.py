@@ -31,7 +31,7 @@ from design.certificate import switching_part, switching_promise, switching_requ
 from design.conditions import Requirement
 from models.scene import Scene, Variants
 from sim.couplings import Chosen
-from sim.engines import ExactBatchEngine, HeldPlant, MujocoBatchEngine, hold
+from sim.engines import Engine, ExactBatchEngine, ExactTimedEngine, HeldPlant, MujocoBatchEngine, hold
 from sim.run import Simulation
 from sim.scenario import Scenario
 from sim.stability import impulse_forces, impulse_growth, unlimited
@@ -215,19 +215,28 @@ def switched_crowd(
     mujoco: bool,
     threads: int = 0,
 ) -> Switched:
-    """The impulse test for every set of humans, under the delays of its index: of (seed, index) and the loop only."""
+    """The impulse test for every set of humans, under the delays of its index: of (seed, index) and the loop only.
+
+    Periods that vary and forces that latch late are the same for all of them, of the seed only.
+    """
     scenario, nsim, scene = simulation.scenario, len(held_by), held_by.scene
-    plants = hold(held_by.plants(), scenario.T)
+    plants = hold(held_by.plants(), scenario.T, scenario.usual_latency)
     states = plants.A.shape[1]
-    free = replace(simulation.process, F=without_theta(simulation, coupling))
+    free = replace(simulation.process, F=without_theta(simulation, coupling)) if scenario.switches else None
 
     def judged(ticks: int) -> Switched:
-        process = replace(free, delays=_crowd_delays(scenario, free, scene, plants, index, seed, ticks))
+        process, timing = simulation.process, scenario.timing(seed, ticks)
+        if free:
+            process = replace(free, delays=_crowd_delays(scenario, free, scene, plants, index, seed, ticks))
         endless = unlimited(process)
-        exact, _ = impulse_growth(endless, ExactBatchEngine(plants, endless.force_limit), scene, states, ticks, nsim)
+        if timing:
+            moved: Engine = ExactTimedEngine(held_by.plants(), timing, endless.force_limit)
+        else:
+            moved = ExactBatchEngine(plants, endless.force_limit)
+        exact, _ = impulse_growth(endless, moved, scene, states, ticks, nsim)
         if not mujoco:
             return Switched(exact, np.full(nsim, np.nan))
-        engine = MujocoBatchEngine(scene, scenario.T, nsim=nsim, nthread=threads, fields=held_by.fields)
+        engine = MujocoBatchEngine(scene, scenario.T, nsim=nsim, nthread=threads, fields=held_by.fields, timing=timing)
         own, clipped = impulse_growth(process, engine, scene, states, ticks, nsim)
         return Switched(exact, np.where(clipped, np.nan, own))
 
@@ -271,7 +280,7 @@ def certified_part(scenario: Scenario, chosen: Chosen, certified: bool) -> dict[
     loop = scenario.loop("I").switching(span)  # the case does not matter to stability
     found = switching_requirement(loop, chosen.coupling)
     on_file = chosen.switching if chosen.switching and chosen.switching.contains(span) else None
-    figures = switching_part(found, loop.sent(chosen.coupling), span)
+    figures = switching_part(found, loop.sent(chosen.coupling), span, loop.T_max)
     proof = _how_proved(found.requirement, on_file)
     parts = {"jitter_proof": figures, "on_file": on_file and msgspec.to_builtins(on_file)}
     return parts | _coverage(scenario.jitter, certified, proof, figures["playout"]["certified"])

@@ -143,7 +143,7 @@ void loop()
 {
   int byte = 0;
   for (uint8_t n = 0; n < 64 && (byte = serialRead()) >= 0; n++) /* a flood of bytes must not keep the tick waiting */
-    hl_receive(&device, (uint8_t)byte, timeUs());
+    if (hl_receive(&device, (uint8_t)byte, timeUs())) writeForces(device.applied);
   serialPump();
   if (digitalRead(STOP_BUTTON) == HIGH) {
     digitalWrite(ENABLE, LOW);

@@ -3,7 +3,7 @@
  * machine, byte for byte.
  *
  *   hl_init     once; the device is silent and its motors carry nothing
- *   hl_receive  for every byte that comes
+ *   hl_receive  for every byte that comes; where it returns true, give the motors d->applied at once (theta = 0)
  *   hl_tick     once per period: what the motors carry from now on, and the bytes to send
  *   hl_estop, hl_fault   at any time, from the context that calls hl_tick (not from an interrupt)
  *
@@ -65,7 +65,7 @@ typedef struct {
 typedef struct {
     hl_info info;
     hl_config config;
-    bool configured, asked, answered;
+    bool configured, asked, answered, latched;
     uint8_t phase, cause, refused, rejected, misses, held, ramp_left;
     uint16_t k, echo, run;
     uint32_t now, config_crc;
@@ -130,6 +130,41 @@ static inline bool hl_init(hl_device *d, const hl_info *info)
     return good;
 }
 
+/* ---- forces ------------------------------------------------------------------------------------------------------ */
+
+static inline int16_t hl_limited(const hl_device *d, uint8_t a, int32_t force)
+{
+    int32_t cap = d->config.cap[a], slew = d->config.slew[a], last = d->applied[a];
+    if (d->config.ramp_in) cap = (int32_t)((uint32_t)cap * d->run / d->config.ramp_in);
+    force = force > cap ? cap : force < -cap ? -cap : force;
+    force = force - last > slew ? last + slew : force - last < -slew ? last - slew : force;
+    return (int16_t)force;
+}
+
+static inline void hl_latch(hl_device *d, const hl_slot *slot)
+{
+    uint8_t a;
+    if (!slot->full) {
+        d->phase = HL_HOLDING;
+        if (d->held >= d->config.hold) hl_halt(d, HL_WATCHDOG);
+        else d->held++;
+    } else if (slot->command == HL_IDLE) {
+        hl_halt(d, HL_BY_COMMAND);
+    } else {
+        d->phase = HL_ARMED;
+        d->held = 0;
+        if (d->run < d->config.ramp_in) d->run++;
+        for (a = 0; a < d->info.axes; a++) d->applied[a] = hl_limited(d, a, slot->force[a]);
+    }
+}
+
+/* The force for this tick, if there is one, may act from now on. */
+static inline void hl_take(hl_device *d, const hl_slot *slot)
+{
+    if (d->phase == HL_ARMED || d->phase == HL_HOLDING) hl_latch(d, slot);
+    else if (d->phase == HL_DISARMED && slot->full && slot->command == HL_ARM) d->phase = HL_ARMED;
+}
+
 /* ---- from the host ---------------------------------------------------------------------------------------------- */
 
 static inline uint8_t hl_refuse(const hl_device *d, const hl_config *c, uint8_t axes)
@@ -138,7 +173,7 @@ static inline uint8_t hl_refuse(const hl_device *d, const hl_config *c, uint8_t 
     if (d->phase == HL_ESTOP) return HL_NOT_ESTOP;
     if (hl_running(d)) return HL_NOT_RUNNING;
     if (axes != d->info.axes) return HL_NOT_AXES;
-    if (c->theta < 1 || c->theta > HL_MAX_THETA) return HL_NOT_THETA;
+    if (c->theta > HL_MAX_THETA) return HL_NOT_THETA;
     if (c->ramp == 0 || (uint64_t)(c->hold + c->ramp) * d->info.period_ns > HL_MAX_RELEASE_NS) return HL_NOT_RELEASE;
     for (a = 0; a < axes; a++)
         if (c->cap[a] < 1 || c->cap[a] > d->info.axis[a].hard_limit) return HL_NOT_CAP;
@@ -175,7 +210,8 @@ static inline void hl_configure(hl_device *d, const uint8_t *p, size_t n)
 static inline void hl_accept(hl_device *d, const uint8_t *p, size_t n, uint32_t now)
 {
     uint16_t apply_at = hl_get16(p + 2), source = hl_get16(p + 4);
-    int16_t ahead = hl_signed((uint16_t)(apply_at - d->k));
+    bool at_once = d->config.theta == 0;
+    int16_t ahead = hl_signed((uint16_t)(apply_at - d->k + at_once)); /* ticks until it is late */
     hl_slot *slot = &d->slot[apply_at % HL_SLOTS];
     bool zero = true;
     int64_t margin;
@@ -186,7 +222,7 @@ static inline void hl_accept(hl_device *d, const uint8_t *p, size_t n, uint32_t 
         return;
     }
     if (!d->configured || (uint16_t)(apply_at - source) != d->config.theta) return;
-    if (ahead > d->config.theta || (ahead > 0 && slot->full)) return;
+    if (ahead > (at_once ? 1 : d->config.theta) || (ahead > 0 && slot->full)) return;
     margin = (int64_t)ahead * d->info.period_ns / 1000 - (int64_t)(uint32_t)(now - d->now);
     d->margin = (int16_t)(margin < -32767 ? -32767 : margin > 32767 ? 32767 : margin);
     d->echo = source;
@@ -194,6 +230,10 @@ static inline void hl_accept(hl_device *d, const uint8_t *p, size_t n, uint32_t 
     slot->full = true;
     slot->command = p[1];
     for (i = 0; i < d->info.axes; i++) slot->force[i] = hl_signed(hl_get16(p + 6 + 2 * i));
+    if (at_once) {
+        hl_take(d, slot);
+        d->latched = true;
+    }
 }
 
 static inline void hl_understand(hl_device *d, const uint8_t *p, size_t n, uint32_t now)
@@ -206,41 +246,19 @@ static inline void hl_understand(hl_device *d, const uint8_t *p, size_t n, uint3
     else d->rejected++;
 }
 
-/* One byte that came at `now` [us]. Whatever cannot be read is counted and dropped. */
-static inline void hl_receive(hl_device *d, uint8_t byte, uint32_t now)
+/* One byte that came at `now` [us]. Whatever cannot be read is counted and dropped. True where d->applied may have
+ * changed: a force that is latched as it comes, or an emergency stop. */
+static inline bool hl_receive(hl_device *d, uint8_t byte, uint32_t now)
 {
     int n = hl_collect(&d->in, byte);
+    uint8_t phase = d->phase;
+    d->latched = false;
     if (n < 0) d->rejected++;
     else if (n > 0) hl_understand(d, d->in.bytes + 1, (size_t)n, now);
+    return d->latched || (d->phase == HL_ESTOP && phase != HL_ESTOP);
 }
 
 /* ---- the tick --------------------------------------------------------------------------------------------------- */
-
-static inline int16_t hl_limited(const hl_device *d, uint8_t a, int32_t force)
-{
-    int32_t cap = d->config.cap[a], slew = d->config.slew[a], last = d->applied[a];
-    if (d->config.ramp_in) cap = (int32_t)((uint32_t)cap * d->run / d->config.ramp_in);
-    force = force > cap ? cap : force < -cap ? -cap : force;
-    force = force - last > slew ? last + slew : force - last < -slew ? last - slew : force;
-    return (int16_t)force;
-}
-
-static inline void hl_latch(hl_device *d, const hl_slot *slot)
-{
-    uint8_t a;
-    if (!slot->full) {
-        d->phase = HL_HOLDING;
-        if (d->held >= d->config.hold) hl_halt(d, HL_WATCHDOG);
-        else d->held++;
-    } else if (slot->command == HL_IDLE) {
-        hl_halt(d, HL_BY_COMMAND);
-    } else {
-        d->phase = HL_ARMED;
-        d->held = 0;
-        if (d->run < d->config.ramp_in) d->run++;
-        for (a = 0; a < d->info.axes; a++) d->applied[a] = hl_limited(d, a, slot->force[a]);
-    }
-}
 
 static inline void hl_ramp_down(hl_device *d)
 {
@@ -290,13 +308,13 @@ static inline size_t hl_write_state(const hl_device *d, const int32_t *counts, u
  * and up to HL_MAX_OUT bytes to send; returns how many. */
 static inline size_t hl_tick(hl_device *d, uint32_t now, const int32_t *counts, int16_t *force, uint8_t *out)
 {
-    hl_slot *slot = &d->slot[++d->k % HL_SLOTS];
+    bool at_once = d->configured && d->config.theta == 0;
+    hl_slot *slot = &d->slot[(uint16_t)(++d->k - at_once) % HL_SLOTS]; /* of the tick before, latched, where at once */
     size_t n = 0;
     d->now = now;
     if (d->phase == HL_DISARMED || d->phase == HL_ARMED || d->phase == HL_HOLDING) {
         if (!slot->full) d->misses++;
-        if (d->phase != HL_DISARMED) hl_latch(d, slot);
-        else if (slot->full && slot->command == HL_ARM) d->phase = HL_ARMED;
+        if (!at_once || (!slot->full && d->phase != HL_DISARMED)) hl_take(d, slot);
     }
     slot->full = false;
     if (d->phase == HL_RAMP) hl_ramp_down(d);

@@ -184,6 +184,58 @@ def test_late_early_and_misaddressed_frames_are_not_used():
     assert rig.state.misses == (rig.device.misses) & 0xFF == 2  # this one, and the tick of the CONFIG
 
 
+def test_with_theta_zero_a_force_acts_as_soon_as_it_comes():
+    """The answer to a tick is latched within it, whenever it comes; the margin is what was left of the tick."""
+    rig = Rig(CONFIG._replace(theta=0))
+    rig.answer(command=Command.ARM, after=200)
+    assert (rig.device.phase, rig.device.applied) == (Phase.ARMED, (0, 0))
+    rig.tick()
+    for k in range(1, 40):
+        after = 25 * k
+        carried = rig.device.applied
+        rig.answer((10 * k, -10 * k), after=after - 1)
+        rig.answer((7, 7), after=after)  # the first one counts
+        assert carried == (10 * (k - 1), -10 * (k - 1))
+        assert rig.device.applied == (10 * k, -10 * k)  # before any tick
+        rig.tick()
+        assert rig.forces == (10 * k, -10 * k)
+        assert (rig.state.echo, rig.state.margin_us) == ((rig.device.k - 1) & 0xFFFF, T - after + 1)
+        assert rig.at == (Phase.ARMED, Cause.NONE)
+    assert rig.device.misses == 1  # the tick of the CONFIG
+
+
+def test_with_theta_zero_late_answers_are_missed_and_held_through():
+    rig = Rig(CONFIG._replace(theta=0, hold=2, ramp=2))
+    rig.answer(command=Command.ARM)
+    rig.tick()
+    rig.answer((100, 100))
+    rig.tick()
+    rig.tick()  # nobody answered the tick before this one
+    assert rig.at == (Phase.HOLDING, Cause.NONE)
+    rig.answer((900, 900), back=1, after=50)
+    assert rig.device.applied == (100, 100)
+    rig.answer((200, 200))
+    assert (rig.device.phase, rig.device.applied) == (Phase.ARMED, (200, 200))
+    seen = []
+    for _ in range(6):
+        rig.tick()
+        seen.append(rig.forces[0])
+    assert seen == [200, 200, 200, 100, 0, 0]  # answered, held twice, then down in two ticks
+    assert rig.at == (Phase.STOPPED, Cause.WATCHDOG)
+
+
+def test_with_theta_zero_idle_begins_the_ramp_at_the_next_tick():
+    rig = Rig(CONFIG._replace(theta=0, ramp=2))
+    rig.answer(command=Command.ARM)
+    rig.tick()
+    rig.answer((100, 100))
+    rig.tick()
+    rig.answer(command=Command.IDLE)
+    assert (rig.at, rig.device.applied) == ((Phase.RAMP, Cause.COMMAND), (100, 100))
+    rig.tick()
+    assert rig.forces == (50, 50)
+
+
 def test_the_margin_says_how_long_before_its_latch_a_force_came():
     for theta, after, margin in [(1, 300, 900), (2, 300, 2100), (15, 0, 18_000), (1, 1200, 0), (1, 60_000, -32_767)]:
         rig = Rig(CONFIG._replace(theta=theta))

@@ -138,7 +138,11 @@ def test_the_rate_by_shortage():
 
 def test_a_human_who_destabilises_a_loop_with_enough_damping_fails_the_check(tmp_path, monkeypatch):
     """Were the condition wrong, the suite would say so: here it is told that a third of the damping is enough."""
-    monkeypatch.setattr("sim.adversary.this_environment", lambda F, delta: replace(real(F, delta), required=(0.5, 0.5)))
+
+    def third(F, delta, *timing):
+        return replace(real(F, delta), required=(0.5, 0.5))
+
+    monkeypatch.setattr("sim.adversary.this_environment", third)
     check = Check("tightness", "How tight?", shortages(("none",), (0,), 5), tightness, "plot_tightness")
     monkeypatch.setattr("cli.suite.CHECKS", (check,))
     assert suite(["--out", str(tmp_path)]) == 1

@@ -228,7 +228,9 @@ def test_the_command_and_the_replay_of_its_worst_human(tmp_path):
 def test_a_wrong_engine_is_found_out(tmp_path, monkeypatch):
     """MuJoCo's explicit Euler calls loops stable that are not: the suite must fail, and say with whom."""
     monkeypatch.setattr(
-        examine_module, "mujoco_loops", lambda held_by, process, nthread: mujoco_loops(held_by, process, "Euler", 1)
+        examine_module,
+        "mujoco_loops",
+        lambda held_by, process, nthread, late: mujoco_loops(held_by, process, "Euler", 1),
     )
     file = tmp_path / "r.json"
     options = ["--case", "none", "--humans", "20", "--duration", "0", "--no-plot"]

@@ -1,0 +1,98 @@
+"""A device that latches a force as soon as it comes: what moves it, what is measured, and what is certified for it."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from hw.control import certified_couplings, overlong_tick, timed
+from hw.emulator import Emulator
+from hw.limits import Fault
+from hw.monitor import Ages, LinkSettings
+from hw.recording import Recorder
+from hw.rehearsal import Rehearsal
+from hw.session import Stage, session_for
+from models.scene import plant
+from sim import load
+from sim.report import coupling_part
+from sim.run import outside_forces
+
+LAB = load("omega-pair").replace(theta=(0, 0))
+TAU = 130  # [us] of an emulated link
+
+
+def test_the_plant_feels_the_last_force_until_the_answer_comes():
+    """The trace's positions, again, from its forces alone, by exponentials before and after each latch."""
+    session = session_for(LAB, LinkSettings(measure=60))
+    session.record = recorder = Recorder(2)
+
+    def plan(ages):
+        met, link = timed(LAB, ages, 0.99, 100.0, at_once=True)
+        assert met.latency == ((pytest.approx(30e-6), pytest.approx(230e-6)),) * 2
+        return certified_couplings(met, "I", None, None, link, spare=0)
+
+    emulator = Emulator(LAB)
+    rehearsal = Rehearsal(session, emulator, plan)
+    rehearsal.run_until_armed(1.2)
+    assert session.stage == Stage.ARMED
+    assert session.config.theta == 0
+    assert session.program.scenario.theta == (0, 0)
+    assert session.counters.late == 0
+    assert session.counters.unlike == 0
+    P, T, link = plant(emulator.plant.scene.model), LAB.T, recorder.link()
+    n, w = len(P.A), P.B.shape[1] - 2
+    whole = np.zeros((n + w + 2, n + w + 2))
+    whole[:n, :n], whole[:n, n:] = P.A, P.B
+    early, later = expm(whole * 1e-6 * TAU)[:n], expm(whole * (T - 1e-6 * TAU))[:n]
+    applied = link["applied"] * emulator.force_step
+    assert abs(applied).max() > 0.2
+    first = int(np.argmax(link["tick"] == emulator.begun_at))
+    pushed = np.zeros((len(applied), w))
+    pushed[first:] = outside_forces(LAB, emulator.plant.scene, 0, len(applied) - first)
+    assert link["received"].all()
+    s, places = np.zeros(n), []
+    for w, (before, after) in zip(pushed, pairwise(applied), strict=False):
+        places.append(s[:2])
+        for stretch, f in ((early, before), (later, after)):
+            s = stretch @ np.concatenate([s, w, -f])
+    counts = LAB.device[0].encoder_step or 1e-12 * emulator.info.encoder_step[0]
+    apart = abs(np.array(places) - link["x"][:-1])
+    assert apart.max() < 0.51 * counts
+
+
+def test_a_link_slower_than_a_period_is_refused():
+    with pytest.raises(Fault, match="answers come up to 1250 us after their tick, T is 1200 us: latch at ticks"):
+        timed(LAB, Ages((1150,) * 100), 0.99, 100.0, at_once=True)
+
+
+def test_the_spread_of_the_ticks_is_what_certificates_are_for():
+    ages = Ages((130,) * 100, 0, (1200,) * 50 + (1201,) * 49 + (3000,))
+    even, link = timed(LAB, ages, 0.9, 100.0)
+    assert (even.T_max, link) == (None, 1)  # a microsecond is what their clock can tell
+    spread, _ = timed(LAB, Ages((130,) * 100, 0, (1150,) * 60 + (1320,) * 40), 0.99, 100.0)
+    assert spread.T_max == pytest.approx(1.32e-3)
+    needs = [
+        certified_couplings(s.replace(delta=(2.0, 2.0)), "I", "published", "closed-loop", 1, spare=0)[0].requirements
+        for s in (even, spread)
+    ]
+    even_need, spread_need = (max(need["closed-loop"].required) for need in needs)
+    assert spread_need == pytest.approx(1.1 * even_need, rel=1e-9)
+    known = LAB.replace(T_max=1.4e-3)
+    assert timed(known, ages, 0.9, 100.0)[0].T_max == 1.4e-3
+
+
+def test_what_one_overlong_tick_may_cost():
+    """The most of -f v - delta v^2 over v is f^2/(4 delta), for every second that it lasts."""
+    v = np.linspace(-3, 3, 100_001)
+    most = sum((f * v - d * v**2).max() for f, d in ((2.0, 1.37), (1.5, 0.9)))
+    assert overlong_tick((2.0, 1.5), (1.37, 0.9)) == pytest.approx(most, rel=1e-6)
+
+
+def test_the_report_names_the_latency():
+    (made,) = certified_couplings(LAB.replace(latency=((3e-5, 2.3e-4),) * 2), "I", None, None, 0, spare=0)
+    part = made.part()
+    assert part["latency_s"] == [[3e-5, 2.3e-4]] * 2
+    assert part["link_delay"] == 0
+    assert part["coupling"] == coupling_part(made.chosen.kind, made.chosen.coupling, LAB.T)
+    assert made.name == "spring-damper for theta = [0, 0] and 30 to 230 us"

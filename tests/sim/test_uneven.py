@@ -1,0 +1,158 @@
+"""Periods that vary and forces that latch within them: engines against each other and against expm, by hand."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from cli.run import main
+from cli.validate import main as validate
+from controller.coupling import SpringDamper
+from controller.delay import Jitter
+from controller.timing import Periods, Timing
+from models.scene import plant
+from sim import load
+from sim.files import InputError
+from sim.run import assemble, make_engine, run
+from sim.stability import close, dominant_mode
+
+SOFT = SpringDamper([879.0, 552.0], [0.39, 0.52])
+PAIR = load("omega-pair").replace(duration=0.3)
+DRAWN, LATE = Periods(0.6e-3, 1.5e-3), ((1e-4, 1.3e-4), (0.0, 5e-4))
+
+
+def by_hand(simulation, ticks):
+    """Plant states (ticks + 1, states) of a run, from latch to latch, each stretch by an exponential of its own."""
+    P, m, timing = plant(simulation.scene.model), simulation.process.channels, simulation.timing
+    n, w, F = len(P.A), P.B.shape[1] - m, simulation.F
+    s, z, held, states = np.zeros(n), np.zeros(F.order), np.zeros(m), []
+    pushed = run(simulation, "exact", ticks=ticks).w
+    for k in range(ticks):
+        states.append(s)
+        x = P.C @ s
+        force, z = F.C @ z + F.D @ x, F.A @ z + F.B @ x
+        T, late = timing.period[k], np.zeros(m) if timing.late is None else timing.late[k]
+        now = 0.0
+        for until in sorted({*late.tolist(), T} - {0.0}):
+            acts = np.where(late <= now, force, held)
+            whole = np.zeros((n + w + m, n + w + m))
+            whole[:n, :n], whole[:n, n:] = P.A, P.B
+            s = (expm(whole * (until - now)) @ np.concatenate([s, pushed[k], acts]))[:n]
+            now = until
+        held = force
+    return np.array(states)
+
+
+@pytest.mark.parametrize("ticks", [{"period": DRAWN}, {"latency": LATE}, {"period": DRAWN, "latency": LATE}])
+def test_both_engines_move_from_latch_to_latch(ticks):
+    simulation = assemble(PAIR.replace(**ticks), SOFT, seed=3)
+    exact = run(simulation, "exact")
+    scale, states = abs(exact.s).max(), plant(simulation.scene.model).A.shape[0]
+    assert abs(exact.s[:60, :states] - by_hand(simulation, 60)).max() < 1e-12 * scale
+    assert abs(run(simulation, "mujoco").s - exact.s).max() < 1e-11 * scale
+    rk4 = [run(simulation, make_engine(simulation, "mujoco", "RK4", n)).s for n in (8, 16)]
+    assert abs(rk4[1] - exact.s).max() < 2e-7 * scale
+    assert abs(rk4[1] - exact.s).max() < abs(rk4[0] - exact.s).max() / 8  # of fourth order
+
+
+def test_time_adds_up_and_the_blocks_of_a_run_do_not_matter():
+    simulation = assemble(PAIR.replace(period=Periods(recorded=(1e-3, 2e-3, 0.5e-3)), duration=3.0), SOFT)
+    trace = run(simulation, "exact")
+    assert trace.t[:5] == pytest.approx([0, 1e-3, 3e-3, 3.5e-3, 4.5e-3])
+    assert len(trace.t) == pytest.approx(3.0 / (3.5e-3 / 3), abs=1)
+    assert trace.t[-1] == pytest.approx(3.0, abs=3e-3)
+    again = run(simulation, "exact", ticks=1500)  # a run is cut into blocks of 1024 ticks
+    np.testing.assert_array_equal(again.s, trace.s[:1500])
+
+
+def test_forces_that_latch_at_ticks_of_length_T_are_the_plain_loop():
+    plain = run(assemble(PAIR, SOFT), "exact")
+    same = run(assemble(PAIR.replace(latency=((0.0, 0.0),) * 2, period=Periods(PAIR.T, PAIR.T)), SOFT), "exact")
+    assert abs(same.x - plain.x).max() < 1e-13 * abs(plain.x).max()
+
+
+def test_the_eigenvalues_of_a_late_loop_are_those_of_its_map_over_a_tick():
+    """A latency that is constant makes a linear loop with the held forces as states."""
+    tau = 3e-4
+    simulation = assemble(PAIR.replace(latency=((tau, tau),) * 2), SOFT)
+    P, m, F = plant(simulation.scene.model), 2, simulation.F
+    n, T = len(P.A), PAIR.T
+    whole = np.zeros((n + m, n + m))
+    whole[:n, :n], whole[:n, n:] = P.A, P.B[:, -m:]
+    early, later = expm(whole * tau)[:n], expm(whole * (T - tau))[:n]
+    A = np.zeros((n + m + F.order,) * 2)
+    force = np.hstack([F.D @ P.C, np.zeros((m, m)), F.C])
+    A[:n, :n], A[:n, n : n + m] = later[:, :n] @ early[:, :n], later[:, :n] @ early[:, n:]
+    A[:n] += later[:, n:] @ force
+    A[n : n + m], A[n + m :, :n], A[n + m :, n + m :] = force, F.B @ P.C, F.A
+    growth = np.log(abs(np.linalg.eigvals(A)).max()) / T
+    assert float(dominant_mode(close(simulation.plant, F)).growth) == pytest.approx(growth, abs=1e-9)
+
+
+def test_what_is_drawn_lies_within_its_range_and_comes_from_the_seed():
+    scenario = PAIR.replace(period=DRAWN, latency=LATE)
+    one, same, other = (scenario.timing(seed, 4000) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.period, same.period)
+    assert (one.period != other.period).any()
+    assert {0.6e-3, 1.5e-3} <= set(one.period.tolist())
+    assert one.late.min(axis=0).tolist() == [1e-4, 0.0]
+    assert one.late.max(axis=0).tolist() == [1.3e-4, 5e-4]
+    assert scenario.loop("I").T_max == 1.5e-3
+    assert scenario.digest != PAIR.digest == PAIR.replace(period=None).digest
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"period": {"min": 1e-3}}, r"period\.min, period\.max are 0\.001 s, none"),
+        ({"period": {"min": 1e-3, "max": 2e-3, "recorded": [1e-3]}}, "either min and max or recorded"),
+        ({"period": {"recorded": [1e-3, 1.0]}}, r"period\.recorded has 1 s"),
+        ({"period": {"min": 1e-3, "max": 2e-3}, "T_max": 1.5e-3}, r"period is up to 0\.002 s, above T_max"),
+        ({"period": {"min": 2e-4, "max": 2e-3}, "latency": [[0, 3e-4]] * 2}, "expected less than every period, 0.0002"),
+    ],
+)
+def test_what_cannot_be_is_refused(changes, said):
+    with pytest.raises(InputError, match=said):
+        PAIR.replace(**changes)
+
+
+def test_forces_latch_within_their_tick():
+    with pytest.raises(ValueError, match="within the period"):
+        Timing(np.array([1e-3]), np.array([[1e-3]]))
+
+
+def test_a_run_says_what_its_ticks_were(tmp_path, capsys):
+    file = tmp_path / "r.json"
+    recorded = tmp_path / "ticks.txt"
+    recorded.write_text("# s\n1.1e-3\n0.8e-3\n\n1.4e-3\n")
+    options = ["--case", "I", "--no-plot", "--no-alternatives", "--duration", "1", "--out", str(tmp_path)]
+    assert main([*options, "--coupling", "spring-damper", "--period", str(recorded), "--json", str(file)]) == 0
+    report = json.loads(file.read_text())
+    assert report["run"]["timing"]["period_s"] == pytest.approx({"least": 0.8e-3, "mean": 1.1e-3, "largest": 1.4e-3})
+    assert report["certificates"]["closed-loop"]["certified"]
+    assert report["stability"]["verdict"] == "stable"
+    assert "even periods" in report["stability"]["reason"]
+    assert report["error"]["position_relative_rms"] < 1e-11
+    assert "0.8 to 1.4 ms long, recorded" in capsys.readouterr().out
+
+
+def test_hands_that_meet_uneven_ticks(tmp_path):
+    """With a coupling nobody grows; without one most do, and both engines agree about whom."""
+    file = tmp_path / "r.json"
+    ticks = ["--period", "0.8e-3,1.6e-3", "--latency", "1e-4:2e-4", "--humans", "12", "--duration", "2"]
+    options = [*ticks, "--no-plot", "--out", str(tmp_path), "--json", str(file)]
+    assert validate(["--case", "I", "--condition", "this-environment", *options]) == 0
+    part = json.loads(file.read_text())["timing"]
+    assert part["covered"]
+    assert part["unstable"] == {"exact": 0, "mujoco": 0}
+    assert validate(["--case", "none", *options]) == 0
+    report = json.loads(file.read_text())
+    assert report["timing"]["unstable"]["exact"] > 0
+    assert report["disagreements"] == 0
+
+
+def test_periods_vary_beside_delays():
+    scenario = PAIR.replace(period=DRAWN, jitter=Jitter((1, 2), (2, 3)), theta=(1, 2))
+    simulation = assemble(scenario, SOFT)
+    assert len(run(simulation, "exact").t) == scenario.samples
