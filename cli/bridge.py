@@ -127,7 +127,7 @@ def print_certificate(
     console.print(_ticks(ages, programs[0].scenario, caps), highlight=False)
     table = Table(title="certified for the delay measured, and softer in reserve")
     table.add_column("coupling", min_width=13)
-    for column in ("K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "promise"):
+    for column in ("K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee"):
         table.add_column(column)
     for program in programs:
         part = program.part()
