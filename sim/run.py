@@ -204,7 +204,7 @@ def run_blocks(
 
 def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
     """Close the loop for the first `ticks` rows of the buffer."""
-    tick, advance = buffer.tick, engine.advance
+    tick, advance = buffer.ticking(), engine.advance
     for k in range(ticks):
         tick(k)  # sample x, compute f and z+
         advance(k)  # limit f, hold -f on the actuators for T, move the plant
