@@ -116,6 +116,7 @@ class Validation:
     duration: float  # [s] of the traces; 0 for none
     threads: int = 0  # of MuJoCo; 0 for all
     environments: tuple[Member, ...] = ()  # that the humans are spread over; empty: all meet the scenario's own
+    lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of the limiter; None: forces are clipped
 
     @property
     def ticks(self) -> int:
@@ -134,7 +135,16 @@ class Validation:
     @property
     def digest(self) -> str:
         """Of all that the findings depend on."""
-        how = self.coupling.form(), self.seed, self.humans, self.links, self.engine, self.ticks, self.environments
+        how = (
+            self.coupling.form(),
+            self.seed,
+            self.humans,
+            self.links,
+            self.engine,
+            self.ticks,
+            self.environments,
+            self.lag,
+        )
         return hashlib.sha256(f"{self.scenario.digest} {how!r}".encode()).hexdigest()[:16]
 
     def crowds(self, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], Crowd | HumanSets]]:
@@ -208,7 +218,7 @@ def examine(
     scenario, member = validation.scenario, validation.environment(indices[0])
     if member:
         scenario = scenario.replace(environment=member.network, box=None)
-    simulation = assemble(scenario, validation.coupling)
+    simulation = assemble(scenario, validation.coupling, validation.lag)
     return _merge([_group(validation, simulation, *group, ticked) for group in validation.crowds(indices)])
 
 

@@ -47,7 +47,9 @@ def devices() -> None:
     for n in (2, 4, 8, 16, 32):
         scenario = star(n)
         loop = scenario.loop("I")
-        design, designed = cpu(lambda loop=loop: design_coupling(loop, "spring-damper", "this-environment"))
+        design, designed = cpu(
+            lambda loop=loop: design_coupling(loop, "spring-damper", "this-environment", limiter=False)
+        )
         needs, audited = cpu(lambda loop=loop, design=design: certify(loop, design.coupling))
         simulation = assemble(scenario, design.coupling)
         trace, ran = cpu(lambda simulation=simulation: run(simulation))
