@@ -30,11 +30,8 @@ SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
 LONGEST_DELAY = 1000  # [samples]; every one is a state
-<<<<<<< HEAD
 MOST_DELAYS = 1000  # of all channels together: the eigenvalues of so many states take ten seconds, of 2000 a minute
-=======
 LONGEST_NAME = 200  # characters, that a table and a picture can show
->>>>>>> main
 _TIMING_STREAM = 6  # keeps these draws apart from those of the humans with the same seed
 _Delays = tuple[int, ...]
 
