@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from controller.lti import Array
+from design.files import InputError
 from sim.crowds import COLUMNS, Findings, Validation, examine
-from sim.files import InputError
 from sim.run import Progress
 
 if TYPE_CHECKING:
