@@ -24,6 +24,7 @@ from design.certificate import (
     digest,
     finite,
     lag,
+    limiter_refusal,
     promise_of,
     prove,
     save,
@@ -309,7 +310,8 @@ def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path, beta: 
         raise InputError(f"--out {out}: {error.strerror}") from None
     proof = certificate.proof if certificate else None
     limited = proof is not None and lag(loop, certificate) is not None
-    return {"file": str(out), "proof": proof, "reason": reason, "switching": switching, "limited_forces": limited}
+    part = {"file": str(out), "proof": proof, "reason": reason, "switching": switching, "limited_forces": limited}
+    return part | {"limiter_refused": limiter_refusal(loop)}
 
 
 def _proved(loop: Loop, design: Design, beta: float | None) -> tuple[Certificate | None, str | None]:
@@ -357,7 +359,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("damping, any switching", proof and _switching_words(proof)),
         *(set_rows(outcome["set"]) if outcome["set"] else []),
         ("guarantee", outcome["promise"] or "none"),
-        ("guarantee, forces", "holds also while forces are limited" if stored["limited_forces"] else None),
+        ("guarantee, forces", _forces(outcome)),
         ("guarantee, delays", switching["promise"] if switching.get("proof") else None),
         (outcome["objective_name"], f"{outcome['objective']:.5g}"),
         ("transparency error", render.transparency_error(transparent)),
@@ -382,6 +384,14 @@ def _best_rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("robustness", f"{need} of the damping is needed at {there['where']}, the worst within {there['percent']:g} %"),
         ("ladder [dB]", climbed or None),
     ]
+
+
+def _forces(outcome: dict[str, Any]) -> str | None:
+    """Whether the guarantee holds at the force limits too; None where a limiter could be had and was not asked for."""
+    if outcome["stored"]["limited_forces"]:
+        return "holds also while forces are limited"
+    refused = outcome["promise"] and outcome["stored"]["limiter_refused"]
+    return "holds while forces stay below the limits" if refused else None
 
 
 def _switching_words(proof: dict[str, Any]) -> str:
