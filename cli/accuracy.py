@@ -12,7 +12,7 @@ from sim.accuracy import SETTINGS, Row, mark_front, measure, reference
 from sim.couplings import NAMES, choose
 from sim.engines import EXPONENTIAL
 from sim.run import Simulation, assemble
-from sim.scenario import InputError, require_linear
+from sim.scenario import InputError, require_even_ticks, require_linear
 from sim.stepping import NEUTRAL, default_substeps, step_radius
 
 HEADS = ("setting", "position", "growth", "verdict", "cycle N", "Hz", "real")
@@ -28,6 +28,7 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
     require_linear(scenario, "sim.accuracy")
+    require_even_ticks(scenario, "sim.accuracy")
     if args.duration is not None:
         scenario = scenario.replace(duration=args.duration)
     out = options.out_folder(args, "accuracy")

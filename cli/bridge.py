@@ -38,7 +38,7 @@ from cli.session_cli import (
     limits_from,
     number,
 )
-from design.certificate import CAVEATS, CONDITIONS
+from design.certificate import CAVEATS, CONDITIONS, LATE
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages
@@ -62,6 +62,8 @@ def main(argv: list[str]) -> int:
     seconds = number(args, "duration", 0.1, LONGEST, scenario.duration)
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
+    if args.latch == "arrival" and args.condition == "theorem4":
+        raise InputError(f"--latch arrival with --condition {args.condition}: {LATE}")
     if args.energy_budget and args.latch == "arrival":
         raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
     if args.energy_budget and not args.energy_budget[0]:
