@@ -299,7 +299,7 @@ def test_an_optimal_coupling_has_another_for_one_tick_more_in_reserve(optimal_ru
     assert fast.requirements["closed-loop"].certified
     assert soft.requirements["closed-loop"].certified
     assert soft.scenario.theta == (2, 2)
-    bridge.print_certificate(Ages((130,) * 100), 1, optimal_rungs, Console(width=160))
+    bridge.print_certificate(Ages((130,) * 100), 1, optimal_rungs, (2.0, 2.0), Console(width=160))
     table = capsys.readouterr().out
     assert re.search(r"│ optimal, theta = 1, 2 .*rational.*this environment", table)
     assert re.search(r"│ optimal, theta = 2, 2 .*rational.*this environment", table)
