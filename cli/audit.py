@@ -18,7 +18,7 @@ from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY, report
 from design.designs import KINDS
 from design.ranges import check_set, set_rows
-from design.result import CONDITION_NAMES, listed
+from design.result import OLDER_NAMES, listed
 from models.device import CATALOGUE, Listed, listed_device
 from sim.couplings import check_stored, fitted, read_coupling
 from sim.report import encoder_steps
@@ -60,7 +60,7 @@ def main(argv: list[str]) -> int:
         "notes": _notes(args, scenario, switching),
         "wall_s": time.perf_counter() - begin,
     }
-    outcome |= {name: outcome[key] for key, name in CONDITION_NAMES.items()}
+    outcome |= {older: outcome[name] for older, name in OLDER_NAMES.items()}
     render.publish(args, outcome, _tables(outcome), _remarks(outcome), out)
     proof = outcome["jitter-proof"]
     holds = outcome["certified"] and (proof is None or proof["certified"])
@@ -207,7 +207,7 @@ def _notes(args: argparse.Namespace, scenario: Scenario, switching: DelayRange |
 
 def _tables(outcome: dict[str, Any]) -> list[Table]:
     parts = [outcome[condition] for condition in render.ORDER]
-    table = Table("", *(CONDITION_NAMES[name] for name in render.ORDER), title=_verdict(outcome), title_justify="left")
+    table = Table("", *render.ORDER, title=_verdict(outcome), title_justify="left")
     for name, cell in ROWS.items():
         table.add_row(name, *(cell(part) for part in parts))
     if not outcome["set"]:
@@ -262,15 +262,13 @@ ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
 def _remarks(outcome: dict[str, Any]) -> list[str]:
     lines = [f"{note}." for note in outcome["notes"]]
     for condition in render.ORDER:
-        part, name = outcome[condition], CONDITION_NAMES[condition]
+        part = outcome[condition]
         sensitivity = part["sensitivity"].get("reason") if part["certified"] else None
         reasons = {"": part.get("reason"), ", stiffest K": part["stiffest"].get("reason"), ", sensitivity": sensitivity}
-        lines += [f"{name}{of}: {reason}." for of, reason in reasons.items() if reason]
+        lines += [f"{condition}{of}: {reason}." for of, reason in reasons.items() if reason]
     for helping in outcome["helps"]:
         enough = "enough" if helping["certified"] else "not enough alone"
-        need = (
-            f"{CONDITION_NAMES[helping['condition']]} then needs {listed(helping['required_damping'])} N s/m, {enough}"
-        )
+        need = f"{helping['condition']} then needs {listed(helping['required_damping'])} N s/m, {enough}"
         lines.append(f"What helps: {helping['change']} ({need}).")
     if (part := outcome["jitter-proof"]) is not None:
         lines += _switching_remarks(part)

@@ -62,7 +62,7 @@ def main(argv: list[str]) -> int:
     seconds = number(args, "duration", 0.1, LONGEST, scenario.duration)
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
-    if args.latch == "arrival" and args.condition == "theorem4":
+    if args.latch == "arrival" and args.condition == "any-environment":
         raise InputError(f"--latch arrival with --condition {args.condition}: {LATE}")
     if args.energy_budget and args.latch == "arrival":
         raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
@@ -129,7 +129,7 @@ def print_certificate(
     console.print(_ticks(ages, programs[0].scenario, caps), highlight=False)
     table = Table(title="certified for the delay measured, and softer in reserve")
     table.add_column("coupling", min_width=13)
-    for column in ("K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "promise"):
+    for column in ("K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee"):
         table.add_column(column)
     for program in programs:
         part = program.part()

@@ -10,9 +10,9 @@ from typing import Any
 from rich.table import Table
 
 from cli import options, render
-from design.certificate import HERE, SET, Stored, SwitchingProof, Verdict, switching_promise, verify
+from design.certificate import HERE, SET, Stored, SwitchingProof, Verdict, switching_guarantee, verify
 from design.ranges import Searched, search_box, search_part, search_words, violated_between
-from design.result import CONDITION_NAMES, listed
+from design.result import listed
 from sim.couplings import read_coupling
 from sim.scenario import InputError
 
@@ -23,7 +23,7 @@ class _Switching:
 
     lo: Sequence[int]
     hi: Sequence[int]
-    promise: str | None = render.figure("switching, guarantee")
+    promise: str | None = render.figure("switching, guarantee")  # older name, as JSON has it
     proof: str | None = render.figure("switching, proof")
     required_damping: Sequence[float] | None = render.figure("switching, required damping [N s/m]", listed)
     margin: float | None = render.figure("switching, margin", "{:.6g}")
@@ -35,8 +35,8 @@ class _Checked:
 
     proved: bool
     reason: str | None = render.figure("reason")
-    condition: str | None = render.figure("condition", CONDITION_NAMES.__getitem__)
-    promise: str | None = render.figure("guarantee")
+    condition: str | None = render.figure("condition")
+    promise: str | None = render.figure("guarantee")  # older name, as JSON has it
     proof: str | None = render.figure("proof")
     vertices: int | None = render.figure("vertices")
     between: Mapping[str, Any] | None = render.figure("between", search_words)
@@ -75,7 +75,7 @@ def _parser() -> options.Parser:
 
 def _searched(stored: Stored) -> Searched | None:
     """The search between the vertices, again, where the file guarantees ranges of parameters."""
-    if not (stored.certificate and stored.certificate.promise == SET):
+    if not (stored.certificate and stored.certificate.guarantee == SET):
         return None
     with render.progress("searching the ranges between their vertices") as move:
         return search_box(stored.loop, stored.coupling.build(stored.loop.T), move)
@@ -87,7 +87,7 @@ def _checked(stored: Stored, verdict: Verdict, searched: Searched | None, second
         verdict.proved,
         verdict.reason,
         claim and claim.condition,
-        claim.promise if claim and verdict.proved else None,
+        claim.guarantee if claim and verdict.proved else None,
         claim.proof if claim and verdict.proved else None,
         len(stored.loop.members()) - 1 if stored.loop.box else None,
         searched and search_part(searched),
@@ -103,9 +103,9 @@ def _switching(stored: Stored, verdict: Verdict) -> _Switching | None:
     span, claim = stored.loop.jitter, stored.certificate and stored.certificate.switching
     if span is None or not isinstance(claim, SwitchingProof):
         return None
-    promise = f"{switching_promise(span)}, in {HERE}" if verdict.proved else None
+    guarantee = f"{switching_guarantee(span)}, in {HERE}" if verdict.proved else None
     proof = "rational" if verdict.proved else None
-    return _Switching(span.lo, span.hi, promise, proof, claim.required, claim.margin)
+    return _Switching(span.lo, span.hi, guarantee, proof, claim.required, claim.margin)
 
 
 def _table(checked: _Checked) -> Table:

@@ -25,7 +25,7 @@ from design import compare
 from design.certificate import CONDITIONS, certificate_part, finite
 from design.compare import AXES, FEEL_HZ, LADDERS, Judged, Limit, Perceived, Setting, optimum, settings
 from design.optimal import Options
-from design.result import CONDITION_NAMES, DesignFailed
+from design.result import OLDER_NAMES, DesignFailed
 from design.transparency import transparency
 from sim import report
 from sim.baselines import PAIRS, SECONDS, SLOW, Rival, rivals
@@ -200,16 +200,16 @@ def _curves(judged: Judged, lines: compare.Curves) -> dict[str, Any]:
     data: dict[str, Any] = {"sigma_F": lines.sigma_F.tolist(), "sigma_M": lines.sigma_M.tolist()}
     data["perceived"] = _perceived(lines.perceived)
     for key, requirement in judged.requirements.items():
-        demand, name = lines.demands[key], CONDITION_NAMES[key]
+        demand = lines.demands[key]
         part = certificate_part(requirement) | {"ratio": finite(requirement.ratio), "demand": _row(demand)}
         if demand is None and not requirement.reason:
-            part["reason"] = f"this coupling is no V in feedback around the environment: no curve for {name}"
-        data |= {key: part, name: part}
-    return data
+            part["reason"] = f"this coupling is no V in feedback around the environment: no curve for {key}"
+        data[key] = part
+    return data | {older: data[name] for older, name in OLDER_NAMES.items() if name in data}
 
 
 def _missing_curves(couplings: list[dict[str, Any]]) -> list[str]:
-    parts = [(c["name"], CONDITION_NAMES[condition], c[condition]) for c in couplings for condition in CONDITIONS]
+    parts = [(c["name"], condition, c[condition]) for c in couplings for condition in CONDITIONS]
     return [f"{name}, {condition}: {part['reason']}" for name, condition, part in parts if "reason" in part]
 
 
@@ -379,7 +379,7 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
         from sim.plots import plot_limits
 
         files.append(plot_limits(outcome, out / "limits.png"))
-    names = " and by ".join(CONDITION_NAMES[name] for name in args.beside)
+    names = " and by ".join(args.beside)
     lines = [f"beside the optimum: the designed spring-damper by {names}"] if names else []
     lines += [f"{name} {row['value']:.4g}: {row['reason']}" for name, row in points if row["reason"]]
     tables = [_limit_table(outcome, name, args.beside) for name in outcome["sweeps"]]
@@ -452,7 +452,7 @@ def _limit_table(outcome: dict[str, Any], name: str, beside: Sequence[str]) -> T
         theta = ",".join(map(str, row["theta"]))
         rows.append((f"{row['value']:.4g}", theta, *errors, _proofs(limits), f"{row['wall_s']:.1f}"))
     title = f"{outcome['objective']} transparency error over {name} · {outcome['scenario']}, case {outcome['case']}"
-    heads = (sweep["unit"], "theta", "optimal", *(CONDITION_NAMES[name] for name in beside), "proof", "seconds")
+    heads = (sweep["unit"], "theta", "optimal", *beside, "proof", "seconds")
     return render.grid(title, heads, rows, left=(1,))
 
 
@@ -466,7 +466,7 @@ def _error(limit: dict[str, Any] | None, objective: str) -> str:
 def _proofs(limits: dict[str, dict[str, Any] | None]) -> str:
     """Rational where every design of a row is proved exactly, else which are only sampled."""
     found = {name: limit["proof"] for name, limit in limits.items() if limit and limit["proof"]}
-    sampled = [CONDITION_NAMES.get(name, name) for name, proof in found.items() if proof != "rational"]
+    sampled = [name for name, proof in found.items() if proof != "rational"]
     if not found:
         return "-"
     return f"sampled: {', '.join(sampled)}" if sampled else "rational"

@@ -23,20 +23,20 @@ from design.certificate import (
     assess,
     digest,
     finite,
+    guarantee_of,
     lag,
     limiter_refusal,
-    promise_of,
     prove,
     save,
+    switching_guarantee,
     switching_part,
-    switching_promise,
     switching_requirement,
 )
 from design.conditions import BETA
 from design.designs import KINDS, NO_LONGER, compare_methods, design_by_kind, usual_condition
 from design.optimal import OBJECTIVES, Optimal, box_around, robustness
 from design.ranges import SAMPLES, SetCheck, check_set, cost_part, price, set_part, set_rows
-from design.result import CONDITION_NAMES, METHODS, Design, DesignFailed, listed
+from design.result import METHODS, Design, DesignFailed, listed
 from design.spring_damper import STIFFEST
 from design.transparency import BAND_HZ, transparency
 from sim import report
@@ -65,7 +65,7 @@ def main(argv: list[str]) -> int:
         "coupling": report.coupling_part(args.coupling, design.coupling, loop.T),
         "certificate": certificates[design.condition],
         "certificates": certificates,
-        "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
+        "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
         "set": whole and set_part(whole),
         "price": _robustness_loss(args, loop, design) if whole else None,
         "transparency": report.transparency_part(transparency(loop.F(design.coupling), loop.E(), loop.lam)),
@@ -199,7 +199,7 @@ def _loop(args: argparse.Namespace) -> Loop:
 def _for_switching(args: argparse.Namespace) -> bool:
     """Whether this design can be made for delays that vary; any other is only judged under them."""
     condition = args.condition or KINDS[args.coupling][0]
-    return args.coupling in ("spring-damper", "optimal") and condition == "closed-loop"
+    return args.coupling in ("spring-damper", "optimal") and condition == "this-environment"
 
 
 def _asked(args: argparse.Namespace, loop: Loop) -> dict[str, Any]:
@@ -293,15 +293,15 @@ def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path, beta: 
     What is not proved for a whole set, or for switching delays, is kept as what it is: a coupling for the nominal
     environment, or for constant delays.
     """
-    if whole and whole.proved and design.condition == "closed-loop":
+    if whole and whole.proved and design.condition == "this-environment":
         certificate, reason = whole.certificate, None
     else:
-        loop = loop if design.condition == "theorem4" else loop.at(loop.environment)
+        loop = loop if design.condition == "any-environment" else loop.at(loop.environment)
         certificate, reason = _proved(loop, design, beta)
     switching = None
     if loop.jitter:
         proof = certificate.proof if certificate else None
-        switching = {"promise": f"{switching_promise(loop.jitter)}, in {HERE}", "proof": proof, "reason": reason}
+        switching = {"promise": f"{switching_guarantee(loop.jitter)}, in {HERE}", "proof": proof, "reason": reason}
         if certificate is None:
             loop = loop.switching(None)
             certificate, reason = _proved(loop, design, beta)
@@ -332,7 +332,7 @@ def _proved(loop: Loop, design: Design, beta: float | None) -> tuple[Certificate
 
 
 def _tables(outcome: dict[str, Any]) -> list[Table]:
-    condition = CONDITION_NAMES[outcome["certificate"]["condition"]]
+    condition = outcome["certificate"]["condition"]
     title = f"{outcome['coupling']['kind']}, case {outcome['case']}, {condition}"
     shown = [render.facts(title, _rows(outcome))]
     if outcome["price"]:

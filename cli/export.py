@@ -14,7 +14,7 @@ import numpy as np
 
 from cli import options, render
 from controller.coupling import SpringDamperForm
-from design.certificate import HERE, SET, Stored, Verdict, switching_promise, verify
+from design.certificate import HERE, SET, Stored, Verdict, switching_guarantee, verify
 from design.export import (
     Block,
     NothingToExport,
@@ -26,7 +26,7 @@ from design.export import (
     process_block,
     trial,
 )
-from design.result import CONDITION_NAMES, listed
+from design.result import listed
 from sim.couplings import read_coupling
 from sim.files import out_file, write
 from sim.scenario import InputError
@@ -110,11 +110,11 @@ def _guarantee(stored: Stored, verdict: Verdict) -> str:
     if claim is None or not verdict.proved:
         return f"NOT CERTIFIED: {verdict.reason}"
     needs = f"needs {listed(claim.required)} of {listed(claim.available)} N s/m of device damping"
-    delays = f"; {switching_promise(stored.loop.jitter)}, in {HERE}" if stored.loop.jitter else ""
-    how = f"{CONDITION_NAMES[claim.condition]}, proof: {claim.proof}"
-    if claim.promise == SET:
+    delays = f"; {switching_guarantee(stored.loop.jitter)}, in {HERE}" if stored.loop.jitter else ""
+    how = f"{claim.condition}, proof: {claim.proof}"
+    if claim.guarantee == SET:
         how += "; at the vertices, between them nothing is proved: design.check searches there"
-    return f"Certified for {claim.promise}{delays} ({how}): {needs}; linear forces only."
+    return f"Certified for {claim.guarantee}{delays} ({how}): {needs}; linear forces only."
 
 
 def _destination(args: argparse.Namespace, block: Block) -> Path:

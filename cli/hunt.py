@@ -75,7 +75,7 @@ def _part(found: Found) -> dict[str, Any]:
         "counterexample": found.counterexample,
         "speed_ratio": list(found.ratio),
         "contacts_last_quarter": list(found.made),
-        "theorem4_required_over_available": found.case.theorem4,
+        "theorem4_required_over_available": found.case.any_environment,
         "coupling": {"K": coupling.K.tolist(), "B": coupling.B.tolist()},
         "theta": list(scenario.theta),
         "device": msgspec.to_builtins(scenario.device[0]),

@@ -23,7 +23,7 @@ from controller.environment import RIGID_WALL
 from controller.loop import Loop
 from controller.lti import SingularLoop
 from controller.timing import Periods
-from design.result import CONDITION_NAMES, DesignFailed
+from design.result import OLDER_NAMES, DesignFailed
 from models.device import MOST_DAMPING
 from sim.files import check_file, folder, nobody_reads
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
@@ -123,12 +123,11 @@ def latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
 
 
 def condition(text: str) -> str:
-    """A condition by its name, or by the name that it had before, as reports and files call it."""
-    known = {name: key for key, name in CONDITION_NAMES.items()} | {key: key for key in CONDITION_NAMES}
-    if text not in known:
-        allowed = ", ".join(CONDITION_NAMES.values())
-        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {allowed}")
-    return known[text]
+    """A condition by its name, or by the name that it had before."""
+    name = OLDER_NAMES.get(text, text)
+    if name not in OLDER_NAMES.values():
+        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(OLDER_NAMES.values())}")
+    return name
 
 
 def _one(kind: Callable[[str], Number], least: float, most: float, unit: str) -> Callable[[str], Number]:
@@ -224,8 +223,8 @@ def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: s
 
 def add_condition_option(parser: argparse._ActionsContainer, what: str = "that the certificate is about") -> None:
     """--condition."""
-    names = ",".join(CONDITION_NAMES.values())
-    help_ = f"{what}: {' or '.join(CONDITION_NAMES.values())} (default: the coupling's own)"
+    names = ",".join(OLDER_NAMES.values())
+    help_ = f"{what}: {' or '.join(OLDER_NAMES.values())} (default: the coupling's own)"
     parser.add_argument("--condition", type=condition, metavar=f"{{{names}}}", help=help_)
 
 

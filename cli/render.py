@@ -21,7 +21,7 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
-from design.result import CONDITION_NAMES, listed
+from design.result import listed
 from sim.files import nobody_reads, write_json
 
 # ----------------------------------------------------------------------------------------------------
@@ -184,7 +184,7 @@ def _formed(value: Any, form: Form) -> str:
 # Phrases that several reports share.
 
 
-ORDER = ("closed-loop", "theorem4")  # of conditions in a table
+ORDER = ("this-environment", "any-environment")  # of conditions in a table
 
 
 def certified(part: Mapping[str, Any]) -> str:
@@ -203,9 +203,9 @@ def needs(part: Mapping[str, Any], digits: int = 6) -> str:
 def certificate_rows(certificates: Mapping[str, dict[str, Any]], digits: int = 6, proof: bool = True) -> Rows:
     """What each condition needs, and whether that is proved exactly, where no other row says it."""
     for name, part in certificates.items():
-        if name in CONDITION_NAMES:
+        if name in ORDER:
             word = certified(part) if proof else certified(part | {"proof": None})
-            yield f"damping, {CONDITION_NAMES[name]}", f"needs {needs(part, digits)}: {word}"
+            yield f"damping, {name}", f"needs {needs(part, digits)}: {word}"
 
 
 def optional(value: float | None, form: str, absent: str = "-") -> str:

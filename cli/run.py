@@ -10,7 +10,7 @@ from typing import Any
 
 from cli import options, render
 from controller.loop import Loop
-from design.certificate import Limits, assess, covered_limits, promise_of
+from design.certificate import Limits, assess, covered_limits, guarantee_of
 from design.designs import usual_condition
 from design.ranges import SetCheck, check_set, set_part, set_rows
 from design.result import listed
@@ -195,7 +195,10 @@ def _net(run: _Run, requirements: dict[str, Any]) -> dict[str, Any]:
     part = run.trace.net.part() if run.trace.net else None
     if part is None or part["guarantee"] is None:
         return {"energy_budget": None, "baseline": part}
-    return {"energy_budget": part | {"idle": idle(run.simulation, requirements["theorem4"], part)}, "baseline": None}
+    return {
+        "energy_budget": part | {"idle": idle(run.simulation, requirements["any-environment"], part)},
+        "baseline": None,
+    }
 
 
 def _steps(args: argparse.Namespace, simulation: Simulation) -> tuple[str | None, int | None, list[str]]:
@@ -237,7 +240,7 @@ def _side_by_side(others: list[Alternative], path: Path) -> Path:
 
 def _panel_title(other: Alternative) -> str:
     kind = ", spring-damper" if other.kind == "spring-damper" else ""
-    guarantee = f"guarantee: {other.promise}" if other.promise else "no guarantee"
+    guarantee = f"guarantee: {other.guarantee}" if other.guarantee else "no guarantee"
     felt = f"grows: {render.optional(other.growth, '{:+.2f} 1/s')}"
     if other.error_percent is not None:
         felt = f"force error {other.error_percent:.2g} %"
@@ -249,7 +252,7 @@ def _certified(chosen: Chosen, requirements: dict[str, Any], loop: Loop, whole: 
     return {
         "certificate": certificates[chosen.condition],
         "certificates": certificates,
-        "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
+        "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
         "set": whole and set_part(whole),
     }
 
@@ -345,7 +348,7 @@ def _beside(others: list[Alternative], outcome: dict[str, Any]) -> Any:
         needs = (_share(other.needs(condition), "never") for condition in render.ORDER)
         grows = other.growth is None or other.growth > MARGINAL
         error = "grows" if grows else render.optional(other.error_percent, "{:.3g} %")
-        cells.append((other.name + mark, *needs, other.promise or "none", _share(other.rendered, "-"), error))
+        cells.append((other.name + mark, *needs, other.guarantee or "none", _share(other.rendered, "-"), error))
     heads = ("coupling", "this-env.", "any-env.", "guarantee", "stiffness", "error")
     title = "the same devices with other couplings (*: this run): required damping in % of theirs,"
     return render.grid(f"{title}\nguarantee, rendered stiffness and force error", heads, cells, left=(0, 3))
@@ -391,10 +394,10 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
     ]
 
 
-def _limiter(part: dict[str, Any], promise: str | None) -> str:
+def _limiter(part: dict[str, Any], guarantee: str | None) -> str:
     limits = f"{listed(part['force_limit'], 4)} N"
     if part["rho"] is None:
-        held = "the guarantee holds while forces stay below the limits" if promise else "not covered"
+        held = "the guarantee holds while forces stay below the limits" if guarantee else "not covered"
         return f"clipped at {limits}: {held} ({part['reason']})"
     return f"the guarantee holds also while forces are limited to {limits} ({part['reason']})"
 

@@ -27,7 +27,7 @@ from cli import options, render
 from controller.coupling import NoCoupling
 from controller.lti import SingularLoop
 from design.certificate import finite
-from design.result import CONDITION_NAMES, DesignFailed
+from design.result import DesignFailed
 from hw.faults import rehearse_faults
 from sim.adversary import Attempt, attempts
 from sim.couplings import choose
@@ -201,18 +201,18 @@ def gain_map(report: dict[str, Any]) -> list[Part]:
     population, simulation = report["population"], report["simulation"]
     rows = [
         (
-            f"certified, {word}",
+            f"certified, {name}",
             f"{report[name]['certified_cells']} of {cells} cells, {report[name]['contradicted_cells']} contradicted",
         )
-        for name, word in CONDITION_NAMES.items()
+        for name in render.ORDER
     ]
     stable = f"{population['stable_cells']} of {population['decided_cells']} cells"
     rows.append((f"stable with all of {population['humans']} random hands", stable))
     odd = f"{simulation['oscillate']} oscillate, {simulation['differ_from_linear']} unlike the linear loop"
     rows.append((f"{len(simulation['points'])} points simulated in MuJoCo", odd))
-    edge = max(report["error"][name]["edge_relative_in_K"] for name in CONDITION_NAMES)
+    edge = max(report["error"][name]["edge_relative_in_K"] for name in render.ORDER)
     rows.append(("edge of the map, error in K", f"{edge:.0e}"))
-    contradicted = sum(report[name]["contradicted_cells"] for name in CONDITION_NAMES)
+    contradicted = sum(report[name]["contradicted_cells"] for name in render.ORDER)
     return [Part("", ("figure", "value"), tuple(rows), f"{contradicted} certified cells that a hand destabilises")]
 
 
@@ -280,11 +280,11 @@ def _by_whom(row: Row) -> str:
 
 def _damping(certificates: dict[str, Any]) -> list[tuple[str, str]]:
     rows = []
-    for name, word in CONDITION_NAMES.items():
+    for name in render.ORDER:
         part = certificates[name]
         needed = [f"{value:.4g}" if value is not None else "infinite" for value in part["required_damping"]]
         available = [f"{value:.4g}" for value in part["available_damping"]]
-        rows.append((f"damping needed, {word}", f"{', '.join(needed)} of {', '.join(available)} N s/m"))
+        rows.append((f"damping needed, {name}", f"{', '.join(needed)} of {', '.join(available)} N s/m"))
     return rows
 
 

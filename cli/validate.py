@@ -11,7 +11,7 @@ import numpy as np
 
 from cli import options, render
 from controller.environment import Member
-from design.certificate import ANY, assess, promise_of
+from design.certificate import ANY, assess, guarantee_of
 from design.designs import usual_condition
 from design.ranges import SetCheck, check_set, set_part
 from sim import report
@@ -38,7 +38,7 @@ def main(argv: list[str]) -> int:
     environments = _environments(args, whole)
     requirements = assess(loop, chosen.coupling, chosen.phi)
     proved = bool(whole and whole.proved)
-    guarantee = promise_of(requirements, loop, proved)
+    guarantee = guarantee_of(requirements, loop, proved)
     certified = guarantee is not None and (not environments or guarantee == ANY or proved)
 
     question = _question(args, scenario, chosen, environments)
@@ -62,7 +62,7 @@ def main(argv: list[str]) -> int:
         _add(outcome, "timing", report.varying_delays_part(findings, met | {"covered": certified}))
     worst = None
     if args.adversary and not findings.interrupted:
-        attacked, ratio = scenario, requirements["closed-loop"].ratio
+        attacked, ratio = scenario, requirements["this-environment"].ratio
         if environments and whole:
             member, requirement = whole.worst_found
             attacked, ratio = scenario.replace(environment=member.network, box=None), requirement.ratio

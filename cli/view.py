@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from cli import options, render
-from design.result import CONDITION_NAMES
 from sim.files import write_json
 from sim.scenario import InputError, require_even_ticks
 from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, Script, first_loop, parse_script
@@ -154,7 +153,7 @@ def _window(session: Session, duration: float | None) -> dict[str, Any]:
 def _print_story(outcome: dict[str, Any], out: render.Screen) -> None:
     """One line per event, and where the film is."""
     for event in outcome["events"]:
-        held = [word for name, word in CONDITION_NAMES.items() if event["certificates"][name]["certified"]]
+        held = [name for name in render.ORDER if event["certificates"][name]["certified"]]
         growth = event["exact_growth_rate_per_s"]
         grows = "no growth" if growth is None else f"{growth:+.3g} 1/s at {event['exact_frequency_hz']:.1f} Hz"
         proved = f"certified ({', '.join(held)})" if held else "NOT certified"

@@ -20,9 +20,8 @@ from cli import options, render
 from controller.environment import RIGID_WALL
 from controller.loop import Loop
 from controller.lti import Array
-from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, promise_of
+from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, guarantee_of
 from design.ranges import check_set, set_part
-from design.result import CONDITION_NAMES
 from sim import report
 from sim.couplings import NAMES, Chosen, choose
 from sim.files import write
@@ -60,7 +59,7 @@ def _table(outcome: dict[str, Any]) -> Table:
     for name in outcome["conditions"]:
         error = outcome.get("error", {}).get(name)
         near = f"; edge within {100 * error['edge_relative_in_K']:.2g} % of the condition's own sweep" if error else ""
-        rows.append((f"certified, {_word(name)}", f"{_share(outcome[name]['certified_cells'], cells)}{near}"))
+        rows.append((f"certified, {name}", f"{_share(outcome[name]['certified_cells'], cells)}{near}"))
     stable = f"{_share(crowd['stable_cells'], cells)} ({crowd['decided_cells']} decided)"
     rows.append((f"stable with all of {crowd['humans']} random humans", stable))
     if simulation["points"]:
@@ -71,18 +70,14 @@ def _table(outcome: dict[str, Any]) -> Table:
     return render.facts(title, [*rows, ("seconds", seconds)], left=True)
 
 
-def _word(name: str) -> str:
-    return CONDITION_NAMES.get(name, name)
-
-
 def _designed_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
     """The fixed coupling in the environment that it was designed for."""
     designed = outcome["designed_for"]
     each = (f"{' - '.join(s['between'])} {s['K']:g} N/m, {s['B']:g} N s/m" for s in designed["contact_springs"])
     needs = "; ".join(
-        f"{word} needs {100 / designed['certificates'][name]['margin']:.4g} % of the damping "
+        f"{name} needs {100 / designed['certificates'][name]['margin']:.4g} % of the damping "
         f"({designed['certificates'][name]['proof']})"
-        for name, word in CONDITION_NAMES.items()
+        for name in render.ORDER
         if designed["certificates"][name]["margin"]
     )
     return [
@@ -104,9 +99,9 @@ def _about(outcome: dict[str, Any]) -> str:
 
 
 def _mark_line(mark: dict[str, Any], humans: int) -> str:
-    ends = ", ".join(f"{_word(name)} {_stiffest(K)}" for name, K in mark["stiffest_K_at_this_B"].items())
+    ends = ", ".join(f"{name} {_stiffest(K)}" for name, K in mark["stiffest_K_at_this_B"].items())
     needs = ", ".join(
-        f"{_word(name)} needs {max(mark[name]['required_damping'], key=lambda d: d or np.inf) or np.inf:.6g} of "
+        f"{name} needs {max(mark[name]['required_damping'], key=lambda d: d or np.inf) or np.inf:.6g} of "
         f"{min(mark[name]['available_damping']):.6g} N s/m "
         f"({'[green]certified[/]' if mark[name]['certified'] else '[red]not certified[/]'})"
         for name in mark["stiffest_K_at_this_B"]
@@ -139,7 +134,7 @@ def _remarks(outcome: dict[str, Any]) -> list[str]:
         lines += [*outcome["remarks"], _about(outcome)]
     for name in outcome["conditions"]:
         if outcome[name].get("reason"):
-            lines.append(f"{_word(name)}: {outcome[name]['reason']}.")
+            lines.append(f"{name}: {outcome[name]['reason']}.")
         if outcome[name].get("contradicted_cells"):
             lines.append(f"[red]CONTRADICTION[/]: {outcome[name]['contradicted_cells']} certified cells are unstable.")
     if not simulation["nonlinear"] and simulation["differ_from_linear"]:
@@ -286,7 +281,7 @@ def add_marks(outcome: dict[str, Any], marks: Sequence[Mark]) -> None:
         }
         for mark in marks
     ]
-    certified = all(mark.requirement["closed-loop"].certified for mark in marks)
+    certified = all(mark.requirement["this-environment"].certified for mark in marks)
     outcome["holds"] = outcome["holds"] and certified
 
 
@@ -411,7 +406,7 @@ def _check_case(args: argparse.Namespace) -> None:
         raise InputError(f"--case none is the loop without coupling, and the map is of couplings: {instead}")
     if args.coupling is None and args.condition:
         why = "without --coupling nothing is designed, and both are drawn"
-        raise InputError(f"--condition {_word(args.condition)}: {why}")
+        raise InputError(f"--condition {args.condition}: {why}")
     for name in ("rigid", "wall", "velocity_filter"):
         if args.coupling is not None and getattr(args, name):
             what = "is about a map of spring-dampers; with --coupling the axes are the environment's"
@@ -448,7 +443,7 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
         "designed_for": {
             "contact_springs": [{"between": s.between, "K": s.stiffness, "B": s.damping} for s in springs],
             "certificates": report.certificates_part(requirements),
-            "promise": promise_of(requirements, loop, bool(whole and whole.proved)),
+            "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
             "set": whole and set_part(whole),
         },
         "remarks": list(chosen.notes),

@@ -1,10 +1,10 @@
 """Conditions, figures of merit and designs for virtual couplings. It sees a device only through its damping.
 
-    from design import design_coupling, certify, promise, transparency_of
+    from design import design_coupling, certify, guarantee, transparency_of
 
 design_coupling(loop, kind)         a Design: the best coupling of a kind for a loop, scenario.loop("I"); see Options
 certify(loop, coupling)             a Requirement by each condition: how much damping the coupling needs, and where
-promise(loop, requirements)         for which environments that makes it safe for every passive human, in words
+guarantee(loop, requirements)       for which environments that makes it safe for every passive human, in words
 transparency_of(loop, coupling)     figures of Transparency: how close what one feels comes to the environment
 DesignFailed                        a ValueError: there is no such coupling
 
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from controller.loop import Loop
     from design.conditions import Requirement
-    from design.designs import Options, certify, design_coupling, promise, transparency_of
+    from design.designs import Options, certify, design_coupling, guarantee, transparency_of
     from design.result import Design, DesignFailed
     from design.transparency import Transparency
 
@@ -33,7 +33,7 @@ __all__ = [
     "Transparency",
     "certify",
     "design_coupling",
-    "promise",
+    "guarantee",
     "transparency_of",
 ]
 

@@ -28,12 +28,12 @@ from design.certificate import (
     ANY,
     CAVEATS,
     LATE,
+    any_environment_of,
     certificate_part,
-    closed_loop_of,
-    promise_of,
+    guarantee_of,
     switching_part,
     switching_requirement,
-    theorem4_of,
+    this_environment_of,
 )
 from design.conditions import (
     Condition,
@@ -54,7 +54,7 @@ LONGEST_DELAY = 100
 
 def requirement(loop: Loop, coupling: Coupling, condition: Condition) -> Requirement:
     """The damping that the condition asks of the devices."""
-    ask = closed_loop_of if condition == "closed-loop" else theorem4_of
+    ask = this_environment_of if condition == "this-environment" else any_environment_of
     try:
         return ask(loop, coupling)
     except ValueError as error:  # no solution of the algebraic loop
@@ -127,7 +127,7 @@ def stiffest(loop: Loop, coupling: Coupling, condition: Condition) -> Stiffest:
     unknown = (None,) * loop.channels
     if not isinstance(coupling, SpringDamper):
         return Stiffest(unknown, "only a spring-damper has a K")
-    if condition == "theorem4":
+    if condition == "any-environment":
         return _stiffest_for_any_environment(loop, coupling)
     K, B = coupling.K, coupling.B
 
@@ -173,7 +173,7 @@ def tolerance(loop: Loop, coupling: Coupling, needs: Requirement) -> Tolerance:
     """How much error in delta, T and delay the certificate by `needs.condition` tolerates."""
     if not needs.certified:
         return Tolerance(None, None, None, NOT_CERTIFIED)
-    if needs.condition == "theorem4" and any(loop.psi):
+    if needs.condition == "any-environment" and any(loop.psi):
         reason = "with psi >= 1 every T and delay needs a multiplier of its own: not searched"
         return Tolerance(needs.required, None, None, reason)
     largest = _largest_period(loop, coupling, needs.condition)
@@ -241,7 +241,7 @@ class Remedy:
 def remedies(loop: Loop, coupling: Coupling, needs: Requirement) -> list[Remedy]:
     """What certifies, or lowers the required damping by 10 % or more, each change alone; [] where it is certified."""
     condition = needs.condition
-    if needs.certified or (condition == "theorem4" and any(loop.psi)):
+    if needs.certified or (condition == "any-environment" and any(loop.psi)):
         return []
     found = [_fewer_samples(loop, coupling, condition, name) for name in ("theta", "psi")]
     if isinstance(coupling, SpringDamper) and coupling.B.any():
@@ -312,9 +312,9 @@ def report(
     loop = loop.at(loop.environment).switching(None)
     check_loop(loop)
     requirements = {name: requirement(loop, coupling, name) for name in reversed(get_args(Condition))}
-    here = requirements["closed-loop"].certified
+    here = requirements["this-environment"].certified
     proved = bool(whole and whole.proved)
-    promised = promise_of(requirements, loop, proved)
+    guaranteed = guarantee_of(requirements, loop, proved)
     gains = coupling if isinstance(coupling, SpringDamper) else None
     return {
         "coupling": {
@@ -334,9 +334,9 @@ def report(
         **{name: _condition_part(loop, coupling, needs) for name, needs in requirements.items()},
         "jitter-proof": _switching_part(loop, coupling, switching) if switching else None,
         "set": whole and set_part(whole),
-        "certified": here and (whole is None or proved or promised == ANY),
-        "promise": promised,
-        "helps": _helps(loop, coupling, requirements["theorem4" if here else "closed-loop"]),
+        "certified": here and (whole is None or proved or guaranteed == ANY),
+        "promise": guaranteed,
+        "helps": _helps(loop, coupling, requirements["any-environment" if here else "this-environment"]),
         "not_covered": CAVEATS,
     }
 
@@ -377,7 +377,7 @@ def _because(reason: str | None) -> dict[str, str]:
 
 
 def _helps(loop: Loop, coupling: Coupling, needs: Requirement) -> list[dict[str, Any]]:
-    """Changes that help the condition that fails first: closed-loop, else any_environment."""
+    """Changes that help the condition that fails first: this-environment, else any_environment."""
     return [
         {
             "change": remedy.change,

@@ -61,6 +61,7 @@ from design.conditions import (
 )
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
 from design.frequency import frequencies, on_circle, rounding
+from design.result import OLDER_NAMES
 
 # ----------------------------------------------------------------------------------------------------
 # The file in which a coupling is kept: the loop it was made for, its coefficients and its certificate, as JSON.
@@ -104,7 +105,7 @@ class Certificate(Strict, frozen=True):
     required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep
     available: tuple[float, ...]  # (m,) [N s/m], the damping for which it is proved
     margin: float  # available / required
-    promise: Literal["any passive environment", "a set", "this environment"]
+    guarantee: Literal["any passive environment", "a set", "this environment"] = msgspec.field(name="promise")
     proof: Literal["sampled", "kyp", "rational"]
     matrices: dict[str, tuple[tuple[Rational, ...], ...]]  # rationals "p/q"
     scenario: str  # digest of the loop and the coupling
@@ -137,14 +138,23 @@ class Stored(Strict, frozen=True):
 
 def digest(*parts: msgspec.Struct) -> str:
     """sha256 over the canonical JSON (sorted keys, shortest decimals, 7 as 7.0 where it is a float) of the parts."""
-    read_back = [msgspec.json.decode(msgspec.json.encode(part), type=type(part)) for part in parts]
-    return hashlib.sha256(msgspec.json.encode(read_back, order="deterministic")).hexdigest()
+    return _sha256([_plain(part) for part in parts])
+
+
+def _plain(part: msgspec.Struct) -> Any:
+    return msgspec.to_builtins(msgspec.json.decode(msgspec.json.encode(part), type=type(part)))
+
+
+def _sha256(plain: list[Any]) -> str:
+    return hashlib.sha256(msgspec.json.encode(plain, order="deterministic")).hexdigest()
 
 
 def sealed(certificate: Certificate) -> Certificate:
-    """The certificate with the digest of all its other fields."""
-    plain = msgspec.structs.replace(certificate, seal="")
-    return msgspec.structs.replace(certificate, seal=digest(plain))
+    """The certificate with the digest of all its other fields, its condition by the name of the first files."""
+    older = {name: before for before, name in OLDER_NAMES.items()}
+    plain = _plain(msgspec.structs.replace(certificate, seal=""))
+    seal = _sha256([plain | {"condition": older[certificate.condition]}])
+    return msgspec.structs.replace(certificate, seal=seal)
 
 
 def load(path: str | Path) -> Stored:
@@ -153,7 +163,7 @@ def load(path: str | Path) -> Stored:
     if not content.strip():
         raise BadFile(f"{path}: is empty, expected a coupling as python -m design stores it")
     try:
-        stored = msgspec.json.decode(content, type=Stored)
+        stored = msgspec.json.decode(_renamed(content), type=Stored)
         json.loads(content, object_pairs_hook=_once)
         return stored
     except _Twice as error:
@@ -176,6 +186,18 @@ def _content(path: Path) -> bytes:
         content = file.read(MOST_BYTES + 1)
     if len(content) > MOST_BYTES:
         raise BadFile(f"{path}: is larger than {MOST_BYTES // 10**6} MB, expected a coupling as design stores it")
+    return content
+
+
+def _renamed(content: bytes) -> bytes:
+    """The content with the condition by its name of today; as it is where it has that, or is no certificate."""
+    try:
+        whole = msgspec.json.decode(content)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return content
+    match whole:
+        case {"certificate": {"condition": str(name)} as claim} if name in OLDER_NAMES:
+            return msgspec.json.encode(whole | {"certificate": claim | {"condition": OLDER_NAMES[name]}})
     return content
 
 
@@ -250,18 +272,18 @@ def certificate_part(requirement: Requirement) -> dict[str, Any]:
     return part | ({"reason": requirement.reason} if requirement.reason else {})
 
 
-def switching_promise(span: DelayRange) -> str:
+def switching_guarantee(span: DelayRange) -> str:
     """Which delays of the forces a coupling is certified for that bears switching, in the environment of its loop."""
     return f"delays switching within {span}"
 
 
-def promise_of(requirements: Mapping[str, Requirement], loop: Loop, whole_set: bool = False) -> str | None:
+def guarantee_of(requirements: Mapping[str, Requirement], loop: Loop, whole_set: bool = False) -> str | None:
     """For which environments a coupling is certified, by its requirements; None for none.
 
     The multiplier that any-environment takes for psi >= 1 is of one environment. `whole_set`: this-environment is
     proved at every vertex of the loop's box, and a search has found no violation between them.
     """
-    if requirements["theorem4"].certified and not any(loop.psi):
+    if requirements["any-environment"].certified and not any(loop.psi):
         return ANY
     if whole_set:
         return SET
@@ -294,7 +316,7 @@ def encoder_part(
 
 
 # ----------------------------------------------------------------------------------------------------
-# A coupling in every environment of a set: what the closed-loop condition asks at each vertex of a box.
+# A coupling in every environment of a set: what the this-environment condition asks at each vertex of a box.
 
 
 def making_covered(loop: Loop) -> bool:
@@ -304,7 +326,7 @@ def making_covered(loop: Loop) -> bool:
 
 
 def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[Requirement]:
-    """The closed-loop condition of this coupling around each of the members, every one frozen."""
+    """The this-environment condition of this coupling around each of the members, every one frozen."""
     return [_required(loop, coupling, member) for member in members]
 
 
@@ -317,7 +339,7 @@ def _required(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
     try:
         F = loop.at(member.network).F(coupling)
     except SingularLoop as error:
-        return refusal("closed-loop", loop.delta, str(error))
+        return refusal("this-environment", loop.delta, str(error))
     return this_environment(F, loop.delta, loop.T_max, loop.latency)
 
 
@@ -372,7 +394,7 @@ def refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof | msgspec.Unse
     if loop.jitter is None:
         return None if proof is msgspec.UNSET else "a proof for switching delays, but the loop's delays are constant"
     reason = "no proof is on file" if proof is msgspec.UNSET else _refuted(loop, coupling, proof)
-    return reason and f"{switching_promise(loop.jitter)}: {reason}"
+    return reason and f"{switching_guarantee(loop.jitter)}: {reason}"
 
 
 def _refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof) -> str | None:
@@ -457,7 +479,7 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
         return None
     if certificate.limiter is not msgspec.UNSET:
         return certificate.limiter.rho
-    covered = certificate.condition == "theorem4" and not any(loop.psi) and loop.jitter is None
+    covered = certificate.condition == "any-environment" and not any(loop.psi) and loop.jitter is None
     return (0.0,) * loop.channels if covered else None
 
 
@@ -482,7 +504,7 @@ def covered_limits(loop: Loop, coupling: Coupling, requirements: Mapping[str, Re
     """The limiter that a coupling may have: of no lag under any-environment, else that of its own condition."""
     if loop.jitter:
         return Limits(None, str(limiter_refusal(loop)))
-    if requirements["theorem4"].certified and not any(loop.psi):
+    if requirements["any-environment"].certified and not any(loop.psi):
         return Limits((0.0,) * loop.channels, "any-environment covers limited forces")
     found = limiter_requirement(loop, coupling)
     requirement = found.requirement
@@ -532,7 +554,7 @@ def _refuted_limiter(loop: Loop, coupling: Coupling, certificate: Certificate) -
     proof = certificate.limiter
     if proof is msgspec.UNSET:
         return None
-    if certificate.condition != "closed-loop":
+    if certificate.condition != "this-environment":
         return "limiter: any-environment needs no proof of its own, and one is on file"
     if reason := limiter_refusal(loop):
         return reason
@@ -594,16 +616,16 @@ def switching_part(found: JitterProof, G: Lti, span: DelayRange, T_max: float | 
 # ----------------------------------------------------------------------------------------------------
 # Certificates of couplings: proved once, stored, and proved again from the file alone without a solver.
 #
-# closed-loop: F(1) is exactly symmetric and positive semidefinite, and with F(z) = F(1) + (z - 1) R(z) the block
+# this-environment: F(1) is exactly symmetric and positive semidefinite, and with F(z) = F(1) + (z - 1) R(z) the block
 #     R + Delta_D/T - F(1)/2
 # is strictly positive real (design.proof.positive_real). On |z| = 1 the Hermitian part of F(1)/(z - 1) is -F(1)/2, so
 # He[F/(z-1)] > -Delta_D/T there; the same certificate shows that F is stable.
 #
-# closed-loop, forces that latch late, or walls without dampers: the blocks of latency_demand and walls_demand, the
+# this-environment, forces that latch late, or walls without dampers: the blocks of latency_demand and walls_demand, the
 # latter with the multipliers g of its walls, stored too.
 #
-# theorem4, psi = 0: with H = V - Theta-hat (11), (12), V-hat = (1 - 1/z) H/T, H(1) is exactly symmetric, and with
-# H(z) = H(1) + (z - 1) R(z) the block
+# any-environment, psi = 0: with H = V - Theta-hat (11), (12), V-hat = (1 - 1/z) H/T, H(1) is exactly symmetric, and
+# with H(z) = H(1) + (z - 1) R(z) the block
 #     H(1)/2 - R
 # is strictly positive real. Then He V-hat = |1 - 1/z|^2 He[H(1)/2 - R]/T >= Delta_V V-hat* V-hat for a small
 # Delta_V > 0, as V-hat carries the same factor: V-hat is stable and output strictly passive. The environment is
@@ -615,7 +637,7 @@ def switching_part(found: JitterProof, G: Lti, span: DelayRange, T_max: float | 
 #
 # A loop whose delays may switch within a range carries a second proof, of any switching (design.jitter.proof).
 #
-# theorem4, psi >= 1: a multiplier Phi, stored too, and two blocks (design.proof.delayed); it is of this environment.
+# any-environment, psi >= 1: a multiplier Phi, stored too, and two blocks (delayed_blocks); it is of this environment.
 
 
 CLAIM_TOLERANCE_CERTIFICATE = (
@@ -654,9 +676,9 @@ def prove(
     `required_damping` gives, of a caller who has just asked. Raises NotProved with the reason.
     """
     _require_limits(loop, coupling, condition)
-    if beta is not None and condition == "theorem4" and any(loop.psi):
+    if beta is not None and condition == "any-environment" and any(loop.psi):
         raise NotProved("limiter: any-environment with delay in the environment does not cover limited forces")
-    if condition == "closed-loop" and loop.environment.walls:
+    if condition == "this-environment" and loop.environment.walls:
         phi = walls_of(loop, coupling).g
     multiplier = None if phi is None else [rational(float(p)) for p in phi]
     requirement = swept or required_damping(loop, coupling, condition, multiplier)
@@ -684,13 +706,15 @@ def prove(
             required=requirement.required,
             available=loop.delta,
             margin=1 / max(requirement.ratio, 1e-12),
-            promise=_promise(loop, condition),
+            guarantee=_guarantee(loop, condition),
             proof="rational",
             matrices={name: rows_of(M) for name, M in proof.items()},
             scenario=digest(loop, coupling.form()),
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
             switching=_switching(loop, coupling, requirement),
-            limiter=msgspec.UNSET if beta is None or condition == "theorem4" else prove_limiter(loop, coupling, beta),
+            limiter=msgspec.UNSET
+            if beta is None or condition == "any-environment"
+            else prove_limiter(loop, coupling, beta),
         )
     )
 
@@ -711,9 +735,9 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
         states = loop.sent(coupling).order
     except SingularLoop:
         return  # the sweep says where
-    states += sum(loop.theta) if condition == "closed-loop" else 0
+    states += sum(loop.theta) if condition == "this-environment" else 0
     _require_size(states)
-    members = len(loop.members()) if condition == "closed-loop" else 1
+    members = len(loop.members()) if condition == "this-environment" else 1
     if members * states**3 > MOST_COST * LARGEST**3:
         raise NotProved(f"a proof in {members} environments over {states} states each takes long")
 
@@ -758,7 +782,7 @@ def _switching(loop: Loop, coupling: Coupling, requirement: Requirement) -> Swit
         return msgspec.UNSET
     proof = prove_switching(loop, coupling)
     if isinstance(proof, str):
-        raise NotProved(f"{switching_promise(loop.jitter)}: {proof}", requirement)
+        raise NotProved(f"{switching_guarantee(loop.jitter)}: {proof}", requirement)
     return proof
 
 
@@ -782,27 +806,29 @@ def verify(stored: Stored) -> Verdict:
 def required_damping(
     loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[Fraction] | None = None
 ) -> Requirement:
-    """The damping that the condition asks, from a refined sweep: closed-loop, the most over all members of the set.
+    """The damping that the condition asks, from a refined sweep; this-environment: the most over all members.
 
-    Raises NotProved where it is undefined: theorem4 with psi >= 1 needs the multiplier phi.
+    Raises NotProved where it is undefined: any-environment with psi >= 1 needs the multiplier phi.
     """
     if loop.environment.walls:
-        if condition == "closed-loop":
+        if condition == "this-environment":
             return walls_of(loop, coupling, phi).requirement
         if any(loop.psi):
-            raise NotProved("with delay in the environment the multiplier of theorem4 is of a linear one: no walls")
-    if condition == "closed-loop":
+            raise NotProved(
+                "with delay in the environment the multiplier of any-environment is of a linear one: no walls"
+            )
+    if condition == "this-environment":
         requirements = in_each(loop, coupling, loop.members())
         return requirements[worst(requirements)]
     if loop.latency:
-        return refusal("theorem4", loop.delta, LATE)
+        return refusal("any-environment", loop.delta, LATE)
     V = coupling.compliance(loop.T)
     if V is None:
-        return refusal("theorem4", loop.delta, no_compliance(coupling))
+        return refusal("any-environment", loop.delta, no_compliance(coupling))
     if not any(loop.psi):
         return any_environment(V, loop.theta, loop.delta, loop.T_max)
     if phi is None or len(phi) != len(loop.delta):
-        raise NotProved("theorem4 with psi >= 1 needs a multiplier Phi, one entry per channel")
+        raise NotProved("any-environment with psi >= 1 needs a multiplier Phi, one entry per channel")
     values = np.array([float(p) for p in phi])
     return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, values, loop.T_max)
 
@@ -861,8 +887,8 @@ def no_compliance(coupling: Coupling) -> str:
     return "without a coupling there is nothing that Theorem 4 could use"
 
 
-def _promise(loop: Loop, condition: Condition) -> Literal["any passive environment", "a set", "this environment"]:
-    if condition == "theorem4":
+def _guarantee(loop: Loop, condition: Condition) -> Literal["any passive environment", "a set", "this environment"]:
+    if condition == "any-environment":
         return "this environment" if any(loop.psi) else "any passive environment"
     # proved at every vertex; whether it is kept between them is searched by design.box.check and design.check
     return "a set" if loop.box else "this environment"
@@ -870,17 +896,17 @@ def _promise(loop: Loop, condition: Condition) -> Literal["any passive environme
 
 def _place_certificate(loop: Loop, condition: Condition, matrix: str) -> str:
     """Which member of a set the matrix P, P1, P2, .. is about, as the beginning of a message."""
-    if loop.box is None or condition == "theorem4":
+    if loop.box is None or condition == "any-environment":
         return ""
     return f"{loop.members()[int(matrix[1:] or 0)].name}: "
 
 
 def _blocks(loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[Fraction] | None) -> dict[str, Lti]:
     """The exact blocks to be strictly positive real, by the name of the matrix that proves it. Raises NotProved."""
-    if condition == "closed-loop" and loop.environment.walls:
+    if condition == "this-environment" and loop.environment.walls:
         assert phi is not None  # prove has found it, or the file holds it
         return {"P": _walls_block(loop, coupling, phi)}
-    if condition == "closed-loop":
+    if condition == "this-environment":
         loops = [loop.at(member.network) for member in loop.members()]
         return {f"P{i or ''}": _this_environment(each, coupling) for i, each in enumerate(loops)}
     T = rational(loop.T)
@@ -935,8 +961,8 @@ def _refuted_claims(loop: Loop, coupling: Coupling, certificate: Certificate) ->
     """Why the figures on file do not follow from the loop and the coupling, or None."""
     if certificate.proof != "rational":
         return f"the certificate is {certificate.proof}: it carries no exact proof"
-    if certificate.promise != _promise(loop, certificate.condition):
-        return f"{certificate.condition} does not promise {certificate.promise!r}"
+    if certificate.guarantee != _guarantee(loop, certificate.condition):
+        return f"{certificate.condition} does not guarantee {certificate.guarantee!r}"
     if certificate.available != loop.delta:
         return f"available is {list(certificate.available)}, the loop has delta = {list(loop.delta)}"
     _require_limits(loop, coupling, certificate.condition)
@@ -969,8 +995,8 @@ def _refuted_proof(loop: Loop, coupling: Coupling, certificate: Certificate) -> 
 
 
 def _multiplier_name(loop: Loop, condition: Condition) -> str:
-    """What the matrices call it: Phi of theorem4 with psi >= 1, or g of walls under closed-loop."""
-    return WALL_MULTIPLIER if condition == "closed-loop" and loop.environment.walls else "Phi"
+    """What the matrices call it: Phi of any-environment with psi >= 1, or g of walls under this-environment."""
+    return WALL_MULTIPLIER if condition == "this-environment" and loop.environment.walls else "Phi"
 
 
 def _multiplier(loop: Loop, certificate: Certificate) -> list[Fraction] | None:
@@ -985,7 +1011,7 @@ def _multiplier(loop: Loop, certificate: Certificate) -> list[Fraction] | None:
         raise NotProved(f"{name} is no row of rational numbers") from None
 
 
-CONDITIONS: tuple[Condition, ...] = ("theorem4", "closed-loop")
+CONDITIONS: tuple[Condition, ...] = ("any-environment", "this-environment")
 
 
 def assess(
@@ -993,43 +1019,43 @@ def assess(
 ) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
 
-    closed-loop is about the nominal environment alone (design.box.check asks for the rest of its box) and the constant
-    theta (design.jitter.part asks for the rest of its range); where there are walls it is about the frozen contact
-    state that asks for most. What `known`, a certificate just made, proves is not proved again.
+    this-environment is about the nominal environment alone (ranges.check asks for the rest of its ranges) and the
+    constant theta (sim.switching.certified_part asks for the rest of its range); where there are walls it is about the
+    frozen contact state that asks for most. What `known`, a certificate just made, proves is not proved again.
     """
     loop = loop.at(loop.environment).switching(None)
-    here = closed_loop_of(loop, coupling)
-    proved = known and known.condition == "closed-loop" and known.scenario == digest(loop, coupling.form())
+    here = this_environment_of(loop, coupling)
+    proved = known and known.condition == "this-environment" and known.scenario == digest(loop, coupling.form())
     return {
-        "theorem4": _proved(loop, coupling, theorem4_of(loop, coupling, phi), phi),
-        "closed-loop": replace(here, proof="rational") if proved else _proved(loop, coupling, here),
+        "any-environment": _proved(loop, coupling, any_environment_of(loop, coupling, phi), phi),
+        "this-environment": replace(here, proof="rational") if proved else _proved(loop, coupling, here),
     }
 
 
-def closed_loop_of(loop: Loop, coupling: Coupling) -> Requirement:
+def this_environment_of(loop: Loop, coupling: Coupling) -> Requirement:
     """What this-environment asks; with walls that have dampers, in their most demanding frozen contact state."""
     if making_covered(loop):
         try:
             return walls_of(loop, coupling).requirement
         except NotProved as error:
-            return refusal("closed-loop", loop.delta, str(error))
+            return refusal("this-environment", loop.delta, str(error))
     maps = (state.F(coupling) for state in loop.frozen())
     requirements = [this_environment(F, loop.delta, loop.T_max, loop.latency) for F in maps]
     return max(requirements, key=lambda requirement: requirement.ratio)
 
 
-def theorem4_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Requirement:
+def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Requirement:
     """What any-environment asks; walls are covered without delay in the environment, and refused with it."""
     if loop.latency:
-        return refusal("theorem4", loop.delta, LATE)
+        return refusal("any-environment", loop.delta, LATE)
     if loop.environment.walls and any(loop.psi):
         reason = "with delay in the environment its multiplier is of a linear one: no walls"
-        return refusal("theorem4", loop.delta, reason)
+        return refusal("any-environment", loop.delta, reason)
     if isinstance(coupling, SpringDamper | MovingAverage) and not any(loop.psi):
         return any_environment_per_channel(coupling.channels(loop.T), loop.theta, loop.delta, loop.T_max)
     V = coupling.compliance(loop.T)
     if V is None:
-        return refusal("theorem4", loop.delta, no_compliance(coupling))
+        return refusal("any-environment", loop.delta, no_compliance(coupling))
     if not any(loop.psi):
         return any_environment(V, loop.theta, loop.delta, loop.T_max)
     if phi is None:
@@ -1038,7 +1064,7 @@ def theorem4_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Req
         try:
             phi = least_phi(loop)
         except ValueError as error:
-            return refusal("theorem4", loop.delta, str(error))
+            return refusal("any-environment", loop.delta, str(error))
     assert phi is not None  # psi >= 1 has a multiplier or none is possible
     return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, phi, loop.T_max)
 

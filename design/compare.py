@@ -18,7 +18,7 @@ from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.bound import bound
-from design.certificate import NotProved, digest, finite, prove, theorem4_of
+from design.certificate import NotProved, any_environment_of, digest, finite, prove
 from design.conditions import (
     Condition,
     Requirement,
@@ -75,19 +75,25 @@ def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Judged:
     F = loop.F(coupling)
     phi = _multiplier(loop, coupling) if phi is None and any(loop.psi) else phi
     requirements = {
-        "closed-loop": this_environment(F, loop.delta, loop.T_max, loop.latency),
-        "theorem4": theorem4_of(loop, coupling, phi),
+        "this-environment": this_environment(F, loop.delta, loop.T_max, loop.latency),
+        "any-environment": any_environment_of(loop, coupling, phi),
     }
     demands: dict[str, Response | None] = dict.fromkeys(requirements)
-    if np.isfinite(requirements["closed-loop"].ratio):
-        demands["closed-loop"] = partial(least_scale, this_environment_demand(F, loop.delta, loop.T_max, loop.latency))
+    if np.isfinite(requirements["this-environment"].ratio):
+        demands["this-environment"] = partial(
+            least_scale, this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
+        )
     V = coupling.compliance(loop.T)
-    if V is not None and np.isfinite(requirements["theorem4"].ratio):
+    if V is not None and np.isfinite(requirements["any-environment"].ratio):
         if any(loop.psi):
             assert phi is not None  # a finite figure had a multiplier
-            demands["theorem4"] = delayed_demand(V, loop.theta, even_damping(loop.delta, loop.T, loop.T_max), phi)
+            demands["any-environment"] = delayed_demand(
+                V, loop.theta, even_damping(loop.delta, loop.T, loop.T_max), phi
+            )
         else:
-            demands["theorem4"] = partial(least_scale, any_environment_demand(V, loop.theta, loop.delta, loop.T_max))
+            demands["any-environment"] = partial(
+                least_scale, any_environment_demand(V, loop.theta, loop.delta, loop.T_max)
+            )
     return Judged(F, requirements, demands)
 
 
@@ -138,7 +144,7 @@ def _multiplier(loop: Loop, coupling: Coupling) -> Array | None:
     try:
         return least_phi(loop)
     except ValueError:
-        return None  # theorem4_of says why
+        return None  # any_environment_of says why
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -225,9 +231,9 @@ class Limit:
     states: int | None  # of the loop; None: no design
     rms_mismatch_db: float | None
     relative_mismatch_db: float | None
-    required_damping: tuple[float | None, ...] | None  # closed-loop, [N s/m]
+    required_damping: tuple[float | None, ...] | None  # this-environment, [N s/m]
     dc_ratio: float | None  # share of the static stiffness that is felt
-    bare_damping: tuple[float | None, ...]  # what the loop without any coupling requires, closed-loop [N s/m]
+    bare_damping: tuple[float | None, ...]  # what the loop without any coupling requires, this-environment [N s/m]
     wall_s: float
     reason: str | None = None  # why there is no design
     proof: str | None = None  # of the condition it was designed for: "rational" (exact) or "sampled"; None: no design
@@ -353,7 +359,7 @@ class Entry:
 
     name: str
     kind: str
-    condition: Condition = "closed-loop"
+    condition: Condition = "this-environment"
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -363,7 +369,9 @@ class LadderRow:
 
     design: str
     case: str
-    required_damping: tuple[float, ...] | None  # by the closed-loop condition [N s/m]; None where infinite or no design
+    required_damping: (
+        tuple[float, ...] | None
+    )  # by the this-environment condition [N s/m]; None where infinite or no design
     certified: bool  # by that condition
     condition: str  # what the proof is of
     relative_mismatch_db: float | None  # None: exact, or no design
@@ -377,14 +385,14 @@ class LadderRow:
 SHORT = (
     Entry("none", "none"),
     Entry("published", "published"),
-    Entry("spring-damper, any-environment", "spring-damper", "theorem4"),
+    Entry("spring-damper, any-environment", "spring-damper", "any-environment"),
     Entry("spring-damper, this-environment", "spring-damper"),
     Entry("optimal", "optimal"),
     Entry("bound for any linear coupling", "bound"),
 )
 FULL = (
     *SHORT[:4],
-    Entry("ccl, one state per channel, any-environment", "ccl", "theorem4"),
+    Entry("ccl, one state per channel, any-environment", "ccl", "any-environment"),
     Entry("optimal, one rung", "optimal", options={"ladder": LADDER[:1]}),
     Entry("optimal, |F| <= 1.5 |E| above 100 Hz", "optimal", options={"high_gain": 1.5}),
     Entry("optimal, sup", "optimal", options={"objective": "sup"}),

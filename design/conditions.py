@@ -56,8 +56,7 @@ from design.frequency import (
     supremum,
 )
 
-#: as files and options of today name them: theorem4 is any-environment, closed-loop is this-environment
-Condition = Literal["closed-loop", "theorem4"]
+Condition = Literal["this-environment", "any-environment"]
 
 C = TypeVar("C", bound=str)  # a Condition, "jitter-proof" or "limiter"
 
@@ -363,7 +362,7 @@ def this_environment(
     available = dampings(delta, F.inputs)
 
     def refused(reason: str) -> Requirement:
-        return refusal("closed-loop", available, reason)
+        return refusal("this-environment", available, reason)
 
     if min(available) == 0:
         return refused("a device guarantees no damping, so no coupling is safe for every passive human")
@@ -386,7 +385,7 @@ def this_environment(
     if least < -slack:
         return refused("the static stiffness F(1) has a negative direction: it pushes outwards")
     ratio, w = supremum(lambda w: least_scale(demand, w), np.concatenate([[0.0], frequencies(F)]))
-    return from_ratio("closed-loop", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
+    return from_ratio("this-environment", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
 
 
 W_ZERO = 1e-10  # [rad/sample] stands for F(1) of many, whose real part is even: sampled, a network may be 0/0 there
@@ -412,7 +411,7 @@ def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float], T_max:
         raise ValueError(f"theta has {len(theta)} entries for {V.inputs} channels")
 
     def refused(reason: str) -> Requirement:
-        return refusal("theorem4", available, reason)
+        return refusal("any-environment", available, reason)
 
     if min(available) == 0:
         return refused("a device guarantees no damping, so no coupling is safe for every passive human")
@@ -426,7 +425,7 @@ def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float], T_max:
     ratio, w = supremum(least, np.concatenate([[0.0], frequencies(V)]))
     if ratio > _NEVER:
         return refused(f"V is not passive enough at {w / (2 * np.pi * V.T):.4g} Hz: its damping vanishes there")
-    return from_ratio("theorem4", ratio, available, w / (2 * np.pi * V.T))
+    return from_ratio("any-environment", ratio, available, w / (2 * np.pi * V.T))
 
 
 #: V is taken to vanish in a direction in which it is smaller than this, beside V(1): nearer to a zero is rounding.
@@ -457,7 +456,7 @@ def any_environment_per_channel(
     worst = max(each, key=lambda r: r.ratio)
     required = tuple(r.required[0] for r in each)
     available = tuple(r.available[0] for r in each)
-    return Requirement("theorem4", required, available, worst.frequency_hz, worst.reason)
+    return Requirement("any-environment", required, available, worst.frequency_hz, worst.reason)
 
 
 def from_ratio(condition: C, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement[C]:
@@ -491,7 +490,7 @@ LEAST_G, MOST_G, G_DIGITS = 1e-3, 1e3, 4
 class WallsProof:
     """What walls that make and break contact ask of the devices."""
 
-    requirement: Requirement  # condition "closed-loop"
+    requirement: Requirement  # condition "this-environment"
     g: tuple[float, ...]  # (w,) the multiplier that shows it
 
 
@@ -510,7 +509,7 @@ def walls_proof(
     available = dampings(delta, m)
 
     def refused(reason: str) -> WallsProof:
-        return WallsProof(refusal("closed-loop", available, reason), tuple(g or (1.0,) * w))
+        return WallsProof(refusal("this-environment", available, reason), tuple(g or (1.0,) * w))
 
     if min(available) == 0:
         return refused("a device guarantees no damping, so no coupling is safe for every passive human")
@@ -539,7 +538,7 @@ def walls_proof(
     if np.isinf(ratio):
         return refused("no multiplier was found with which the walls are covered, whatever the damping")
     return WallsProof(
-        from_ratio("closed-loop", max(ratio, 0.0), available, at / (2 * np.pi * G.T)), tuple(found.tolist())
+        from_ratio("this-environment", max(ratio, 0.0), available, at / (2 * np.pi * G.T)), tuple(found.tolist())
     )
 
 
@@ -646,7 +645,7 @@ def any_environment_delayed(
     available = dampings(delta, V.inputs)
 
     def refused(reason: str) -> Requirement:
-        return refusal("theorem4", available, reason)
+        return refusal("any-environment", available, reason)
 
     if not V.is_stable():
         return refused("the coupling V has a pole on or outside the unit circle")
@@ -660,7 +659,7 @@ def any_environment_delayed(
     ratio, w = supremum(needed, np.concatenate([[0.0], frequencies(V)]))
     if np.isinf(ratio):
         return refused(f"V is not passive enough at {w / (2 * np.pi * V.T):.4g} Hz for this multiplier")
-    return from_ratio("theorem4", ratio, available, w / (2 * np.pi * V.T))
+    return from_ratio("any-environment", ratio, available, w / (2 * np.pi * V.T))
 
 
 def uncovered(environment: Lti, psi: Sequence[int], Phi: Array) -> float:

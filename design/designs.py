@@ -11,11 +11,11 @@ import msgspec
 
 from controller.coupling import Coupling
 from controller.loop import DelayRange, Loop
-from design import certificate as promises
+from design import certificate as guarantees
 from design.certificate import LATE, Stored, assess, switching_requirement
 from design.conditions import Condition, Requirement, this_environment
 from design.ranges import check_set
-from design.result import CONDITION_NAMES, Design, DesignFailed, Row, bare, known, of_kind, one_of
+from design.result import Design, DesignFailed, Row, bare, known, of_kind, one_of
 from design.transparency import Transparency, transparency
 
 # ----------------------------------------------------------------------------------------------------
@@ -24,10 +24,10 @@ from design.transparency import Transparency, transparency
 
 #: name -> the conditions that it can be made for, its own first
 KINDS = {
-    "spring-damper": ("theorem4", "closed-loop"),
-    "moving-average": ("theorem4",),
-    "ccl": ("theorem4",),
-    "optimal": ("closed-loop",),
+    "spring-damper": ("any-environment", "this-environment"),
+    "moving-average": ("any-environment",),
+    "ccl": ("any-environment",),
+    "optimal": ("this-environment",),
 }
 
 
@@ -39,7 +39,7 @@ def usual_condition(loop: Loop, kind: str | None) -> str | None:
     """
     if kind not in (None, "spring-damper"):
         return None
-    return "theorem4" if loop.environment.walls or loop.box or loop.jitter else "closed-loop"
+    return "any-environment" if loop.environment.walls or loop.box or loop.jitter else "this-environment"
 
 
 #: kind -> what else can be asked of it, in words of design.api.Options
@@ -97,8 +97,8 @@ def design_by_kind(
 
     if loop.latency is None:
         return made(loop)
-    if condition == "theorem4":
-        raise ValueError(f"latency: {LATE}, or design for {CONDITION_NAMES['closed-loop']}")
+    if condition == "any-environment":
+        raise ValueError(f"latency: {LATE}, or design for this-environment")
     return _with_latency(loop, made)
 
 
@@ -180,8 +180,8 @@ def design_coupling(
     """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
 
     `kind` is "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal"; `condition` is
-    "theorem4" (any passive environment) or "closed-loop" (this environment), None for the kind's own. `options` are
-    those of the kind, see Options; switching is not taken from loop.jitter.
+    "any-environment" or "this-environment", None for the kind's own. `options` are those of the kind, see
+    Options; switching is not taken from loop.jitter.
 
     Returns a Design: `coupling` (for a spring-damper with K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the damping
     that it needs, from a sweep of the coupling alone), `figure` and `objective` (what was minimised, and its value).
@@ -199,10 +199,10 @@ def design_coupling(
 
 
 def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[str]]:
-    """What both conditions, "theorem4" and "closed-loop", ask of a coupling in its loop.
+    """What both conditions, "any-environment" and "this-environment", ask of a coupling in its loop.
 
-    With a box around the loop's environment closed-loop is about the environment and every vertex: the figure is that
-    of the one that asks the most, proved only if all are. Between the vertices nothing is proved, but searched: a
+    With ranges around the loop's environment this-environment is about the environment and every vertex: the figure is
+    that of the one that asks the most, proved only if all are. Between the vertices nothing is proved, but searched: a
     violation found there (design.box.worst_member) is the figure then, and not certified. With a range of delays,
     loop.jitter, there is a third, "jitter-proof": what any switching within the range asks.
 
@@ -219,13 +219,13 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[st
     requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, phi))
     if whole := check_set(loop, alone, samples=0):
         _, worst = whole.worst if whole.proved else whole.worst_found
-        requirements["closed-loop"] = replace(worst, proof="rational" if whole.proved else "sampled")
+        requirements["this-environment"] = replace(worst, proof="rational" if whole.proved else "sampled")
     if loop.jitter:
         requirements["jitter-proof"] = switching_requirement(loop, alone).requirement
     return requirements
 
 
-def promise(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str | None:
+def guarantee(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str | None:
     """For which environments `certify(loop, coupling)` says that a coupling is safe, in words; None where for none.
 
     "any passive environment", "a set" (the loop's environment and its box), "this environment", or each contact state
@@ -233,11 +233,11 @@ def promise(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str | N
     """
     of_kind("loop", loop, Loop, LOOP)
     of_kind("requirements", requirements, Mapping, "what certify returned")
-    if "closed-loop" not in requirements:
+    if "this-environment" not in requirements:
         raise ValueError(f"requirements has {', '.join(requirements) or 'nothing'}, expected what certify returned")
-    held = requirements["closed-loop"]
+    held = requirements["this-environment"]
     whole_set = loop.box is not None and held.certified and held.proof == "rational"
-    return promises.promise_of(requirements, loop, whole_set)
+    return guarantees.guarantee_of(requirements, loop, whole_set)
 
 
 def transparency_of(loop: Loop, coupling: Coupling | Design) -> Transparency:

@@ -688,7 +688,7 @@ class _Climb:
         from design import spring_damper  # its solvers load slowly, and most designs end before
 
         try:
-            gains = spring_damper.design(self.loop, "closed-loop").coupling
+            gains = spring_damper.design(self.loop, "this-environment").coupling
             return self._proved(self._assessed(gains, np.nan))
         except (DesignFailed, ValueError):
             return None
@@ -714,7 +714,7 @@ class _Climb:
         objective = self.options.objective
         return Optimal(
             coupling,
-            "closed-loop",
+            "this-environment",
             objective,
             figures.rms_mismatch if objective == "rms" else figures.relative_mismatch,
             requirement,
@@ -730,7 +730,7 @@ class _Climb:
     def _proved(self, found: Optimal) -> Optimal:
         """The same with its certificate, or why it has none."""
         try:
-            certificate = prove(self.loop, found.coupling, "closed-loop", swept=found.requirement)
+            certificate = prove(self.loop, found.coupling, "this-environment", swept=found.requirement)
         except NotProved as error:
             return replace(found, wall_s=self.elapsed, reason=str(error))
         requirement = replace(found.requirement, proof="rational")

@@ -1,4 +1,4 @@
-"""Whether a coupling keeps its promise for a set of environments: proved at the vertices of a box, searched between."""
+"""Whether a coupling keeps its guarantee for ranges of environments: proved at the vertices, searched between."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tupl
 
 
 # ----------------------------------------------------------------------------------------------------
-# What a promise for a set of environments costs: the robust coupling beside the one made for the nominal one.
+# What a guarantee for a set of environments costs: the robust coupling beside the one made for the nominal one.
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Cost:
 
     name: str
     ratio: tuple[float, float]  # required over available damping: in the nominal environment, and the most
-    violated: int  # members at which the closed-loop condition fails
+    violated: int  # members at which the this-environment condition fails
     rms_db: tuple[float, float]  # mismatch: in the nominal environment, and at its worst vertex
     sup_db: tuple[float, float]
     worst: str  # the vertex with the largest rms mismatch
@@ -187,7 +187,7 @@ WHAT_IS_PROVED = (
 
 @dataclass(frozen=True, eq=False)
 class SetCheck:
-    """The closed-loop condition over a box. `members` and `at_members` are the environment and the vertices."""
+    """The this-environment condition over a box. `members` and `at_members` are the environment and the vertices."""
 
     members: tuple[Member, ...]
     at_members: tuple[Requirement, ...]
@@ -196,8 +196,8 @@ class SetCheck:
     searched: Searched
     at_found: Requirement  # at the worst environment that the search has found
     seed: int
-    certificate: Certificate | None  # of the whole set, with the promise "a set"
-    reason: str | None  # why the set is not promised
+    certificate: Certificate | None  # of the whole set, with the guarantee "a set"
+    reason: str | None  # why the set is not guaranteed
 
     @property
     def proved(self) -> bool:
@@ -238,7 +238,7 @@ def check_set(
     searched = searched or search_box(loop, coupling, progress)
     members, drawn = loop.members(), inside(loop.network, loop.box, samples, seed)
     try:
-        certificate, reason = certificate or prove(loop, coupling, "closed-loop"), None
+        certificate, reason = certificate or prove(loop, coupling, "this-environment"), None
     except NotProved as error:
         certificate, reason = None, str(error)
     at_members, at_samples = in_each(loop, coupling, members), in_each(loop, coupling, drawn)
@@ -260,7 +260,7 @@ def search_box(loop: Loop, coupling: Coupling, progress: Progress = lambda done,
 
 
 def violated_between(place: Member, ratio: float) -> str:
-    """Why a coupling that is proved at every vertex is promised no set."""
+    """Why a coupling that is proved at every vertex has no guarantee for the set."""
     needs = f"{ratio:.4f} of the damping is needed" if np.isfinite(ratio) else "no damping is enough"
     return f"proved at the vertices, but violated between them: {needs} at {place.name}"
 
@@ -333,5 +333,5 @@ def set_rows(part: dict[str, Any]) -> list[tuple[str, str]]:
         inside = f"{found['certified']} of {found['samples']} random samples certified, {ratio} of the damping"
         rows.append(("set, inside", inside))
     if exact and not part["certified"]:
-        rows.append(("set", f"[red]not promised[/]: {part['reason']}"))
+        rows.append(("set", f"[red]not guaranteed[/]: {part['reason']}"))
     return rows

@@ -45,7 +45,8 @@ class Infeasible(DesignFailed):
 
 
 #: the key of a condition in files and reports -> its name in words and options
-CONDITION_NAMES: dict[str, str] = {"closed-loop": "this-environment", "theorem4": "any-environment"}
+#: what files, options and reports called the conditions before
+OLDER_NAMES = {"closed-loop": "this-environment", "theorem4": "any-environment"}  # older name
 
 
 def listed(values: Iterable[float | None], digits: int = 6) -> str:

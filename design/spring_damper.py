@@ -199,7 +199,7 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> tuple[Comple
 
 
 # ----------------------------------------------------------------------------------------------------
-# Spring-damper gains under the closed-loop condition, for one environment: a local search from several starts.
+# Spring-damper gains under the this-environment condition, for one environment: a local search from several starts.
 #
 # The set is not convex in (K, B), so nothing here is proved best. The rms mismatch is minimised by sequential
 # quadratic programming with the condition at sampled frequencies; where the refined sweep of design.margin finds it
@@ -299,7 +299,7 @@ def least_rms(
 ) -> tuple[SpringDamper | None, float, int]:
     """(gains, rms mismatch as a ratio, searches) of the best local optimum; gains None if none was found.
 
-    `optimum` searches from one start; the default finds what closed-loop certifies.
+    `optimum` searches from one start; the default finds what this-environment certifies.
     """
     optimum = optimum or partial(_certified_optimum, loop)
     E, best, least, searches = loop.E(), None, np.inf, 0
@@ -482,7 +482,7 @@ NEGLIGIBLE = 1e-6
 
 def design(
     loop: Loop,
-    condition: str = "theorem4",
+    condition: str = "any-environment",
     starts: Sequence[SpringDamper] = (),
     switching: tuple[Sequence[int], Sequence[int]] | None = None,
     limiter: bool = False,
@@ -492,20 +492,20 @@ def design(
     """The best spring-damper under `condition`; by default the starts are chosen, a start need not be feasible.
 
     any-environment: minimises ||W1 L W2||_inf (23) over the exact set; the result does not depend on the start.
-    closed-loop: minimises the rms mismatch in this environment from every start, local optima only; with
+    this-environment: minimises the rms mismatch in this environment from every start, local optima only; with
     `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it, with `limiter` also
     while forces are limited (any-environment is anyway, at no cost).
-    Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for closed-loop.
+    Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for this-environment.
     """
-    if condition == "theorem4" and switching is None:
+    if condition == "any-environment" and switching is None:
         return _for_any_environment(Shaping(loop, W1, W2), starts[0] if starts else None)
-    if condition == "closed-loop":
+    if condition == "this-environment":
         if switching and limiter:
             raise ValueError("limiter and switching: limited forces are proved for constant delays, ask for one")
         return _for_this_environment(loop, starts, switching, limiter)
     if switching:
-        raise ValueError("delays that vary are designed for by the closed-loop condition only")
-    raise ValueError(f"condition is {condition!r}, expected 'any_environment' or 'closed-loop'")
+        raise ValueError("delays that vary are designed for by the this-environment condition only")
+    raise ValueError(f"condition is {condition!r}, expected 'any-environment' or 'this-environment'")
 
 
 def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design:
@@ -524,7 +524,7 @@ def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design
             break
     coupling = _coupling(loop, gains)
     requirement = verified(loop, coupling, phi)
-    return Design(coupling, "theorem4", "loop-norm", norm, requirement, sdps, time.perf_counter() - started, phi)
+    return Design(coupling, "any-environment", "loop-norm", norm, requirement, sdps, time.perf_counter() - started, phi)
 
 
 def _for_this_environment(
@@ -539,7 +539,7 @@ def _for_this_environment(
         search = partial(least_rms, loop, optimum=partial(_limited_optimum, loop))
     coupling, rms, searches = search(starts)
     if coupling is None:
-        certifies = "the closed-loop condition certifies"
+        certifies = "the this-environment condition certifies"
         if switching:
             certifies += f" under any switching from {tuple(switching[0])} to {tuple(switching[1])} samples"
         if limiter:
@@ -551,7 +551,7 @@ def _for_this_environment(
         raise DesignFailed(None, (), line)
     coupling = SpringDamper(coupling.K, np.where(NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B))
     requirement = this_environment(loop.F(coupling), loop.delta, loop.T_max)
-    return Design(coupling, "closed-loop", "rms", rms, requirement, searches, time.perf_counter() - started)
+    return Design(coupling, "this-environment", "rms", rms, requirement, searches, time.perf_counter() - started)
 
 
 def _default_starts(loop: Loop) -> list[SpringDamper]:
@@ -577,7 +577,9 @@ def stiffest(loop: Loop) -> Design:
     coupling = _coupling(loop, gains)
     requirement = verified(loop, coupling, phi)
     total = float(coupling.K.sum())
-    return Design(coupling, "theorem4", "stiffness", total, requirement, sdps, time.perf_counter() - started, phi)
+    return Design(
+        coupling, "any-environment", "stiffness", total, requirement, sdps, time.perf_counter() - started, phi
+    )
 
 
 def moving_average(loop: Loop) -> Design:
@@ -592,7 +594,7 @@ def moving_average(loop: Loop) -> Design:
     coupling = MovingAverage(weight, terms.tolist(), RESERVE / (1 - RESERVE) * terms**2 * weight)
     requirement = verified(loop, coupling, phi)
     total = float(coupling.stiffness.sum())
-    return Design(coupling, "theorem4", "stiffness", total, requirement, 0, time.perf_counter() - started, phi)
+    return Design(coupling, "any-environment", "stiffness", total, requirement, 0, time.perf_counter() - started, phi)
 
 
 def verified(loop: Loop, coupling: SpringDamper | MovingAverage, phi: Array | None) -> Requirement:

@@ -22,7 +22,7 @@ from controller.coupling import Coupling
 from controller.environment import environment
 from controller.loop import force_map
 from controller.lti import Array, Lti
-from design.certificate import assess, certificate_part, promise_of
+from design.certificate import assess, certificate_part, guarantee_of
 from design.conditions import Requirement
 from design.result import DesignFailed
 from hw.limits import Fault, Gain, Heat, Limits, Units, check_jolt, check_jump, check_range, check_speed, shape
@@ -33,7 +33,7 @@ from sim.report import coupling_part
 from sim.scenario import InputError, Scenario
 
 _SPEED_SECONDS = 0.01  # over which a speed is taken: one count of the coarsest encoder is 0.03 m/s
-_FALLBACK = ("spring-damper", "theorem4")  # what softer couplings are where the one asked for cannot be had
+_FALLBACK = ("spring-damper", "any-environment")  # what softer couplings are where the one asked for cannot be had
 
 
 class Controller(Protocol):
@@ -352,7 +352,7 @@ class CertifiedCoupling:
         return host_controller(self.scenario, self.chosen.coupling, self.link)
 
     def part(self) -> dict[str, Any]:
-        """As plain data: coupling, certificates, promise."""
+        """As plain data: coupling, certificates, guarantee."""
         return {
             "link_delay": self.link,
             "theta": list(self.scenario.theta),
@@ -361,7 +361,7 @@ class CertifiedCoupling:
             "coupling": coupling_part(self.chosen.kind, self.chosen.coupling, self.scenario.T),
             "certificate": certificate_part(self.requirements[self.chosen.condition]),
             "certificates": {name: certificate_part(r) for name, r in self.requirements.items()},
-            "promise": promise_of(self.requirements, self.scenario.loop(self.case)),
+            "promise": guarantee_of(self.requirements, self.scenario.loop(self.case)),
             "remarks": self.remarks(),
         }
 
@@ -386,8 +386,8 @@ def certified_coupling(
     slower = scenario.replace(theta=delays, latency=None if link else scenario.latency)
     try:
         # a latency is derived for this environment only
-        wanted = condition or ("closed-loop" if slower.latency else None)
-        chosen = Chosen("given", given, "closed-loop") if given else choose(slower, case, name, wanted)
+        wanted = condition or ("this-environment" if slower.latency else None)
+        chosen = Chosen("given", given, "this-environment") if given else choose(slower, case, name, wanted)
     except DesignFailed as error:
         raise Fault(f"no coupling for a link of {link} ticks: {error}") from None
     requirements = assess(slower.loop(case), chosen.coupling, chosen.phi)
@@ -404,7 +404,7 @@ def certified_couplings(
     """The coupling for the measured delay and up to `spare` softer ones, each for one tick more.
 
     A softer one is of the same kind or from the same file; where that is not certified for the longer delay, it is
-    the spring-damper by Theorem 4, which promises the most. Raises Fault where the first coupling is not certified;
+    the spring-damper by Theorem 4, which guarantees the most. Raises Fault where the first coupling is not certified;
     where no softer one is, the ladder ends.
     """
     found, wanted = [certified_coupling(scenario, case, name, condition, link)], [(name, condition), _FALLBACK]

@@ -1,4 +1,4 @@
-"""What may be done to a device, and by which device: limits of forces and encoders, and what INFO must promise first.
+"""What may be done to a device, and by which device: limits of forces and encoders, and what INFO must declare first.
 
 Pure functions, no clock, no port. Order matters: a number that is not finite is found before any clamping, because
 max(-12, min(12, nan)) is +12.

@@ -15,7 +15,7 @@ import numpy as np
 
 from controller.coupling import Coupling
 from controller.lti import Array
-from design.certificate import promise_of
+from design.certificate import guarantee_of
 from design.conditions import Requirement
 from design.result import COUPLING, Design, bare, number, of_kind, whole
 from hw.control import CertifiedCoupling, Program, certified_coupling, certified_couplings, timed
@@ -205,7 +205,7 @@ class Rehearsed:
     latency: tuple[float, float] | None  # [s] between which forces latch after their tick; None where at ticks
     coupling: Coupling | None  # that the device was armed with, or would have been
     requirements: dict[str, Requirement]  # of that coupling by both conditions, as `certify` gives them
-    promise: str | None  # for which environments they hold
+    guarantee: str | None  # for which environments they hold
     result: Trace | None  # t, x and f of every tick, as `simulate` gives them; handles are not measured
     zero_after: float | None  # from the wish to stop until no motor does anything [s]; None where it never ran
 
@@ -239,7 +239,9 @@ def rehearse(
     require_constant_delay(scenario, "rehearse")
     require_even_ticks(scenario, "rehearse")
     if min(scenario.delta) <= 0:
-        raise InputError(f"delta is {list(scenario.delta)}: a device without damping can promise no human anything")
+        raise InputError(
+            f"delta is {list(scenario.delta)}: a device without damping can guarantee nothing to any human"
+        )
     session = session_for(scenario, LinkSettings(measure=_MEASURE))
     session.record = recorder = Recorder(scenario.channels)
     programs: list[CertifiedCoupling] = []
@@ -287,7 +289,7 @@ def _outcome(
         latency=first.scenario.latency[0] if first and first.scenario.latency else None,
         coupling=first and first.chosen.coupling,
         requirements=first.requirements if first else {},
-        promise=promise_of(first.requirements, first.scenario.loop(first.case)) if first else None,
+        guarantee=guarantee_of(first.requirements, first.scenario.loop(first.case)) if first else None,
         result=result_of(recorder, session.units, scenario.T, meta) if ran and len(recorder) else None,
         zero_after=rehearsal.zero_after(stopped[0]) if stopped and ran else None,
     )

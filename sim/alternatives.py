@@ -1,4 +1,4 @@
-"""The same devices and hands with other couplings: what each promise costs, from no coupling to the best one.
+"""The same devices and hands with other couplings: what each guarantee costs, from no coupling to the best one.
 
 A run is of one coupling. Beside it stand the loop without any, the paper's printed gains where the loop is the paper's,
 the spring-damper for any passive environment, the one for this environment, and the optimal coupling where it is quick
@@ -14,9 +14,8 @@ from typing import Any
 
 from controller.coupling import Coupling
 from controller.lti import Array
-from design.certificate import assess, finite, promise_of
+from design.certificate import assess, finite, guarantee_of
 from design.conditions import Requirement
-from design.result import CONDITION_NAMES
 from design.transparency import decibels, transparency
 from sim.accuracy import credible_part, force_error
 from sim.couplings import choose
@@ -29,9 +28,9 @@ from sim.trace import Trace
 _ROWS = (
     ("none", None),
     ("published", None),
-    ("spring-damper", "theorem4"),
-    ("spring-damper", "closed-loop"),
-    ("optimal", "closed-loop"),
+    ("spring-damper", "any-environment"),
+    ("spring-damper", "this-environment"),
+    ("optimal", "this-environment"),
 )
 _QUICK = 2
 
@@ -44,7 +43,7 @@ class Alternative:
     condition: str | None
     coupling: Coupling | None = None
     requirements: dict[str, Requirement] | None = None
-    promise: str | None = None
+    guarantee: str | None = None
     rendered: float | None = None  # share of the static stiffness that is felt
     rms_mismatch_db: float | None = None
     growth: float | None = None  # [1/s] of the exact loop
@@ -58,20 +57,20 @@ class Alternative:
     def name(self) -> str:
         """As tables and pictures call it: a spring-damper by its condition."""
         if self.kind == "spring-damper":
-            return CONDITION_NAMES[self.condition or ""]
+            return self.condition or ""
         return {"optimal": "best (optimal)"}.get(self.kind, self.kind)
 
     def part(self) -> dict[str, Any]:
         """As plain data."""
         damping = {
-            CONDITION_NAMES.get(name, name): [finite(float(x)) for x in requirement.required]
+            name: [finite(float(x)) for x in requirement.required]
             for name, requirement in (self.requirements or {}).items()
         }
         part: dict[str, Any] = {
             "coupling": self.kind,
-            "condition": CONDITION_NAMES.get(self.condition or "", self.condition),
+            "condition": self.condition,
             "required_damping": damping,
-            "promise": self.promise,
+            "promise": self.guarantee,
             "dc_ratio": self.rendered,
             "rms_mismatch_db": self.rms_mismatch_db,
             "growth_rate_per_s": self.growth,
@@ -110,7 +109,7 @@ def _possible(scenario: Scenario, case: str, kind: str, condition: str | None) -
     if kind == "published":
         return scenario.loop(case) == load().loop(case)
     one_environment = scenario.environment.walls or scenario.box
-    if condition == "closed-loop" and one_environment:
+    if condition == "this-environment" and one_environment:
         return False
     return kind != "optimal" or scenario.channels <= _QUICK
 
@@ -129,7 +128,7 @@ def _alternative(scenario: Scenario, case: str, kind: str, condition: str | None
         condition,
         chosen.coupling,
         dict(requirements),
-        promise_of(requirements, loop, False),
+        guarantee_of(requirements, loop, False),
         finite(felt.dc_ratio),
         finite(decibels(felt.rms_mismatch)),
         finite(growth),

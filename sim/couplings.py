@@ -9,7 +9,7 @@ from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design import certificate as store
-from design.certificate import Stored, switching_promise, verify
+from design.certificate import Stored, switching_guarantee, verify
 from design.designs import KINDS, design_by_kind
 from design.result import PUBLISHED, DesignFailed
 from sim.scenario import InputError, Scenario
@@ -40,11 +40,11 @@ def choose(scenario: Scenario, case: str, name: str | None = None, condition: st
         name = "none"
     name = name or "spring-damper"
     if name == "none":
-        return Chosen(name, NoCoupling(), condition or "closed-loop")
+        return Chosen(name, NoCoupling(), condition or "this-environment")
     if name == "published":
         if scenario.channels != 2:
             raise InputError(f"--coupling published: the paper prints gains for 2 channels, not {scenario.channels}")
-        return Chosen(name, PUBLISHED[case], condition or "theorem4")
+        return Chosen(name, PUBLISHED[case], condition or "any-environment")
     if name in KINDS:
         try:
             design = design_by_kind(scenario.loop(case), name, condition)
@@ -57,7 +57,7 @@ def choose(scenario: Scenario, case: str, name: str | None = None, condition: st
         raise InputError(f"--coupling is {name!r}, allowed are {', '.join(NAMES)} or a FILE.json")
     stored = read_coupling(name)
     coupling = fitted(stored, name, scenario.channels, scenario.T)
-    made_for = stored.certificate.condition if stored.certificate else "closed-loop"
+    made_for = stored.certificate.condition if stored.certificate else "this-environment"
     checked = check_stored(stored, scenario.loop(case))
     return Chosen(Path(name).name, coupling, condition or made_for, notes=checked.notes, switching=checked.switching)
 
@@ -103,13 +103,13 @@ def check_stored(stored: Stored, loop: Loop) -> FileCheck:
     switching = stored.loop.jitter if proved else None
     if switching and switching.contains(loop.jitter or DelayRange(loop.theta, loop.theta)):
         if loop.theta != stored.loop.theta or loop.jitter not in (None, switching):
-            here = switching_promise(loop.jitter) if loop.jitter else f"the constant theta = {list(loop.theta)}"
-            notes.append(f"the file proves {switching_promise(switching)}, which covers {here}")
+            here = switching_guarantee(loop.jitter) if loop.jitter else f"the constant theta = {list(loop.theta)}"
+            notes.append(f"the file proves {switching_guarantee(switching)}, which covers {here}")
         return FileCheck(tuple(notes), switching)
     differ += ["theta"] if loop.theta != stored.loop.theta else []
     if loop.jitter and proved:
-        made_for = switching_promise(switching) if switching else "constant delays"
-        notes.append(f"the file proves {made_for}: {switching_promise(loop.jitter)} are judged anew here")
+        made_for = switching_guarantee(switching) if switching else "constant delays"
+        notes.append(f"the file proves {made_for}: {switching_guarantee(loop.jitter)} are judged anew here")
     if differ:
         notes.append(
             f"the coupling was stored for another loop (different {', '.join(differ)}), and is judged anew here"

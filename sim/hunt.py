@@ -2,9 +2,9 @@
 
 It is for walls with dampers: of walls without, docs/theory.md proves that making and breaking contact is covered. Every
 draw is a loop of one channel: a light rigid device, a random delay, an environment of a spring, a mass and one or two
-walls at random places, a random spring-damper coupling. The device gets just the damping that the closed-loop condition
-asks in the worst frozen contact state, so all of them are certified; draws that theorem4 certifies as well are left
-out, because there the answer is known. Lossless hands are let go from random states: half of them of random
+walls at random places, a random spring-damper coupling. The device gets just the damping that this-environment asks in
+the worst frozen contact state, so all of them are certified; draws that any-environment certifies as well are left out,
+because there the answer is known. Lossless hands are let go from random states: half of them of random
 mass and stiffness, half those of many whose modes above 5 Hz decay most slowly in a frozen state. No force limit, no
 outside force.
 
@@ -25,7 +25,7 @@ from controller.environment import GROUND, Network, Spring, Wall
 from controller.loop import Loop
 from controller.lti import Array
 from controller.process import Process, StepBuffer
-from design.certificate import closed_loop_of, theorem4_of
+from design.certificate import any_environment_of, this_environment_of
 from models.device import RigidDevice
 from models.human import Human, Link
 from models.scene import Crowd, variants
@@ -90,11 +90,11 @@ def bounce(process: Process, engine: Engine, start: Array, ticks: int, windows: 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A loop whose frozen contact states are all certified, and theorem4 not."""
+    """A loop whose frozen contact states are all certified, and any-environment not."""
 
     scenario: Scenario
     coupling: SpringDamper
-    theorem4: float  # damping that theorem4 requires over what there is
+    any_environment: float  # damping that any-environment requires over what there is
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ class Found:
 
 
 def draw(seed: int, index: int, dampers: bool = True) -> Case | None:
-    """Loop `index` of a seed; None where theorem4 certifies it too, or no damping does.
+    """Loop `index` of a seed; None where any-environment certifies it too, or no damping does.
 
     Without `dampers` the device gets what is proved for walls that make and break contact.
     """
@@ -134,7 +134,10 @@ def draw(seed: int, index: int, dampers: bool = True) -> Case | None:
     network = Network(("tip",), (spring,), {"mass": mass}, tuple(walls))
     coupling = SpringDamper(np.array([K]), np.array([B]))
     loop = Loop(T, (theta,), (0,), (theta,), (1.0,), network)
-    frozen, whatever = closed_loop_of(loop, coupling).ratio * (1 + _SPARE), theorem4_of(loop, coupling).ratio
+    frozen, whatever = (
+        this_environment_of(loop, coupling).ratio * (1 + _SPARE),
+        any_environment_of(loop, coupling).ratio,
+    )
     if not 0.01 < frozen < min(whatever, 20.0):
         return None
     device = RigidDevice(mass=between(0.01, 0.25), damping=frozen, force_limit=_LIMIT)

@@ -46,7 +46,7 @@ _STYLES: tuple[dict[str, Any], ...] = (
 _IDEAL: dict[str, Any] = {"color": "0.45", "linestyle": "-", "linewidth": 3.0, "alpha": 0.55}
 _STABLE, _UNSTABLE = "#DDEBF4", "#F6D9C6"  # areas
 #: the two conditions, by the keys that reports have
-_CONDITIONS = {"closed-loop": "this environment", "theorem4": "any passive environment"}
+_CONDITIONS = {"this-environment": "this environment", "any-environment": "any passive environment"}
 
 
 def _panels(title: str, rows: int, columns: int, size: tuple[float, float], **shared: Any) -> tuple[Figure, Any]:
@@ -427,7 +427,7 @@ def plot_required_damping(data: dict[str, Any], path: Path) -> Path:
             at = max(part["binding_frequency_hz"], hz[0]), min(binds, top)
             axis.plot(*at, "o" if binds <= top else "^", color=style["color"])
         axis.axhspan(scale, 1.12 * top, color="black", alpha=0.06, linewidth=0)
-        delayed = condition == "theorem4" and any(data["psi"])
+        delayed = condition == "any-environment" and any(data["psi"])
         words += " (with a multiplier of this one)" if delayed else ""
         axis.set(xscale="log", title=words, xlabel="frequency [Hz]", ylim=(-0.5 * scale, 1.12 * top))
         axis.legend(fontsize=8)
@@ -473,8 +473,8 @@ def _over_frequency(title: str, rows: int, columns: int, size: tuple[float, floa
 #: design -> what it is called, and how it is drawn
 _CURVES: dict[str, tuple[str, dict[str, Any]]] = {
     "optimal": ("the optimal coupling", _STYLES[0] | {"marker": "o"}),
-    "closed-loop": (f"spring-damper, {_CONDITIONS['closed-loop']}", _STYLES[1] | {"marker": "s"}),
-    "theorem4": (f"spring-damper, {_CONDITIONS['theorem4']}", _STYLES[2] | {"marker": "^"}),
+    "this-environment": (f"spring-damper, {_CONDITIONS['this-environment']}", _STYLES[1] | {"marker": "s"}),
+    "any-environment": (f"spring-damper, {_CONDITIONS['any-environment']}", _STYLES[2] | {"marker": "^"}),
 }
 #: the floor of the picture [dB]: in case I a loop that needs no coupling has minus infinity
 _EXACT = -60.0
@@ -561,8 +561,8 @@ def _draw_sweep(axis: Axes, name: str, sweep: dict[str, Any], figure: str, here:
 
 #: in the order of drawing: the broken line lies on the other, so that both are seen where they are the same
 _LINES: dict[str, dict[str, Any]] = {
-    "closed-loop": _STYLES[2] | {"linestyle": "-", "linewidth": 3.6},
-    "theorem4": _STYLES[0] | {"linestyle": "--", "linewidth": 1.8},
+    "this-environment": _STYLES[2] | {"linestyle": "-", "linewidth": 3.6},
+    "any-environment": _STYLES[0] | {"linestyle": "--", "linewidth": 1.8},
     MODEL_KEPT: _STYLES[3] | {"linewidth": 1.8},
 }
 

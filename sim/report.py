@@ -16,7 +16,7 @@ from controller.lti import Array
 from controller.timing import Timing
 from design.certificate import ANY, CAVEATS, MAKING, assess, certificate_part, encoder_part, finite
 from design.conditions import Requirement
-from design.result import CONDITION_NAMES, PRINTED_TAU_DB, PUBLISHED, listed
+from design.result import OLDER_NAMES, PRINTED_TAU_DB, PUBLISHED, listed
 from design.transparency import Transparency, decibels
 from models.human import Person
 from sim.adversary import Worst
@@ -35,7 +35,7 @@ from sim.trace import Trace
 def certificates_part(requirements: Mapping[str, Requirement]) -> dict[str, Any]:
     """Both conditions, each under its name and under the name that it had before: the same objects."""
     parts = {name: certificate_part(requirement) for name, requirement in requirements.items()}
-    return parts | {CONDITION_NAMES[name]: part for name, part in parts.items()}
+    return parts | {older: parts[name] for older, name in OLDER_NAMES.items() if name in parts}
 
 
 def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
@@ -88,14 +88,12 @@ def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> dict[str
 def remarks(outcome: dict[str, Any]) -> list[str]:
     """What a reader must know to read the figures rightly."""
     lines = []
-    certificates = {name: outcome["certificates"][name] for name in ("theorem4", "closed-loop")}
-    name = "theorem4" if outcome["certificate"]["condition"] == "theorem4" else "closed-loop"
+    certificates = {name: outcome["certificates"][name] for name in ("any-environment", "this-environment")}
+    name = "any-environment" if outcome["certificate"]["condition"] == "any-environment" else "this-environment"
     part = certificates[name]
     if not part["certified"] and "reason" not in part:
         worst = max(n / a for n, a in zip(part["required_damping"], part["available_damping"], strict=True))
-        condition = f"the {CONDITION_NAMES[name]} condition" + (
-            " (the paper's Theorem 4)" if name == "theorem4" else ""
-        )
+        condition = f"the {name} condition" + (" (the paper's Theorem 4)" if name == "any-environment" else "")
         what = "The loop without coupling fails" if outcome["coupling"]["kind"] == "none" else "This coupling fails"
         lines.append(f"{what} {condition}: it needs {worst:.3g} times the damping that the devices guarantee.")
     if "contact" in outcome["stability"]:
@@ -107,7 +105,7 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
             lines.append(f"{name}: {outcome[name]['reason']}.")
     for name, part in certificates.items():
         if "reason" in part:
-            lines.append(f"{CONDITION_NAMES[name]}: {part['reason']}.")
+            lines.append(f"{name}: {part['reason']}.")
     if outcome.get("jitter"):
         lines.append(f"Delays that vary: {outcome['jitter']['covers']}.")
     if part := outcome.get("encoder"):
@@ -130,7 +128,7 @@ def beside_the_paper(scenario: Scenario, case: str, outcome: dict[str, Any]) -> 
 def _printed_gains(scenario: Scenario, case: str, outcome: dict[str, Any]) -> list[dict[str, str]]:
     printed, got = PUBLISHED[case], outcome["coupling"]
     need = assess(scenario.loop(case), printed)
-    theorem4, closed_loop = (need[name].required for name in ("theorem4", "closed-loop"))
+    any_environment, this_environment = (need[name].required for name in ("any-environment", "this-environment"))
     here = "none" if got["K"] is None else f"K = {listed(got['K'], 5)}, B = {listed(got['B'], 5)}"
     return [
         {
@@ -142,7 +140,7 @@ def _printed_gains(scenario: Scenario, case: str, outcome: dict[str, Any]) -> li
         {
             "what": "damping that the printed gains need [N s/m]",
             "paper": f"at most {listed(scenario.delta, 5)}",
-            "here": f"{listed(theorem4, 5)} by Theorem 4; {listed(closed_loop, 5)} in this environment",
+            "here": f"{listed(any_environment, 5)} by Theorem 4; {listed(this_environment, 5)} in this environment",
             "why": "Theorem 4 as printed is strictly infeasible (E-hat has a pole at z = 1); mended, it refuses them",
         },
     ]

@@ -27,7 +27,7 @@ from controller.delay import LOST, Jitter, Ticks, realising
 from controller.loop import DelayRange, force_map
 from controller.lti import Array, Lti
 from controller.process import Process, StepBuffer
-from design.certificate import switching_part, switching_promise, switching_requirement
+from design.certificate import switching_guarantee, switching_part, switching_requirement
 from design.conditions import Requirement
 from models.scene import Scene, Variants
 from sim.couplings import Chosen
@@ -316,7 +316,7 @@ def _coverage(jitter: Jitter, certified: bool, proof: str | None, buffered: bool
 def _how_proved(requirement: Requirement, on_file: DelayRange | None) -> str:
     """What shows that any switching within the range is safe, "" where nothing does."""
     if on_file:
-        return f"proved in the coupling's file for {switching_promise(on_file)}"
+        return f"proved in the coupling's file for {switching_guarantee(on_file)}"
     if not requirement.certified:
         return ""
     return "proved exactly" if requirement.proof == "rational" else "by a refined sweep, without an exact proof"

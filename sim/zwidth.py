@@ -36,7 +36,7 @@ from controller.loop import Loop, force_map
 from controller.lti import Array, Complex, Lti, Sampled, SingularLoop, as_like
 from controller.process import Process, contact
 from design.audit import check_loop, edge
-from design.certificate import CONDITIONS, LATE, theorem4_of
+from design.certificate import CONDITIONS, LATE, any_environment_of
 from design.conditions import (
     Requirement,
     any_environment_ratios,
@@ -122,7 +122,7 @@ class CouplingSweep(_Sweep):
     def refusals(self) -> dict[str, str]:
         """Conditions that say nothing of any cell, and why."""
         reason = self.multiplier[1]
-        return {"theorem4": reason} if reason else {}
+        return {"any-environment": reason} if reason else {}
 
     @cached_property
     def multiplier(self) -> tuple[Array | None, str | None]:
@@ -156,9 +156,9 @@ class CouplingSweep(_Sweep):
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Required over available damping, (n,); inf where no damping is enough. Of walls, in the worst state."""
-        if condition == "closed-loop":
+        if condition == "this-environment":
             couplings = self._couplings(K, B)
-            return np.max([self._closed_loop_ratios(state, couplings) for state in self._states], axis=0)
+            return np.max([self._this_environment_ratios(state, couplings) for state in self._states], axis=0)
         phi, reason = self.multiplier
         if reason:
             return np.full(K.size, np.inf)
@@ -175,11 +175,11 @@ class CouplingSweep(_Sweep):
         """The same of one coupling by a sweep of its own, which a map is checked against."""
         loop = self.loop
         coupling = SpringDamper([K] * loop.channels, [B] * loop.channels, self.cutoff)
-        if condition == "closed-loop":
+        if condition == "this-environment":
             states = [this_environment(s.F(coupling), loop.delta, loop.T_max, loop.latency) for s in self._states]
             return max(states, key=lambda requirement: requirement.ratio)
         phi, reason = self.multiplier
-        return refusal("theorem4", loop.delta, reason) if reason else theorem4_of(loop, coupling, phi)
+        return refusal("any-environment", loop.delta, reason) if reason else any_environment_of(loop, coupling, phi)
 
     def _couplings(self, K: Array, B: Array, channels: int | None = None) -> SpringDamper:
         m = channels or self.loop.channels
@@ -191,7 +191,7 @@ class CouplingSweep(_Sweep):
         """The loop in each frozen contact state, all walls touching first."""
         return self.loop.frozen()[::-1]
 
-    def _closed_loop_ratios(self, loop: Loop, couplings: SpringDamper) -> Array:
+    def _this_environment_ratios(self, loop: Loop, couplings: SpringDamper) -> Array:
         return self._ratios(loop.F(couplings), lambda z: loop.sent_at(couplings, z))
 
 
@@ -202,7 +202,7 @@ class EnvironmentSweep(_Sweep):
     An optimal coupling is the pair of a fixed Q and a model of the environment, and where that is another one than the
     model was of, two things may happen:
 
-        closed-loop   the model is the environment of the cell: F = Theta (Psi E - Psi E Q Psi E), as with ranges
+        this-environment   the model is the environment of the cell: F = Theta (Psi E - Psi E Q Psi E), as with ranges
         model kept    nobody tells the coupling: V = Q (I - Psi E0 Q)^-1 of the scenario's E0 faces E
 
     A coupling of each cell's own would be certified everywhere, since Q near E^-1 turns the force off. Raises
@@ -236,9 +236,9 @@ class EnvironmentSweep(_Sweep):
         """Conditions that say nothing of any cell, and why."""
         if any(self.loop.psi):
             why = "with delay in the environment it takes a multiplier for each: ask design.audit about single ones"
-            return {"theorem4": why}
+            return {"any-environment": why}
         reason = self._any_environment.reason
-        return {"theorem4": reason} if reason else {}
+        return {"any-environment": reason} if reason else {}
 
     def force_maps(self, K: Array, B: Array) -> tuple[Lti, ...]:
         """F in every environment, the coupling's model following it; one stack, since there is no contact to freeze."""
@@ -251,7 +251,7 @@ class EnvironmentSweep(_Sweep):
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Required over available damping, (n,); inf where no damping is enough."""
-        if condition == "theorem4":
+        if condition == "any-environment":
             return np.full(K.size, self._any_environment.ratio)
         matrices, coupling, psi = self._matrices(K, B), self._facing(condition), delay(self.loop.psi, self.loop.T)
 
@@ -263,22 +263,22 @@ class EnvironmentSweep(_Sweep):
 
     def requirement(self, condition: str, K: float, B: float) -> Requirement:
         """The damping that the condition asks of the devices in one environment, by a sweep of its own."""
-        if condition == "theorem4":
+        if condition == "any-environment":
             return self._any_environment
         try:
             F = self._force_map(self._matrices(np.array([K]), np.array([B])), self._facing(condition))[0]
             return this_environment(F, self.loop.delta, self.loop.T_max, self.loop.latency)
         except SingularLoop as error:
-            return refusal("closed-loop", self.loop.delta, str(error))
+            return refusal("this-environment", self.loop.delta, str(error))
 
     @cached_property
     def _any_environment(self) -> Requirement:
-        """theorem4's requirement, which no spring of the environment changes."""
+        """any-environment's requirement, which no spring of the environment changes."""
         if any(self.loop.psi):
-            return refusal("theorem4", self.loop.delta, "not asked")
+            return refusal("any-environment", self.loop.delta, "not asked")
         if self.loop.latency:
-            return refusal("theorem4", self.loop.delta, LATE)
-        return theorem4_of(self.loop, self.coupling)
+            return refusal("any-environment", self.loop.delta, LATE)
+        return any_environment_of(self.loop, self.coupling)
 
     def _facing(self, condition: str) -> Coupling:
         """The coupling; for MODEL_KEPT as the V whose model stays that of the scenario's environment."""

@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 
 from controller.coupling import Coupling
-from design.certificate import assess, promise_of
+from design.certificate import assess, guarantee_of
 from design.conditions import Requirement
 from design.designs import KINDS
 from sim.couplings import Chosen, choose
@@ -144,7 +144,7 @@ class PreparedLoop:
     assembly: Simulation
     mode: Mode  # of the exact linear loop; before walls, of the worst contact state
     requirements: dict[str, Requirement]
-    promise: str | None
+    guarantee: str | None
 
     @property
     def scenario(self) -> Scenario:
@@ -185,5 +185,5 @@ def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> Prep
     assembly, loop = assemble(scenario, chosen.coupling), scenario.loop(menu.case)
     requirements = assess(loop, chosen.coupling, chosen.phi)
     return PreparedLoop(
-        menu, label, chosen, assembly, worst_mode(assembly), requirements, promise_of(requirements, loop)
+        menu, label, chosen, assembly, worst_mode(assembly), requirements, guarantee_of(requirements, loop)
     )

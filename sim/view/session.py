@@ -316,5 +316,5 @@ def _facts(prepared: PreparedLoop) -> dict[str, Any]:
         "exact_growth_rate_per_s": finite(float(prepared.mode.growth)),
         "exact_frequency_hz": float(prepared.mode.frequency_hz),
         "certificates": {name: certificate_part(need) for name, need in prepared.requirements.items()},
-        "promise": prepared.promise,
+        "promise": prepared.guarantee,
     }

@@ -170,9 +170,9 @@ def main() -> None:
     }
     made: dict[str, Coupling] = {}
     for name, kind, condition in (
-        ("spring-damper, any environment", "spring-damper", "theorem4"),
-        ("spring-damper, this environment", "spring-damper", "closed-loop"),
-        ("optimal, this environment", "optimal", "closed-loop"),
+        ("spring-damper, any environment", "spring-damper", "any-environment"),
+        ("spring-damper, this environment", "spring-damper", "this-environment"),
+        ("optimal, this environment", "optimal", "this-environment"),
     ):
         made[name] = design_coupling(scenario.loop("I"), kind, condition).coupling
     E, late = environment(network, T), delay(scenario.psi, T)

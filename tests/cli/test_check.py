@@ -23,7 +23,7 @@ def leave(monkeypatch, *argv: str) -> int:
 @pytest.fixture
 def path(tmp_path):
     file = tmp_path / "coupling.json"
-    save(Stored.of(PAIR, SOFT, prove(PAIR, SOFT, "theorem4")), file)
+    save(Stored.of(PAIR, SOFT, prove(PAIR, SOFT, "any-environment")), file)
     return file
 
 

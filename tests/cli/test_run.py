@@ -47,7 +47,7 @@ def test_the_default_is_the_design_for_this_environment_with_the_price_of_others
     """Not the paper's condition: that renders half the stiffness, and the first run should show what is possible."""
     code, report = run(tmp_path, "--case", "I", "--side-by-side", "--duration", "10")
     assert code == 0
-    assert report["certificate"]["condition"] == "closed-loop"
+    assert report["certificate"]["condition"] == "this-environment"
     assert report["certificate"]["proof"] == "rational"
     assert report["promise"] == "this environment"
     assert report["ideal_force"]["error_percent"] == pytest.approx(14.0, abs=0.1)
@@ -74,7 +74,7 @@ def test_where_one_environment_is_not_all_the_default_is_any_environment(tmp_pat
     """Walls that make and break contact, and ranges, are covered by any-environment alone."""
     for name in ("one-wall", "omega-pair-box"):
         _, report = run(tmp_path, "--scenario", name, "--no-plot", "--duration", "0.5")
-        assert report["certificate"]["condition"] == "theorem4"
+        assert report["certificate"]["condition"] == "any-environment"
         assert [row["coupling"] for row in report["alternatives"]] == ["none", "spring-damper"]
     _, report = run(tmp_path, "--no-plot", "--duration", "0.5", "--no-alternatives")
     assert report["alternatives"] == []
@@ -90,7 +90,7 @@ def test_the_papers_case_i_is_designed_certified_and_proved(tmp_path):
     assert set(report) >= SECTIONS
     assert report["coupling"]["kind"] == "spring-damper"
     assert report["coupling"]["K"] == pytest.approx([878.77, 551.88], rel=1e-4)
-    assert report["certificate"]["condition"] == "theorem4"
+    assert report["certificate"]["condition"] == "any-environment"
     assert report["certificate"]["certified"]
     assert report["certificate"]["proof"] == "rational"
     assert report["promise"] == "any passive environment"
@@ -104,7 +104,7 @@ def test_the_papers_case_i_is_designed_certified_and_proved(tmp_path):
 def test_published_gains_are_refused_by_their_own_condition(tmp_path):
     _, report = run(tmp_path, "--coupling", "published", "--no-plot", "--engine", "exact")
     assert report["certificate"]["required_damping"] == pytest.approx([7.63, 7.84], abs=0.005)
-    assert report["certificates"]["closed-loop"]["required_damping"] == pytest.approx([1.3987] * 2, rel=1e-4)
+    assert report["certificates"]["this-environment"]["required_damping"] == pytest.approx([1.3987] * 2, rel=1e-4)
     assert report["stability"]["exact_growth_rate_per_s"] == pytest.approx(-0.939, abs=1e-3)
     assert report["stability"]["exact_frequency_hz"] == pytest.approx(83.8, abs=0.1)
     assert any("5.72 times the damping" in line for line in report["remarks"])
@@ -139,7 +139,7 @@ def test_a_tampered_coupling_is_named(tmp_path):
     """One gain changed by 1 %: judged anew, and the report says that the file's certificate does not hold."""
     scenario = load()
     data = SpringDamper((400.0, 300.0), (0.1, 0.1))
-    stored = Stored.of(scenario.loop("I"), data, prove(scenario.loop("I"), data, "theorem4"))
+    stored = Stored.of(scenario.loop("I"), data, prove(scenario.loop("I"), data, "any-environment"))
     save(stored, tmp_path / "good.json")
     changed = SpringDamper((404.0, 300.0), (0.1, 0.1))
     save(msgspec.structs.replace(stored, coupling=changed.form()), tmp_path / "bad.json")

@@ -28,7 +28,7 @@ def printed(table: Table, width: int) -> str:
 def test_numbers_are_whole(width, fold):
     table = Table("a name of a few words", *(f"heading {n}" for n in "abcde"), title="what it is")
     table.columns[0].overflow = "fold" if fold else "ellipsis"
-    table.add_row("spring-damper:closed-loop", *NUMBERS)
+    table.add_row("spring-damper:this-environment", *NUMBERS)
     lines = printed(table, width).splitlines()
     assert re.findall(r"-?\d+\.\d+", " ".join(lines)) == NUMBERS
     assert "…" not in "".join(lines)
@@ -66,6 +66,6 @@ def test_a_name_is_no_markup(name):
 def test_our_own_tags_are_colours():
     text = io.StringIO()
     Screen(file=text, width=60, force_terminal=True, color_system="standard", highlight=False).print(
-        "[red]not promised[/]: [m]"
+        "[red]not guaranteed[/]: [m]"
     )
-    assert text.getvalue() == "\x1b[31mnot promised\x1b[0m: [m]\n"
+    assert text.getvalue() == "\x1b[31mnot guaranteed\x1b[0m: [m]\n"

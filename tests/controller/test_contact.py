@@ -172,13 +172,13 @@ def boxed(scenario):
 
 
 @pytest.mark.parametrize(("name", "humans", "seconds"), [("exact", 200, 6.0), ("mujoco", 20, 3.0)])
-def test_random_hands_on_walls_come_to_rest_under_theorem4(name, humans, seconds):
+def test_random_hands_on_walls_come_to_rest_under_any_environment(name, humans, seconds):
     """Walls of 20000 and 2000 N/m hit at up to 0.3 m/s, a coupling certified for whatever is passive.
 
     The speed falls from the first quarter to the last in every run, though contact is made thousands of times.
     """
     scenario = boxed(load())
-    assert assess(scenario.loop("I"), SOFT)["theorem4"].certified
+    assert assess(scenario.loop("I"), SOFT)["any-environment"].certified
     loop = assemble(scenario, SOFT)
     ((_, crowd),) = crowds(Population(damping=(0.3, 30.0)), 2, 0, range(humans), 1)
     sets = variants(scenario.device, crowd)
@@ -221,18 +221,18 @@ def test_a_run_reports_the_contact_and_who_covers_it(tmp_path):
     assert soft["stability"]["growth_rate_per_s"] is None
     assert "contact was made 2 times" in soft["stability"]["reason"]
     z = np.exp(1j * np.linspace(1e-4, np.pi, 20_000))
-    touching = (3000 + 2 * (1 - 1 / z) / 1e-3) / z  # closed-loop: -T He[F/(z - 1)] at most
-    assert bare["certificates"]["closed-loop"]["required_damping"][0] == pytest.approx(
+    touching = (3000 + 2 * (1 - 1 / z) / 1e-3) / z  # this-environment: -T He[F/(z - 1)] at most
+    assert bare["certificates"]["this-environment"]["required_damping"][0] == pytest.approx(
         (-1e-3 * touching / (z - 1)).real.max(), rel=1e-6
     )
     assert bare["promise"] is None
     assert any("no certificate covers it" in line for line in bare["remarks"])
 
 
-def test_closed_loop_is_asked_of_every_frozen_state():
+def test_this_environment_is_asked_of_every_frozen_state():
     """Two walls make four linear loops: the requirement is the largest of the states', each recomputed here."""
     loop = boxed(load()).loop("I")
-    requirement = assess(loop, SOFT)["closed-loop"]
+    requirement = assess(loop, SOFT)["this-environment"]
     singles = [
         this_environment(
             force_map(environment(held(loop.environment, state), loop.T), SOFT, (1, 2), (0, 0)), loop.delta
@@ -243,19 +243,19 @@ def test_closed_loop_is_asked_of_every_frozen_state():
     assert len({single.ratio for single in singles}) == 4
     assert requirement.proof == "sampled"
     with pytest.raises(NotProved, match="of walls with dampers"):
-        prove(loop, SOFT, "closed-loop")
-    assert prove(loop, SOFT, "theorem4").promise == "any passive environment"
+        prove(loop, SOFT, "this-environment")
+    assert prove(loop, SOFT, "any-environment").guarantee == "any passive environment"
     late = boxed(load()).replace(psi=(1, 0)).loop("I")
-    assert "no walls" in (assess(late, SOFT)["theorem4"].reason or "")
+    assert "no walls" in (assess(late, SOFT)["any-environment"].reason or "")
 
 
 def test_a_stiffer_coupling_is_promised_for_frozen_states_only():
-    """K = 1772 N/m behind one sample of delay: closed-loop asks 1.3699 of 1.37 with the wall, theorem4 2.38."""
+    """K = 1772 N/m behind one sample of delay: 1.3699 of 1.37 with the wall, and 2.38 in any environment."""
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1772.0], [0.453])
-    assert requirement(loop, coupling, "closed-loop").certified
-    assert not requirement(loop, coupling, "theorem4").certified
+    assert requirement(loop, coupling, "this-environment").certified
+    assert not requirement(loop, coupling, "any-environment").certified
     assert report(loop, coupling)["promise"] == FROZEN
-    assert requirement(loop.at(held(loop.network, [False])), coupling, "closed-loop").ratio == 0
+    assert requirement(loop.at(held(loop.network, [False])), coupling, "this-environment").ratio == 0
 
 
 def test_a_coupling_with_a_model_of_its_own_cannot_face_walls():

@@ -16,11 +16,11 @@ from controller.loop import Loop
 from controller.lti import Lti
 from design import certificate as store
 from design.audit import MOST_EXTRA_SAMPLES, edge, remedies, report, requirement, stiffest, tolerance
-from design.certificate import ANY, CAVEATS, promise_of
+from design.certificate import ANY, CAVEATS, guarantee_of
 from design.designs import certify
 from design.result import CASE_I
 
-CONDITIONS = ("closed-loop", "theorem4")
+CONDITIONS = ("this-environment", "any-environment")
 T = 1.2e-3
 SAFE = SpringDamper([870.0, 545.0], [0.38, 0.52])
 
@@ -59,14 +59,14 @@ def strict(text: str) -> dict:
 
 
 @pytest.mark.parametrize(
-    ("K", "B", "theta", "closed_loop", "theorem4"),
+    ("K", "B", "theta", "this_environment", "any_environment"),
     [(5000, 0, 0, 2.5, 2.5), (5000, 30, 0, 32.5, 32.5), (800, 0.7, 0, 1.1, 1.1), (5000, 0, 1, 7.5, 10.0)],
 )
-def test_closed_forms_of_a_rigid_wall(K, B, theta, closed_loop, theorem4):
+def test_closed_forms_of_a_rigid_wall(K, B, theta, this_environment, any_environment):
     """K T/2 + B without delay, 3 K T/2 with one sample; Theorem 4 asks (theta + 1)^2 K T/2 of a spring."""
     subject = wall(K, B, theta)
-    assert requirement(*subject, "closed-loop").required[0] == pytest.approx(closed_loop, rel=1e-9)
-    assert requirement(*subject, "theorem4").required[0] == pytest.approx(theorem4, rel=1e-9)
+    assert requirement(*subject, "this-environment").required[0] == pytest.approx(this_environment, rel=1e-9)
+    assert requirement(*subject, "any-environment").required[0] == pytest.approx(any_environment, rel=1e-9)
 
 
 @pytest.mark.parametrize(("theta", "proved"), [(0, True), (1, True), (1, False)])
@@ -74,11 +74,13 @@ def test_a_coupling_before_a_rigid_wall_is_proved_and_stored_like_any_other(thet
     """It needs 500 and 1500 N/m times T; a wall that is never left, so that nothing else is promised."""
     loop, coupling = wall(1000, 0, theta, delta=1.51 if proved else 1.49)
     needs = certify(loop, coupling)
-    assert needs["closed-loop"].required[0] == pytest.approx((theta + 0.5) * 1000 * 1e-3)
-    assert needs["closed-loop"].proof == ("rational" if proved else "sampled")
-    assert promise_of(needs, loop) == ((ANY if theta == 0 else "a rigid wall only") if proved else None)
+    assert needs["this-environment"].required[0] == pytest.approx((theta + 0.5) * 1000 * 1e-3)
+    assert needs["this-environment"].proof == ("rational" if proved else "sampled")
+    assert guarantee_of(needs, loop) == ((ANY if theta == 0 else "a rigid wall only") if proved else None)
     if proved:
-        store.save(store.Stored.of(loop, coupling, store.prove(loop, coupling, "closed-loop")), tmp_path / "wall.json")
+        store.save(
+            store.Stored.of(loop, coupling, store.prove(loop, coupling, "this-environment")), tmp_path / "wall.json"
+        )
         again = store.load(tmp_path / "wall.json")
         assert again.loop == loop
         assert store.verify(again).proved
@@ -97,11 +99,11 @@ def test_what_a_rigid_wall_cannot_have():
 def test_a_wall_is_the_limit_of_a_stiff_environment():
     ground = Network(("a",), (Spring(("a", GROUND), 1e9),))
     loop, coupling = wall(2000, 0.4, 1)
-    ratio = requirement(loop.at(ground), coupling, "closed-loop").ratio
-    assert ratio == pytest.approx(requirement(loop, coupling, "closed-loop").ratio, rel=1e-5)
+    ratio = requirement(loop.at(ground), coupling, "this-environment").ratio
+    assert ratio == pytest.approx(requirement(loop, coupling, "this-environment").ratio, rel=1e-5)
 
 
-@pytest.mark.parametrize(("condition", "theta", "K"), [("closed-loop", 0, 2340), ("theorem4", 0, 2340)])
+@pytest.mark.parametrize(("condition", "theta", "K"), [("this-environment", 0, 2340), ("any-environment", 0, 2340)])
 def test_the_stiffest_spring_before_a_wall_is_colgates(condition, theta, K):
     """2 (delta - B)/T."""
     assert stiffest(*wall(100, 0.2, theta), condition).K[0] == pytest.approx(K, rel=1e-6)
@@ -116,19 +118,19 @@ def test_the_largest_period_before_a_wall_is_colgates():
 
 def test_the_papers_gains_and_their_figures():
     outcome = report(*pair(CASE_I))
-    assert outcome["closed-loop"]["required_damping"] == pytest.approx([1.39871] * 2, rel=1e-5)
-    assert outcome["theorem4"]["required_damping"] == pytest.approx([7.63, 7.84], abs=0.005)
+    assert outcome["this-environment"]["required_damping"] == pytest.approx([1.39871] * 2, rel=1e-5)
+    assert outcome["any-environment"]["required_damping"] == pytest.approx([7.63, 7.84], abs=0.005)
     assert not outcome["certified"]
     assert outcome["promise"] is None
-    assert outcome["theorem4"]["stiffest"]["K"] == [None, None]
-    assert "B = 5.47 N s/m alone uses up delta = 1.37" in outcome["theorem4"]["stiffest"]["reason"]
+    assert outcome["any-environment"]["stiffest"]["K"] == [None, None]
+    assert "B = 5.47 N s/m alone uses up delta = 1.37" in outcome["any-environment"]["stiffest"]["reason"]
 
 
-def test_the_theorem4_gains_as_the_literature_rounds_them():
-    """(879, 552) / (.39, .52) are 0.02 % beyond Theorem 4, and far inside the closed-loop condition."""
+def test_the_any_environment_gains_as_the_literature_rounds_them():
+    """(879, 552) / (.39, .52) are 0.02 % beyond Theorem 4, and far inside the this-environment condition."""
     outcome = report(*pair(SpringDamper([879.0, 552.0], [0.39, 0.52])))
-    assert outcome["closed-loop"]["required_damping"] == pytest.approx([0.714344] * 2, rel=1e-6)
-    assert outcome["theorem4"]["required_damping"] == pytest.approx([1.37026, 1.37015], abs=1e-5)
+    assert outcome["this-environment"]["required_damping"] == pytest.approx([0.714344] * 2, rel=1e-6)
+    assert outcome["any-environment"]["required_damping"] == pytest.approx([1.37026, 1.37015], abs=1e-5)
     assert outcome["promise"] == "this environment"
 
 
@@ -162,47 +164,49 @@ def test_just_inside_is_certified_and_just_outside_is_not(subject, condition):
 
 def test_figures_that_do_not_exist_say_why():
     spring = wall(0.01, 0.0, delta=1.0)
-    found = tolerance(*spring, requirement(*spring, "closed-loop"))
+    found = tolerance(*spring, requirement(*spring, "this-environment"))
     assert (found.largest_T, found.extra_samples) == (None, None)
     assert f"{MOST_EXTRA_SAMPLES} samples more" in found.reason
     assert "largest T tried" in found.reason
-    assert "no scale of K" in stiffest(*wall(5000, 30), "closed-loop").reason
-    assert "stiffest K tried" in stiffest(*pair(SAFE, delta=(3.0, 3.0)), "closed-loop").reason
-    assert "nothing to lose" in tolerance(*pair(CASE_I), requirement(*pair(CASE_I), "closed-loop")).reason
+    assert "no scale of K" in stiffest(*wall(5000, 30), "this-environment").reason
+    assert "stiffest K tried" in stiffest(*pair(SAFE, delta=(3.0, 3.0)), "this-environment").reason
+    assert "nothing to lose" in tolerance(*pair(CASE_I), requirement(*pair(CASE_I), "this-environment")).reason
 
 
 def test_remedies_are_tried_and_mild():
     subject = wall(5000, 0.5, 1)
-    changes = {r.change.split(":")[0]: r for r in remedies(*subject, requirement(*subject, "closed-loop"))}
+    changes = {r.change.split(":")[0]: r for r in remedies(*subject, requirement(*subject, "this-environment"))}
     assert changes["less delay"].requirement.required[0] == pytest.approx(3.0)
     assert not changes["less delay"].requirement.certified
     assert changes["faster"].requirement.certified
     assert changes["faster"].requirement.required[0] > 0.98 * 1.37
-    assert remedies(*wall(500, 0), requirement(*wall(500, 0), "closed-loop")) == []
-    assert {helping["condition"] for helping in report(*wall(5000, 0))["helps"]} == {"closed-loop"}
+    assert remedies(*wall(500, 0), requirement(*wall(500, 0), "this-environment")) == []
+    assert {helping["condition"] for helping in report(*wall(5000, 0))["helps"]} == {"this-environment"}
 
 
 def test_a_delayed_environment_needs_a_multiplier_that_the_default_scenario_has_not():
-    needs = requirement(*pair(SAFE, psi=(1, 1)), "theorem4")
+    needs = requirement(*pair(SAFE, psi=(1, 1)), "any-environment")
     assert not needs.certified
     assert "the environment alone uses up" in needs.reason
     softer = Network(("a",), (Spring(("a", GROUND), 100.0, 0.2),))
     subject = Loop(T, (0,), (1,), (0,), (1.37,), softer), SpringDamper([200.0], [0.2])
-    assert requirement(*subject, "theorem4").certified
-    assert "multiplier" in stiffest(*subject, "theorem4").reason
+    assert requirement(*subject, "any-environment").certified
+    assert "multiplier" in stiffest(*subject, "any-environment").reason
 
 
 def test_any_coupling_can_be_audited():
     V = SAFE.compliance(T)
     general, structured = report(*pair(Compliance(V))), report(*pair(SAFE))
-    assert general["closed-loop"]["required_damping"] == pytest.approx(structured["closed-loop"]["required_damping"])
-    assert general["theorem4"]["margin"] == pytest.approx(structured["theorem4"]["margin"], rel=1e-6)
+    assert general["this-environment"]["required_damping"] == pytest.approx(
+        structured["this-environment"]["required_damping"]
+    )
+    assert general["any-environment"]["margin"] == pytest.approx(structured["any-environment"]["margin"], rel=1e-6)
     assert general["coupling"]["kind"] == "compliance"
-    assert "only a spring-damper" in general["theorem4"]["stiffest"]["reason"]
+    assert "only a spring-damper" in general["any-environment"]["stiffest"]["reason"]
     nothing = report(*pair(NoCoupling()))
-    assert nothing["closed-loop"]["required_damping"] == pytest.approx([1.7229] * 2, rel=3e-5)
-    assert nothing["theorem4"]["required_damping"] == [None, None]
-    assert "without a coupling" in nothing["theorem4"]["reason"]
+    assert nothing["this-environment"]["required_damping"] == pytest.approx([1.7229] * 2, rel=3e-5)
+    assert nothing["any-environment"]["required_damping"] == [None, None]
+    assert "without a coupling" in nothing["any-environment"]["reason"]
 
 
 def test_promises():
@@ -244,8 +248,8 @@ def test_the_command(run, argv, code, required):
     assert exit_code == code
     assert outcome["certified"] == (code == 0)
     if required:
-        assert outcome["closed-loop"]["required_damping"][0] == pytest.approx(required, rel=3e-5)
-    assert set(outcome) >= {"theorem4", "closed-loop", "promise", "helps", "not_covered", "wall_s"}
+        assert outcome["this-environment"]["required_damping"][0] == pytest.approx(required, rel=3e-5)
+    assert set(outcome) >= {"any-environment", "this-environment", "promise", "helps", "not_covered", "wall_s"}
     assert outcome["not_covered"] == CAVEATS
     assert "certified" in err
     assert "not for walls with dampers that make and break" in " ".join(err.split())
@@ -282,7 +286,7 @@ def test_stored_couplings(run):
         assert strict(out)["promise"] == "any passive environment"
     code, out, _ = run("--coupling", "unstable.json", "--json", "-")
     assert code == 1
-    assert "unit circle" in strict(out)["theorem4"]["reason"]
+    assert "unit circle" in strict(out)["any-environment"]["reason"]
     assert run("--coupling", "gains.json", "--T", "1e-3")[0] == 0
 
 

@@ -52,7 +52,7 @@ def nominal_only():
 
 @pytest.fixture(scope="module")
 def stored(robust):
-    return Stored.of(LOOP, robust.coupling, prove(LOOP, robust.coupling, "closed-loop"))
+    return Stored.of(LOOP, robust.coupling, prove(LOOP, robust.coupling, "this-environment"))
 
 
 @pytest.fixture(scope="module")
@@ -216,14 +216,14 @@ def test_ranges_however_wide_have_an_answer():
     box = Box((UncertainSpring(("contact 1", "mass"), (700.0, 4000.0)),))
     found = optimal.design(change(LOOP, box=box), SHORT)
     assert found.proved
-    assert found.certificate.promise == "a set"
+    assert found.certificate.guarantee == "a set"
 
 
 # the proof
 
 
 def test_every_vertex_is_proved_and_the_file_says_a_set(stored):
-    assert stored.certificate.promise == "a set"
+    assert stored.certificate.guarantee == "a set"
     assert set(stored.certificate.matrices) == {"P", "P1", "P2", "P3"}
     assert verify(stored).proved
 
@@ -250,7 +250,7 @@ def test_a_wider_box_is_another_claim(stored):
 
 def test_a_coupling_for_one_environment_is_not_proved_for_the_set(nominal_only):
     with pytest.raises(NotProved, match=r"^vertex 2 .*needs 1\.409"):
-        prove(LOOP, nominal_only.coupling, "closed-loop")
+        prove(LOOP, nominal_only.coupling, "this-environment")
     part = set_part(check_set(LOOP, nominal_only.coupling, samples=8))
     assert not part["certified"]
     assert part["vertices_certified"] == 2
@@ -270,8 +270,8 @@ def test_a_fixed_coupling_may_be_promised_a_set_or_any_environment():
         assert check.proved
         data = StoredSpringDamper(gains, (0.3865, 0.522))
         if any_environment:
-            assert prove(LOOP, data, "theorem4").promise == "any passive environment"
-        assert prove(LOOP, data, "closed-loop").promise == "a set"
+            assert prove(LOOP, data, "any-environment").guarantee == "any passive environment"
+        assert prove(LOOP, data, "this-environment").guarantee == "a set"
 
 
 def test_files_without_a_box_have_the_digest_that_they_always_had():
@@ -300,7 +300,7 @@ def test_design_check_run_audit_and_validate_speak_of_the_set(scenario_file, tmp
     assert (alone["coupling"], whole["coupling"], whole["violated"]) == ("nominal only", "whole set", 0)
     assert alone["violated"] >= 1
     assert alone["rms_mismatch_db"]["nominal"] < whole["rms_mismatch_db"]["nominal"]
-    assert load(file).certificate.promise == "a set"
+    assert load(file).certificate.guarantee == "a set"
 
     code, checked = told(check_main, str(file), "--json", str(report))
     assert (code, checked["promise"], checked["vertices"]) == (0, "a set", 3)
@@ -324,7 +324,7 @@ def test_design_check_run_audit_and_validate_speak_of_the_set(scenario_file, tmp
 
 
 def test_a_violated_vertex_leaves_the_commands_with_1(scenario_file, tmp_path, capsys):
-    stiff = ["--condition", "closed-loop", "--scenario", str(scenario_file), "--samples", "4"]
+    stiff = ["--condition", "this-environment", "--scenario", str(scenario_file), "--samples", "4"]
     assert design_main([*stiff, "--out", str(tmp_path / "s.json"), "--json", "-"]) == 1
     outcome = json.loads(capsys.readouterr().out)
     assert outcome["promise"] == "this environment"

@@ -47,14 +47,14 @@ def test_delay_inside_the_environment_is_proved_with_its_multiplier(psi):
     """Theorem 4 with psi >= 1: the design's Phi is stored, and only for this environment is anything promised."""
     loop = change(DEFAULT, psi=psi, environment=SOFT_NETWORK)
     found = spring_damper.design(loop)
-    stored = Stored.of(loop, found.coupling, prove(loop, found.coupling, "theorem4", found.phi))
-    assert stored.certificate.promise == "this environment"
+    stored = Stored.of(loop, found.coupling, prove(loop, found.coupling, "any-environment", found.phi))
+    assert stored.certificate.guarantee == "this environment"
     assert set(stored.certificate.matrices) == {"P", "P_E", "Phi"}
     assert verify(stored) == Verdict(True)
     with pytest.raises(NotProved, match="needs a multiplier Phi"):
-        prove(loop, found.coupling, "theorem4")
+        prove(loop, found.coupling, "any-environment")
     with pytest.raises(NotProved, match="E-hat \\+ Phi is not passive"):
-        prove(loop, found.coupling, "theorem4", 0.9 * found.phi)
+        prove(loop, found.coupling, "any-environment", 0.9 * found.phi)
     forged = sealed(change(stored.certificate, matrices=stored.certificate.matrices | {"Phi": (("1/100", "1/100"),)}))
     assert not verify(change(stored, certificate=forged)).proved
 
@@ -62,12 +62,12 @@ def test_delay_inside_the_environment_is_proved_with_its_multiplier(psi):
 def test_a_model_too_large_to_prove_in_seconds_is_said_so():
     loop = change(DEFAULT, theta=(150, 150), delta=(600.0, 600.0))
     with pytest.raises(NotProved, match="over 306 states takes long: up to 300 are tried"):
-        prove(loop, SpringDamper((4.0, 4.0), (0.5, 0.5)), "closed-loop")
+        prove(loop, SpringDamper((4.0, 4.0), (0.5, 0.5)), "this-environment")
 
 
 def test_a_model_of_a_hundred_states_is_proved():
     loop = change(DEFAULT, theta=(45, 46), delta=(400.0, 400.0))
-    stored = certified(loop, SpringDamper((300.0, 200.0), (0.1, 0.1)), "closed-loop")
+    stored = certified(loop, SpringDamper((300.0, 200.0), (0.1, 0.1)), "this-environment")
     assert len(stored.certificate.matrices["P"]) == 97
     assert verify(stored) == Verdict(True)
 
@@ -79,11 +79,11 @@ def certified(loop: Loop, coupling, condition: str) -> Stored:
 @pytest.mark.parametrize(
     ("coupling", "condition", "ratio"),
     [
-        (STIFF, "closed-loop", 1.363 / 1.37),
-        (SpringDamper((879, 552), (0.39, 0.52)), "closed-loop", 0.714344 / 1.37),
-        (SOFT, "closed-loop", 0.714 / 1.37),
-        (SOFT, "theorem4", 0.9999),
-        (SpringDamper((400.0, 300.0), (0.0, 0.5)), "theorem4", None),
+        (STIFF, "this-environment", 1.363 / 1.37),
+        (SpringDamper((879, 552), (0.39, 0.52)), "this-environment", 0.714344 / 1.37),
+        (SOFT, "this-environment", 0.714 / 1.37),
+        (SOFT, "any-environment", 0.9999),
+        (SpringDamper((400.0, 300.0), (0.0, 0.5)), "any-environment", None),
     ],
 )
 def test_safe_gains_are_proved_and_proved_again_from_the_file(tmp_path, coupling, condition, ratio):
@@ -100,11 +100,11 @@ def test_safe_gains_are_proved_and_proved_again_from_the_file(tmp_path, coupling
 @pytest.mark.parametrize(
     ("coupling", "condition"),
     [
-        (PUBLISHED["I"], "closed-loop"),
-        (PUBLISHED["I"], "theorem4"),
-        (NoCoupling(), "closed-loop"),
-        (NoCoupling(), "theorem4"),
-        (SpringDamper((879, 552), (0.39, 0.52)), "theorem4"),  # the optimal gains, rounded up
+        (PUBLISHED["I"], "this-environment"),
+        (PUBLISHED["I"], "any-environment"),
+        (NoCoupling(), "this-environment"),
+        (NoCoupling(), "any-environment"),
+        (SpringDamper((879, 552), (0.39, 0.52)), "any-environment"),  # the optimal gains, rounded up
     ],
 )
 def test_unsafe_gains_are_refused(coupling, condition):
@@ -114,15 +114,15 @@ def test_unsafe_gains_are_refused(coupling, condition):
 
 
 def test_no_coupling_is_proved_where_the_damping_suffices():
-    assert verify(certified(change(DEFAULT, delta=(1.7232, 1.7232)), NoCoupling(), "closed-loop")).proved
+    assert verify(certified(change(DEFAULT, delta=(1.7232, 1.7232)), NoCoupling(), "this-environment")).proved
 
 
 @pytest.mark.parametrize(("K", "B"), [(1000.0, 0.0), (500.0, 0.3), (30.0, 2.0)])
 def test_one_channel_without_delay_is_colgates_condition_to_one_part_in_a_million(K, B):
     needed = K * 1e-3 / 2 + B
-    assert verify(certified(wall(K, B, needed * (1 + 1e-6)), NoCoupling(), "closed-loop")).proved
+    assert verify(certified(wall(K, B, needed * (1 + 1e-6)), NoCoupling(), "this-environment")).proved
     with pytest.raises(NotProved, match="needs"):
-        prove(wall(K, B, needed * (1 - 1e-6)), NoCoupling(), "closed-loop")
+        prove(wall(K, B, needed * (1 - 1e-6)), NoCoupling(), "this-environment")
 
 
 def test_three_channels_with_unequal_delays_and_dampings():
@@ -130,7 +130,7 @@ def test_three_channels_with_unequal_delays_and_dampings():
     network = Network(contacts=("a", "b", "c"), springs=springs, masses={"hub": 0.4})
     loop = Loop(1e-3, (0, 3, 1), (0, 0, 0), (0, 3, 1), (2.0, 0.8, 1.37), network)
     coupling = SpringDamper((1500.0, 250.0, 500.0), (0.5, 0.2, 0.3))
-    for condition in ("closed-loop", "theorem4"):
+    for condition in ("this-environment", "any-environment"):
         assert verify(certified(loop, coupling, condition)).proved
 
 
@@ -138,24 +138,24 @@ def test_a_general_compliance_is_proved_under_both_conditions():
     V = controller_coupling.SpringDamper([800.0, 500.0], [0.39, 0.52]).compliance(1.2e-3)
     crossed = Lti(V.A, V.B, V.C, V.D + 1e-5, V.T)  # full, and symmetric at z = 1
     rounded = Compliance(Lti(*(np.round(getattr(crossed, n), 12) for n in "ABCD"), V.T))
-    for condition in ("closed-loop", "theorem4"):
+    for condition in ("this-environment", "any-environment"):
         assert verify(certified(DEFAULT, rounded, condition)).proved
 
 
 def test_a_static_asymmetry_is_refused():
     anchored = change(FIGURE_4, springs=(*FIGURE_4.springs, Spring(("mass", "ground"), 50.0)))
     V = Compliance(Lti.constant([[2e-3, 1e-4], [2e-4, 2e-3]], 1.2e-3))
-    for condition in ("closed-loop", "theorem4"):
+    for condition in ("this-environment", "any-environment"):
         with pytest.raises(NotProved, match="symmetric"):
             prove(change(DEFAULT, environment=anchored), V, condition)
 
 
-def test_environment_delay_is_proved_by_the_closed_loop_condition_only():
+def test_environment_delay_is_proved_by_the_this_environment_condition_only():
     loop = change(DEFAULT, psi=(1, 1), delta=(2.5, 2.5))
     damped = SpringDamper((2000.0, 2000.0), (3.0, 3.0))
-    assert verify(certified(loop, damped, "closed-loop")).proved
+    assert verify(certified(loop, damped, "this-environment")).proved
     with pytest.raises(NotProved, match="psi >= 1 needs a multiplier"):
-        prove(loop, damped, "theorem4")
+        prove(loop, damped, "any-environment")
 
 
 def test_the_proof_succeeds_exactly_where_the_sweep_says_so():
@@ -164,9 +164,9 @@ def test_the_proof_succeeds_exactly_where_the_sweep_says_so():
     outcomes = []
     for _ in range(60):
         loop, coupling = random_case(rng)
-        ratio = required_damping(loop, coupling, "closed-loop").ratio
+        ratio = required_damping(loop, coupling, "this-environment").ratio
         try:
-            proved = verify(certified(loop, coupling, "closed-loop")).proved
+            proved = verify(certified(loop, coupling, "this-environment")).proved
         except NotProved:
             proved = False
         outcomes.append(proved)
@@ -185,13 +185,13 @@ def random_case(rng: np.random.Generator) -> tuple[Loop, SpringDamper]:
     psi = tuple(rng.integers(0, 2, m).tolist())
     loop = Loop(1e-3, theta, psi, theta, (1.0,) * m, network)
     coupling = SpringDamper(tuple(rng.uniform(300, 9000, m).tolist()), tuple(rng.uniform(0, 3, m).tolist()))
-    ratio = required_damping(loop, coupling, "closed-loop").ratio
+    ratio = required_damping(loop, coupling, "this-environment").ratio
     delta = float(min(ratio, 100.0) * rng.uniform(0.5, 1.5))
     return change(loop, delta=(max(delta, 1e-3),) * m), coupling
 
 
 def test_tampering_is_rejected_with_the_reason():
-    good = certified(DEFAULT, STIFF, "closed-loop")
+    good = certified(DEFAULT, STIFF, "this-environment")
     stiffer = SpringDamper((7806.0 * 1.01, 3137.0), STIFF.B)
     P = [list(row) for row in good.certificate.matrices["P"]]
     P[0][0] = "7" + P[0][0]
@@ -208,12 +208,22 @@ def test_tampering_is_rejected_with_the_reason():
         assert any(part in verdict.reason for part in reason.split("|")), verdict.reason
 
 
+def test_a_file_that_calls_the_condition_by_its_older_name_is_read_and_still_proved(tmp_path):
+    good = certified(DEFAULT, STIFF, "this-environment")
+    save(good, tmp_path / "new.json")
+    older = (tmp_path / "new.json").read_text().replace("this-environment", "closed-loop")  # older name
+    (tmp_path / "old.json").write_text(older)  # older name
+    assert "closed-loop" in older  # older name
+    assert load(tmp_path / "old.json") == good
+    assert verify(load(tmp_path / "old.json")).proved
+
+
 def test_a_forger_who_repairs_the_digests_still_has_to_prove():
-    good = certified(DEFAULT, STIFF, "closed-loop")
+    good = certified(DEFAULT, STIFF, "this-environment")
     starved = change(DEFAULT, delta=(1.36, 1.36))
-    forged = change(prove(change(DEFAULT, delta=(1.38, 1.38)), STIFF, "closed-loop"), available=(1.36, 1.36))
+    forged = change(prove(change(DEFAULT, delta=(1.38, 1.38)), STIFF, "this-environment"), available=(1.36, 1.36))
     honest_digest = digest(starved, STIFF.form())
-    requirement = required_damping(starved, STIFF, "closed-loop")
+    requirement = required_damping(starved, STIFF, "this-environment")
     forged = change(forged, scenario=honest_digest, required=requirement.required, margin=1 / requirement.ratio)
     verdict = verify(Stored.of(starved, STIFF, sealed(forged)))
     assert not verdict.proved
@@ -222,7 +232,7 @@ def test_a_forger_who_repairs_the_digests_still_has_to_prove():
         "margin is": change(good.certificate, margin=2.0),
         "required is": change(good.certificate, required=(0.1, 0.1)),
         "available is": change(good.certificate, available=(2.0, 2.0)),
-        "does not promise": change(good.certificate, promise="any passive environment"),
+        "does not guarantee": change(good.certificate, guarantee="any passive environment"),
         "carries no exact proof": change(good.certificate, proof="sampled"),
         "expected P": change(good.certificate, matrices={}),
         "the model has 9 states": change(good.certificate, matrices={"P": (("1",),)}),
@@ -248,7 +258,7 @@ def test_a_forger_who_repairs_the_digests_still_has_to_prove():
 )
 def test_a_bad_file_is_one_line_that_names_the_field(tmp_path, old, new, names):
     path = tmp_path / "coupling.json"
-    save(certified(DEFAULT, STIFF, "closed-loop"), path)
+    save(certified(DEFAULT, STIFF, "this-environment"), path)
     text = path.read_bytes()
     assert old in text
     path.write_bytes(text.replace(old, new, 1))
@@ -276,7 +286,7 @@ def test_coefficients_that_no_coupling_has_are_refused():
 
 
 def test_an_entry_of_a_proof_beyond_floating_point_is_no_proof():
-    good = certified(DEFAULT, STIFF, "closed-loop")
+    good = certified(DEFAULT, STIFF, "this-environment")
     rows = [list(row) for row in good.certificate.matrices["P"]]
     rows[0][0] = "1" + "0" * 400
     forged = sealed(change(good.certificate, matrices={"P": tuple(map(tuple, rows))}))
@@ -291,7 +301,7 @@ def cancelling(size: float) -> Compliance:
     return Compliance(Lti(0.5 * np.eye(3), np.ones((3, 1)), [[size + 0.1, -size, -0.1]], [[2e-3]], 1e-3))
 
 
-@pytest.mark.parametrize("condition", ["closed-loop", "theorem4"])
+@pytest.mark.parametrize("condition", ["this-environment", "any-environment"])
 def test_a_realisation_that_rounding_makes_another_system_is_refused(condition):
     """Over the rationals the modes are not there. The tick in floating point keeps some of them."""
     loop = change(wall(1000.0, 0.0, 5.0), theta=(1,), lam=(1,))
@@ -322,10 +332,10 @@ def test_the_bound_on_rounding_holds_for_a_tick():
 
 
 def test_a_sweep_that_says_no_is_not_outvoted(monkeypatch):
-    good = certified(DEFAULT, STIFF, "closed-loop")
+    good = certified(DEFAULT, STIFF, "this-environment")
     worse = this_environment(DEFAULT.F(STIFF), (1.0, 1.0))
     ratio = worse.required[0] / 1.37 * 1.01
-    needs = from_ratio("closed-loop", ratio, DEFAULT.delta, 1.0)
+    needs = from_ratio("this-environment", ratio, DEFAULT.delta, 1.0)
     monkeypatch.setattr(design_certificate, "required_damping", lambda *_: needs)
     claims = change(good.certificate, required=needs.required, margin=1 / ratio)
     reason = verify(change(good, certificate=sealed(claims))).reason
@@ -341,13 +351,13 @@ def test_a_sweep_that_says_no_is_not_outvoted(monkeypatch):
 )
 def test_limits_are_checked_before_anything_is_built(monkeypatch, loop, coupling, said):
     monkeypatch.setattr(Loop, "sent", lambda *_: pytest.fail("built"))
-    for condition in ("closed-loop", "theorem4"):
+    for condition in ("this-environment", "any-environment"):
         with pytest.raises(NotProved, match=said):
             prove(loop, coupling, condition)
 
 
 def test_a_proof_with_endless_digits_is_refused_in_a_moment(tmp_path):
-    good = certified(DEFAULT, STIFF, "closed-loop")
+    good = certified(DEFAULT, STIFF, "this-environment")
     rows = [[f"1/{10**600 + 2 * (9 * i + j) + 1}" for j in range(9)] for i in range(9)]
     reason = verify(change(good, certificate=sealed(change(good.certificate, matrices={"P": tuple(map(tuple, rows))}))))
     assert reason.reason == "P has a common denominator of more than 4000 bits: testing it would take minutes"
@@ -361,7 +371,7 @@ def test_a_proof_with_endless_digits_is_refused_in_a_moment(tmp_path):
 @pytest.mark.parametrize("name", ["T", "K", "version", "proof"])
 def test_a_name_that_stands_twice_is_refused(tmp_path, name):
     path = tmp_path / "coupling.json"
-    save(certified(DEFAULT, STIFF, "closed-loop"), path)
+    save(certified(DEFAULT, STIFF, "this-environment"), path)
     lines = path.read_text().splitlines(keepends=True)
     at = next(i for i, line in enumerate(lines) if f'"{name}":' in line)
     value = {"T": "0.002", "K": "[1.0, 1.0]", "version": "1", "proof": '"kyp"'}[name]
@@ -394,11 +404,11 @@ def test_a_body_that_only_dampers_drag_is_proved(network):
     m = len(network.contacts)
     loop = Loop(1e-3, (1,) * m, (0,) * m, (1,) * m, (5.0,) * m, network)
     for coupling in (NoCoupling(), SpringDamper((900.0,) * m, (0.2,) * m)):
-        needed = required_damping(loop, coupling, "closed-loop").required
+        needed = required_damping(loop, coupling, "this-environment").required
         for factor, expected in ((1 + 1e-4, True), (1 - 1e-6, False)):
             asked = change(loop, delta=tuple(d * factor for d in needed))
             try:
-                assert verify(certified(asked, coupling, "closed-loop")).proved == expected
+                assert verify(certified(asked, coupling, "this-environment")).proved == expected
             except NotProved:
                 assert not expected
 
@@ -430,11 +440,11 @@ def test_the_proof_succeeds_exactly_where_the_sweep_says_so_on_any_network():
             continue
         gains = np.exp(rng.uniform(5, 9, m)).round(3), (rng.uniform(0, 3, m) * (rng.random() < 0.8)).round(4)
         coupling = NoCoupling() if rng.random() < 0.15 else SpringDamper(*gains)
-        ratio = required_damping(loop, coupling, "closed-loop").ratio
+        ratio = required_damping(loop, coupling, "this-environment").ratio
         loop = change(loop, delta=(float(max(min(ratio, 100.0) * rng.uniform(0.5, 1.5), 1e-3)),) * m)
-        ratio = required_damping(loop, coupling, "closed-loop").ratio
+        ratio = required_damping(loop, coupling, "this-environment").ratio
         try:
-            outcomes.append(prove(loop, coupling, "closed-loop").proof == "rational")
+            outcomes.append(prove(loop, coupling, "this-environment").proof == "rational")
         except NotProved:
             outcomes.append(False)
         assert outcomes[-1] == (ratio < 1) or 1 - 1e-4 <= ratio <= 1

@@ -343,7 +343,7 @@ def test_unilateral_springs_are_passive_under_backward_euler():
     assert touching > 25
 
 
-def test_the_frozen_promise_ends_with_another_stiffness():
+def test_the_frozen_guarantee_ends_with_another_stiffness():
     """Contact springs 20 % stiffer: 1.516 in place of 1.363; a mass changed tenfold does not matter."""
 
     def required(factor, mass):

@@ -273,7 +273,7 @@ def disarmed(monkeypatch):
 
 
 ALPHA = (500.0, 250.0)
-EITHER: list = ["closed-loop", "theorem4"]
+EITHER: list = ["this-environment", "any-environment"]
 
 
 def proves(asked: Loop, coupling, condition, phi=None) -> bool:
@@ -293,18 +293,18 @@ def assert_loop_limit(asked: Loop, coupling, condition, limit: float, phi=None) 
 @pytest.mark.usefixtures("disarmed")
 def test_each_condition_is_proved_by_its_own_block():
     asked, coupling = loop(to_ground(1000.0), (1,)), SpringDamper((800.0,), (0.0,))
-    assert_loop_limit(asked, coupling, "theorem4", 800 * T * 2)
+    assert_loop_limit(asked, coupling, "any-environment", 800 * T * 2)
     joined = 1 / (1 / 800 + 1 / 1000)
-    assert_loop_limit(asked, coupling, "closed-loop", 1.5 * joined * T)
+    assert_loop_limit(asked, coupling, "this-environment", 1.5 * joined * T)
 
 
 @pytest.mark.usefixtures("disarmed")
 def test_every_vertex_of_a_range_is_proved():
     """The stiffest spring decides, and is named."""
     asked = change(loop(to_ground(1000.0), (1,)), box=Box((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),)))
-    assert_loop_limit(asked, NoCoupling(), "closed-loop", 1.5 * 1600 * T)
+    assert_loop_limit(asked, NoCoupling(), "this-environment", 1.5 * 1600 * T)
     with pytest.raises(NotProved, match=r"^vertex 2 \(tip 0-ground 1600 N/m, 0 N s/m\): the condition is violated"):
-        prove(change(asked, delta=(1.5 * 1600 * T * (1 - CLOSE),)), NoCoupling(), "closed-loop")
+        prove(change(asked, delta=(1.5 * 1600 * T * (1 - CLOSE),)), NoCoupling(), "this-environment")
 
 
 @pytest.mark.usefixtures("disarmed")
@@ -313,10 +313,10 @@ def test_delay_in_the_environment_is_proved_with_its_multiplier():
     asked, coupling, a = loop(to_ground(100.0), (1,), (1,)), SpringDamper((K,), (0.0,)), 1 / 900.0
     phi = environment_needs * (1 + CLOSE)
     limit = T / (2 * min(a * (T / phi - 2 * a) / (4 * T / phi - 6 * a), (T / phi - 2 * a) / 2))
-    assert_loop_limit(asked, coupling, "theorem4", limit, [phi])
+    assert_loop_limit(asked, coupling, "any-environment", limit, [phi])
     enough = change(asked, delta=(2 * limit,))
-    assert proves(enough, coupling, "theorem4", [phi])
-    assert not proves(enough, coupling, "theorem4", [environment_needs * (1 - CLOSE)])
+    assert proves(enough, coupling, "any-environment", [phi])
+    assert not proves(enough, coupling, "any-environment", [environment_needs * (1 - CLOSE)])
 
 
 @pytest.mark.usefixtures("disarmed")
@@ -326,7 +326,7 @@ def test_a_range_of_delays_is_proved_by_its_own_block():
     limits = [T * (a / 2 + (K / 2) ** 2 / (2 * a) + K) for a in ALPHA]
     assert limits[1] > 1.01 * limits[0]
     assert limits[0] == pytest.approx(1.5 * K * T)  # where the sharper multiplier asks no more than theta = 1 does
-    assert_loop_limit(asked, NoCoupling(), "closed-loop", limits[1])
+    assert_loop_limit(asked, NoCoupling(), "this-environment", limits[1])
 
 
 # forgeries: everything that a forger can repair is repaired
@@ -343,19 +343,19 @@ NEGATIVE = "the KYP matrix has a negative direction, beyond the error bound of f
 
 def test_the_proof_of_one_condition_does_not_serve_the_other():
     asked, coupling = loop(to_ground(1000.0), (1,), delta=(2.0,)), SpringDamper((800.0,), (0.0,))
-    here, anywhere = (prove(asked, coupling, condition) for condition in ("closed-loop", "theorem4"))
+    here, anywhere = (prove(asked, coupling, condition) for condition in ("this-environment", "any-environment"))
     assert len(here.matrices["P"]) == len(anywhere.matrices["P"])  # it is not the size that gives it away
     assert forged(asked, coupling, anywhere) is None
     assert forged(asked, coupling, anywhere, matrices=here.matrices) == NEGATIVE
-    assert "does not promise" in forged(asked, coupling, here, promise="any passive environment")
+    assert "does not guarantee" in forged(asked, coupling, here, guarantee="any passive environment")
     soft = change(asked, environment=to_ground(100.0))  # any-environment's proof is far from this environment's need
-    assert forged(soft, coupling, prove(soft, coupling, "closed-loop"), matrices=anywhere.matrices) is not None
+    assert forged(soft, coupling, prove(soft, coupling, "this-environment"), matrices=anywhere.matrices) is not None
 
 
 def test_the_proof_of_the_nominal_environment_does_not_serve_a_vertex():
     asked = loop(to_ground(1000.0), (1,), delta=(1.5 * 1600 * T * 1.001,))
     asked = change(asked, box=Box((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),)))
-    made = prove(asked, NoCoupling(), "closed-loop")
+    made = prove(asked, NoCoupling(), "this-environment")
     assert made.required == pytest.approx((1.5 * 1600 * T,), rel=1e-9)  # of the neediest vertex
     nominal = made.matrices["P"]
     assert forged(asked, NoCoupling(), made) is None
@@ -364,7 +364,7 @@ def test_the_proof_of_the_nominal_environment_does_not_serve_a_vertex():
     assert forged(asked, NoCoupling(), made, matrices={"P": nominal}) == "matrices are P, expected P, P1, P2"
 
 
-@pytest.mark.parametrize(("condition", "name"), [("closed-loop", "F(1)"), ("theorem4", "H(1)")])
+@pytest.mark.parametrize(("condition", "name"), [("this-environment", "F(1)"), ("any-environment", "H(1)")])
 def test_a_static_part_that_is_asymmetric_by_1e_12_is_refused(condition, name):
     asked = loop(to_ground(900.0, 700.0), (1, 0), delta=(3.0, 3.0))
 
@@ -384,7 +384,7 @@ def test_an_asymmetry_of_1e_12_is_refused_behind_delay_and_for_switching_too():
     def crossed(other):
         return Compliance(Lti.constant([[2e-3, 1e-4], [other, 2e-3]], T))
 
-    made = prove(asked, crossed(1e-4), "theorem4", phi)
+    made = prove(asked, crossed(1e-4), "any-environment", phi)
     skew = crossed(1e-4 * (1 + 1e-12))
     assert forged(asked, skew, made) == "H(1) is not exactly symmetric"
     switching = change(asked, psi=(0, 0)).switching(DelayRange((0, 0), (1, 1)))
@@ -400,7 +400,7 @@ def test_a_static_stiffness_that_is_indefinite_by_1e_12_is_refused():
     def model(tap):
         return InternalModel([0.0], [[[0.0, 0.0], [0.0, 0.001]], [[0.0, 0.0], [0.0, tap]]])
 
-    made = prove(asked, model(0.0), "closed-loop")
+    made = prove(asked, model(0.0), "this-environment")
     assert forged(asked, model(0.0), made) is None
     assert forged(asked, model(1e-18), made).startswith("F(1) is not positive semidefinite")
     switching = asked.switching(DelayRange((0, 0), (1, 1)))
@@ -412,9 +412,9 @@ def test_a_static_stiffness_that_is_indefinite_by_1e_12_is_refused():
 def test_a_multiplier_is_below_the_damping_and_covers_the_environment(monkeypatch):
     K, a = 900.0, 1 / 900.0
     asked, coupling, phi = loop(to_ground(100.0), (1,), (1,), (4.0,)), SpringDamper((K,), (0.0,)), 0.1
-    made = prove(asked, coupling, "theorem4", [phi])
+    made = prove(asked, coupling, "any-environment", [phi])
     assert forged(asked, coupling, made) is None
-    claimed = from_ratio("theorem4", made.required[0] / 4.0, (4.0,), 1.0)
+    claimed = from_ratio("any-environment", made.required[0] / 4.0, (4.0,), 1.0)
     monkeypatch.setattr(certificate, "required_damping", lambda *_: claimed)  # the figures on file, for any Phi
 
     def with_phi(value: str) -> str | None:
@@ -429,7 +429,7 @@ def test_a_multiplier_is_below_the_damping_and_covers_the_environment(monkeypatc
 
 def test_figures_are_held_to_a_millionth():
     asked = loop(FIGURE_4, (1, 2), delta=(1.37, 1.37))
-    made = prove(asked, STIFF, "closed-loop")
+    made = prove(asked, STIFF, "this-environment")
     for factor, sound in ((1 + 2e-6, False), (1 - 2e-6, False), (1 + 5e-7, True)):
         required = tuple(d * factor for d in made.required)
         one = (made.required[0], made.required[1] * factor)
@@ -444,7 +444,7 @@ def test_figures_are_held_to_a_millionth():
 def test_the_figures_of_switching_are_held_to_a_millionth():
     soft = SpringDamper((878.767, 551.883), (0.386476, 0.521984))
     asked = loop(FIGURE_4, (1, 2), delta=(1.37, 1.37)).switching(DelayRange((1, 1), (2, 2)))
-    made = prove(asked, soft, "closed-loop")
+    made = prove(asked, soft, "this-environment")
     for factor, sound in ((1 + 2e-6, False), (1 - 2e-6, False), (1 + 5e-7, True)):
         for name in ("required", "margin"):
             value = np.multiply(getattr(made.switching, name), factor).tolist()
@@ -456,7 +456,7 @@ def test_the_figures_of_switching_are_held_to_a_millionth():
 
 def test_a_ragged_proof_is_refused():
     asked = loop(FIGURE_4, (1, 2), delta=(1.37, 1.37))
-    made = prove(asked, STIFF, "closed-loop")
+    made = prove(asked, STIFF, "this-environment")
     P = made.matrices["P"]
     ragged = (P[0][:-1], *P[1:])
     assert forged(asked, STIFF, made, matrices={"P": ragged}) == "P has a row of 8 entries, the model has 9 states"

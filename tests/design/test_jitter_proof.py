@@ -55,7 +55,7 @@ def test_a_spring_needs_what_its_longest_delay_needs(lo, hi):
 
 
 @pytest.mark.parametrize("theta", [(1, 2), (0, 3)])
-def test_a_range_of_one_delay_is_the_closed_loop_condition(theta):
+def test_a_range_of_one_delay_is_the_this_environment_condition(theta):
     F = force_map(environment(FIGURE_4, T), STIFF, theta, (0, 0))
     found = jitter_proof(sent(), theta, theta, DELTA).requirement
     assert found.required == pytest.approx(this_environment(F, DELTA).required, rel=1e-12)
@@ -186,7 +186,7 @@ def audit(tmp_path, *options):
 def test_audit_reports_switching_beside_the_constants(tmp_path):
     code, report = audit(tmp_path, "--K", "7806,3137", "--B", "0.105,1.68", "--jitter", "1,2")
     assert code == 1  # certified for the constant (1, 2), not for what was asked
-    assert report["closed-loop"]["certified"]
+    assert report["this-environment"]["certified"]
     assert report["jitter-proof"]["required_damping"] == pytest.approx([2.0413] * 2, rel=1e-4)
     assert report["jitter-proof"]["playout"]["required_damping"] == pytest.approx([1.7022] * 2, rel=1e-4)
     code, report = audit(tmp_path, "--K", "879,552", "--B", "0.39,0.52", "--jitter", "1-2,1-2")

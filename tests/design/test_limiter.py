@@ -185,7 +185,7 @@ def test_the_least_multiple_of_a_singular_gain(rank):
 
 @pytest.fixture(scope="module")
 def stored() -> Stored:
-    return Stored.of(PAIR, BUILT, prove(PAIR, BUILT, "closed-loop", beta=0.01))
+    return Stored.of(PAIR, BUILT, prove(PAIR, BUILT, "this-environment", beta=0.01))
 
 
 def test_the_exact_proof_survives_the_file(stored, tmp_path):
@@ -205,18 +205,18 @@ def test_the_exact_proof_survives_the_file(stored, tmp_path):
 def test_files_without_it_stay_as_they_were(tmp_path):
     """A coupling needs 1.385 with the limiter: its linear proof is untouched, the other is refused with the figure."""
     stiff = SpringDamper((7806.0, 3137.0), (0.105, 1.68))
-    plain = prove(PAIR, stiff, "closed-loop")
+    plain = prove(PAIR, stiff, "this-environment")
     assert "limiter" not in msgspec.to_builtins(plain)
     assert lag(PAIR, plain) is None
     with pytest.raises(NotProved, match=r"limiter: needs 1.38533, 1.38533 N s/m of damping, has 1.37, 1.37"):
-        prove(PAIR, stiff, "closed-loop", beta=0.01)
+        prove(PAIR, stiff, "this-environment", beta=0.01)
 
 
 def test_any_environment_is_its_own_proof():
     soft = SpringDamper((879.0, 552.0), (0.39, 0.52))
     loop = msgspec.structs.replace(PAIR, delta=(1.4, 1.4))
-    assert prove(loop, soft, "theorem4", beta=0.01) == prove(loop, soft, "theorem4")
-    assert lag(loop, prove(loop, soft, "theorem4")) == (0.0, 0.0)
+    assert prove(loop, soft, "any-environment", beta=0.01) == prove(loop, soft, "any-environment")
+    assert lag(loop, prove(loop, soft, "any-environment")) == (0.0, 0.0)
     requirement = any_environment(soft.compliance(T), PAIR.theta, (1.4, 1.4))
     assert requirement.certified
     assert not covers_lag(requirement, 0.01)  # 1.37 of 1.4: no room for 3 %
@@ -270,7 +270,7 @@ def test_loops_that_are_not_covered_are_refused_in_words(change, reason):
 def test_delay_in_the_environment_is_open_under_any_environment():
     loop = msgspec.structs.replace(PAIR, psi=(1, 1))
     with pytest.raises(NotProved, match="any-environment with delay in the environment does not cover limited forces"):
-        prove(loop, BUILT, "theorem4", (0.1, 0.1), beta=0.01)
+        prove(loop, BUILT, "any-environment", (0.1, 0.1), beta=0.01)
 
 
 # the design
@@ -282,12 +282,12 @@ def test_a_spring_damper_designed_with_the_block():
     def rms_db(coupling) -> float:
         return 20 * np.log10(transparency(PAIR.F(coupling), PAIR.E(), PAIR.lam).rms_mismatch)
 
-    made = design(PAIR, "closed-loop", limiter=True)
+    made = design(PAIR, "this-environment", limiter=True)
     assert 0.999 < 1 / prove_limiter(PAIR, made.coupling).margin < 1
     assert rms_db(BUILT) == pytest.approx(-9.16, abs=0.01)
     assert rms_db(made.coupling) < -10.5  # found; the linear design has -11.19 and is not proved with limited forces
     with pytest.raises(ValueError, match="proved for constant delays, ask for one"):
-        design(PAIR, "closed-loop", switching=((1, 1), (2, 2)), limiter=True)
+        design(PAIR, "this-environment", switching=((1, 1), (2, 2)), limiter=True)
 
 
 # energy: motions that take as much as they can

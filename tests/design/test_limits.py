@@ -89,7 +89,7 @@ def test_more_rungs_are_never_worse():
 
 
 def test_a_point_without_a_solution_keeps_its_reason():
-    limit = measured(IMPOSSIBLE, "spring-damper", "closed-loop", {})
+    limit = measured(IMPOSSIBLE, "spring-damper", "this-environment", {})
     assert limit.rms_mismatch_db is None
     assert limit.reason
     assert limit.wall_s > 0
@@ -100,7 +100,7 @@ def test_nothing_is_designed_twice():
 
     def counted(setting):
         calls.append(setting)
-        return measured(setting, "spring-damper", "theorem4", {})
+        return measured(setting, "spring-damper", "any-environment", {})
 
     recall = remembered(counted, False)
     along = settings("order", LOOP, Options(), 2)
@@ -114,7 +114,7 @@ def test_nothing_is_designed_twice():
 
 
 def test_the_command_draws_and_reports(tmp_path, capsys):
-    wish = ("--beside", "theorem4", "--functions", "4", "--diagonal")  # the last two no longer matter
+    wish = ("--beside", "any-environment", "--functions", "4", "--diagonal")  # the last two no longer matter
     code, report = run(tmp_path, "--over", "damping=1:2,order=1:2", "--points", "3", *wish)
     assert code == 0
     assert set(report["sweeps"]) == {"damping", "order"}
@@ -129,8 +129,8 @@ def test_the_command_draws_and_reports(tmp_path, capsys):
         "without effect: --functions, --diagonal" in " ".join(line.split())
         for line in capsys.readouterr().out.split("·")
     )
-    assert len(damping["theorem4"]) == 3
-    assert "closed-loop" not in damping
+    assert len(damping["any-environment"]) == 3
+    assert "this-environment" not in damping
     assert any("(here)" in line for line in report["gains"])
     assert any("without any coupling: needs 1.723, 1.723 N s/m, 1.26 times" in line for line in report["gains"])
     assert (tmp_path / "out" / "limits.png").read_bytes().startswith(b"\x89PNG")
@@ -138,7 +138,9 @@ def test_the_command_draws_and_reports(tmp_path, capsys):
 
 
 def test_nothing_found_is_exit_code_1(tmp_path, monkeypatch):
-    monkeypatch.setattr(command, "optimum", lambda setting: measured(IMPOSSIBLE, "spring-damper", "closed-loop", {}))
+    monkeypatch.setattr(
+        command, "optimum", lambda setting: measured(IMPOSSIBLE, "spring-damper", "this-environment", {})
+    )
     code, report = run(tmp_path, "--over", "order=1:2", "--points", "2", "--beside", "none")
     assert code == 1
     assert all(row["reason"] for row in report["sweeps"]["order"]["optimal"])
@@ -152,7 +154,7 @@ def test_interrupting_keeps_the_points_that_are_done(tmp_path, monkeypatch):
         calls.append(setting)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return measured(setting, "spring-damper", "theorem4", {})  # what is designed does not matter here
+        return measured(setting, "spring-damper", "any-environment", {})  # what is designed does not matter here
 
     monkeypatch.setattr(command, "optimum", interrupted)
     code, report = run(tmp_path, "--over", "damping=1.3:1.5", "--points", "4", "--beside", "none")
@@ -216,10 +218,10 @@ def test_rungs_are_the_designs_that_they_name():
     assert not published.certified
     assert published.proof is None
     assert published.relative_mismatch_db == pytest.approx(7.70, abs=0.005)
-    theorem4 = ladder_row("I", LOOP, by_name["spring-damper, any-environment"])
-    assert theorem4.required_damping == pytest.approx([0.7145] * 2, abs=1e-4)
-    assert theorem4.condition == "theorem4"
-    assert theorem4.proof == "rational"
+    any_environment = ladder_row("I", LOOP, by_name["spring-damper, any-environment"])
+    assert any_environment.required_damping == pytest.approx([0.7145] * 2, abs=1e-4)
+    assert any_environment.condition == "any-environment"
+    assert any_environment.proof == "rational"
     optimal = ladder_row("I", LOOP, by_name["optimal"])
     assert optimal.rms_mismatch_db <= -34.8
     assert optimal.proof == "rational"
@@ -256,14 +258,14 @@ def test_a_point_says_what_is_proved_of_it(monkeypatch):
     """Each design's own condition; a proof that fails leaves the point sampled, with the reason."""
     setting = settings("order", LOOP, SMALL, 1)[0]
     assert (optimum(setting).proof, optimum(setting).proof_reason) == ("rational", None)
-    assert measured(IMPOSSIBLE, "spring-damper", "closed-loop", {}).proof is None
+    assert measured(IMPOSSIBLE, "spring-damper", "this-environment", {}).proof is None
 
     def hopeless(*arguments):
         raise limit_curve.NotProved("too many states")
 
     monkeypatch.setattr(limit_curve, "prove", hopeless)
-    limit = measured(setting, "spring-damper", "theorem4", {})
+    limit = measured(setting, "spring-damper", "any-environment", {})
     assert (limit.proof, limit.proof_reason) == ("sampled", "too many states")
-    row = {"optimal": {"proof": "rational"}, "theorem4": {"proof": limit.proof}, "closed-loop": None}
+    row = {"optimal": {"proof": "rational"}, "any-environment": {"proof": limit.proof}, "this-environment": None}
     assert command._proofs(row) == "sampled: any-environment"
     assert command._proofs({"optimal": {"proof": None}}) == "-"

@@ -201,7 +201,7 @@ def test_analysis_agrees_with_the_frequency_condition():
     assert 16 < sum(verdicts) < len(verdicts) - 16
 
 
-def scalar_theorem4(V, E, theta, psi, delta):
+def scalar_any_environment(V, E, theta, psi, delta):
     """Lemma 4 for one channel, by hand: inf Re V-hat/|V-hat|^2 against phi/(1 - phi/delta), phi = sup -Re E-hat."""
     systems = (V, E)
     z = on_circle(frequencies(*systems, points=4000))
@@ -221,7 +221,7 @@ def test_analysis_with_environment_delay_agrees_with_lemma_4_by_hand():
         E = environment(network, T)
         theta, psi, delta = int(rng.integers(0, 3)), int(rng.integers(1, 3)), rng.uniform(0.5, 3)
         V = SpringDamper([np.exp(rng.uniform(4, 7))], [np.exp(rng.uniform(-3, 0.5))]).compliance(T)
-        phi, room = scalar_theorem4(V, E, theta, psi, delta)
+        phi, room = scalar_any_environment(V, E, theta, psi, delta)
         if abs(room) < 2e-3 * delta or abs(phi - delta) < 1e-3:
             continue
         verdicts.append(room > 0)

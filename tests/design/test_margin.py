@@ -31,13 +31,13 @@ def default(coupling) -> Lti:
         (SpringDamper([7806.0, 3137.0], [0.105, 1.68]), 1.36326),
     ],
 )
-def test_closed_loop_figures(coupling, required):
+def test_this_environment_figures(coupling, required):
     result = this_environment(default(coupling), DELTA)
     assert result.required == pytest.approx((required, required), rel=3e-5)
     assert result.certified == (required < 1.37)
 
 
-def test_theorem4_figures():
+def test_any_environment_figures():
     assert any_environment_per_channel(CASE_I.channels(T), THETA, DELTA).required == pytest.approx(
         (7.63, 7.84), abs=0.005
     )
@@ -49,7 +49,7 @@ def test_theorem4_figures():
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_theorem4_of_a_spring_damper_is_the_trigonometric_maximum(seed):
+def test_any_environment_of_a_spring_damper_is_the_trigonometric_maximum(seed):
     """max |K T vt + B (1 - z^-n)|^2 / (4 (K T/2 + B)), on a grid of a million points."""
     rng = np.random.default_rng(seed)
     theta, K, B = int(rng.integers(0, 6)), np.exp(rng.uniform(4, 9)), np.exp(rng.uniform(-3, 2))

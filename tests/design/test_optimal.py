@@ -242,7 +242,7 @@ def test_a_coupling_for_ranges_is_proved_at_every_vertex_and_searched_between():
     found = design(ranged, SHORT)
     assert found.proved
     assert len(found.certificate.matrices) == len(ranged.members())
-    assert found.certificate.promise == "a set"
+    assert found.certificate.guarantee == "a set"
     spread = robustness(loop, found.coupling)
     assert spread.kept
     for network in vertices(loop.environment).values():

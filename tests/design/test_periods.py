@@ -31,13 +31,13 @@ def test_a_report_on_switching_delays_is_for_the_longest_period(tmp_path):
         report = json.loads(file.read_text())
         stored = msgspec.json.decode((tmp_path / "c.json").read_bytes(), type=Stored)
         loop = stored.loop.switching(None)
-        buffered = required_damping(change(loop, theta=(2, 2)), stored.coupling.build(loop.T), "closed-loop")
+        buffered = required_damping(change(loop, theta=(2, 2)), stored.coupling.build(loop.T), "this-environment")
         needs.append((report["jitter_proof"]["playout"]["required_damping"], list(buffered.required)))
     for shown, swept_alone in needs:
         assert shown == pytest.approx(swept_alone, rel=1e-6)
 
 
-@pytest.mark.parametrize("condition", ["closed-loop", "theorem4"])
+@pytest.mark.parametrize("condition", ["this-environment", "any-environment"])
 def test_the_longest_period_scales_the_required_damping(condition):
     even = required_damping(LOOP, SOFT, condition)
     uneven = required_damping(change(LOOP, T_max=LONG), SOFT, condition)
@@ -55,9 +55,9 @@ def test_so_it_does_with_delays_that_switch_and_with_the_multiplier_of_a_delayed
     delayed = change(LOOP, psi=(1, 0), environment=soft)
     longer = change(delayed, T_max=LONG, delta=tuple(1.6 * d for d in LOOP.delta))
     found = design(delayed)
-    asked = [required_damping(one, found.coupling, "theorem4", found.phi) for one in (delayed, longer)]
+    asked = [required_damping(one, found.coupling, "any-environment", found.phi) for one in (delayed, longer)]
     assert asked[1].ratio == pytest.approx(asked[0].ratio, rel=1e-7)
-    assert verify(Stored.of(longer, found.coupling, prove(longer, found.coupling, "theorem4", found.phi))).proved
+    assert verify(Stored.of(longer, found.coupling, prove(longer, found.coupling, "any-environment", found.phi))).proved
 
 
 def test_the_any_environment_line_by_hand():
@@ -80,7 +80,7 @@ def test_the_damping_of_a_tick_is_exact_over_the_rationals():
     assert window / even == Fraction(8, 5)
 
 
-@pytest.mark.parametrize("condition", ["closed-loop", "theorem4"])
+@pytest.mark.parametrize("condition", ["this-environment", "any-environment"])
 def test_a_certificate_of_uneven_periods_is_proved_stored_and_verified(condition):
     loop = change(LOOP, T_max=LONG)
     stored = Stored.of(loop, SOFT, prove(loop, SOFT, condition))
@@ -92,8 +92,8 @@ def test_a_certificate_of_uneven_periods_is_proved_stored_and_verified(condition
 
 def test_a_design_for_uneven_periods_is_certified_for_them():
     loop = change(LOOP, T_max=LONG)
-    found = design(loop, "closed-loop")
-    requirement = assess(loop, found.coupling)["closed-loop"]
+    found = design(loop, "this-environment")
+    requirement = assess(loop, found.coupling)["this-environment"]
     assert requirement.certified
     assert requirement.proof == "rational"
     assert requirement.ratio == pytest.approx(1, rel=1e-3)  # it uses the damping that there is
@@ -164,7 +164,7 @@ def growing(damping, mean, seed=7):
 
 @pytest.mark.parametrize("mean", [50, 1000, None])
 def test_no_hand_grows_at_the_requirement_of_the_longest_period_and_some_do_below(mean):
-    need = required_damping(ONE, COUPLING, "closed-loop").required[0]
+    need = required_damping(ONE, COUPLING, "this-environment").required[0]
     assert need == pytest.approx(1.244099, rel=1e-6)
     assert growing(1.01 * 1.6 * need, mean) == 0
     assert growing(0.6 * 1.6 * need, mean) > 0

@@ -42,7 +42,7 @@ def test_the_known_optimum_is_reached_from_any_start(case, norm, start):
     assert found.requirement.certified
 
 
-@pytest.mark.parametrize("condition", ["theorem4", "closed-loop"])
+@pytest.mark.parametrize("condition", ["any-environment", "this-environment"])
 def test_a_damper_of_nothing_is_zero(condition):
     """Without delay Colgate's KT/2 + B <= delta makes every damper cost stiffness: before a stiff wall none is best."""
     wall = Network(("c",), (Spring(("c", "ground"), 1e4),))
@@ -178,26 +178,26 @@ def test_without_a_multiplier_the_delayed_condition_is_the_plain_one():
 
 
 @pytest.mark.parametrize(("case", "rms_db"), [("I", -10.98), ("II", -7.99)])
-def test_the_closed_loop_design_spends_the_environments_own_damping(case, rms_db):
+def test_the_this_environment_design_spends_the_environments_own_damping(case, rms_db):
     loop = asked(CASES[case])
-    found = design(loop, "closed-loop")
+    found = design(loop, "this-environment")
     assert 20 * np.log10(found.objective) <= rms_db
-    assert found.requirement.condition == "closed-loop"
+    assert found.requirement.condition == "this-environment"
     assert found.requirement.ratio <= 1 - RESERVE
     assert found.coupling.K.min() > 2500
     assert not any_environment(found.coupling.compliance(T), loop.theta, DELTA).certified
 
 
-def test_the_closed_loop_design_keeps_a_delayed_environment_stable():
+def test_the_this_environment_design_keeps_a_delayed_environment_stable():
     loop = asked((0, 0), psi=(1, 1), delta=(2.0, 2.0))
-    found = design(loop, "closed-loop")
+    found = design(loop, "this-environment")
     assert found.requirement.ratio <= 1 - RESERVE
     assert force_map(loop.E(), found.coupling, loop.theta, loop.psi).is_stable()
 
 
 def test_a_search_that_finds_nothing_does_not_claim_that_there_is_nothing():
     with pytest.raises(DesignFailed, match="no spring-damper was found") as caught:
-        design(asked((0, 0), psi=(1, 1), delta=(0.5, 0.5)), "closed-loop")
+        design(asked((0, 0), psi=(1, 1), delta=(0.5, 0.5)), "this-environment")
     assert not isinstance(caught.value, Infeasible)
 
 
@@ -228,7 +228,7 @@ def test_an_active_environment_is_refused():
 
 
 def test_an_unknown_condition_is_refused():
-    with pytest.raises(ValueError, match="condition is 'both', expected 'any_environment' or 'closed-loop'"):
+    with pytest.raises(ValueError, match="condition is 'both', expected 'any-environment' or 'this-environment'"):
         design(asked(), "both")
 
 

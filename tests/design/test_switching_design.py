@@ -25,7 +25,7 @@ RANGE = ((1, 1), (2, 2))
 def made(tmp_path_factory):
     """(report, coupling) of the design command, once."""
     out = tmp_path_factory.mktemp("design")
-    options = ["--condition", "closed-loop", "--jitter", "1,2", "--out", str(out / "c.json")]
+    options = ["--condition", "this-environment", "--jitter", "1,2", "--out", str(out / "c.json")]
     assert main([*options, "--json", str(out / "r.json")]) == 0
     return json.loads((out / "r.json").read_text()), load_stored(out / "c.json").coupling.build(load().T)
 
@@ -63,15 +63,15 @@ def test_a_range_that_is_too_wide_says_so():
     loop = load().replace(theta=(3, 3), delta=(0.02, 0.02)).loop("I")
     starts = [SpringDamper([2e4, 2e4], [0.5, 0.5])]
     with pytest.raises(DesignFailed, match=r"under any switching from \(0, 0\) to \(9, 9\) samples"):
-        design(loop, "closed-loop", starts, switching=((0, 0), (9, 9)))
+        design(loop, "this-environment", starts, switching=((0, 0), (9, 9)))
 
 
 @pytest.mark.parametrize(
     "options",
     [
         ["--condition", "any-environment", "--jitter", "1,2"],  # without it the design is for this environment
-        ["--condition", "closed-loop", "--jitter", "2,1"],
-        ["--condition", "closed-loop", "--jitter", "1"],
+        ["--condition", "this-environment", "--jitter", "2,1"],
+        ["--condition", "this-environment", "--jitter", "1"],
     ],
 )
 def test_requests_that_make_no_sense_are_refused(options, tmp_path):
@@ -79,9 +79,9 @@ def test_requests_that_make_no_sense_are_refused(options, tmp_path):
         main([*options, "--out", str(tmp_path / "c.json")])
 
 
-def test_theorem4_is_not_designed_for_delays_that_vary():
-    with pytest.raises(ValueError, match="closed-loop condition only"):
-        design(load().loop("I"), "theorem4", switching=RANGE)
+def test_any_environment_is_not_designed_for_delays_that_vary():
+    with pytest.raises(ValueError, match="this-environment condition only"):
+        design(load().loop("I"), "any-environment", switching=RANGE)
 
 
 def test_an_optimal_coupling_for_switching_delays():

@@ -48,7 +48,7 @@ change = msgspec.structs.replace
 
 @pytest.fixture(scope="module")
 def stored() -> Stored:
-    return Stored.of(LOOP, SOFT, prove(LOOP, SOFT, "closed-loop"))
+    return Stored.of(LOOP, SOFT, prove(LOOP, SOFT, "this-environment"))
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def file(stored, tmp_path) -> str:
 
 @pytest.fixture
 def constant_file(tmp_path) -> str:
-    save(Stored.of(PAIR, STIFF, prove(PAIR, STIFF, "closed-loop")), tmp_path / "constant.json")
+    save(Stored.of(PAIR, STIFF, prove(PAIR, STIFF, "this-environment")), tmp_path / "constant.json")
     return str(tmp_path / "constant.json")
 
 
@@ -99,7 +99,7 @@ def test_what_is_on_file_is_a_witness_on_a_dense_sweep(stored):
 def test_other_ranges_are_proved_too(lo, hi):
     soft = SpringDamper((300.0, 250.0), (0.3, 0.3))
     loop = PAIR.switching(DelayRange(lo, hi))
-    made = Stored.of(loop, soft, prove(loop, soft, "theorem4"))
+    made = Stored.of(loop, soft, prove(loop, soft, "any-environment"))
     assert verify(made).proved
     assert [a > 0 for a in made.certificate.switching.alpha] == [a < b for a, b in zip(lo, hi, strict=True)]
 
@@ -114,9 +114,9 @@ def test_every_constant_delay_of_the_range_asks_no_more(coupling):
 
 
 def test_what_is_not_jitter_proof_is_not_certified_as_such():
-    assert prove(PAIR, STIFF, "closed-loop").switching is msgspec.UNSET
+    assert prove(PAIR, STIFF, "this-environment").switching is msgspec.UNSET
     with pytest.raises(NotProved, match=r"^delays switching within \[1, 2\] samples: needs 2\.04"):
-        prove(LOOP, STIFF, "closed-loop")
+        prove(LOOP, STIFF, "this-environment")
 
 
 def test_files_without_a_range_keep_their_digests():
@@ -125,7 +125,9 @@ def test_files_without_a_range_keep_their_digests():
     assert digest(PAIR, STIFF.form()) == expected
     assert digest(LOOP, STIFF.form()) != expected
     matrices, figures = {"P": (("1/2", "0"), ("0", "3"))}, ((1.25, 1.25), (1.37, 1.37), 1.096)
-    old = Certificate("closed-loop", *figures, "this environment", "rational", matrices, "ab" * 32, {"numpy": "2.0.0"})
+    old = Certificate(
+        "this-environment", *figures, "this environment", "rational", matrices, "ab" * 32, {"numpy": "2.0.0"}
+    )
     assert sealed(old).seal == "5a8b5bd2efbe574d18642debfb79affac9fb654f3de659112e3642ac37d39691"
 
 
@@ -215,7 +217,7 @@ def told(capsys, main, *options) -> tuple[int, dict]:
     return code, json.loads(capsys.readouterr().out)
 
 
-def test_check_names_the_promise_and_the_proof(stored, file, tmp_path, capsys):
+def test_check_names_the_guarantee_and_the_proof(stored, file, tmp_path, capsys):
     code, report = told(capsys, check_main, file)
     assert (code, report["proved"]) == (0, True)
     assert report["switching"]["promise"] == "delays switching within [1, 2] samples, in this environment"
@@ -246,7 +248,7 @@ def test_a_run_says_what_the_file_covers(run, file):
     for theta in ("2,2", "1,1", "2,1"):
         outcome = run(file, "--theta", theta)
         assert remark + f"the constant theta = [{theta[0]}, {theta[2]}]" in outcome["remarks"]
-        assert outcome["certificates"]["closed-loop"]["certified"]
+        assert outcome["certificates"]["this-environment"]["certified"]
     outcome = run(file, "--jitter", "1,2", "--playout")
     assert remark + "the constant theta = [2, 2]" in outcome["remarks"]
     assert outcome["jitter"]["covered"]
@@ -303,7 +305,7 @@ def test_without_an_exact_proof_the_file_keeps_the_constants(tmp_path, capsys, m
     """A limit on states between the two models: said in the report, and the file claims no switching."""
     monkeypatch.setattr(positive_real, "LARGEST", condition_block(LOOP, SOFT, (1.0, 1.0)).order - 1)
     out = str(tmp_path / "c.json")
-    options = ["--condition", "closed-loop", "--jitter", "1,2", "--out", out]
+    options = ["--condition", "this-environment", "--jitter", "1,2", "--out", out]
     code, outcome = told(capsys, design_main, *options)
     assert code == 0
     assert outcome["jitter_proof"]["proof"] == "sampled"
@@ -315,7 +317,7 @@ def test_without_an_exact_proof_the_file_keeps_the_constants(tmp_path, capsys, m
 
 
 def test_a_design_for_a_range_without_its_theta_is_refused(tmp_path):
-    options = ["--condition", "closed-loop", "--jitter", "2,3", "--out", str(tmp_path / "c.json")]
+    options = ["--condition", "this-environment", "--jitter", "2,3", "--out", str(tmp_path / "c.json")]
     with pytest.raises(
         ValueError, match=r"--jitter is 2-3: theta is \[1, 2\], outside of its jitter, \[2, 3\] samples"
     ):
@@ -337,7 +339,7 @@ def test_certify_judges_any_switching():
     found = certify(LOOP, coupling)
     assert found["jitter-proof"].certified
     assert found["jitter-proof"].proof == "rational"
-    assert found["closed-loop"] == certify(PAIR, coupling)["closed-loop"]
+    assert found["this-environment"] == certify(PAIR, coupling)["this-environment"]
     assert "jitter-proof" not in certify(PAIR, coupling)
 
 
@@ -346,7 +348,7 @@ def test_certify_judges_every_vertex_of_a_box(K, certified):
     """The nominal environment alone would certify both."""
     loop = change(PAIR, box=Box((UncertainSpring(("mass", "contact 1"), (640.0, 960.0), absent=True),)))
     coupling = built.SpringDamper(K, (0.105, 1.68))
-    found, nominal = certify(loop, coupling)["closed-loop"], certify(PAIR, coupling)["closed-loop"]
+    found, nominal = certify(loop, coupling)["this-environment"], certify(PAIR, coupling)["this-environment"]
     at = [
         this_environment(force_map(environment(m.network, T), coupling, (1, 2), (0, 0)), DELTA) for m in loop.members()
     ]
@@ -361,7 +363,7 @@ def test_certify_judges_every_vertex_of_a_box(K, certified):
 def test_the_bridge_says_how_long_a_force_may_be_held(tmp_path):
     """Ages under isolated missed answers, from the line itself, lie within what the file proves."""
     loop = change(LOOP, theta=(1, 1), lam=(1, 1))
-    save(Stored.of(loop, SOFT, prove(loop, SOFT, "closed-loop")), tmp_path / "one.json")
+    save(Stored.of(loop, SOFT, prove(loop, SOFT, "this-environment")), tmp_path / "one.json")
     scenario = scenario_of().replace(theta=(1, 1))
     first, second = certified_couplings(scenario, "I", str(tmp_path / "one.json"), None, 1, spare=1)
     assert first.remarks() == ["a force that is held through 1 missed answer is covered by the file's proof"]

@@ -17,8 +17,8 @@ from design.certificate import (
     NotProved,
     Stored,
     assess,
+    guarantee_of,
     making_covered,
-    promise_of,
     prove,
     sealed,
     verify,
@@ -185,20 +185,20 @@ def test_frozen_motions_fall_to_a_nonnegative_value():
 
 @pytest.mark.parametrize(("loop", "coupling"), [(held(3000.0), COUPLING), (PAIR, BOTH)])
 def test_it_is_proved_stored_and_verified(loop, coupling):
-    stored = Stored.of(loop, coupling, prove(loop, coupling, "closed-loop"))
+    stored = Stored.of(loop, coupling, prove(loop, coupling, "this-environment"))
     assert set(stored.certificate.matrices) == {"P", "g"}
     again = msgspec.json.decode(msgspec.json.encode(stored), type=Stored)
     assert verify(again).proved
-    judged = assess(loop, coupling)["closed-loop"]
+    judged = assess(loop, coupling)["this-environment"]
     assert judged.proof == "rational"
     required = np.array(judged.required)
     for factor, proved in ((1.001, True), (0.999, False)):
         one = change(loop, delta=tuple((factor * required).tolist()))
         if proved:
-            prove(one, coupling, "closed-loop")
+            prove(one, coupling, "this-environment")
         else:
             with pytest.raises(NotProved):
-                prove(one, coupling, "closed-loop")
+                prove(one, coupling, "this-environment")
     matrices = stored.certificate.matrices
     forged = sealed(change(stored.certificate, matrices=matrices | {"g": (("0",) * len(matrices["g"][0]),)}))
     assert not verify(change(stored, certificate=forged)).proved
@@ -217,14 +217,14 @@ def test_what_is_not_covered_is_said():
     assert making_covered(loop)
     assert not making_covered(damped)
     with pytest.raises(NotProved, match="walls with dampers"):
-        prove(damped, COUPLING, "closed-loop")
+        prove(damped, COUPLING, "this-environment")
     with pytest.raises(NotProved, match="linear model of the environment"):
-        prove(loop, InternalModel(np.zeros(1), np.zeros((2, 1, 1))), "closed-loop")
+        prove(loop, InternalModel(np.zeros(1), np.zeros((2, 1, 1))), "this-environment")
     one_way = Compliance(Lti.constant([[1e-3, 5e-4], [0.0, 1e-3]], PAIR.T))
     assert "not symmetric" in walls_of(PAIR, one_way).requirement.reason
     judged = assess(pressed_at_rest(), SpringDamper([1300.0], [0.45]))
-    assert not judged["theorem4"].certified
-    assert promise_of(judged, pressed_at_rest()) == MAKING
+    assert not judged["any-environment"].certified
+    assert guarantee_of(judged, pressed_at_rest()) == MAKING
 
 
 def test_couplings_may_be_stiffer_than_any_environment_allows():
@@ -232,7 +232,7 @@ def test_couplings_may_be_stiffer_than_any_environment_allows():
     loop = Loop(1e-3, (1,), (0,), (1,), (1.37,), Network(("tip",), walls=(Wall(("tip", GROUND), 3000.0, gap=0.005),)))
     coupling = SpringDamper([1300.0], [0.45])
     assert any_environment(coupling.compliance(loop.T), loop.theta, loop.delta).ratio > 1.2
-    assert prove(loop, coupling, "closed-loop").promise == "this environment"
+    assert prove(loop, coupling, "this-environment").guarantee == "this environment"
 
 
 # Hands on a wall that is made and left, simulated exactly.

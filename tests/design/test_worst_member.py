@@ -1,4 +1,4 @@
-"""The search for the worst environment of a box, and what a violation between the vertices does to a promise."""
+"""The search for the worst environment of a box, and what a violation between the vertices does to a guarantee."""
 
 import json
 from itertools import product
@@ -157,11 +157,11 @@ def test_neither_the_vertices_nor_random_points_see_it_but_no_set_is_promised(kn
     part = set_part(known)
     assert (part["proof"], part["certified"], part["search"]["violated"]) == ("rational", False, True)
     assert part["reason"].startswith("proved at the vertices, but violated between them: 1.04")
-    assert any("not promised" in words for _, words in set_rows(part))
+    assert any("not guaranteed" in words for _, words in set_rows(part))
 
 
-def test_fewer_samples_do_not_make_it_a_promise():
-    requirement = certify(EDGE, VERTICES_ONLY)["closed-loop"]  # draws none
+def test_fewer_samples_do_not_make_it_a_guarantee():
+    requirement = certify(EDGE, VERTICES_ONLY)["this-environment"]  # draws none
     assert not requirement.certified
     assert requirement.ratio == pytest.approx(1.0428, abs=1e-3)
     assert requirement.proof == "sampled"
@@ -169,15 +169,15 @@ def test_fewer_samples_do_not_make_it_a_promise():
 
 def test_its_file_is_stored_for_the_environment_alone(known, tmp_path):
     assert known.at_members[0].certified
-    design = Design(VERTICES_ONLY, "closed-loop", "rms", 0.07, known.at_members[0], 1, 0.0)
+    design = Design(VERTICES_ONLY, "this-environment", "rms", 0.07, known.at_members[0], 1, 0.0)
     assert _store(BOX, design, known, tmp_path / "c.json")["proof"] == "rational"
     stored = load(tmp_path / "c.json")
-    assert (stored.loop.box, stored.certificate.promise) == (None, "this environment")
+    assert (stored.loop.box, stored.certificate.guarantee) == (None, "this environment")
 
 
 def test_design_check_searches_again_and_rejects_a_file_that_was_made_without(tmp_path, capsys):
     file = tmp_path / "c.json"
-    save(Stored.of(EDGE, VERTICES_ONLY, prove(EDGE, VERTICES_ONLY, "closed-loop")), file)
+    save(Stored.of(EDGE, VERTICES_ONLY, prove(EDGE, VERTICES_ONLY, "this-environment")), file)
     assert verify(load(file)).proved  # of the vertices it is a proof
     assert check_main([str(file), "--json", "-"]) == 1
     result = json.loads(capsys.readouterr().out)

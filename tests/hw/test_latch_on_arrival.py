@@ -77,10 +77,12 @@ def test_the_spread_of_the_ticks_is_what_certificates_are_for():
     spread, _ = timed(LAB, Ages((130,) * 100, 0, (1150,) * 60 + (1320,) * 40), 0.99, 100.0)
     assert spread.T_max == pytest.approx(1.32e-3)
     needs = [
-        certified_couplings(s.replace(delta=(2.0, 2.0)), "I", "published", "closed-loop", 1, spare=0)[0].requirements
+        certified_couplings(s.replace(delta=(2.0, 2.0)), "I", "published", "this-environment", 1, spare=0)[
+            0
+        ].requirements
         for s in (even, spread)
     ]
-    even_need, spread_need = (max(need["closed-loop"].required) for need in needs)
+    even_need, spread_need = (max(need["this-environment"].required) for need in needs)
     assert spread_need == pytest.approx(1.1 * even_need, rel=1e-9)
     known = LAB.replace(T_max=1.4e-3)
     assert timed(known, ages, 0.9, 100.0)[0].T_max == 1.4e-3
@@ -120,7 +122,10 @@ def test_a_session_is_certified_and_replayed_bit_for_bit(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (["--condition", "theorem4"], "--latch arrival with --condition theorem4: a latency of a fraction"),
+        (
+            ["--condition", "any-environment"],
+            "--latch arrival with --condition any-environment: a latency",
+        ),
         (["--energy-budget", "0.01"], "--energy-budget with --latch arrival"),
         (["--latency", "1e-4"], "latency: hw.bridge takes the ticks that it has"),
     ],

@@ -259,7 +259,7 @@ def test_the_host_and_the_link_share_the_delay(scenario, rungs):
 
 
 def test_nothing_uncertified_is_loaded(scenario, rungs):
-    with pytest.raises(Fault, match=r"published is not certified for theta = \[1, 2\]: theorem4 needs 7.629"):
+    with pytest.raises(Fault, match=r"published is not certified for theta = \[1, 2\]: any-environment needs 7.629"):
         certified_coupling(scenario, "I", "published", None, 1)
     with pytest.raises(Fault, match="at most theta = 15"):
         certified_coupling(scenario, "I", None, None, 16)
@@ -296,8 +296,8 @@ def test_an_optimal_coupling_has_another_for_one_tick_more_in_reserve(optimal_ru
     fast, soft = optimal_rungs
     assert (fast.chosen.kind, soft.chosen.kind) == ("optimal", "optimal")
     assert (fast.link, soft.link) == (1, 2)
-    assert fast.requirements["closed-loop"].certified
-    assert soft.requirements["closed-loop"].certified
+    assert fast.requirements["this-environment"].certified
+    assert soft.requirements["this-environment"].certified
     assert soft.scenario.theta == (2, 2)
     bridge.print_certificate(Ages((130,) * 100), 1, optimal_rungs, (2.0, 2.0), Console(width=160))
     table = capsys.readouterr().out

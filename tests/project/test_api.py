@@ -17,7 +17,7 @@ import sim
 from cli.run import main as run_command
 from cli.validate import main as validate_command
 from controller.coupling import NoCoupling, SpringDamper
-from design import Options, certify, design_coupling, promise, transparency_of
+from design import Options, certify, design_coupling, guarantee, transparency_of
 from design.designs import KINDS, OPTIONS
 from hw import rehearse
 from models.device import RigidDevice
@@ -75,7 +75,7 @@ def test_the_options_are_those_that_the_designs_take():
     assert set(Options.__annotations__) == {name for names in OPTIONS.values() for name in names}
 
 
-def test_promise_and_transparency_are_those_of_the_commands(tmp_path):
+def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
     from cli.design import main as design_command
 
     loop = load().loop("I")
@@ -87,21 +87,21 @@ def test_promise_and_transparency_are_those_of_the_commands(tmp_path):
         == 0
     )
     report = json.loads((tmp_path / "r.json").read_text())
-    assert promise(loop, certify(loop, found)) == report["promise"] == "any passive environment"
+    assert guarantee(loop, certify(loop, found)) == report["promise"] == "any passive environment"
     figures = transparency_of(loop, found)
     assert figures.mismatch_db == report["transparency"]["relative_mismatch_db"]
     assert figures == transparency_of(loop, found.coupling)
     assert transparency_of(loop, NoCoupling()).mismatch_db == -np.inf  # F = Theta Psi E = Lambda E in case I
-    assert promise(loop, certify(loop, SpringDamper([2870, 2320], [5.47, 5.55]))) is None
+    assert guarantee(loop, certify(loop, SpringDamper([2870, 2320], [5.47, 5.55]))) is None
     box = load("omega-pair-box").loop("I")
-    assert promise(box, certify(box, SpringDamper([300, 300], [0.1, 0.1]))) == "any passive environment"
+    assert guarantee(box, certify(box, SpringDamper([300, 300], [0.1, 0.1]))) == "any passive environment"
 
 
 def test_a_session_is_rehearsed():
     """The link takes 130 us from a sample to its force, which one tick of 1 ms covers."""
     scenario = load().replace(T=1e-3, theta=(1, 1))
     session = rehearse(scenario, seconds=0.5)
-    assert (session.stage, session.theta, session.promise) == ("finished", (1, 1), "any passive environment")
+    assert (session.stage, session.theta, session.guarantee) == ("finished", (1, 1), "any passive environment")
     assert session.delay == pytest.approx(130e-6, abs=2e-6)  # the clock ticks in us, and each way is rounded
     designed = design_coupling(scenario.loop("I")).coupling
     np.testing.assert_array_equal(session.coupling.K, designed.K)
@@ -111,7 +111,7 @@ def test_a_session_is_rehearsed():
     assert force[-1] < 0.05 * force.max()  # the last tick of a ramp of 100 to 250
     given = rehearse(scenario, SOFT, seconds=0.5)
     assert given.coupling is SOFT
-    assert given.requirements["closed-loop"].certified
+    assert given.requirements["this-environment"].certified
 
 
 def test_a_session_that_is_refused_says_why():
@@ -154,10 +154,10 @@ def test_a_design_is_certified_and_goes_where_a_coupling_goes():
     loop = load().loop("I")
     found = design_coupling(loop)
     requirements = certify(loop, found)
-    assert requirements["theorem4"].certified
-    assert requirements["theorem4"].proof == "rational"
-    assert requirements["theorem4"].required == pytest.approx((1.3699, 1.3699), abs=1e-4)  # (1 - 1e-4) of 1.37
-    assert certify(loop, found.coupling)["closed-loop"].required == requirements["closed-loop"].required
+    assert requirements["any-environment"].certified
+    assert requirements["any-environment"].proof == "rational"
+    assert requirements["any-environment"].required == pytest.approx((1.3699, 1.3699), abs=1e-4)  # (1 - 1e-4) of 1.37
+    assert certify(loop, found.coupling)["this-environment"].required == requirements["this-environment"].required
     assert (validate(load(), found, humans=10, engine="exact", duration=0).exact < 0).all()
 
 
@@ -218,7 +218,7 @@ LOOP = SHORT.loop("I")
         (lambda: certify(LOOP, None), "coupling is None, expected a coupling (controller.coupling), or a Design"),
         (lambda: certify(LOOP, SpringDamper), "expected a coupling (controller.coupling), or a Design"),
         (lambda: transparency_of(LOOP, "spring-damper"), "coupling is 'spring-damper' (str), expected a coupling"),
-        (lambda: promise(LOOP, SOFT), "expected what certify returned"),
+        (lambda: guarantee(LOOP, SOFT), "expected what certify returned"),
         (lambda: simulate(LOOP), 'scenario is a Loop, expected a Scenario, as load("omega-pair") gives it'),
         (lambda: simulate(SHORT, "spring-damper"), "coupling is 'spring-damper' (str), expected a coupling"),
         (lambda: simulate(SHORT, substeps=1.5), "substeps is 1.5 (float), allowed are whole numbers, 1 to 10000"),

@@ -13,8 +13,12 @@ EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 
 #: what each must print; figures are those that docs and other tests have
 SAYS = {
-    "audit": ["closed-loop: needs 1.3987, 1.3987 of 1.37 N s/m: not certified", "the gains times 0.8995"],
-    "compare_couplings": ["any passive environment", "closed-loop +1.36.. ", r"-17.6. .*-34.8. .*this environment"],
+    "audit": ["this-environment: needs 1.3987, 1.3987 of 1.37 N s/m: not certified", "the gains times 0.8995"],
+    "compare_couplings": [
+        "any passive environment",
+        "this-environment +1.36.. ",
+        r"-17.6. .*-34.8. .*this environment",
+    ],
     "neural_environment": [
         r"budget 1e\+09 J: limited 0 of 5000",
         r"budget 0.01 J: limited [34]\d{3} of 5000",
@@ -36,7 +40,7 @@ def test_a_device_without_damping_ends_the_example_with_one_line(tmp_path):
         [sys.executable, "mine.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 1
-    assert done.stderr == "error: delta is [0.0, 0.0]: a device without damping can promise no human anything\n"
+    assert done.stderr == "error: delta is [0.0, 0.0]: a device without damping can guarantee nothing to any human\n"
 
 
 def test_examples_import_only_what_is_for_scripts():

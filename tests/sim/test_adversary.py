@@ -1,4 +1,4 @@
-"""The search for the worst passive human finds one where the closed-loop condition fails, and none where it holds."""
+"""The search for the worst passive human finds one where this-environment fails, and none where it holds."""
 
 import json
 import sys

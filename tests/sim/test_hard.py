@@ -101,7 +101,7 @@ def sustained(damping: float, near: int = 0) -> tuple[float, int, float]:
 
 def test_saturation_breaks_a_certificate_and_damped_hands_mend_it():
     """Section 7's counterexample: certified for the linear loop, yet with lossless hands clipping goes on for ever."""
-    assert assess(load().loop("I"), CLOSED_LOOP)["closed-loop"].certified
+    assert assess(load().loop("I"), CLOSED_LOOP)["this-environment"].certified
     far, near, frequency = sustained(0.0, near=100)
     print(f"lossless hands: {far:.1%} of 200 far and {near} of 100 near starts clip after 48 s, at {frequency:.2f} Hz")
     assert far > 0.2

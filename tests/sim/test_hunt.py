@@ -22,7 +22,7 @@ def cases():
     return {i: case for i in range(8) if (case := draw(0, i))}
 
 
-def test_every_frozen_state_of_a_draw_is_certified_and_theorem4_is_not(cases):
+def test_every_frozen_state_of_a_draw_is_certified_and_any_environment_is_not(cases):
     assert len(cases) > 4
     for case in cases.values():
         s, channels = case.scenario, case.coupling.channels(case.scenario.T)

@@ -82,17 +82,21 @@ def test_undefined_errors_have_a_reason():
 
 
 def test_the_command_ranks_the_designs(tmp_path):
-    """The optimum renders case I to half a percent; theorem4's spring-damper is about half of the force off."""
+    """The optimum renders case I to half a percent; any-environment's spring-damper is about half of the force off."""
     errors = {}
-    for name, condition in (("optimal", None), ("spring-damper", "theorem4"), ("spring-damper", "closed-loop")):
+    for name, condition in (
+        ("optimal", None),
+        ("spring-damper", "any-environment"),
+        ("spring-damper", "this-environment"),
+    ):
         file = tmp_path / "r.json"
         options = ["--coupling", name, *(["--condition", condition] if condition else []), "--engine", "exact"]
         assert main([*options, "--no-plot", "--duration", "4", "--out", str(tmp_path), "--json", str(file)]) == 0
         errors[name, condition] = json.loads(file.read_text())["ideal_force"]["error_percent"]
     assert errors["optimal", None] < 2
-    assert errors["optimal", None] < errors["spring-damper", "closed-loop"] / 5
-    assert errors["spring-damper", "closed-loop"] < errors["spring-damper", "theorem4"] / 2
+    assert errors["optimal", None] < errors["spring-damper", "this-environment"] / 5
+    assert errors["spring-damper", "this-environment"] < errors["spring-damper", "any-environment"] / 2
     trace = Trace.load_npz(tmp_path / "trace.npz")
     expected = by_hand(SCENARIO.T, trace.x, (1, 2))
     error = np.sqrt(((trace.f - expected) ** 2).sum() / (expected**2).sum())
-    assert errors["spring-damper", "closed-loop"] == pytest.approx(100 * error, rel=1e-6)
+    assert errors["spring-damper", "this-environment"] == pytest.approx(100 * error, rel=1e-6)

@@ -77,6 +77,6 @@ def test_the_report_says_which_guarantee_holds(tmp_path):
     assert covered["rho"] == [0.0, 0.0]
     assert covered["force_limit"] == [12.0, 12.0]
     assert report(*anywhere, "--no-limiter")["limiter"]["rho"] is None
-    uncovered = report("--case", "I", "--condition", "closed-loop")["limiter"]
+    uncovered = report("--case", "I", "--condition", "this-environment")["limiter"]
     assert uncovered["rho"] is None
     assert uncovered["certificate"]["required_damping"][0] > 1.37

@@ -38,7 +38,7 @@ def given(simulation, trace):
 def test_a_budget_that_does_not_act_changes_nothing(engine):
     """Certified for any environment at 95 % of the damping, from rest, without cap and without a joule."""
     weaker = SHORT.replace(delta=tuple(0.95 * d for d in SHORT.delta)).loop("I")
-    coupling = design_coupling(weaker, "spring-damper", "theorem4").coupling
+    coupling = design_coupling(weaker, "spring-damper", "any-environment").coupling
     with_budget = simulate(SHORT, coupling, engine, energy_budget=0.0)
     alone = simulate(SHORT, coupling, engine)
     part = with_budget.meta["energy_budget"]
@@ -52,7 +52,7 @@ def test_a_budget_that_does_not_act_changes_nothing(engine):
 @pytest.mark.parametrize("start", [0.0, 0.01])
 def test_no_hand_is_given_more_than_the_budget_by_a_hostile_loop(start, vary):
     """The optimal coupling on springs 2.5 times stiffer; the users' work does not count, so nobody is given more."""
-    coupling = design_coupling(load().loop("I"), "optimal", "closed-loop").coupling
+    coupling = design_coupling(load().loop("I"), "optimal", "this-environment").coupling
     scenario = stiffer(load().replace(duration=4.0), 2.5)
     simulation = assemble(scenario, coupling)
     if vary:
@@ -90,7 +90,7 @@ def test_walls_stand_behind_a_budget_too():
 
 def test_the_shell_bounds_what_an_environment_of_ones_own_gives():
     """A force that pushes along the motion: without shell it drives the hands, with it it gives 2 mJ at most."""
-    coupling = design_coupling(SHORT.loop("I"), "spring-damper", "theorem4").coupling
+    coupling = design_coupling(SHORT.loop("I"), "spring-damper", "any-environment").coupling
     V, energies = coupling.compliance(SHORT.T), {}
 
     def thief():

@@ -140,7 +140,7 @@ def coupling(name, ratio, at):
     none = {"ratio": None, "demand": None, "binding_frequency_hz": None, "reason": "no V"}
     felt = {"stiffness": [[1.0, 9.0], [-5.0, 9.0], [7.0, 9.0]], "damping": [[0.1, 2.0]] * 3}
     sigma = {"sigma_F": [[3.0, 1.0]] * 3, "sigma_M": [[0.0, 0.0]] * 3}
-    return {"name": name, "closed-loop": part, "theorem4": none, "perceived": felt} | sigma
+    return {"name": name, "this-environment": part, "any-environment": none, "perceived": felt} | sigma
 
 
 def report(available=(1.37, 1.37), psi=(0, 0)):
@@ -179,7 +179,10 @@ def test_singular_values_and_what_is_felt_stand_as_reported(drawn):
 def k_b_map():
     B, K = np.array([0.0, 1.0, 2.0]), np.array([10.0, 20.0])
     growth = np.array([-1.0, -1.0, 1.0, 1.0, np.nan, -1.0])
-    ratio = {"theorem4": np.array([0.5, 0.5, 2, 2, 2, 2.0]), "closed-loop": np.array([0.5, 0.5, 2, 2, 2, 2.0])}
+    ratio = {
+        "any-environment": np.array([0.5, 0.5, 2, 2, 2, 2.0]),
+        "this-environment": np.array([0.5, 0.5, 2, 2, 2, 2.0]),
+    }
     return SimpleNamespace(grid=SimpleNamespace(B=B, K=K, scale="linear", shape=(2, 3)), growth=growth, ratio=ratio)
 
 

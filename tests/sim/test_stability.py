@@ -25,7 +25,7 @@ def test_exact_and_measured_growth(coupling, growth, frequency):
     assert measured == pytest.approx(mode.growth, abs=1e-3)
 
 
-def test_the_closed_loop_matrix_is_the_loop():
+def test_the_this_environment_matrix_is_the_loop():
     """Stepping the matrix by hand gives the loop's own record."""
     assembly = assemble(load().replace(theta=(3, 0), psi=(1, 2), duration=0.5), CASE_I)
     record = run(assembly, "exact")

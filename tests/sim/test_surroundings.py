@@ -61,9 +61,9 @@ def test_the_figures_are_those_of_a_dense_sweep(scenario, optimal):
         return R.at(z) @ E
 
     for K, B in ((90.0, 0.3), (350.0, 2.0), (1213.2, 2.54)):
-        found = sweep.ratios("closed-loop", np.array([K]), np.array([B]))[0]
+        found = sweep.ratios("this-environment", np.array([K]), np.array([B]))[0]
         assert found == pytest.approx(densely(sweep, filtered, K, B), rel=1e-5)
-        assert sweep.requirement("closed-loop", K, B).ratio == pytest.approx(found, rel=1e-7)
+        assert sweep.requirement("this-environment", K, B).ratio == pytest.approx(found, rel=1e-7)
 
 
 def test_the_model_of_a_pair_may_stay_behind():
@@ -82,23 +82,23 @@ def test_the_model_of_a_pair_may_stay_behind():
     assert found[2] == pytest.approx(densely(sweep, kept, 300.0, 0.5), rel=1e-5)
     assert found[2] != pytest.approx(found[1], rel=1e-4)
     assert np.isinf(found[0])
-    assert "knows none" in sweep.refusals["theorem4"]
+    assert "knows none" in sweep.refusals["any-environment"]
 
 
 def test_a_wall_without_coupling_and_delay_needs_half_the_stiffness_times_T_plus_the_damping():
     scenario = load("one-wall").replace(environment=WALL, theta=(0,))
     sweep = around(scenario, NoCoupling())
     K, B = np.array([100.0, 900.0, 3000.0]), np.array([0.1, 0.9, 0.0])
-    needed = sweep.ratios("closed-loop", K, B) * sweep.loop.delta[0]
+    needed = sweep.ratios("this-environment", K, B) * sweep.loop.delta[0]
     # near w = 0, at 1e-5 rad/sample, 1e-16 of rounding is 1e-11 of F/(z-1), and that is K T/w large
     np.testing.assert_allclose(needed, K * scenario.T / 2 + B, rtol=1e-6)
 
 
 def test_what_no_environment_changes_is_the_same_in_all():
     sweep = around(PAIR, SpringDamper([800.0, 500.0], [0.4, 0.5]))
-    assert sweep.conditions == ("theorem4", "closed-loop")
-    ratios = sweep.ratios("theorem4", np.array([50.0, 5e3]), np.array([0.1, 3.0]))
-    assert ratios[0] == ratios[1] == sweep.requirement("theorem4", 1.0, 1.0).ratio < 1
+    assert sweep.conditions == ("any-environment", "this-environment")
+    ratios = sweep.ratios("any-environment", np.array([50.0, 5e3]), np.array([0.1, 3.0]))
+    assert ratios[0] == ratios[1] == sweep.requirement("any-environment", 1.0, 1.0).ratio < 1
 
 
 def test_the_population_meets_the_filter_in_the_environment_of_the_cell(optimal):
@@ -123,10 +123,10 @@ def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
     assert report["axes"] == "environment"
     assert report["coupling"]["kind"] == "optimal"
     assert report["designed_for"]["promise"] == "this environment"
-    assert report["designed_for"]["certificates"]["closed-loop"]["proof"] == "rational"
-    assert report["conditions"] == ["theorem4", "closed-loop"]
-    assert report["closed-loop"]["contradicted_cells"] == 0
-    assert 0 < report["closed-loop"]["certified_cells"] < 64
+    assert report["designed_for"]["certificates"]["this-environment"]["proof"] == "rational"
+    assert report["conditions"] == ["any-environment", "this-environment"]
+    assert report["this-environment"]["contradicted_cells"] == 0
+    assert 0 < report["this-environment"]["certified_cells"] < 64
     assert report["simulation"]["differ_from_linear"] == 0
     for name in report["conditions"]:
         missing = any(value is None for row in report[name]["required_over_available"] for value in row)
@@ -141,8 +141,8 @@ def test_the_map_of_an_optimal_coupling(tmp_path, capsys):
     [
         (["--coupling", "optimal", "--rigid"], "--rigid with --coupling optimal: it is about a map of spring-dampers"),
         (["--coupling", "none", "--velocity-filter", "50"], "--velocity-filter with --coupling none"),
-        (["--coupling", "optimal", "--condition", "theorem4"], "for optimal allowed are closed-loop"),
-        (["--condition", "theorem4"], "--condition any-environment: without --coupling nothing is designed"),
+        (["--coupling", "optimal", "--condition", "any-environment"], "for optimal allowed are this-environment"),
+        (["--condition", "any-environment"], "--condition any-environment: without --coupling nothing is designed"),
         (["--coupling", "optimal", "--scenario", "one-wall"], "an optimal coupling holds a linear model"),
         (["--coupling", "published", "--scenario", "one-wall"], "the paper prints gains for 2 channels"),
     ],

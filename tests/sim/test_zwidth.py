@@ -52,7 +52,7 @@ def wall(theta, K, B):
     """Force maps and both conditions' damping [N s/m] against a rigid wall, this-environment first."""
     sweep = rigid(theta)
     assert sweep.loop.delta == (DELTA,)
-    return [DELTA * sweep.ratios(name, np.array(K), np.array(B)) for name in ("closed-loop", "theorem4")]
+    return [DELTA * sweep.ratios(name, np.array(K), np.array(B)) for name in ("this-environment", "any-environment")]
 
 
 # --- the figures ---------------------------------------------------------------------------------------------------
@@ -77,7 +77,7 @@ def test_the_map_is_that_of_design_margin(name):
     sweep = SWEEPS[name]
     rng = np.random.default_rng(1)
     K, B = np.exp(rng.uniform(np.log(30), np.log(8e3), 8)), np.append(0.0, rng.uniform(0, 3, 7))
-    for condition in ("theorem4", "closed-loop"):
+    for condition in ("any-environment", "this-environment"):
         drawn = sweep.ratios(condition, K, B)
         true = np.array([sweep.requirement(condition, k, b).ratio for k, b in zip(K, B, strict=True)])
         assert (np.isfinite(drawn) == np.isfinite(true)).all()
@@ -92,8 +92,8 @@ def test_no_cell_of_the_widest_plane_is_lost(scenario):
     """K = 1e-3 N/m in series with a free mass swings at 1e-5 rad/sample: F(1) must be asked for far below that."""
     sweep = of(scenario, scenario.theta)
     K, B = (axis.ravel() for axis in np.meshgrid(np.geomspace(1e-3, 1e9, 5), np.geomspace(1e-5, 1e6, 4)))
-    true = [sweep.requirement("closed-loop", k, b).ratio for k, b in zip(K, B, strict=True)]
-    np.testing.assert_allclose(sweep.ratios("closed-loop", K, B), true, rtol=2e-9)
+    true = [sweep.requirement("this-environment", k, b).ratio for k, b in zip(K, B, strict=True)]
+    np.testing.assert_allclose(sweep.ratios("this-environment", K, B), true, rtol=2e-9)
 
 
 def test_a_wall_without_delay_needs_half_the_stiffness_times_T_plus_the_damping():
@@ -325,7 +325,7 @@ def test_a_coarse_encoder_makes_a_stable_loop_oscillate_by_its_steps():
 
 
 def test_a_one_sided_wall_is_simulated_with_the_coupling_in_front_of_it():
-    """Under theorem4 contact made and broken comes to rest: an unstable pulling spring is what oscillates."""
+    """Under any-environment contact made and broken comes to rest: an unstable pulling spring is what oscillates."""
     sweep = rigid(0, one_sided=True)
     (process,) = sweep.processes(np.array([2000.0]), np.array([0.3]), sweep.devices)
     assert process.contact is not None
@@ -387,7 +387,7 @@ def test_where_the_limits_of_an_omega3_lie(audit):
     code, report, _ = audit
     (mark,) = report["marks"]
     assert code == DOES_NOT_HOLD
-    for condition in ("theorem4", "closed-loop"):
+    for condition in ("any-environment", "this-environment"):
         assert mark[condition]["required_damping"] == pytest.approx([2.5])
         assert not mark[condition]["certified"]
         assert mark["stiffest_K_at_this_B"][condition] == pytest.approx(2740, rel=1e-5)
@@ -399,12 +399,12 @@ def test_where_the_limits_of_an_omega3_lie(audit):
 def test_the_map_holds_together(audit):
     _, report, _ = audit
     K, B = np.meshgrid(report["grid"]["K"], report["grid"]["B"], indexing="ij")
-    ratio = np.array(report["closed-loop"]["required_over_available"], float)
+    ratio = np.array(report["this-environment"]["required_over_available"], float)
     # constant over frequency at B = 0, where rounding at the lowest one is 1e-8
     np.testing.assert_allclose(ratio * DELTA, K * T / 2 + B, rtol=3e-8)
     growth = np.array(report["population"]["growth_rate_per_s"], float)
     assert (growth[ratio < 1] <= 1e-9).all()
-    assert report["closed-loop"]["contradicted_cells"] == 0
+    assert report["this-environment"]["contradicted_cells"] == 0
     assert (growth[(B == 0) & (K > 3300)] > 0).all()
     assert len(report["simulation"]["points"]) == 9
     assert report["simulation"]["differ_from_linear"] == 0
@@ -422,8 +422,8 @@ def test_the_files_of_a_map(audit):
     rows = list(csv.DictReader((out / "map.csv").read_text().splitlines()))
     assert len(rows) == 144
     assert sum(row["simulated"] != "" for row in rows) == 9
-    assert float(rows[0]["closed-loop required/available"]) == pytest.approx(
-        report["closed-loop"]["required_over_available"][0][0]
+    assert float(rows[0]["this-environment required/available"]) == pytest.approx(
+        report["this-environment"]["required_over_available"][0][0]
     )
 
 
@@ -431,7 +431,7 @@ def test_a_seed_gives_the_same_map_again(audit, tmp_path):
     _, report, _ = audit
     zwidth.main([*OMEGA3, "--duration", "1.5", "--no-plot", "--out", str(tmp_path)])
     again = json.loads((tmp_path / "report.json").read_text())
-    for part in ("population", "simulation", "closed-loop", "theorem4", "marks"):
+    for part in ("population", "simulation", "this-environment", "any-environment", "marks"):
         assert again[part] == report[part]
 
 
@@ -449,7 +449,7 @@ def test_the_keyboard_keeps_what_is_done(stage, tmp_path, monkeypatch, capsys):
     assert zwidth.main(options) == INTERRUPTED
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["interrupted"]
-    known = [report["theorem4"]["required_over_available"], report["population"]["growth_rate_per_s"]]
+    known = [report["any-environment"]["required_over_available"], report["population"]["growth_rate_per_s"]]
     whole = [all(value is not None for row in rows for value in row) for rows in known]
     assert whole == {"certificates": [False, False], "population": [True, False], "MuJoCo": [True, True]}[stage]
     assert any(value is not None for row in known[0] for value in row)
@@ -521,5 +521,5 @@ def test_a_map_is_of_late_forces_and_of_the_longest_period(tmp_path):
     }.items():
         assert zwidth.main([*wall, *options, "--out", str(tmp_path), "--json", str(file)]) == 0
         (mark,) = json.loads(file.read_text())["marks"]
-        needs[name] = mark["closed-loop"]["required_damping"][0]
+        needs[name] = mark["this-environment"]["required_damping"][0]
     assert needs == pytest.approx({"late": 0.774878, "whole": 1.8, "long": 0.9}, abs=2e-6)
