@@ -39,7 +39,7 @@ figures: .venv/ready
 	cp out/side-by-side/couplings.png docs/pictures/side-by-side.png
 	cp out/figure-5/figure.png docs/pictures/figure-5.png
 	cp out/figure-6/figure.png docs/pictures/figure-6.png
-	$(PY) -m design.compare --coupling published,spring-damper,spring-damper:this-environment --out out/couplings
+	$(PY) -m design.compare --coupling published,spring-damper:any-environment,spring-damper --out out/couplings
 	for name in required-damping perceived singular-values; do cp out/couplings/$$name.png docs/pictures/; done
 	$(PY) -m sim.view --case I --video docs/pictures/view.gif --fps 5
 	$(PY) -m design.compare --over --out out/limits

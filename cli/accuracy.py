@@ -9,7 +9,7 @@ from typing import Any
 from cli import options, render
 from controller.coupling import NoCoupling
 from sim.accuracy import SETTINGS, Row, mark_front, measure, reference
-from sim.couplings import NAMES, choose
+from sim.couplings import NAMES, choose, limits_of
 from sim.engines import EXPONENTIAL
 from sim.run import Simulation, assemble
 from sim.scenario import InputError, require_even_ticks, require_linear
@@ -32,8 +32,9 @@ def main(argv: list[str]) -> int:
     if args.duration is not None:
         scenario = scenario.replace(duration=args.duration)
     out = options.out_folder(args, "accuracy")
-    chosen = choose(scenario, args.case, args.coupling, args.condition)
-    coupled, uncoupled = assemble(scenario, chosen.coupling), assemble(scenario, NoCoupling())
+    chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter)
+    lag = limits_of(scenario, chosen.coupling, limiter=args.limiter).rho
+    coupled, uncoupled = assemble(scenario, chosen.coupling, lag), assemble(scenario, NoCoupling())
     default = max(default_substeps(loop, "RK4") for loop in (coupled, uncoupled))
 
     rows, skipped, interrupted = _rows(coupled, uncoupled, default)
@@ -64,6 +65,7 @@ def _parser() -> options.Parser:
     parser = options.Parser("sim.accuracy", "Speed against error, engine by engine.", example)
     options.add_loop_options(parser)
     options.add_coupling_options(parser, ", ".join(NAMES))
+    options.add_limiter_option(parser)
     duration = "of each run (default: the scenario's)"
     parser.add_argument("--duration", type=options.number(), metavar="SECONDS", help=duration)
     options.add_output_options(parser, picture=True)

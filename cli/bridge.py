@@ -23,6 +23,7 @@ from cli.options import (
     INTERRUPTED,
     Parser,
     add_energy_budget_option,
+    add_limiter_option,
     add_loop_options,
     add_output_options,
     out_folder,
@@ -75,7 +76,8 @@ def main(argv: list[str]) -> int:
 
     def plan(ages: Ages) -> Sequence[CertifiedCoupling]:
         met, link = timed(scenario, ages, float(args.quantile), 1e6 * float(args.guard), args.latch == "arrival")
-        programs = certified_couplings(met, args.case, args.coupling, args.condition, link)
+        asked = args.case, args.coupling, args.condition
+        programs = certified_couplings(met, *asked, link, limiter=args.limiter)
         print_certificate(ages, link, programs, session.limits.cap, console(args))
         return programs
 
@@ -111,6 +113,7 @@ def _parser() -> argparse.ArgumentParser:
     latch = "when forces act: at whole ticks (default), or as soon as they arrive, certified for the latency measured"
     parser.add_argument("--latch", choices=("tick", "arrival"), default="tick", help=latch)
     add_energy_budget_option(parser)
+    add_limiter_option(parser)
     parser.add_argument("--duration", metavar="SECONDS", help="of forces at full gain (default: the scenario's)")
     parser.add_argument("--no-plot", action="store_true", help="write no picture")
     add_output_options(parser)
@@ -132,7 +135,7 @@ def print_certificate(
     for column in ("K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee"):
         table.add_column(column)
     for program in programs:
-        part = program.part()
+        part = program.part(caps)
         certificate = next(c for c in (part["certificate"], *part["certificates"].values()) if c["certified"])
         coupling = part["coupling"]
         table.add_row(
@@ -144,7 +147,7 @@ def print_certificate(
         )
     console.print(table)
     for program in programs:
-        for remark in program.remarks():
+        for remark in (program.limits.words(caps), *program.remarks()):
             console.print(f"[dim]·[/] theta = {list(program.scenario.theta)}: {remark}", highlight=False)
     if len(programs) == 1:
         console.print("no reserve: nothing softer is certified, so late answers end the session")

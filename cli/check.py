@@ -10,7 +10,7 @@ from typing import Any
 from rich.table import Table
 
 from cli import options, render
-from design.certificate import HERE, SET, Stored, SwitchingProof, Verdict, switching_guarantee, verify
+from design.certificate import HERE, SET, Stored, SwitchingProof, Verdict, lag, switching_guarantee, verify
 from design.ranges import Searched, search_box, search_part, search_words, violated_between
 from design.result import listed
 from sim.couplings import read_coupling
@@ -43,6 +43,7 @@ class _Checked:
     required_damping: Sequence[float] | None = render.figure("required damping [N s/m]", listed)
     available_damping: Sequence[float] = render.figure("available damping [N s/m]", listed)
     margin: float | None = render.figure("margin", "{:.6g}")
+    limited_forces: str | None = render.figure("forces")
     wall_s: float = render.figure("seconds", "{:.6g}")
     switching: _Switching | None = field(default=None)
 
@@ -94,6 +95,7 @@ def _checked(stored: Stored, verdict: Verdict, searched: Searched | None, second
         claim and claim.required,
         stored.loop.delta,
         claim and claim.margin,
+        "proved, also while forces are limited" if verdict.proved and lag(stored.loop, claim) is not None else None,
         seconds,
         _switching(stored, verdict),
     )

@@ -18,21 +18,22 @@ from design.certificate import (
     ANY,
     HERE,
     Certificate,
+    LimiterCertificate,
+    Limits,
     NotProved,
     Stored,
     assess,
+    covered_limits,
     digest,
     finite,
     guarantee_of,
     lag,
-    limiter_refusal,
     prove,
     save,
     switching_guarantee,
     switching_part,
     switching_requirement,
 )
-from design.conditions import BETA
 from design.designs import KINDS, NO_LONGER, compare_methods, design_by_kind, usual_condition
 from design.optimal import OBJECTIVES, Optimal, box_around, robustness
 from design.ranges import SAMPLES, SetCheck, check_set, cost_part, price, set_part, set_rows
@@ -41,7 +42,7 @@ from design.spring_damper import STIFFEST
 from design.transparency import BAND_HZ, transparency
 from sim import report
 from sim.files import out_file
-from sim.scenario import InputError
+from sim.scenario import InputError, Scenario
 
 
 def main(argv: list[str]) -> int:
@@ -51,7 +52,8 @@ def main(argv: list[str]) -> int:
         raise InputError("--case none has no coupling to design: give I or II")
     options.check_json(args)
     out = out_file(args.out, f"out/design-{args.case}.json", "the file of the coupling")
-    loop = _loop(args)
+    scenario = options.scenario_from(args)
+    loop = _loop(args, scenario)
     design = _design(args, loop)
     best = design if isinstance(design, Optimal) else None
     held = best and best.certificate
@@ -59,6 +61,7 @@ def main(argv: list[str]) -> int:
     with render.progress("searching the ranges") as move:
         whole = check_set(loop, design.coupling, args.seed, args.samples, move, best and best.searched, held)
     certificates = report.certificates_part(requirements)
+    limits = Limits(None, "as asked") if args.limiter is False else covered_limits(loop, design.coupling, requirements)
     outcome = {
         "case": args.case,
         "seed": args.seed,
@@ -73,7 +76,8 @@ def main(argv: list[str]) -> int:
         "objective_name": design.figure,
         "sdps": design.sdps,
         "wall_s": design.wall_s,
-        "stored": _store(loop, design, whole, out, BETA if args.limiter else None),
+        "stored": _store(loop, design, whole, out, limits.certificate),
+        "limiter": limits.part([device.force_limit for device in scenario.device]),
         "jitter_proof": _switching_figures(loop, design),
     }
     if best:
@@ -98,8 +102,11 @@ def _parser() -> options.Parser:
     options.add_condition_option(parser, "what to certify")
     jitter = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"
     parser.add_argument("--jitter", type=options.delay_ranges, metavar="LO,HI", help=jitter)
-    limiter = "spring-damper for this-environment, proved also while forces are limited (any-environment is anyway)"
-    parser.add_argument("--limiter", action="store_true", help=limiter)
+    limiter = (
+        "spring-damper for this-environment: proved also while forces are limited, or not made (default: if it can)"
+    )
+    parser.add_argument("--limiter", action="store_const", const=True, help=limiter)
+    options.add_limiter_option(parser, "design and prove as if forces were never at their limits")
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
     ccl.add_argument("--method", choices=METHODS, help="complementarity is as printed (default inner)")
@@ -167,9 +174,9 @@ OPTIONS = {
 }
 
 
-def _loop(args: argparse.Namespace) -> Loop:
+def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     """The scenario's loop with the range of delays that --jitter gives. Raises InputError."""
-    loop = options.scenario_from(args).loop(args.case)
+    loop = scenario.loop(args.case)
     if args.ranges is not None:
         if loop.box or loop.environment.walls:
             raise InputError(f"--ranges and {'[box]' if loop.box else 'environment.walls'}: give one of them")
@@ -206,6 +213,8 @@ def _asked(args: argparse.Namespace, loop: Loop) -> dict[str, Any]:
     """The arguments of the design's own function. Raises InputError for options of another coupling."""
     given = {name: getattr(args, name) for name in OPTIONS}
     given = {name: value for name, value in given.items() if value is not None and value is not False}
+    if args.coupling == "spring-damper" and args.limiter is not None:
+        given["limiter"] = args.limiter
     for name in given:
         if args.coupling not in OPTIONS[name]:
             allowed = " or ".join(OPTIONS[name])
@@ -214,8 +223,6 @@ def _asked(args: argparse.Namespace, loop: Loop) -> dict[str, Any]:
     if args.coupling == "optimal":
         return optimal_options(args)[0]
     given.pop("compare", None)
-    if args.limiter and loop.box:
-        raise InputError("--limiter and [box]: limited forces are proved for one environment, not for ranges")
     if given.pop("full", False):
         given["diagonal"] = False
     return given
@@ -287,8 +294,10 @@ def _robustness_loss(args: argparse.Namespace, loop: Loop, design: Design) -> li
     return [cost_part(row) for row in price(loop, couplings)]
 
 
-def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path, beta: float | None = None) -> dict[str, Any]:
-    """Save the coupling with the proof of its condition, with `beta` also of limited forces, or without a proof.
+def _store(
+    loop: Loop, design: Design, whole: SetCheck | None, out: Path, limiter: LimiterCertificate | None = None
+) -> dict[str, Any]:
+    """Save the coupling with the proof of its condition, and that of limited forces, or without a proof.
 
     What is not proved for a whole set, or for switching delays, is kept as what it is: a coupling for the nominal
     environment, or for constant delays.
@@ -297,32 +306,31 @@ def _store(loop: Loop, design: Design, whole: SetCheck | None, out: Path, beta: 
         certificate, reason = whole.certificate, None
     else:
         loop = loop if design.condition == "any-environment" else loop.at(loop.environment)
-        certificate, reason = _proved(loop, design, beta)
+        certificate, reason = _proved(loop, design, limiter)
     switching = None
     if loop.jitter:
         proof = certificate.proof if certificate else None
         switching = {"promise": f"{switching_guarantee(loop.jitter)}, in {HERE}", "proof": proof, "reason": reason}
         if certificate is None:
             loop = loop.switching(None)
-            certificate, reason = _proved(loop, design, beta)
+            certificate, reason = _proved(loop, design, limiter)
     try:
         save(Stored.of(loop, design.coupling, certificate), out)
     except OSError as error:
         raise InputError(f"--out {out}: {error.strerror}") from None
     proof = certificate.proof if certificate else None
     limited = proof is not None and lag(loop, certificate) is not None
-    part = {"file": str(out), "proof": proof, "reason": reason, "switching": switching, "limited_forces": limited}
-    return part | {"limiter_refused": limiter_refusal(loop)}
+    return {"file": str(out), "proof": proof, "reason": reason, "switching": switching, "limited_forces": limited}
 
 
-def _proved(loop: Loop, design: Design, beta: float | None) -> tuple[Certificate | None, str | None]:
+def _proved(loop: Loop, design: Design, limiter: LimiterCertificate | None) -> tuple[Certificate | None, str | None]:
     """The certificate of all that the loop claims, or why there is none."""
     held = design.certificate if isinstance(design, Optimal) else None
     if held and held.scenario == digest(loop, design.coupling.form()):
         return held, None
     try:
         phi = None if design.phi is None else design.phi.tolist()
-        return prove(loop, design.coupling, design.condition, phi, beta), None
+        return prove(loop, design.coupling, design.condition, phi, limiter), None
     except NotProved as error:
         return None, str(error)
 
@@ -360,7 +368,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("damping, any switching", proof and _switching_words(proof)),
         *(set_rows(outcome["set"]) if outcome["set"] else []),
         ("guarantee", outcome["promise"] or "none"),
-        ("guarantee, forces", _forces(outcome)),
+        ("guarantee, forces", outcome["limiter"]["words"]),
         ("guarantee, delays", switching["promise"] if switching.get("proof") else None),
         (outcome["objective_name"], f"{outcome['objective']:.5g}"),
         ("transparency error", render.transparency_error(transparent)),
@@ -385,14 +393,6 @@ def _best_rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("robustness", f"{need} of the damping is needed at {there['where']}, the worst within {there['percent']:g} %"),
         ("ladder [dB]", climbed or None),
     ]
-
-
-def _forces(outcome: dict[str, Any]) -> str | None:
-    """Whether the guarantee holds at the force limits too; None where a limiter could be had and was not asked for."""
-    if outcome["stored"]["limited_forces"]:
-        return "holds also while forces are limited"
-    refused = outcome["promise"] and outcome["stored"]["limiter_refused"]
-    return "holds while forces stay below the limits" if refused else None
 
 
 def _switching_words(proof: dict[str, Any]) -> str:

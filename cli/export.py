@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -40,6 +41,9 @@ def main(argv: list[str]) -> int:
     options.check_json(args)
     if args.without_theta and not args.process:
         raise InputError("--without-theta without --process: a coupling alone has no delay")
+    if args.force_limit and (not args.process or args.format == "control"):
+        other = "--format control: that is linear" if args.process else "a coupling alone sends no forces"
+        raise InputError(f"--force-limit is for --process, {other}")
     stored = read_coupling(args.coupling)
     verdict = _verdict(stored)
     block = _block(args, stored, verdict)
@@ -54,6 +58,7 @@ def main(argv: list[str]) -> int:
         "channels": block.system.inputs,
         "states": block.system.order,
         "T_s": block.system.T,
+        "force_limit": None if block.limiter is None else block.limiter.limit.tolist(),
         "certificate": {"proved": verdict.proved, "reason": verdict.reason},
         "test": {"ticks": len(test.inputs), "seed": args.seed, "largest_output": float(np.abs(test.outputs).max())},
     }
@@ -73,6 +78,8 @@ def _parser() -> options.Parser:
     parser.add_argument("--process", action="store_true", help="coupling, environment and delays as one block (6)")
     link = "leave out Theta, where the link to the devices is that delay"
     parser.add_argument("--without-theta", action="store_true", help=link)
+    limit = "with the limiter that the certificate covers, for forces of up to so much [N]; one is for all channels"
+    parser.add_argument("--force-limit", type=options.several(float, 1e-3, 1e6, "N"), metavar="N,N,..", help=limit)
     options.add_output_options(parser, "FILE", "the file (default out/export/<coupling>-<what>.<suffix>)")
     return parser
 
@@ -87,15 +94,17 @@ def _verdict(stored: Stored) -> Verdict:
 def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> Block:
     """The block that was asked for, with lines on where it comes from. Raises InputError."""
     try:
-        block = process_block(stored, not args.without_theta) if args.process else coupling_block(stored)
+        m = len(stored.loop.theta)
+        limit = options.per_channel("--force-limit", args.force_limit, m) if args.force_limit else None
+        block = process_block(stored, not args.without_theta, limit) if args.process else coupling_block(stored)
     except NothingToExport as error:
         raise InputError(f"{args.coupling}: {error} (--process)") from None
     origin = (
         f"Written by python -m design.export from {Path(args.coupling).name}: {_gains(stored)}",
         *block.about,
-        _guarantee(stored, verdict),
+        _guarantee(stored, verdict, block.limiter is not None),
     )
-    return Block(block.name, block.system, block.input, block.output, origin)
+    return replace(block, about=origin)
 
 
 def _gains(stored: Stored) -> str:
@@ -105,7 +114,7 @@ def _gains(stored: Stored) -> str:
     return f"coupling of kind {coupling.__struct_config__.tag}"
 
 
-def _guarantee(stored: Stored, verdict: Verdict) -> str:
+def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
     claim = stored.certificate
     if claim is None or not verdict.proved:
         return f"NOT CERTIFIED: {verdict.reason}"
@@ -114,7 +123,9 @@ def _guarantee(stored: Stored, verdict: Verdict) -> str:
     how = f"{claim.condition}, proof: {claim.proof}"
     if claim.guarantee == SET:
         how += "; at the vertices, between them nothing is proved: design.check searches there"
-    return f"Certified for {claim.guarantee}{delays} ({how}): {needs}; linear forces only."
+    return f"Certified for {claim.guarantee}{delays} ({how}): {needs}; " + (
+        "also while forces are limited." if limited else "linear forces only."
+    )
 
 
 def _destination(args: argparse.Namespace, block: Block) -> Path:
@@ -142,11 +153,12 @@ def _content(kind: str, block: Block, test: Trial, file: str) -> Any:
     return archive
 
 
-def _rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
+def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
     certificate = outcome["certificate"]
     return [
         ("file", outcome["file"]),
         ("block", f"{outcome['channels']} channels, {outcome['states']} states, T = {outcome['T_s']:g} s"),
         ("certificate", "[green]proved[/]" if certificate["proved"] else f"[red]none[/]: {certificate['reason']}"),
+        ("force limits", outcome["force_limit"] and f"{listed(outcome['force_limit'])} N, by the limiter"),
         ("test vector", f"{outcome['test']['ticks']} ticks, in the file"),
     ]

@@ -228,6 +228,12 @@ def add_condition_option(parser: argparse._ActionsContainer, what: str = "that t
     parser.add_argument("--condition", type=condition, metavar=f"{{{names}}}", help=help_)
 
 
+def add_limiter_option(parser: argparse._ActionsContainer, what: str = "clip forces at the devices' limits") -> None:
+    """--no-limiter: `limiter` is None, what is usual, or False."""
+    help_ = f"{what}, in place of the limiter that a guarantee covers"
+    parser.add_argument("--no-limiter", dest="limiter", action="store_const", const=False, help=help_)
+
+
 def add_energy_budget_option(parser: argparse._ActionsContainer) -> None:
     """--energy-budget."""
     what = "scale forces so that no passive hand is given more than W0 [J]; save at most CAP of what users put in"

@@ -10,15 +10,14 @@ from typing import Any
 
 from cli import options, render
 from controller.loop import Loop
-from design.certificate import Limits, assess, covered_limits, guarantee_of
-from design.designs import usual_condition
+from design.certificate import assess, guarantee_of
 from design.ranges import SetCheck, check_set, set_part, set_rows
 from design.result import listed
 from design.transparency import transparency
 from sim import report
 from sim.accuracy import ForceError, credible_part, force_error, position_error
 from sim.alternatives import Alternative, alternatives
-from sim.couplings import NAMES, Chosen, choose
+from sim.couplings import NAMES, Chosen, choose, limits_of
 from sim.engines import INTEGRATORS, default_integrator
 from sim.files import write
 from sim.nets import BASELINES, Classic, EnergyNet, idle, netted
@@ -41,7 +40,7 @@ def main(argv: list[str]) -> int:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)
 
     requirements = assess(simulated.loop(args.case), chosen.coupling, chosen.phi)
-    limits = _limits(args, simulated, chosen, requirements)
+    limits = limits_of(simulated, chosen.coupling, requirements, args.limiter)
     done = _run(args, simulated, chosen, limits.rho)
     outcome = {
         "case": args.case,
@@ -86,8 +85,7 @@ def _parser() -> options.Parser:
     parser.add_argument("--duration", type=options.number(), metavar="SECONDS", help="default: the scenario's")
     who = "other humans: [[human]] per channel in a .toml, or `humans` in a .py"
     parser.add_argument("--human", metavar="FILE", help=who)
-    clip = "clip forces at the devices' limits, in place of the limiter that a guarantee covers"
-    parser.add_argument("--no-limiter", action="store_true", help=clip)
+    options.add_limiter_option(parser)
     vertex = "simulate at this vertex of the scenario's ranges (default 0: nominal)"
     parser.add_argument("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
     options.add_output_options(parser, picture=True)
@@ -100,8 +98,7 @@ def _parser() -> options.Parser:
 def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
     """The coupling; with a baseline there is none, and the note says whose that is. Raises InputError."""
     if args.coupling not in BASELINES:
-        usual = None if args.case == "none" else usual_condition(scenario.loop(args.case), args.coupling)
-        return choose(scenario, args.case, args.coupling, args.condition or usual)
+        return choose(scenario, args.case, args.coupling, args.condition, args.limiter)
     if args.energy_budget:
         raise InputError(f"--energy-budget with --coupling {args.coupling}: give one of them")
     note = f"baseline, without a guarantee here: {BASELINES[args.coupling]}; no coupling besides."
@@ -149,15 +146,6 @@ class _Run:
     def loop(self, case: str) -> Loop:
         """What was simulated, as a design knows it."""
         return self.simulation.scenario.loop(case)
-
-
-def _limits(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, requirements: dict[str, Any]) -> Limits:
-    """The limiter of this run: where a guarantee covers one and the command does not ask for clipping."""
-    if args.no_limiter:
-        return Limits(None, "forces are clipped, as asked")
-    if scenario.jitter:
-        return Limits(None, "limiter: limited forces are proved for constant delays")
-    return covered_limits(scenario.loop(args.case), chosen.coupling, requirements)
 
 
 def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tuple[float, ...] | None) -> _Run:
@@ -387,19 +375,11 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         *(render.delay_rows(jitter) if jitter else []),
         *(_contact_rows(contact, run["samples"]) if contact else []),
         ("simulated in", run["environment"] if outcome["set"] else None),
-        ("force limits", _limiter(outcome["limiter"], outcome["promise"])),
+        ("force limits", outcome["limiter"]["words"]),
         ("limited ticks", f"{stability['clipped_ticks']} of {run['samples']}"),
         ("speed", speed),
         ("position error", position),
     ]
-
-
-def _limiter(part: dict[str, Any], guarantee: str | None) -> str:
-    limits = f"{listed(part['force_limit'], 4)} N"
-    if part["rho"] is None:
-        held = "the guarantee holds while forces stay below the limits" if guarantee else "not covered"
-        return f"clipped at {limits}: {held} ({part['reason']})"
-    return f"the guarantee holds also while forces are limited to {limits} ({part['reason']})"
 
 
 def _net_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:

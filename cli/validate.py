@@ -12,11 +12,10 @@ import numpy as np
 from cli import options, render
 from controller.environment import Member
 from design.certificate import ANY, assess, guarantee_of
-from design.designs import usual_condition
 from design.ranges import SetCheck, check_set, set_part
 from sim import report
 from sim.adversary import Worst, search
-from sim.couplings import NAMES, Chosen, choose
+from sim.couplings import NAMES, Chosen, choose, limits_of
 from sim.crowds import ENGINES, MIXED, Findings, Validation, validate, validate_on_cluster
 from sim.run import assemble
 from sim.scenario import InputError, Scenario, require_linear, save_humans
@@ -30,8 +29,7 @@ def main(argv: list[str]) -> int:
     """Meet random humans. 0: the claims hold, 1: not, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
-    condition = args.condition or usual_condition(scenario.loop(args.case), args.coupling)
-    chosen = choose(scenario, args.case, args.coupling, None if args.case == "none" else condition)
+    chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter)
     loop = scenario.loop(args.case)
     with render.progress("searching the ranges") as move:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)
@@ -41,7 +39,8 @@ def main(argv: list[str]) -> int:
     guarantee = guarantee_of(requirements, loop, proved)
     certified = guarantee is not None and (not environments or guarantee == ANY or proved)
 
-    question = _question(args, scenario, chosen, environments)
+    limits = limits_of(scenario, chosen.coupling, requirements, args.limiter)
+    question = _question(args, scenario, chosen, environments, limits.rho)
     findings, wall = _findings(args, question)
     outcome = {
         "case": args.case,
@@ -52,6 +51,7 @@ def main(argv: list[str]) -> int:
         **report.validation_part(question, findings, certified, wall),
         "promise": guarantee,
         "set": whole and set_part(whole),
+        "limiter": limits.part([device.force_limit for device in scenario.device]),
         "remarks": list(chosen.notes),
     }
     if scenario.jitter:
@@ -86,6 +86,7 @@ def _parser() -> options.Parser:
     options.add_loop_options(parser)
     options.add_varying_delay_options(parser)
     options.add_coupling_options(parser, ", ".join(NAMES))
+    options.add_limiter_option(parser)
     humans, count = "random humans per device (default 1000)", options.whole(1, 1_000_000)
     parser.add_argument("--humans", type=count, default=1000, metavar="N", help=humans)
     parser.add_argument("--links", choices=tuple(LINKS), help="of each human (default: the scenario's population)")
@@ -130,11 +131,15 @@ def _environments(args: argparse.Namespace, whole: SetCheck | None) -> tuple[Mem
 
 
 def _question(
-    args: argparse.Namespace, scenario: Scenario, chosen: Chosen, environments: tuple[Member, ...]
+    args: argparse.Namespace,
+    scenario: Scenario,
+    chosen: Chosen,
+    environments: tuple[Member, ...],
+    lag: tuple[float, ...] | None,
 ) -> Validation:
     links = LINKS[args.links] if args.links else scenario.population.links
     work = args.humans, links, args.engine, args.duration
-    return Validation(scenario, chosen.coupling, args.seed, *work, environments=environments)
+    return Validation(scenario, chosen.coupling, args.seed, *work, environments=environments, lag=lag)
 
 
 def _findings(args: argparse.Namespace, question: Validation) -> tuple[Findings, float]:
@@ -214,7 +219,8 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
             "MuJoCo's growth rates",
             render.optional(outcome["largest_difference_per_s"], "within {:.1e} 1/s of the exact ones", "") or None,
         ),
-        ("traces", traces and f"{traces['duration_s']:g} s each, {traces['clipped_runs']} clipped"),
+        ("traces", traces and f"{traces['duration_s']:g} s each, {traces['clipped_runs']} reached a force limit"),
+        ("force limits", outcome["limiter"]["words"]),
         ("handles come to rest", traces and _settled(traces)),
         ("energy audit W >= 0", audit and _audited(audit)),
         *([*render.delay_rows(switching), _growing("delays", switching)] if switching else []),
@@ -250,7 +256,8 @@ def _settled(traces: dict[str, Any]) -> str:
 
 
 def _audited(audit: dict[str, Any]) -> str:
-    return f"{audit['audited'] - audit['violated']} of {audit['audited']}, {audit['clipped']} clipped left out"
+    left = f", {audit['clipped']} clipped left out" if audit["clipped"] else ""
+    return f"{audit['audited'] - audit['violated']} of {audit['audited']}{left}"
 
 
 def _growing(what: str, switching: dict[str, Any]) -> tuple[str, str | None]:

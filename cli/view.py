@@ -35,7 +35,8 @@ def main(argv: list[str]) -> int:
         _check_speed(args)
     label, script = _beginning(args, scenario.channels)
     # --case none begins without a coupling; those that keys bring are for case I
-    menu = Menu("I" if args.case == "none" else args.case, args.condition, args.coupling if label == GIVEN else None)
+    given = args.coupling if label == GIVEN else None
+    menu = Menu("I" if args.case == "none" else args.case, args.condition, given, args.limiter)
     prepared = first_loop(menu, scenario, label)
     executor = ThreadPoolExecutor(1)
     try:
@@ -57,6 +58,7 @@ def _parser() -> options.Parser:
     what = f"to begin with: {', '.join(_names())} or FILE.json; designed is spring-damper"
     parser.add_argument("--coupling", metavar="NAME|FILE", help=what)
     options.add_condition_option(parser, "of a design")
+    options.add_limiter_option(parser)
     parser.add_argument("--script", metavar="EVENTS", help=f"what happens when [s] (default of a video: '{SCRIPT}')")
     seconds, until = options.number(1e-3, LONGEST, "s"), "a window until it is closed, a video until after its script"
     parser.add_argument("--duration", type=seconds, metavar="SECONDS", help=f"default: {until}")

@@ -22,7 +22,7 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from controller.coupling import Coupling
 from controller.delay import HeldLine, Ticks, delay, packet_delays
@@ -216,7 +216,7 @@ class BoxProblem:
             object.__setattr__(self, name, frozen(getattr(self, name), 1, name))
         if not (self.lower < self.upper).all():
             raise ValueError(f"limits are {self.lower.tolist()} to {self.upper.tolist()}, expected lower < upper")
-        _ = self._regular
+        _ = self.regular
 
     def solve(self, q: Array) -> tuple[Array, Array]:
         """(v, f) for every column of q, both (n, nsim); what is at a limit is exactly there."""
@@ -237,7 +237,7 @@ class BoxProblem:
         return np.count_nonzero(self.M - np.diag(np.diag(self.M))) == 0
 
     @cached_property
-    def _regular(self) -> bool:
+    def regular(self) -> bool:
         """Whether all principal minors are positive; of more than ten unknowns, those of order one."""
         n = len(self.M)
         scale = np.sqrt(np.maximum(np.abs(np.diag(self.M)), 1e-300))
@@ -293,7 +293,7 @@ class BoxProblem:
         of its three states at most once. The same holds of n - 1 in between, and so on.
         """
         n, k = q.shape
-        M = self.M if self._regular else self.M + GROUNDED * self._diagonal.max() * np.eye(n)
+        M = self.M if self.regular else self.M + GROUNDED * self._diagonal.max() * np.eye(n)
         lower, upper, one = self.lower[:, None], self.upper[:, None], np.eye(n)
         signs, v, left = np.zeros((n, k)), np.zeros((n, k)), np.arange(k)
         for turn in range(4 * n + 3**n):
@@ -378,6 +378,19 @@ class Limiter:
         lower = np.concatenate([-self.limit, np.full(w, -np.inf)])
         return BoxProblem(M, lower, np.concatenate([self.limit, np.zeros(w)]))
 
+    @cached_property
+    def kick(self) -> Array:
+        """What [e; p] adds to [f; z+], (m + order, m + w)."""
+        G, m, w = self._whole, self.channels, len(self.walls)
+        return np.vstack([G.D[:m, m:], G.B[:, m:], np.zeros((w, m + w))])
+
+    @cached_property
+    def sent_rows(self) -> NDArray[np.intp]:
+        """Where [f; z+] holds f_e, (m,): the output itself, or the first place of its line."""
+        m = self.channels
+        lines = m + self._step.order + np.concatenate([[0], np.cumsum(self.theta)[:-1]]).astype(int)
+        return np.where(np.array(self.theta) == 0, np.arange(m), lines)
+
     @property
     def open(self) -> Lti:
         """F while no force is limited and no wall touches, with the state of the whole."""
@@ -394,11 +407,7 @@ class Limiter:
     def transition(self) -> Callable[[Array, Array], None]:
         """One tick for any number of simulations: see Process.transition."""
         m, w, F, step, whole = self.channels, len(self.walls), self.open, self._step, self._whole
-        linear = np.block([[F.C, F.D], [F.A, F.B]]).dot
-        kick = np.vstack([whole.D[:m, m:], whole.B[:, m:], np.zeros((w, m + w))])
-        # the rows of [f; z+] that hold f_e: the output itself, or the first place of its line
-        lines = m + step.order + np.concatenate([[0], np.cumsum(self.theta)[:-1]]).astype(int)
-        sent = np.where(np.array(self.theta) == 0, np.arange(m), lines)
+        linear, kick, sent = np.block([[F.C, F.D], [F.A, F.B]]).dot, self.kick, self.sent_rows
         limit, solve = self.limit[:, None], self.problem.solve
         finite = [(i, most) for i, most in zip(sent.tolist(), self.limit.tolist(), strict=True) if most < np.inf]
         if not w:
@@ -445,6 +454,18 @@ class Limiter:
 
         return walled_tick
 
+    def at_rest(self, x: Array) -> Array:
+        """The state that displacements x (m,) [m] lead to where they are held, no wall touching: see resting.
+
+        The slip is the one that a force of F(1) x needs, so that the lines hold forces within the limits.
+        """
+        m, G = self.channels, self.sent
+        free = Lti(G.A, G.B[:, :m], G.C[:m], G.D[:m, :m], G.T)
+        stiffness = np.stack([free.C @ resting(free, unit) for unit in np.eye(m)], axis=1) + free.D
+        (e,), (f,) = (side.T for side in BoxProblem(stiffness, -self.limit, self.limit).solve(stiffness @ x[:, None]))
+        lines = np.repeat(f, self.theta)
+        return np.concatenate([resting(free, x - e), e, lines, np.zeros(len(self.walls))])
+
     def depths(self, z: Array) -> Array:
         """h [m] at each tick but the last, (ticks - 1, w, ..), from the states at all of them, (ticks, order, ..)."""
         return z[1:, z.shape[1] - len(self.walls) :]
@@ -468,6 +489,14 @@ def limited(
     late = Lti.diag(delay(psi, T), Lti.constant(np.eye(w), T))
     sent = coupling.around(late @ walled_environment(network, T), further=w)
     return Limiter(sent, tuple(theta), np.asarray(limit), np.asarray(rho), network.walls)
+
+
+def resting(F: Lti, x: Array) -> Array:
+    """The state z = A z + B x in which F rests with the displacements x held.
+
+    Where F drifts (an environment with a free mass, whose place no x decides), the shortest such z.
+    """
+    return np.asarray(np.linalg.lstsq(np.eye(F.order) - F.A, F.B @ x, rcond=None)[0], dtype=np.float64)
 
 
 class Net(Protocol):
@@ -535,6 +564,10 @@ class Process:
             return x
         step = np.where(coarse, self.encoder_step, 1.0)
         return np.where(coarse, np.round(x / step) * step, x)
+
+    def at_rest(self, x: Array) -> Array:
+        """The state in which the process rests with the displacements x (m,) [m] held."""
+        return self.limiter.at_rest(x) if self.limiter else resting(self.F, x)
 
     def frozen(self) -> dict[State, Lti]:
         """The linear force maps that the process switches between, by the walls that touch: F alone without walls."""

@@ -442,9 +442,6 @@ def _margin(found: JitterProof) -> float:
 # and the environment together are a passive environment.
 
 
-LARGEST_BETA = 0.05  # up to which any-environment is claimed beside it
-
-
 def limiter_refusal(loop: Loop) -> str | None:
     """Why the limiter's own condition has nothing to say of a loop, or None."""
     if loop.jitter:
@@ -491,13 +488,33 @@ class Limits:
     reason: str  # why it holds, or why it does not
     requirement: Requirement | None = None  # by the condition `limiter`, where it was asked
     c: tuple[tuple[float, ...], ...] = ()  # its multiplier
+    certificate: LimiterCertificate | None = None  # its proof
+
+    def words(self, force_limit: Sequence[float]) -> str:
+        """In one line, for forces limited to so many N."""
+        amounts = [f"{f:.4g}" for f in force_limit]
+        limit = f"{', '.join(amounts if len(set(amounts)) > 1 else amounts[:1])} N"
+        if self.rho is None:
+            return f"clipped at {limit}: a guarantee holds while forces stay below ({self.reason})"
+        if not self.proved:
+            return f"certified, also while forces are limited to {limit} ({self.reason})"
+        return f"proved, also while forces are limited to {limit}"
+
+    @property
+    def proved(self) -> bool:
+        """In exact arithmetic."""
+        return self.rho is not None and (self.requirement is None or self.requirement.proof == "rational")
 
     def part(self, force_limit: Sequence[float]) -> dict[str, Any]:
         """As plain data."""
-        asked = self.requirement and certificate_part(self.requirement)
-        rho = None if self.rho is None else list(self.rho)
-        limit = [finite(f) for f in force_limit]
-        return {"rho": rho, "force_limit": limit, "reason": self.reason, "certificate": asked, "c": self.c}
+        return {
+            "rho": None if self.rho is None else list(self.rho),
+            "force_limit": [finite(f) for f in force_limit],
+            "reason": self.reason,
+            "words": self.words(force_limit),
+            "certificate": self.requirement and certificate_part(self.requirement),
+            "c": self.c,
+        }
 
 
 def covered_limits(loop: Loop, coupling: Coupling, requirements: Mapping[str, Requirement]) -> Limits:
@@ -506,21 +523,24 @@ def covered_limits(loop: Loop, coupling: Coupling, requirements: Mapping[str, Re
         return Limits(None, str(limiter_refusal(loop)))
     if requirements["any-environment"].certified and not any(loop.psi):
         return Limits((0.0,) * loop.channels, "any-environment covers limited forces")
+    if not requirements["this-environment"].certified:
+        return Limits(None, "no guarantee that it could extend")
     found = limiter_requirement(loop, coupling)
     requirement = found.requirement
     if not requirement.certified:
         needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
         return Limits(None, requirement.reason or needs, requirement, found.c)
     try:
-        prove_limiter(loop, coupling, c=found.c)
+        proved = prove_limiter(loop, coupling, c=found.c)
     except NotProved as refused:
         return Limits(found.rho, f"swept, not proved: {refused}", requirement, found.c)
-    return Limits(found.rho, "proved with its own block", replace(requirement, proof="rational"), found.c)
-
-
-def covers_lag(requirement: Requirement, beta: float) -> bool:
-    """Whether any-environment (psi = 0) still holds behind a limiter of lag beta delta/T > 0."""
-    return beta <= LARGEST_BETA and requirement.ratio <= 1 - 3 * beta
+    return Limits(
+        found.rho,
+        "by a proof of its own, for this environment",
+        replace(requirement, proof="rational"),
+        found.c,
+        proved,
+    )
 
 
 def prove_limiter(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | None = None) -> LimiterCertificate:
@@ -666,18 +686,16 @@ def prove(
     coupling: Coupling,
     condition: Condition,
     phi: Sequence[float] | None = None,
-    beta: float | None = None,
+    limiter: LimiterCertificate | None = None,
     swept: Requirement | None = None,
 ) -> Certificate:
     """A certificate with an exact proof of the condition; `phi` [N s/m] is Theorem 4's multiplier where psi >= 1.
 
-    With `beta` also of forces that are limited, by a limiter of rho = beta delta/T under this-environment; under
-    any-environment without delay in the environment rho is 0 and the certificate is the same. `swept` is what
+    With `limiter`, which `prove_limiter` gives of this loop, also of forces that are limited, under this-environment;
+    under any-environment without delay in the environment rho is 0 and the certificate is the same. `swept` is what
     `required_damping` gives, of a caller who has just asked. Raises NotProved with the reason.
     """
     _require_limits(loop, coupling, condition)
-    if beta is not None and condition == "any-environment" and any(loop.psi):
-        raise NotProved("limiter: any-environment with delay in the environment does not cover limited forces")
     if condition == "this-environment" and loop.environment.walls:
         phi = walls_of(loop, coupling).g
     multiplier = None if phi is None else [rational(float(p)) for p in phi]
@@ -712,9 +730,7 @@ def prove(
             scenario=digest(loop, coupling.form()),
             versions={"python": platform.python_version(), "numpy": np.__version__, "scipy": scipy.__version__},
             switching=_switching(loop, coupling, requirement),
-            limiter=msgspec.UNSET
-            if beta is None or condition == "any-environment"
-            else prove_limiter(loop, coupling, beta),
+            limiter=msgspec.UNSET if limiter is None or condition == "any-environment" else limiter,
         )
     )
 

@@ -12,7 +12,7 @@ import msgspec
 from controller.coupling import Coupling
 from controller.loop import DelayRange, Loop
 from design import certificate as guarantees
-from design.certificate import LATE, Stored, assess, switching_requirement
+from design.certificate import LATE, Stored, assess, limiter_refusal, switching_requirement
 from design.conditions import Condition, Requirement, this_environment
 from design.ranges import check_set
 from design.result import Design, DesignFailed, Row, bare, known, of_kind, one_of
@@ -24,22 +24,21 @@ from design.transparency import Transparency, transparency
 
 #: name -> the conditions that it can be made for, its own first
 KINDS = {
-    "spring-damper": ("any-environment", "this-environment"),
+    "spring-damper": ("this-environment", "any-environment"),
     "moving-average": ("any-environment",),
     "ccl": ("any-environment",),
     "optimal": ("this-environment",),
 }
 
 
-def usual_condition(loop: Loop, kind: str | None) -> str | None:
-    """What the commands design a spring-damper for where nobody says it: this environment, which feels best.
+def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
+    """What a coupling is designed for where nobody says it: a spring-damper for this environment, which feels best.
 
-    Any environment where this-environment covers less than the loop: walls that make and break contact, ranges, delays
-    that vary. None, the kind's own, for others.
+    For any environment where this-environment covers less than the loop: walls that make and break contact, ranges,
+    delays that vary. Other kinds for their own condition.
     """
-    if kind not in (None, "spring-damper"):
-        return None
-    return "any-environment" if loop.environment.walls or loop.box or loop.jitter else "this-environment"
+    less = loop.environment.walls or loop.box or loop.jitter
+    return "any-environment" if less and "any-environment" in KINDS[kind] else KINDS[kind][0]
 
 
 #: kind -> what else can be asked of it, in words of design.api.Options
@@ -74,13 +73,15 @@ def design_by_kind(
 ) -> Design:
     """Design and verify a coupling; `options` are those of the design's own function: order, method, diagonal for ccl,
     those of design.optimal.Options for optimal. `progress` hears what takes long: (what, steps done, of how many).
+    Without a condition it is the usual one. A spring-damper for this environment is covered also while forces are
+    limited, unless `limiter` is False or no such one is found; with `limiter` True it is that or none.
 
     Raises ValueError for a kind or condition that does not exist, Infeasible or DesignFailed (design.failure) where
     there is nothing to return.
     """
     if kind not in KINDS:
         raise ValueError(f"coupling is {kind!r}, allowed are {', '.join(KINDS)}")
-    condition = condition or KINDS[kind][0]
+    condition = condition or usual_condition(loop, kind)
     if condition not in KINDS[kind]:
         raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(KINDS[kind])}")
     from design import fixed_order as ccl  # cvxpy takes a second to import
@@ -93,13 +94,32 @@ def design_by_kind(
             return ccl.design(loop, **options)
         if kind == "moving-average":
             return spring_damper.moving_average(loop)
-        return spring_damper.design(loop, condition, **options)
+        return _spring_damper(loop, condition, **options)
 
     if loop.latency is None:
         return made(loop)
     if condition == "any-environment":
         raise ValueError(f"latency: {LATE}, or design for this-environment")
     return _with_latency(loop, made)
+
+
+def _spring_damper(loop: Loop, condition: str, limiter: bool | None = None, **options: Any) -> Design:
+    """A spring-damper, with the limiter's block in the place of the linear one where that is asked for or usual."""
+    from design.spring_damper import design
+
+    if limiter is False or condition == "any-environment":  # with rho = 0 any-environment covers limited forces anyway
+        return design(loop, condition, **options)
+    refusal = limiter_refusal(loop)
+    if limiter and refusal:
+        raise ValueError(refusal)
+    if refusal or options.get("switching"):
+        return design(loop, condition, **options)
+    try:
+        return design(loop, condition, limiter=True, **options)
+    except DesignFailed:
+        if limiter:
+            raise
+        return design(loop, condition, **options)
 
 
 #: A design for forces that latch late leaves at most this share of the damping, and is sought so often.
@@ -164,7 +184,7 @@ class Options(TypedDict, total=False):
     method: str  # ccl: complementarity, inner or fixed-poles
     diagonal: bool  # ccl: no gain across channels
     switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of delays that vary
-    limiter: bool  # spring-damper, this-environment: covered also while forces are limited
+    limiter: bool  # spring-damper, this-environment: covered also while forces are limited (usual) or not
     objective: Literal["rms", "sup"]  # optimal: of the mismatch relative to the environment
     band_hz: tuple[float, float]  # optimal: where the mismatch counts
     high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: kept low, not limited
@@ -180,8 +200,9 @@ def design_coupling(
     """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
 
     `kind` is "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal"; `condition` is
-    "any-environment" or "this-environment", None for the kind's own. `options` are those of the kind, see
-    Options; switching is not taken from loop.jitter.
+    "any-environment" or "this-environment", None for what the commands design: a spring-damper for this environment,
+    also while forces are limited; for any environment before walls, ranges or delays that vary. `options` are those of
+    the kind, see Options; switching is not taken from loop.jitter.
 
     Returns a Design: `coupling` (for a spring-damper with K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the damping
     that it needs, from a sweep of the coupling alone), `figure` and `objective` (what was minimised, and its value).

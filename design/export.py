@@ -13,7 +13,8 @@ import numpy as np
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
-from design.certificate import Stored
+from controller.process import GROUNDED, PIVOT_ROUNDING, Limiter
+from design.certificate import Stored, lag
 
 # ----------------------------------------------------------------------------------------------------
 # What is exported: one state-space block, the order in which its sums are taken, and a test vector in that order.
@@ -21,9 +22,14 @@ from design.certificate import Stored
 # A tick is y = C z + D u, z+ = A z + B u. Every entry of y and of z+ is one sum in double precision that starts at
 # 0.0 and adds, one rounded product after another, the states z_0, z_1, .. and then the inputs u_0, u_1, ..: an order
 # that every language can keep, so that an exported block repeats its test vector to the last bit.
+#
+# Where forces are limited, a tick that asks for more solves the box problem of controller.process by switching the
+# first wrong limit, which ends (docs/theory.md), with elimination in the order of the channels, which needs no pivots
+# since all principal minors are positive. e then moves [y; z+] by its kick, and the forces that leave are set to f_e.
 
 
 TICKS = 64  # of a test vector: longer than the delays and the fast modes of a loop
+MOST_TURNS = 100_000  # of a tick's box problem; a handful are needed
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,7 @@ class Block:
     input: Signal
     output: Signal
     about: tuple[str, ...]  # what it is, one line each
+    limiter: Limiter | None = None  # whose loop the system is while no force is limited
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,18 +79,37 @@ def coupling_block(stored: Stored) -> Block:
     return Block("coupling", with_a_state(V), FORCE, GIVEN_WAY, about)
 
 
-def process_block(stored: Stored, with_theta: bool = True) -> Block:
-    """F(z) (6), device displacements to forces; Theta is left out where the link to the devices is the delay."""
+def process_block(stored: Stored, with_theta: bool = True, force_limit: Sequence[float] | None = None) -> Block:
+    """F(z) (6), device displacements to forces; Theta is left out where the link to the devices is the delay.
+
+    With `force_limit` (m,) [N] they leave through the limiter of the certificate. Raises NothingToExport where that
+    covers none.
+    """
     loop = stored.loop
     theta = loop.theta if with_theta else (0,) * len(loop.theta)
     if loop.environment.walls:
         raise NothingToExport("environment.walls: contact that makes and breaks is not a linear block")
+    if force_limit is not None:
+        return _limited_block(stored, theta, force_limit, with_theta)
     F = delay(theta, loop.T) @ loop.sent(stored.built())
     about = (
         "f = F x: the whole discrete process; the devices get -f, held for T. Forces are not limited here.",
         _delays(loop, with_theta),
     )
     return Block("process", with_a_state(F), DISPLACEMENT, FORCE, about)
+
+
+def _limited_block(stored: Stored, theta: Sequence[int], force_limit: Sequence[float], with_theta: bool) -> Block:
+    loop, rho = stored.loop, lag(stored.loop, stored.certificate)
+    if rho is None:
+        raise NothingToExport("its certificate covers no limited forces: design it anew, or leave out --force-limit")
+    limiter = Limiter(loop.sent(stored.built()), tuple(theta), np.array(force_limit), np.array(rho))
+    about = (
+        "f: the whole discrete process with its limiter; the devices get -f, held for T. Forces never exceed "
+        f"{', '.join(f'{f:g}' for f in force_limit)} N: the contact slips instead, and the certificate holds there.",
+        _delays(loop, with_theta),
+    )
+    return Block("process", limiter.open, DISPLACEMENT, FORCE, about, limiter)
 
 
 def with_a_state(system: Lti) -> Lti:
@@ -95,13 +121,16 @@ def with_a_state(system: Lti) -> Lti:
 
 
 def trial(block: Block, seed: int = 0) -> Trial:
-    """Normally distributed inputs and the outputs that `sequential` gives."""
+    """Normally distributed inputs, with a limiter such that a third of the ticks are limited, and the outputs."""
     rng = np.random.default_rng(seed)
     inputs = block.input.size * rng.standard_normal((TICKS, block.system.inputs))
-    return Trial(inputs, sequential(block.system, inputs))
+    if block.limiter:
+        share = np.abs(sequential(block.system, inputs)) / block.limiter.limit
+        inputs = inputs / np.quantile(share.max(axis=1), 2 / 3)
+    return Trial(inputs, sequential(block.system, inputs, block.limiter))
 
 
-def sequential(system: Lti, inputs: Array) -> Array:
+def sequential(system: Lti, inputs: Array, limiter: Limiter | None = None) -> Array:
     """Outputs (ticks, p) for inputs (ticks, m), from rest, every sum in the order that the module states."""
     rows = np.block([[system.C, system.D], [system.A, system.B]])
     z, outputs = np.zeros(system.order), []
@@ -109,9 +138,71 @@ def sequential(system: Lti, inputs: Array) -> Array:
         sums = np.zeros(len(rows))
         for column, value in zip(rows.T, [*z, *u], strict=True):
             sums = sums + column * value
+        if limiter:
+            free = sums[limiter.sent_rows]
+            if (np.abs(free) > limiter.limit).any():
+                e, f = _boxed(box_matrix(limiter).tolist(), limiter.limit.tolist(), free.tolist())
+                for column, value in zip(limiter.kick.T, e, strict=True):
+                    sums = sums + column * value
+                sums[limiter.sent_rows] = f
         outputs.append(sums[: system.outputs])
         z = sums[system.outputs :]
     return np.array(outputs)
+
+
+def box_matrix(limiter: Limiter) -> Array:
+    """M of the box problem, (m, m), regular also where nothing holds the environment."""
+    M = limiter.problem.M
+    return M if limiter.problem.regular else M + GROUNDED * np.diag(M).max() * np.eye(len(M))
+
+
+def _turns(m: int) -> int:
+    """Switches of a limit after which the box problem is solved for sure."""
+    return min(3**m, MOST_TURNS)
+
+
+def _boxed(M: list[list[float]], limit: list[float], q: list[float]) -> tuple[list[float], list[float]]:
+    """(e, f) of f = q - M e, as the C file computes it, operation by operation."""
+    m = len(q)
+    sign, e, f = [0.0] * m, [0.0] * m, [0.0] * m
+    for _ in range(_turns(m)):
+        a = [[M[i][j] if sign[i] and sign[j] else float(i == j) for j in range(m)] for i in range(m)]
+        v = [q[i] - sign[i] * limit[i] if sign[i] else 0.0 for i in range(m)]
+        for k in range(m):
+            for i in range(k + 1, m):
+                ratio = a[i][k] / a[k][k]
+                for j in range(k + 1, m):
+                    a[i][j] -= ratio * a[k][j]
+                v[i] -= ratio * v[k]
+        for i in reversed(range(m)):
+            for j in range(i + 1, m):
+                v[i] -= a[i][j] * v[j]
+            v[i] /= a[i][i]
+        wrong = False
+        for i in range(m):
+            sum_, size = q[i], abs(q[i])
+            for j in range(m):
+                sum_ -= M[i][j] * v[j]
+                size += abs(M[i][j] * v[j])
+            tiny = size * PIVOT_ROUNDING
+            e[i] = v[i] if sign[i] * v[i] > 0.0 else 0.0
+            f[i] = limit[i] if sum_ > limit[i] else -limit[i] if sum_ < -limit[i] else sum_
+            if sign[i]:
+                f[i] = sign[i] * limit[i]
+            if wrong:
+                continue
+            wrong = True
+            if not sign[i] and sum_ > limit[i] + tiny:
+                sign[i] = 1.0
+            elif not sign[i] and sum_ < -limit[i] - tiny:
+                sign[i] = -1.0
+            elif sign[i] and sign[i] * v[i] * M[i][i] < -tiny:
+                sign[i] = 0.0
+            else:
+                wrong = False
+        if not wrong:
+            break
+    return e, f
 
 
 def data(block: Block, test: Trial) -> dict[str, Any]:
@@ -124,8 +215,19 @@ def data(block: Block, test: Trial) -> dict[str, Any]:
         "input": block.input.what,
         "output": block.output.what,
         **{name: getattr(system, name).tolist() for name in "ABCD"},
+        **(_limiter_data(block.limiter) if block.limiter else {}),
         "test_input": test.inputs.tolist(),
         "test_output": test.outputs.tolist(),
+    }
+
+
+def _limiter_data(limiter: Limiter) -> dict[str, Any]:
+    """What turns the linear tick into the limited one; rows are counted in [y; z+] from 0."""
+    return {
+        "limit": limiter.limit.tolist(),
+        "box_matrix": box_matrix(limiter).tolist(),
+        "kick": limiter.kick.tolist(),
+        "sent_rows": limiter.sent_rows.tolist(),
     }
 
 
@@ -266,6 +368,7 @@ void ${name}_reset(${name}_state *state)
         state->z[i] = 0.0;
 }
 
+$limit_defined
 void ${name}_step(${name}_state *state, const double $u[${NAME}_CHANNELS], double $y[${NAME}_CHANNELS])
 {
     double next[${NAME}_STATES], out[${NAME}_CHANNELS];
@@ -286,7 +389,7 @@ void ${name}_step(${name}_state *state, const double $u[${NAME}_CHANNELS], doubl
             sum += ${name}_B[i][j] * $u[j];
         next[i] = sum;
     }
-    for (i = 0; i < ${NAME}_STATES; i++)
+$limited    for (i = 0; i < ${NAME}_STATES; i++)
         state->z[i] = next[i];
     for (i = 0; i < ${NAME}_CHANNELS; i++)
         $y[i] = out[i];
@@ -342,6 +445,90 @@ void ${name}_free(const ${name}_state *state, double $y[${NAME}_CHANNELS])
 """
 
 
+#: the box problem, and what a tick does that asks for more than a limit
+LIMIT_DEFINED = """
+static double ${name}_size(double a)
+{
+    return a < 0.0 ? -a : a;
+}
+
+/* f = q - M e within the limits, e of the sign of the limit that is reached: the first wrong limit is switched. */
+static void ${name}_limit(const double q[${NAME}_CHANNELS], double e[${NAME}_CHANNELS], double f[${NAME}_CHANNELS])
+{
+    double sign[${NAME}_CHANNELS] = {0.0}, a[${NAME}_CHANNELS][${NAME}_CHANNELS], v[${NAME}_CHANNELS];
+    int turn, wrong, i, j, k;
+    for (turn = 0; turn < $turns; turn++) {
+        for (i = 0; i < ${NAME}_CHANNELS; i++) {
+            for (j = 0; j < ${NAME}_CHANNELS; j++)
+                a[i][j] = sign[i] != 0.0 && sign[j] != 0.0 ? ${name}_M[i][j] : (i == j ? 1.0 : 0.0);
+            v[i] = sign[i] != 0.0 ? q[i] - sign[i] * ${name}_LIMIT[0][i] : 0.0;
+        }
+        for (k = 0; k < ${NAME}_CHANNELS; k++)
+            for (i = k + 1; i < ${NAME}_CHANNELS; i++) {
+                double ratio = a[i][k] / a[k][k];
+                for (j = k + 1; j < ${NAME}_CHANNELS; j++)
+                    a[i][j] -= ratio * a[k][j];
+                v[i] -= ratio * v[k];
+            }
+        for (i = ${NAME}_CHANNELS - 1; i >= 0; i--) {
+            for (j = i + 1; j < ${NAME}_CHANNELS; j++)
+                v[i] -= a[i][j] * v[j];
+            v[i] /= a[i][i];
+        }
+        wrong = 0;
+        for (i = 0; i < ${NAME}_CHANNELS; i++) {
+            double limit = ${name}_LIMIT[0][i], sum = q[i], size = ${name}_size(q[i]), tiny;
+            for (j = 0; j < ${NAME}_CHANNELS; j++) {
+                sum -= ${name}_M[i][j] * v[j];
+                size += ${name}_size(${name}_M[i][j] * v[j]);
+            }
+            tiny = size * $rounding;
+            e[i] = sign[i] * v[i] > 0.0 ? v[i] : 0.0;
+            f[i] = sum > limit ? limit : (sum < -limit ? -limit : sum);
+            if (sign[i] != 0.0)
+                f[i] = sign[i] * limit;
+            if (wrong)
+                continue;
+            wrong = 1;
+            if (sign[i] == 0.0 && sum > limit + tiny)
+                sign[i] = 1.0;
+            else if (sign[i] == 0.0 && sum < -limit - tiny)
+                sign[i] = -1.0;
+            else if (sign[i] != 0.0 && sign[i] * v[i] * ${name}_M[i][i] < -tiny)
+                sign[i] = 0.0;
+            else
+                wrong = 0;
+        }
+        if (!wrong)
+            return;
+    }
+}
+"""
+LIMITED = """    {
+        double q[${NAME}_CHANNELS], e[${NAME}_CHANNELS], f[${NAME}_CHANNELS];
+        int more = 0;
+        for (i = 0; i < ${NAME}_CHANNELS; i++) {
+            q[i] = ${name}_SENT[i] < ${NAME}_CHANNELS ? out[${name}_SENT[i]] : next[${name}_SENT[i] - ${NAME}_CHANNELS];
+            more |= ${name}_size(q[i]) > ${name}_LIMIT[0][i];
+        }
+        if (more) {
+            ${name}_limit(q, e, f);
+            for (j = 0; j < ${NAME}_CHANNELS; j++) {
+                for (i = 0; i < ${NAME}_CHANNELS; i++)
+                    out[i] += ${name}_KICK[i][j] * e[j];
+                for (i = 0; i < ${NAME}_STATES; i++)
+                    next[i] += ${name}_KICK[${NAME}_CHANNELS + i][j] * e[j];
+            }
+            for (i = 0; i < ${NAME}_CHANNELS; i++)
+                if (${name}_SENT[i] < ${NAME}_CHANNELS)
+                    out[${name}_SENT[i]] = f[i];
+                else
+                    next[${name}_SENT[i] - ${NAME}_CHANNELS] = f[i];
+        }
+    }
+"""
+
+
 def c_source(block: Block, test: Trial, file: str) -> str:
     """The file's text; numbers are hexadecimal, so that no compiler's decimal conversion matters."""
     system, name = block.system, block.name
@@ -368,6 +555,15 @@ def c_source(block: Block, test: Trial, file: str) -> str:
         ),
     }
     loose = name == "coupling"
+    words["limit_defined"] = words["limited"] = ""
+    if limiter := block.limiter:
+        words |= {"turns": str(_turns(system.inputs)), "rounding": PIVOT_ROUNDING.hex()}
+        tables = (("LIMIT", limiter.limit[None]), ("M", box_matrix(limiter)), ("KICK", limiter.kick))
+        words["tables"] += "".join("\n\n" + _table(f"static const double {name}_{of}", rows) for of, rows in tables)
+        rows = ", ".join(map(str, limiter.sent_rows))
+        words["tables"] += f"\n\nstatic const int {name}_SENT[{system.inputs}] = {{{rows}}};"
+        words["limit_defined"] = Template(LIMIT_DEFINED).substitute(words)
+        words["limited"] = Template(LIMITED).substitute(words)
     words["more_declared"] = Template(FREE_DECLARED).substitute(words) if loose else ""
     words["more_defined"] = Template(FREE_DEFINED).substitute(words) if loose else ""
     return SOURCE_C.substitute(words)

@@ -535,9 +535,14 @@ def _for_this_environment(
 ) -> Design:
     started, starts = time.perf_counter(), starts or _default_starts(loop)
     search = partial(least_rms_switching, loop, *switching) if switching else partial(least_rms, loop)
-    if limiter:
-        search = partial(least_rms, loop, optimum=partial(_limited_optimum, loop))
     coupling, rms, searches = search(starts)
+    if limiter:  # a little softer than without limits: nearly always found from there
+        search = partial(least_rms, loop, optimum=partial(_limited_optimum, loop))
+        linear, before = coupling, searches
+        coupling, rms, searches = search([linear] if linear else starts)
+        if coupling is None and linear:
+            coupling, rms, searches = search(starts)
+        searches += before
     if coupling is None:
         certifies = "the this-environment condition certifies"
         if switching:

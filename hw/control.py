@@ -22,13 +22,15 @@ from controller.coupling import Coupling
 from controller.environment import environment
 from controller.loop import force_map
 from controller.lti import Array, Lti
+from controller.process import Limiter, limited
+from design.certificate import Limits as ForceLimits
 from design.certificate import assess, certificate_part, guarantee_of
 from design.conditions import Requirement
 from design.result import DesignFailed
 from hw.limits import Fault, Gain, Heat, Limits, Units, check_jolt, check_jump, check_range, check_speed, shape
 from hw.monitor import Ages, ClockMonitor, CommandMonitor, Counters, EncoderMonitor, EncoderTest, LinkSettings
 from hw.protocol import MAX_THETA, Config, State
-from sim.couplings import Chosen, choose
+from sim.couplings import Chosen, choose, limits_of
 from sim.report import coupling_part
 from sim.scenario import InputError, Scenario
 
@@ -65,10 +67,39 @@ class LinearController:
         return self._output[n:].copy()
 
 
-def host_controller(scenario: Scenario, coupling: Coupling, link: int) -> LinearController:
-    """F as the host runs it, at rest: the link adds the remaining delay. Raises ValueError where link is too long."""
-    E = environment(scenario.environment, scenario.T)
+class LimitedController:
+    """The loop whose forces leave through a limiter, from rest."""
+
+    def __init__(self, limiter: Limiter) -> None:
+        F = limiter.open
+        self.limiter, self.T, self._m = limiter, F.T, F.inputs
+        self._tick = limiter.transition()
+        self._input, self._output = (np.zeros((F.order + F.inputs, 1)) for _ in range(2))
+
+    def step(self, x: Sequence[float]) -> Array:
+        """Forces (m,) [N] within the limits for the displacements x (m,) [m]; the state moves on by one tick."""
+        m, before, after = self._m, self._input, self._output
+        before[-m:, 0] = x
+        self._tick(before, after)
+        before[:-m] = after[m:]
+        return after[:m, 0].copy()
+
+
+def host_controller(
+    scenario: Scenario,
+    coupling: Coupling,
+    link: int,
+    lag: Sequence[float] | None = None,
+    cap: Sequence[float] = (),
+) -> LinearController | LimitedController:
+    """F as the host runs it, at rest: the link adds the remaining delay. Raises ValueError where link is too long.
+
+    With `lag`, rho (m,) [N/m], forces leave through a limiter of `cap` (m,) [N].
+    """
     host = [n - link for n in scenario.theta]
+    if lag is not None:
+        return LimitedController(limited(scenario.environment, coupling, host, scenario.psi, scenario.T, cap, lag))
+    E = environment(scenario.environment, scenario.T)
     return LinearController(force_map(E, coupling, host, scenario.psi))
 
 
@@ -317,8 +348,8 @@ class Program(Protocol):
         """For the log."""
         ...
 
-    def controller(self) -> Controller:
-        """A fresh one, at rest."""
+    def controller(self, cap: Sequence[float]) -> Controller:
+        """A fresh one, at rest, for forces of up to `cap` (m,) [N]."""
         ...
 
 
@@ -331,6 +362,7 @@ class CertifiedCoupling:
     case: str
     chosen: Chosen
     requirements: dict[str, Requirement]
+    limits: ForceLimits  # whether that holds for forces at the cap too
 
     @property
     def certified(self) -> bool:
@@ -348,11 +380,11 @@ class CertifiedCoupling:
         span = self.chosen.switching
         return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
 
-    def controller(self) -> LinearController:
-        return host_controller(self.scenario, self.chosen.coupling, self.link)
+    def controller(self, cap: Sequence[float]) -> LinearController | LimitedController:
+        return host_controller(self.scenario, self.chosen.coupling, self.link, self.limits.rho, cap)
 
-    def part(self) -> dict[str, Any]:
-        """As plain data: coupling, certificates, guarantee."""
+    def part(self, cap: Sequence[float]) -> dict[str, Any]:
+        """As plain data: coupling, certificates, guarantee, for forces of up to `cap` (m,) [N]."""
         return {
             "link_delay": self.link,
             "theta": list(self.scenario.theta),
@@ -362,6 +394,7 @@ class CertifiedCoupling:
             "certificate": certificate_part(self.requirements[self.chosen.condition]),
             "certificates": {name: certificate_part(r) for name, r in self.requirements.items()},
             "promise": guarantee_of(self.requirements, self.scenario.loop(self.case)),
+            "limiter": self.limits.part(cap),
             "remarks": self.remarks(),
         }
 
@@ -374,9 +407,17 @@ class CertifiedCoupling:
 
 
 def certified_coupling(
-    scenario: Scenario, case: str, name: str | None, condition: str | None, link: int, given: Coupling | None = None
+    scenario: Scenario,
+    case: str,
+    name: str | None,
+    condition: str | None,
+    link: int,
+    given: Coupling | None = None,
+    limiter: bool | None = None,
 ) -> CertifiedCoupling:
     """The coupling `name`, or the one that is `given`, for a link of `link` ticks, with its certificates.
+
+    Forces leave through the limiter that these cover, unless `limiter` is False.
 
     Raises Fault where no coupling is certified for it, InputError where the request contradicts itself.
     """
@@ -387,11 +428,12 @@ def certified_coupling(
     try:
         # a latency is derived for this environment only
         wanted = condition or ("this-environment" if slower.latency else None)
-        chosen = Chosen("given", given, "this-environment") if given else choose(slower, case, name, wanted)
+        chosen = Chosen("given", given, "this-environment") if given else choose(slower, case, name, wanted, limiter)
     except DesignFailed as error:
         raise Fault(f"no coupling for a link of {link} ticks: {error}") from None
     requirements = assess(slower.loop(case), chosen.coupling, chosen.phi)
-    made = CertifiedCoupling(min(slower.theta) if link else 0, slower, case, chosen, requirements)
+    limits = limits_of(slower, chosen.coupling, requirements, limiter)
+    made = CertifiedCoupling(min(slower.theta) if link else 0, slower, case, chosen, requirements, limits)
     if not made.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"
         raise Fault(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(made)}")
@@ -399,7 +441,13 @@ def certified_coupling(
 
 
 def certified_couplings(
-    scenario: Scenario, case: str, name: str | None, condition: str | None, link: int, spare: int = 2
+    scenario: Scenario,
+    case: str,
+    name: str | None,
+    condition: str | None,
+    link: int,
+    spare: int = 2,
+    limiter: bool | None = None,
 ) -> tuple[CertifiedCoupling, ...]:
     """The coupling for the measured delay and up to `spare` softer ones, each for one tick more.
 
@@ -407,11 +455,12 @@ def certified_couplings(
     the spring-damper by Theorem 4, which guarantees the most. Raises Fault where the first coupling is not certified;
     where no softer one is, the ladder ends.
     """
-    found, wanted = [certified_coupling(scenario, case, name, condition, link)], [(name, condition), _FALLBACK]
+    found = [certified_coupling(scenario, case, name, condition, link, limiter=limiter)]
+    wanted = [(name, condition), _FALLBACK]
     while len(found) <= spare and wanted:
         kind, by = wanted[0]
         try:
-            found.append(certified_coupling(scenario, case, kind, by, found[-1].link + 1))
+            found.append(certified_coupling(scenario, case, kind, by, found[-1].link + 1, limiter=limiter))
         except (Fault, InputError):
             wanted.pop(0)
     return tuple(found)

@@ -80,7 +80,7 @@ class Excitation:
     def seconds(self) -> float:
         return len(self.signal) * self.T
 
-    def controller(self) -> Controller:
+    def controller(self, cap: Sequence[float]) -> Controller:
         return _Player(self)
 
 

@@ -83,7 +83,7 @@ class Shaped:
     """A force that may be sent, and what had to be done to it."""
 
     force: tuple[float, ...]  # (m,) [N]
-    clipped: bool  # at the cap
+    clipped: bool  # at the cap, by the limiter or by being cut here
     slowed: bool  # at the slew limit
 
 
@@ -116,7 +116,7 @@ def shape(
     for wanted, last, cap in zip(wishes, previous, limits.cap, strict=True):
         capped = max(-cap, min(cap, wanted))
         sent = max(last - step, min(last + step, capped))
-        clipped |= capped != wanted
+        clipped |= abs(wanted) >= cap
         slowed |= sent != capped
         force.append(sent)
     _require_finite(force)

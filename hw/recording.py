@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from controller.coupling import Form
 from controller.lti import Array
-from hw.control import BudgetPlan, CertifiedCoupling, LinearController, Program, SentBudget, TraceRow, host_controller
+from hw.control import BudgetPlan, CertifiedCoupling, Controller, Program, SentBudget, TraceRow, host_controller
 from hw.limits import Fault, Limits, Units, shape
 from hw.protocol import NO_MARGIN, Config
 from hw.session import Session
@@ -82,14 +82,14 @@ class Recorder:
         }
 
 
-def steady_ticks(recorder: Recorder, force_step: Sequence[float]) -> list[list[int]]:
+def steady_ticks(recorder: Recorder, force_step: Sequence[float], cap: Sequence[float]) -> list[list[int]]:
     """[first, stop) of each arming in which the loop was one linear loop: full gain, until a cap or the slew rate cuts.
 
-    Missed ticks are not left out. `force_step` (m,) [N].
+    Missed ticks are not left out. `force_step` and `cap` (m,) [N].
     """
     link = recorder.link()
     asked = -np.round(link["asked"] / np.array(force_step))
-    cut = link["received"] & np.any(link["sent"] != asked, axis=1)
+    cut = link["received"] & np.any((link["sent"] != asked) | (np.abs(link["asked"]) >= cap), axis=1)
     stretches = []
     for arming in np.unique(link["arming"]):
         full = np.flatnonzero((link["arming"] == arming) & (link["gain"] == 1.0))
@@ -232,7 +232,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
     """Stage, cause and log; the coupling with its certificates; what the link did, as a report without a verdict."""
     begin = session.log[0].t_us if session.log else 0
     log = [{"t_s": 1e-6 * (e.t_us - begin), "stage": str(e.stage), "cause": e.cause} for e in session.log]
-    parts = session.program.part() if isinstance(session.program, CertifiedCoupling) else {}
+    parts = session.program.part(session.limits.cap) if isinstance(session.program, CertifiedCoupling) else {}
     empty = {"coupling": None, "certificate": None, "certificates": None, "promise": None, "theta": None}
     loop = isinstance(session.program, CertifiedCoupling) and len(recorder) > 0
     report = {
@@ -248,7 +248,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
             "scenario_digest": session.scenario.digest,
             "pace": pace,  # below 1: slow motion, in which a link looks faster than it is
             "encoder_step_m": list(session.units.encoder_step) if len(recorder) else None,
-            "steady_ticks": steady_ticks(recorder, session.units.force_step) if loop else [],
+            "steady_ticks": steady_ticks(recorder, session.units.force_step, session.limits.cap) if loop else [],
         },
     }
     trace = result_of(recorder, session.units, session.scenario.T, report) if loop else None
@@ -311,6 +311,7 @@ def _recipe_of(session: Session, program: Program, config: Config) -> dict[str, 
         "limits": asdict(session.limits),
         "force_step": list(session.units.force_step),
         "cap": list(config.cap),
+        "lag": None if program.limits.rho is None else list(program.limits.rho),
     }
 
 
@@ -327,6 +328,7 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     force_step: tuple[float, ...]
     cap: tuple[int, ...]
     energy_budget: BudgetPlan | None = None
+    lag: tuple[float, ...] | None = None  # (m,) [N/m] rho of the limiter, where there was one
 
     def __post_init__(self) -> None:
         """Raises ValueError naming what no session can have written."""
@@ -342,10 +344,11 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             allowed = f"{soonest} to {least}, the scenario's least theta"
             raise ValueError(f"link_delay is {self.link_delay}, allowed are {allowed}")
 
-    def controller(self) -> LinearController:
+    def controller(self) -> Controller:
         """F as the host ran it. Raises InputError where nothing can have run."""
         try:
-            return host_controller(self.scenario, self.coupling.build(self.scenario.T), self.link_delay)
+            coupling = self.coupling.build(self.scenario.T)
+            return host_controller(self.scenario, coupling, self.link_delay, self.lag, self.limits.cap)
         except ValueError as error:
             raise InputError(f"the trace cannot be replayed: {error}") from None
 

@@ -134,7 +134,7 @@ class Session:
             assert self.program
             assert self.config
             self.drive = Drive(
-                self.program.controller(),
+                self.program.controller(self.limits.cap),
                 self.units,
                 self.config,
                 self.limits,

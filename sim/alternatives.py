@@ -18,7 +18,7 @@ from design.certificate import assess, finite, guarantee_of
 from design.conditions import Requirement
 from design.transparency import decibels, transparency
 from sim.accuracy import credible_part, force_error
-from sim.couplings import choose
+from sim.couplings import choose, limits_of
 from sim.run import assemble, run
 from sim.scenario import Scenario, load
 from sim.stability import exact_growth, unstable
@@ -119,8 +119,9 @@ def _alternative(scenario: Scenario, case: str, kind: str, condition: str | None
         chosen = choose(scenario, case, kind, condition)
     except ValueError as error:
         return Alternative(kind, condition, reason=str(error))
-    loop, simulation = scenario.loop(case), assemble(scenario, chosen.coupling)
+    loop = scenario.loop(case)
     requirements = assess(loop, chosen.coupling, chosen.phi)
+    simulation = assemble(scenario, chosen.coupling, limits_of(scenario, chosen.coupling, requirements).rho)
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)
     made = Alternative(

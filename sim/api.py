@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 from controller.coupling import Coupling, NoCoupling
 from controller.lti import Array
 from design.result import COUPLING, Design, bare, number, of_kind, one_of, whole
 from sim import crowds
+from sim.couplings import limits_of
 from sim.engines import INTEGRATORS
 from sim.nets import EnergyNet, Plugged, netted
 from sim.run import ENGINES, Progress, assemble, make_engine, run
@@ -31,14 +32,14 @@ def simulate(
     seed: int = 0,
     environment: Callable[[Array], Array] | None = None,
     energy_budget: float | None = None,
-    lag: Sequence[float] | None = None,
+    limiter: bool = True,
 ) -> Trace:
     """The scenario's run, from rest, for `scenario.duration` seconds.
 
     `coupling` None is the loop without one; `engine` is "mujoco" or "exact" (the linear loop, no Coulomb friction);
     `integrator` of MuJoCo, None for "exponential", or "RK4" where a device has Coulomb friction; `substeps` steps per
-    period, None for what the plant asks; `seed` draws delays that vary; `lag`, rho (m,) [N/m], limits forces as
-    `design.certificate.covered_limits` says that a guarantee covers it, None clips them.
+    period, None for what the plant asks; `seed` draws delays that vary. Forces are limited as a guarantee covers it,
+    where one does (`meta["limiter"]` says); elsewhere, and with `limiter` False, they are clipped.
 
     `environment` takes the place of the scenario's: anything that answers, once a tick, where its port would be if it
     gave no force, (m,) [m], with a force fed back (m,) [N]. A shell makes it passive, which may give `energy_budget`
@@ -60,9 +61,8 @@ def simulate(
         one_of("integrator", integrator, tuple(INTEGRATORS))
     if substeps is not None:
         substeps = whole("substeps", substeps, 1, MOST)
-    if lag is not None and scenario.switches:
-        raise ValueError("lag: limited forces are covered for constant delays only")
-    simulation = assemble(scenario, alone, lag)
+    limits = limits_of(scenario, alone, limiter=limiter and environment is None)
+    simulation = assemble(scenario, alone, limits.rho)
     if scenario.switches:
         simulation, _ = switching(simulation, alone, seed, scenario.samples)
     integrator, substeps, remarks = settle(simulation, engine, integrator, substeps)
@@ -79,6 +79,7 @@ def simulate(
         "integrator": integrator,
         "substeps": substeps,
         "seed": seed,
+        "limiter": limits.part([device.force_limit for device in scenario.device]),
         "stability": None if scenario.switches or environment else stability_part(simulation, trace),
         "remarks": remarks,
         "energy_budget": trace.net.part() if trace.net else None,
@@ -95,13 +96,14 @@ def validate(
     duration: float = 2.0,
     shards: int = 1,
     progress: Progress = lambda done, total: None,
+    limiter: bool = True,
 ) -> crowds.Findings:
     """Let `humans` random passive humans (one per device each time) hold the devices, without voluntary motion.
 
     They are drawn from `scenario.population`; number i depends on `seed` and i alone. `engine` is "exact", "mujoco" or
     "both"; `duration` [s] of the traces, 0 for none (then growth rates are those of the period maps alone); `shards`
     local processes (a script that asks for more than 1 needs `if __name__ == "__main__"`); `progress` is
-    called with the parts done and all of them.
+    called with the parts done and all of them; `limiter` as of `simulate`.
 
     Returns Findings, n = humans: `exact` and `mujoco` (n,) growth rates [1/s], positive where a human makes the loop
     unstable, `radius` (n,) of the exact loop, `frequency` (n,) [Hz], `disagreements` (n,) of the engines, and more.
@@ -119,7 +121,9 @@ def validate(
     if not (duration == 0 or duration >= 4 * scenario.T):
         raise InputError(f"duration is {duration:g}, allowed are 0 and {4 * scenario.T:g} s or more")
     links = getattr(scenario.population, "links", 1)  # of a user's own population there are none
-    return crowds.validate(crowds.Validation(scenario, alone, seed, humans, links, engine, duration), shards, progress)
+    lag = limits_of(scenario, alone, limiter=limiter).rho
+    question = crowds.Validation(scenario, alone, seed, humans, links, engine, duration, lag=lag)
+    return crowds.validate(question, shards, progress)
 
 
 def _bare(coupling: Coupling | Design | None) -> Coupling:

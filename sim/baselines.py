@@ -20,6 +20,7 @@ from design.designs import design_by_kind
 from design.result import DesignFailed
 from models.scene import Crowd, variants
 from sim.accuracy import force_error
+from sim.couplings import limits_of
 from sim.engines import ExactBatchEngine, hold
 from sim.nets import BASELINES, Classic, EnergyNet, netted
 from sim.run import Simulation, assemble, run, run_blocks
@@ -82,7 +83,7 @@ def _judged(
     net: Classic | EnergyNet | None,
     design: tuple[str, str] | None,
 ) -> Rival:
-    simulation = assemble(scenario, coupling)
+    simulation = assemble(scenario, coupling, limits_of(scenario, coupling).rho if design else None)
     most = max(scenario.samples, round(SECONDS / scenario.T))
     with_net = netted(simulation, coupling, net, most) if net else simulation
     trace = run(with_net, "exact")

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, MovingAverage, NoCoupling
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design import certificate as store
-from design.certificate import Stored, switching_guarantee, verify
+from design.certificate import Limits, Stored, assess, covered_limits, switching_guarantee, verify
+from design.conditions import Requirement
 from design.designs import KINDS, design_by_kind
 from design.result import PUBLISHED, DesignFailed
 from sim.scenario import InputError, Scenario
@@ -29,8 +32,14 @@ class Chosen:
     switching: DelayRange | None = None  # its file proves that any switching of the delays within it is safe here
 
 
-def choose(scenario: Scenario, case: str, name: str | None = None, condition: str | None = None) -> Chosen:
-    """The coupling of a case; by default the designed spring-damper.
+def choose(
+    scenario: Scenario,
+    case: str,
+    name: str | None = None,
+    condition: str | None = None,
+    limiter: bool | None = None,
+) -> Chosen:
+    """The coupling of a case; by default the designed spring-damper, see design.designs.design_by_kind for `limiter`.
 
     Raises InputError where the request contradicts itself, DesignFailed where there is no such coupling.
     """
@@ -47,7 +56,8 @@ def choose(scenario: Scenario, case: str, name: str | None = None, condition: st
         return Chosen(name, PUBLISHED[case], condition or "any-environment")
     if name in KINDS:
         try:
-            design = design_by_kind(scenario.loop(case), name, condition)
+            asked: dict[str, Any] = {"limiter": limiter} if limiter is not None and name == "spring-damper" else {}
+            design = design_by_kind(scenario.loop(case), name, condition, **asked)
         except DesignFailed:
             raise
         except ValueError as error:
@@ -60,6 +70,21 @@ def choose(scenario: Scenario, case: str, name: str | None = None, condition: st
     made_for = stored.certificate.condition if stored.certificate else "this-environment"
     checked = check_stored(stored, scenario.loop(case))
     return Chosen(Path(name).name, coupling, condition or made_for, notes=checked.notes, switching=checked.switching)
+
+
+def limits_of(
+    scenario: Scenario,
+    coupling: Coupling,
+    requirements: Mapping[str, Requirement] | None = None,
+    limiter: bool | None = None,
+) -> Limits:
+    """How forces are limited in a loop: by the limiter that a guarantee covers, unless `limiter` is False."""
+    if limiter is False:
+        return Limits(None, "forces are clipped, as asked")
+    if scenario.jitter:
+        return Limits(None, "limiter: limited forces are proved for constant delays")
+    loop = scenario.loop("I")  # the reference does not matter
+    return covered_limits(loop, coupling, assess(loop, coupling) if requirements is None else requirements)
 
 
 def read_coupling(path: str | Path) -> Stored:

@@ -127,6 +127,7 @@ class Validation:
     duration: float  # [s] of the traces; 0 for none
     threads: int = 0  # of MuJoCo; 0 for all
     environments: tuple[Member, ...] = ()  # that the humans are spread over; empty: all meet the scenario's own
+    lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of the limiter; None: forces are clipped
 
     @property
     def ticks(self) -> int:
@@ -211,7 +212,7 @@ def examine(
     scenario, member = validation.scenario, validation.environment(indices[0])
     if member:
         scenario = scenario.replace(environment=member.network, box=None)
-    simulation = assemble(scenario, validation.coupling)
+    simulation = assemble(scenario, validation.coupling, validation.lag)
     return _merge([_group(validation, simulation, *group, ticked) for group in validation.crowds(indices)])
 
 

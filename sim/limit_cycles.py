@@ -142,7 +142,7 @@ def _motors_and_handles(scene: Scene) -> tuple[int, ...]:
 # the hand presses with a constant force, eased in; and what still oscillates at the end decides (sim.stability).
 
 
-_UNLIMITED = 1e6  # [N] force limit of a motor that does not saturate: the largest that a device may have
+UNLIMITED = 1e6  # [N] force limit of a motor that does not saturate: the largest that a device may have
 _BATCH = 20  # simulations in one MuJoCo batch
 _EASE = 0.5  # [s] in which the press grows
 _BLOCK = 64  # ticks between two looks at the keyboard
@@ -159,7 +159,7 @@ class Effects:
     saturation: bool = False  # whether motors have their force limits
 
     def on(self, devices: Sequence[Device]) -> tuple[Device, ...]:
-        changes: dict[str, float] = {} if self.saturation else {"force_limit": _UNLIMITED}
+        changes: dict[str, float] = {} if self.saturation else {"force_limit": UNLIMITED}
         if self.quantisation is not None:
             changes["encoder_step"] = self.quantisation
         if self.friction is not None:
@@ -308,7 +308,7 @@ def _simulate(
     buffer = _ManyProcesses(processes, min(_BLOCK, ticks), n, scene.outside)
     starts = np.stack([trial.start for trial in trials], axis=1)
     buffer.s[0] = starts[:n]
-    if processes[0].contact is None:  # the states of a process with walls are others: it begins at rest
+    if processes[0].contact is None:  # the states of a process with walls or a limiter are others: it begins at rest
         buffer.z[0] = starts[n:]
     seen, kept, done = list(_motors_and_handles(scene)), [], 0
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
@@ -343,8 +343,10 @@ class _ManyProcesses(StepBuffer):
 
     def __init__(self, processes: Sequence[Process], ticks: int, plant_states: int, outside: int) -> None:
         super().__init__(processes[0], ticks, plant_states, outside, len(processes))
-        walls = len(processes[0].contact.walls) if processes[0].contact else 0
-        self._together = _linear(processes) if walls == 0 else _one_wall(processes) if walls == 1 else _each(processes)
+        made = _linear if processes[0].contact is None else _each
+        if isinstance(processes[0].contact, Contact) and len(processes[0].contact.walls) == 1:
+            made = _one_wall
+        self._together = made(processes)
 
     def tick(self, k: int) -> None:
         self._together(self.seen(k), self._output[k])

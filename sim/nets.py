@@ -21,7 +21,7 @@ from controller.coupling import Coupling
 from controller.delay import LOST, Ticks, ages
 from controller.loop import DelayRange
 from controller.lti import Array, Lti
-from controller.process import Net, Process, contact
+from controller.process import Limiter, Net, Process, contact, limited
 from design.conditions import Requirement
 from sim.run import Simulation
 from sim.scenario import Scenario
@@ -86,9 +86,12 @@ def netted(simulation: Simulation, coupling: Coupling, wanted: Wanted, ticks: in
         samples = scenario.samples if ticks is None else ticks
         constant = np.broadcast_to(np.array(scenario.theta)[None, :, None], (samples, process.channels, 1))
         process = with_delays(simulation, coupling, constant).process
-        if scenario.environment.walls:
-            undelayed = (0,) * process.channels
-            walled = contact(scenario.environment, coupling, undelayed, scenario.psi, scenario.T)
+        undelayed, before = ((0,) * process.channels, scenario.psi, scenario.T), process.contact
+        if isinstance(before, Limiter):
+            walled = limited(scenario.environment, coupling, *undelayed, before.limit, before.rho)
+            process = replace(process, F=walled.open, contact=walled)
+        elif before:
+            walled = contact(scenario.environment, coupling, *undelayed)
             process = replace(process, F=walled.open, contact=walled)
     else:
         spans = scenario.delay_range

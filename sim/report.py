@@ -301,7 +301,7 @@ def validation_part(question: Validation, findings: Findings, certified: bool, w
         "simulated_s_per_s": findings.simulated / wall,
     }
     if certified and question.ticks and question.scenario.latency is None:  # it knows positions at ticks only
-        part["energy_audit"] = _energy(findings)
+        part["energy_audit"] = _energy(question, findings)
         part["holds"] = part["holds"] and part["energy_audit"]["holds"]
     if not findings.index.size:
         part |= {"holds": None, "reason": "interrupted before the first batch of humans was done"}
@@ -406,8 +406,9 @@ def _traces(question: Validation, findings: Findings) -> dict[str, Any] | None:
     return part
 
 
-def _energy(findings: Findings) -> dict[str, Any]:
-    unclipped = findings.clipped == 0
+def _energy(question: Validation, findings: Findings) -> dict[str, Any]:
+    """Forces that were clipped are covered by nothing; those of a limiter are."""
+    unclipped = (findings.clipped == 0) | (question.lag is not None)
     violated = unclipped & ~(findings.energy >= -ROUNDING * findings.audited)
     return {
         "audited": int(unclipped.sum()),

@@ -259,7 +259,7 @@ class ImpulseTest:
 
     growth: Array  # (nsim,) [1/s] of the exact loop's dominant mode, up to the first clipped tick; nan below the noise
     clipped: NDArray[np.int64]  # (nsim,) ticks with a force at its limit
-    least_energy: Array  # (nsim,) [J] least W(N) up to the first clipped tick
+    least_energy: Array  # (nsim,) [J] least W(N), with a limiter at any tick, else up to the first clipped one
     audited: Array  # (nsim,) [J] sum of the magnitudes of what W adds up: the scale of its rounding
     settling: Array  # (nsim,) rms of the handles' speeds in the last quarter over that in the second
     simulated: float  # [s] of all simulations together
@@ -363,7 +363,7 @@ class _Audit:
 
     def __init__(self, process: Process, scene: Scene, loops: ClosedLoop, delta: Array, ticks: int) -> None:
         nsim = loops.A.shape[0]
-        self._limit = process.force_limit[:, None]
+        self._limit, self._limiter = process.force_limit[:, None], process.limiter
         self._B, self._T, self._damping = loops.B, loops.T, delta[:, None] / loops.T
         self._left = left_eigenvector(loops)  # (nsim, n)
         self._speeds = _Speeds(scene, nsim, (ticks // 4, ticks // 2), (ticks - ticks // 4, ticks))
@@ -375,15 +375,17 @@ class _Audit:
     def see(self, buffer: StepBuffer, first: int, count: int) -> None:
         """Take in the first `count` rows of the buffer; row 0 is tick `first`."""
         z, s, w, f = (rows[: count + 1] for rows in (buffer.z, buffer.s, buffer.w, buffer.f))
-        clipped = (np.abs(f[:count]) >= self._limit).any(axis=1)  # (ticks, nsim)
+        limiter = self._limiter  # acts before its force arrives
+        clipped = (limiter.slips(z) != 0 if limiter else np.abs(f[:count]) >= self._limit).any(axis=1)  # (ticks, nsim)
         linear = self._linear & ~np.logical_or.accumulate(clipped, axis=0)
         self._clipped += clipped.sum(axis=0)
         self._usable += linear.sum(axis=0)
         self._linear = linear[-1]
 
         moved = np.diff(buffer.x[: count + 1], axis=0)
-        work = np.where(linear[:, None], f[:count] * moved, 0.0).sum(axis=1)
-        spent = np.where(linear[:, None], self._damping * moved**2, 0.0).sum(axis=1)
+        audited = np.ones_like(linear) if limiter else linear
+        work = np.where(audited[:, None], f[:count] * moved, 0.0).sum(axis=1)
+        spent = np.where(audited[:, None], self._damping * moved**2, 0.0).sum(axis=1)
         energy = self._energy + np.cumsum(work + spent, axis=0)
         self._least = np.minimum(self._least, energy.min(axis=0))
         self._energy = energy[-1]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import cached_property
@@ -34,9 +34,9 @@ from controller.environment import (
 )
 from controller.loop import Loop, force_map
 from controller.lti import Array, Complex, Lti, Sampled, SingularLoop, as_like
-from controller.process import Process, contact
+from controller.process import Limiter, Process, contact, limited
 from design.audit import check_loop, edge
-from design.certificate import CONDITIONS, LATE, any_environment_of
+from design.certificate import CONDITIONS, LATE, any_environment_of, covered_limits
 from design.conditions import (
     Requirement,
     any_environment_ratios,
@@ -49,7 +49,7 @@ from design.lmi import least_phi
 from design.result import DesignFailed
 from models.device import Device
 from models.human import Population
-from sim.limit_cycles import Cells, HeldDevices, Plan, Points, Progress, simulate_cells
+from sim.limit_cycles import UNLIMITED, Cells, HeldDevices, Plan, Points, Progress, simulate_cells
 from sim.scenario import InputError
 from sim.stability import MARGINAL
 
@@ -144,8 +144,13 @@ class CouplingSweep(_Sweep):
         return tuple(state.F(self._couplings(K, B)) for state in self._states)
 
     def processes(self, K: Array, B: Array, devices: Sequence[Device]) -> list[Process]:
-        """What the computer does every T with each coupling; limits and encoder steps are those of `devices`."""
+        """What the computer does every T with each coupling; limits and encoder steps are those of `devices`.
+
+        Where motors have limits, forces leave through the limiter that a guarantee covers; the rest are clipped.
+        """
         limits = self._limits(devices)
+        if (limits[0] < UNLIMITED).any():
+            return [Process(limiter.open, *limits, limiter) for limiter in self._limiters(K, B, limits[0])]
         if self.walled is None:
             F = self.force_maps(K, B)[0]
             return [Process(F[i], *limits) for i in range(K.size)]
@@ -153,6 +158,22 @@ class CouplingSweep(_Sweep):
         timing = self.loop.theta, self.loop.psi, self.loop.T
         walls = [contact(self.walled, Compliance(V[i]), *timing) for i in range(K.size)]
         return [Process(each.open, *limits, each) for each in walls]
+
+    def _limiters(self, K: Array, B: Array, force_limit: Array) -> Iterator[Limiter]:
+        """Those of the couplings; one that is not covered never slips, so that its motors clip."""
+        loop, couplings = self.loop, self._couplings(K, B)
+        sent, V = loop.sent(couplings) if self.walled is None else None, couplings.compliance(loop.T)
+        for i, (k, b) in enumerate(zip(K.tolist(), B.tolist(), strict=True)):
+            coupling = SpringDamper([k] * loop.channels, [b] * loop.channels, self.cutoff)
+            requirements = {name: self.requirement(name, k, b) for name in CONDITIONS}
+            rho = covered_limits(loop, coupling, requirements).rho
+            if self.one_sided and rho and any(rho):
+                rho = None  # a proof of the wall that holds
+            limit, lag = force_limit if rho else np.full(loop.channels, np.inf), rho or (0.0,) * loop.channels
+            if sent:
+                yield Limiter(sent[i], loop.theta, limit, np.array(lag))
+            elif self.walled:
+                yield limited(self.walled, Compliance(V[i]), loop.theta, loop.psi, loop.T, limit, lag)
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Required over available damping, (n,); inf where no damping is enough. Of walls, in the worst state."""

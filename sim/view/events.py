@@ -7,10 +7,10 @@ import re
 from dataclasses import dataclass
 
 from controller.coupling import Coupling
-from design.certificate import assess, guarantee_of
+from design.certificate import Limits, assess, guarantee_of
 from design.conditions import Requirement
 from design.designs import KINDS
-from sim.couplings import Chosen, choose
+from sim.couplings import Chosen, choose, limits_of
 from sim.run import Simulation, assemble
 from sim.scenario import LONGEST_DELAY, InputError, Scenario
 from sim.stability import Mode, worst_mode
@@ -132,6 +132,7 @@ class Menu:
     case: str
     condition: str | None = None  # what a coupling is designed for, by default its own
     given: str | None = None  # the file of --coupling
+    limiter: bool | None = None  # False: forces are clipped
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +146,7 @@ class PreparedLoop:
     mode: Mode  # of the exact linear loop; before walls, of the worst contact state
     requirements: dict[str, Requirement]
     guarantee: str | None
+    limits: Limits
 
     @property
     def scenario(self) -> Scenario:
@@ -178,12 +180,12 @@ def _choose(menu: Menu, scenario: Scenario, label: str) -> Chosen:
             raise InputError("there is no coupling from a file (start with --coupling FILE.json)")
         return choose(scenario, menu.case, menu.given)
     name = COUPLINGS[label]
-    return choose(scenario, menu.case, name, menu.condition if name in KINDS else None)
+    return choose(scenario, menu.case, name, menu.condition if name in KINDS else None, menu.limiter)
 
 
 def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> PreparedLoop:
-    assembly, loop = assemble(scenario, chosen.coupling), scenario.loop(menu.case)
+    loop = scenario.loop(menu.case)
     requirements = assess(loop, chosen.coupling, chosen.phi)
-    return PreparedLoop(
-        menu, label, chosen, assembly, worst_mode(assembly), requirements, guarantee_of(requirements, loop)
-    )
+    limits = limits_of(scenario, chosen.coupling, requirements, menu.limiter)
+    assembly, guarantee = assemble(scenario, chosen.coupling, limits.rho), guarantee_of(requirements, loop)
+    return PreparedLoop(menu, label, chosen, assembly, worst_mode(assembly), requirements, guarantee, limits)

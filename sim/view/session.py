@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.lti import Array, Lti, SingularLoop
+from controller.lti import Array, SingularLoop
 from controller.process import StepBuffer
 from design.certificate import certificate_part, finite
 from design.result import DesignFailed
@@ -261,7 +261,7 @@ class Session:
         outside = prepared.assembly.plant.B.shape[1] - process.channels
         tape = StepBuffer(process, _STRETCH, s.size, outside)
         tape.s[0, :, 0] = s
-        tape.z[0, :, 0] = rest(process.F, s[: process.channels])
+        tape.z[0, :, 0] = process.at_rest(s[: process.channels])
         self.prepared, self._tape = prepared, tape
         self._start_engine()
 
@@ -277,14 +277,6 @@ class Session:
         plant = gripped(assembly.scene, held.channel, assembly.scenario.T) if held else assembly.plant
         self._engine = ExactEngine(plant, assembly.process.force_limit)
         self._engine.start(self._tape)
-
-
-def rest(F: Lti, x: Array) -> Array:
-    """The state z = A z + B x in which F rests with the displacements x held.
-
-    Where F drifts (an environment with a free mass, whose place no x decides), the shortest such z.
-    """
-    return np.asarray(np.linalg.lstsq(np.eye(F.order) - F.A, F.B @ x, rcond=None)[0], dtype=np.float64)
 
 
 def _rehearsed(prepared: PreparedLoop, script: Script) -> list[tuple[int, Event, PreparedLoop | None]]:
@@ -317,4 +309,5 @@ def _facts(prepared: PreparedLoop) -> dict[str, Any]:
         "exact_frequency_hz": float(prepared.mode.frequency_hz),
         "certificates": {name: certificate_part(need) for name, need in prepared.requirements.items()},
         "promise": prepared.guarantee,
+        "limiter": prepared.limits.part([device.force_limit for device in prepared.scenario.device]),
     }

@@ -14,7 +14,7 @@ import numpy as np
 from controller.lti import Array
 from design.conditions import Requirement
 from models.scene import APART, DRAWN, STEP, Scene
-from sim.view.events import GIVEN, KEYS, Couple, words
+from sim.view.events import GIVEN, KEYS, Couple, PreparedLoop, words
 from sim.view.session import HISTORY, Frame, Grip
 
 Colour = tuple[float, float, float]
@@ -97,6 +97,7 @@ def overlay(frame: Frame, live: bool) -> Lines:
         ("growth", f"{mode.growth:+.3g} 1/s at {mode.frequency_hz:.1f} Hz: {mode.verdict}"),
         ("this environment", _needs(here)),
         ("any environment", _needs(prepared.requirements["any-environment"])),
+        ("force limits", _limited(prepared)),
         ("largest force", f"{np.abs(frame.history).max():.2f} N in {HISTORY:g} s, {frame.clipped} ticks at the limit"),
     ]
     if np.any(frame.push):
@@ -109,6 +110,11 @@ def overlay(frame: Frame, live: bool) -> Lines:
         first, *rest = textwrap.wrap(frame.note, _WIDTH)
         lines += [("last", first), *(("", line) for line in rest)]
     return lines
+
+
+def _limited(prepared: PreparedLoop) -> str:
+    """Whether a guarantee holds at the force limits."""
+    return "clipped: not covered" if prepared.limits.rho is None else "limited: the guarantee holds there too"
 
 
 def _needs(requirement: Requirement) -> str:

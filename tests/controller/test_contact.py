@@ -250,7 +250,7 @@ def test_this_environment_is_asked_of_every_frozen_state():
 
 
 def test_a_stiffer_coupling_is_promised_for_frozen_states_only():
-    """K = 1772 N/m behind one sample of delay: 1.3699 of 1.37 with the wall, and 2.38 in any environment."""
+    """K = 1772 N/m behind one sample of delay: this-environment asks 1.3699 of 1.37, any-environment 2.38."""
     loop, coupling = load("one-wall").loop("I"), SpringDamper([1772.0], [0.453])
     assert requirement(loop, coupling, "this-environment").certified
     assert not requirement(loop, coupling, "any-environment").certified

@@ -197,6 +197,22 @@ def test_a_clipped_cycle_gives_energy_however_slow_and_a_limited_one_does_not():
         assert (np.abs(f).max(axis=0) <= limit).all()
 
 
+@pytest.mark.parametrize("x", [(0.001, -0.002), (0.03, -0.02), (0.05, 0.05)])
+def test_at_rest_is_where_held_displacements_lead(x):
+    """Within the limits the linear state; beyond them the slip that the loop itself settles to."""
+    limiter = limited(FIGURE_4, STIFF, (1, 2), (0, 0), T, LIMITS, (10.0, 10.0))
+    z, held = limiter.at_rest(np.array(x)), StepBuffer(closed(limiter), 6000, 2)
+    held.x[:, :, 0] = x
+    held.z[0, :, 0] = z
+    for k in range(6000):
+        held.tick(k)
+    np.testing.assert_allclose(held.z[1:, :, 0], np.broadcast_to(z, (6000, z.size)), atol=1e-9)
+    stiffness = limiter.sent.dc()
+    e = limiter.slips(held.z)[0, :, 0]
+    np.testing.assert_allclose(held.f[0, :, 0], stiffness @ (np.array(x) - e), atol=1e-9)
+    assert (e != 0).any() == (np.abs(stiffness @ x) > LIMITS).any()
+
+
 def test_bad_limits_are_named():
     G = Lti.constant(np.eye(2), T)
     with pytest.raises(ValueError, match="rho has 1 entries for 2 channels"):

@@ -18,7 +18,7 @@ from controller.environment import FIGURE_4, GROUND, Network, Spring, environmen
 from controller.loop import Loop, force_map
 from controller.lti import Lti
 from controller.process import Process, StepBuffer
-from design.certificate import Stored, prove, save
+from design.certificate import Stored, prove, prove_limiter, save
 from design.export import process_block, sequential, trial
 from sim.scenario import InputError
 
@@ -74,6 +74,70 @@ def test_the_order_of_the_sums_in_plain_python():
             sums.append(total)
         assert sums[: G.outputs] == y
         z = sums[G.outputs :]
+
+
+@pytest.fixture(scope="module")
+def limited_files(tmp_path_factory):
+    """The default pair, five channels in a star, and four contacts that nothing holds."""
+    folder, stored = tmp_path_factory.mktemp("limited"), {}
+    names = ("a", "b", "c", "d", "e")
+    star = tuple(Spring((name, "hub"), 300.0, 0.5) for name in names)
+    free = tuple(Spring(pair, 500.0, 0.2) for pair in (("a", "b"), ("b", "c"), ("c", "d")))
+    networks = {
+        "star": Network(names, (*star, Spring(("hub", GROUND), 200.0, 0.1)), {"hub": 0.1}),
+        "free": Network(names[:4], free),
+    }
+    for name, network in networks.items():
+        m = len(network.contacts)
+        loop = Loop(T, tuple(range(m)), (0,) * m, tuple(range(m)), (5.0,) * m, network)
+        soft = SpringDamper((600.0,) * m, (0.5,) * m)
+        stored[name] = Stored.of(loop, soft, prove(loop, soft, "any-environment"))
+    built = SpringDamper((5832.0, 2545.0), (0.187, 1.386))
+    stored["pair"] = Stored.of(PAIR, built, prove(PAIR, built, "this-environment", limiter=prove_limiter(PAIR, built)))
+    for name, one in stored.items():
+        save(one, folder / f"{name}.json")
+    return folder, stored
+
+
+@pytest.mark.parametrize(
+    ("name", "limit"), [("pair", (12.0, 5.0)), ("star", (2.0,) * 5), ("free", (3.0, 2.0, 1.0, 2.0))]
+)
+def test_limited_forces_are_those_of_the_simulator(limited_files, name, limit):
+    """To rounding, with a third of the ticks limited; the tick of the simulator solves the same problem another way."""
+    stored = limited_files[1][name]
+    block = process_block(stored, force_limit=limit)
+    test, m = trial(block), len(limit)
+    process = Process(block.limiter.open, np.full(m, np.inf), np.zeros(m), block.limiter)
+    buffer = StepBuffer(process, len(test.inputs), m)
+    for k, x in enumerate(test.inputs):
+        buffer.x[k, :, 0] = x
+        buffer.tick(k)
+    np.testing.assert_allclose(buffer.f[:-1, :, 0], test.outputs, atol=1e-7 * max(limit))
+    limited = (np.abs(test.outputs) >= limit).any(axis=1)
+    assert 0.2 < limited.mean() < 0.9
+    assert (np.abs(test.outputs) <= limit).all()
+
+
+@needs_cc
+@pytest.mark.parametrize(("name", "limit"), [("pair", "12,5"), ("star", "2"), ("free", "3,2,1,2")])
+def test_limited_c_code_repeats_its_test_vector(limited_files, name, limit):
+    folder = limited_files[0]
+    out = folder / f"{name}.c"
+    assert main([str(folder / f"{name}.json"), "--process", "--force-limit", limit, "--out", str(out)]) == 0
+    assert "also while forces are limited" in out.read_text()
+    done = run(compiled([out], "-O2", "-DHAPTIC_LOOP_TEST"))
+    assert (done.returncode, done.stdout) == (0, "process: 64 ticks repeat to the last bit\n")
+
+
+def test_force_limits_that_no_certificate_covers_are_refused(place, limited_files):
+    folder = limited_files[0]
+    with pytest.raises(InputError, match="its certificate covers no limited forces"):
+        main([str(place / "full.json"), "--process", "--force-limit", "3", "--out", str(place / "x.c")])
+    with pytest.raises(InputError, match="--force-limit is for --process"):
+        main([str(folder / "pair.json"), "--force-limit", "3", "--out", str(place / "x.c")])
+    control = ["--process", "--format", "control", "--force-limit", "3", "--out", str(place / "x.py")]
+    with pytest.raises(InputError, match="--format control: that is linear"):
+        main([str(folder / "pair.json"), *control])
 
 
 @pytest.mark.parametrize("data", COUPLINGS.values(), ids=COUPLINGS)

@@ -23,7 +23,7 @@ from hw.recording import Recorder, digest, load, outcome, recipes_of, replay, re
 from hw.rehearsal import Rehearsal
 from hw.session import Session
 from models.scene import plant
-from sim.couplings import choose
+from sim.couplings import choose, limits_of
 from sim.engines import hold
 from sim.run import assemble, outside_forces, run
 from sim.scenario import InputError
@@ -254,7 +254,7 @@ def test_the_host_and_the_link_share_the_delay(scenario, rungs):
     """What the host runs, delayed by the link, is the F that was certified."""
     z = np.exp(1j * np.linspace(0.01, 3, 50))
     F = assemble(rungs[0].scenario, rungs[0].chosen.coupling).F
-    on_host = rungs[0].controller().F.at(z) * z[:, None, None] ** -rungs[0].link
+    on_host = rungs[0].controller((12.0, 12.0)).limiter.open.at(z) * z[:, None, None] ** -rungs[0].link
     np.testing.assert_allclose(on_host, F.at(z), rtol=1e-9, atol=1e-9)  # two orders of the same sums
 
 
@@ -537,7 +537,7 @@ def test_steady_ticks_end_where_a_force_is_cut(scenario, rungs, cap, slew):
 
     session.record = record
     Rehearsal(session, Emulator(lively(scenario)), lambda ages: rungs).run_until_armed(1.2)
-    ((first, stop),) = steady_ticks(recorder, session.units.force_step)
+    ((first, stop),) = steady_ticks(recorder, session.units.force_step, session.limits.cap)
     assert (recorder.link()["gain"][first:] == 1.0).all()
     full = np.diff(cuts, prepend=0)[first:]
     assert 0 <= stop - first - int(np.argmax(full > 0)) <= 2
@@ -558,7 +558,8 @@ def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, 
     made = certified_coupling(scenario, "I", None, None, 1) if settles else None
     if made is None:
         chosen = choose(scenario, "I", name, None)
-        made = Dared(1, scenario, "I", chosen, assess(scenario.loop("I"), chosen.coupling))
+        requirements = assess(scenario.loop("I"), chosen.coupling)
+        made = Dared(1, scenario, "I", chosen, requirements, limits_of(scenario, chosen.coupling, requirements))
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, [made], recorder=recorder)
     session = rehearsal.run_until_armed(2.0 if settles else 7.0)
@@ -640,6 +641,22 @@ def test_result_of_holds_the_last_known_force(trace):
     np.testing.assert_array_equal(result.f[k], result.f[k - 1])
 
 
+def test_forces_at_the_cap_are_limited_under_the_guarantee_and_replay(scenario, rungs, tmp_path):
+    """A cap of 0.3 N: the limiter keeps every force within it, a third of the ticks are limited, and |f| <= cap."""
+    recorder = Recorder(2)
+    session = Session(scenario, Limits((0.3, 0.2)), FAST)
+    session.record = recorder
+    Rehearsal(session, Emulator(lively(scenario)), lambda ages: rungs).run_until_armed(2.0)
+    report = outcome("I", session, recorder, 0)
+    assert report["limiter"]["words"].startswith("proved, also while forces are limited to 0.3, 0.2 N")
+    asked = np.abs(recorder.link()["asked"])
+    assert (asked <= (0.3, 0.2)).all()
+    assert (asked == (0.3, 0.2)).any(axis=1).mean() > 1 / 3
+    assert session.counters.clipped > len(recorder) / 3
+    path = save(tmp_path, session, recorder, report, False)[0]
+    assert replay(*load(path)).identical
+
+
 class _Thief:
     """A controller that pushes along the motion, as far from a certificate as can be."""
 
@@ -665,16 +682,21 @@ def test_a_budget_under_the_bridge_stands_by_while_the_coupling_is_certified_and
 
 @pytest.mark.parametrize("faults", [(), ("down:drop=0.02@0.5",)], ids=["clean", "lossy"])
 def test_a_thief_under_the_bridge_is_limited_and_hands_get_no_more_than_the_budget(
-    scenario, rungs, monkeypatch, faults
+    scenario, rungs, monkeypatch, tmp_path, faults
 ):
-    monkeypatch.setattr(CertifiedCoupling, "controller", lambda self: _Thief(self.scenario.T))
+    """And the replay repeats what the budget did, bit by bit."""
+    for module in ("control", "recording"):
+        monkeypatch.setattr(f"hw.{module}.host_controller", lambda scenario, *given: _Thief(scenario.T))
     taken = {}
     for budget in (0.01, 10.0):
         recorder = Recorder(2)
         settings = LinkSettings(measure=100, test_encoders=False, energy_budget=(budget, np.inf))
         run = rehearsal_of(scenario, rungs, *faults, recorder=recorder, settings=settings)
         run.run_to_the_end(5.0)
-        (part,) = outcome("I", run.session, recorder, 0)["energy_budget"]
+        report = outcome("I", run.session, recorder, 0)
+        (part,) = report["energy_budget"]
+        path = save(tmp_path, run.session, recorder, report, False)[0]
+        assert replay(*load(path)).identical
         trace = result_of(recorder, run.session.units, scenario.T, {})
         dx = np.diff(trace.x, axis=0)
         lost = (dx**2 * np.array(scenario.delta)).sum(axis=1) / scenario.T

@@ -61,9 +61,10 @@ def test_limited_and_clipped_runs_agree_while_no_force_is_at_its_limit():
 
 def test_a_script_limits_forces_as_the_command_does():
     scenario = weak(0.3, 0.2)
-    loop = scenario.loop("I")
-    trace = simulate(scenario, SOFT, "exact", lag=covered_limits(loop, SOFT, assess(loop, SOFT)).rho)
-    np.testing.assert_array_equal(trace.f, run(assemble(scenario, SOFT, (0.0, 0.0)), "exact").f)
+    for limiter, rho in ((True, (0.0, 0.0)), (False, None)):
+        trace = simulate(scenario, SOFT, "exact", limiter=limiter)
+        np.testing.assert_array_equal(trace.f, run(assemble(scenario, SOFT, rho), "exact").f)
+        assert trace.meta["limiter"]["rho"] == (None if rho is None else list(rho))
 
 
 def test_the_report_says_which_guarantee_holds(tmp_path):
@@ -77,6 +78,9 @@ def test_the_report_says_which_guarantee_holds(tmp_path):
     assert covered["rho"] == [0.0, 0.0]
     assert covered["force_limit"] == [12.0, 12.0]
     assert report(*anywhere, "--no-limiter")["limiter"]["rho"] is None
-    uncovered = report("--case", "I", "--condition", "this-environment")["limiter"]
+    usual = report("--case", "I")["limiter"]
+    assert usual["rho"] == pytest.approx([11.4167, 11.4167])
+    assert usual["words"].startswith("proved, also while forces are limited to 12 N")
+    uncovered = report("--case", "I", "--coupling", "optimal")["limiter"]
     assert uncovered["rho"] is None
-    assert uncovered["certificate"]["required_damping"][0] > 1.37
+    assert "no damping is enough for the limiter" in uncovered["words"]

@@ -26,7 +26,7 @@ from sim.stability import close, dominant_mode
 from sim.view import film
 from sim.view.events import GIVEN, KEYS, Delay, Menu, Push, Restart, changed, first_loop, parse_script, words
 from sim.view.film import Flat
-from sim.view.session import DAMPING, STIFFNESS, Grip, Pace, Session, gripped, rest
+from sim.view.session import DAMPING, STIFFNESS, Grip, Pace, Session, gripped
 from sim.view.stage import COLUMNS, Stage, apart, channels, dressed, envelope, keys_help, overlay, places, scale
 from sim.view.window import loop, typed
 
@@ -107,7 +107,7 @@ def test_frames_tell_the_forces_since_the_last_one(none):
 def test_rest_is_where_a_held_position_leads(published):
     """z = A z + B x, and the force is F(1) x; F(1) from the transfer function itself."""
     F, x = published.assembly.F, np.array([0.01, -0.004])
-    z = rest(F, x)
+    z = published.assembly.process.at_rest(x)
     assert np.allclose(F.A @ z + F.B @ x, z, atol=1e-12)
     # rounding: forces of 10 N as differences of numbers about 1e4 larger
     assert np.allclose(F.C @ z + F.D @ x, F.at(1.0 + 0j).real @ x, atol=1e-8)

@@ -315,6 +315,22 @@ def test_the_effects_are_simulated():
     assert (limited.amplitude < 0.2 * points(rigid(1), [1500.0, 2500.0], [0.0, 0.2], duration=4.0).amplitude).all()
 
 
+def test_motors_that_saturate_have_the_limiter_where_a_guarantee_covers_it():
+    """Against a rigid wall behind a sample: any-environment to 1140 N/m, this environment alone at 1700 N/m with 1.4
+    N s/m, nothing at 2500. The covered ones rest under a press at their limits; a wall that only pushes has rho = 0 or
+    none."""
+    sweep, devices = rigid(1), Effects(saturation=True).on(rigid(1).devices)
+    one, two, three = sweep.processes(np.array([600.0, 600.0, 2500.0]), np.array([0.1, 0.3, 0.2]), devices)
+    for process, limit in ((one, 12.0), (two, 12.0), (three, np.inf)):
+        assert process.limiter.limit == limit
+        assert process.force_limit == 12.0
+    assert one.limiter.rho == 0.0
+    held = points(sweep, [300.0, 600.0], [0.0, 0.3], Effects(saturation=True), press=20.0)
+    assert not held.oscillates.any()
+    (walled,) = rigid(1, one_sided=True).processes(np.array([600.0]), np.array([0.1]), devices)
+    assert (walled.limiter.limit, walled.limiter.rho, len(walled.walls)) == (12.0, 0.0, 1)
+
+
 def test_a_coarse_encoder_makes_a_stable_loop_oscillate_by_its_steps():
     calm = points(rigid(1), [300.0, 800.0], [0.0, 0.05], threshold=1e-5)
     coarse = points(rigid(1), [300.0, 800.0], [0.0, 0.05], Effects(quantisation=2e-4), threshold=1e-5)
@@ -327,7 +343,7 @@ def test_a_coarse_encoder_makes_a_stable_loop_oscillate_by_its_steps():
 def test_a_one_sided_wall_is_simulated_with_the_coupling_in_front_of_it():
     """Under any-environment contact made and broken comes to rest: an unstable pulling spring is what oscillates."""
     sweep = rigid(0, one_sided=True)
-    (process,) = sweep.processes(np.array([2000.0]), np.array([0.3]), sweep.devices)
+    (process,) = sweep.processes(np.array([2000.0]), np.array([0.3]), Effects().on(sweep.devices))
     assert process.contact is not None
     pulled, pushed = (np.zeros((process.F.order + 1, 1)) for _ in range(2))
     pulled[-1], pushed[-1] = -1e-3, 1e-3

@@ -1,0 +1,273 @@
+"""Each guarantee beyond the plain linear loop, put to the test at its edge: `python -m sim.suite --only guarantees`.
+
+A loop is drawn, and its devices get a little more or much less damping than its guarantee asks for. Then two
+adversaries try to take energy out of it, from rest. One moves the devices as it likes: waves, noise, and at every tick
+the step that takes the most, with limits so low that forces are limited a good part of the time. The other draws
+lossless hands with a push, keeps the ones that move on most, and varies them. A guarantee says that the energy balance
+
+        sum f'dx + dx' Delta dx/T + w'|dx|  >=  -given
+
+holds at every tick, w being declared Coulomb friction where that pays, and `given` what a budget may give.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from controller.coupling import SpringDamper
+from controller.environment import GROUND, Network, Spring, Wall
+from controller.loop import Loop
+from controller.lti import Array
+from controller.process import Process, StepBuffer, limited
+from design.certificate import walls_of
+from design.conditions import BETA, encoder_friction, limiter, limiter_lag, this_environment
+from models.device import RigidDevice
+from models.human import Human, Link
+from models.scene import Crowd, variants
+from sim.engines import ExactBatchEngine, hold
+from sim.nets import EnergyNet, netted
+from sim.run import assemble, run_blocks
+from sim.scenario import Scenario
+
+ENOUGH = 1.02  # times what a guarantee asks for
+_GIVEN = 0.005  # [J] of the budget
+_PUSHED = 24  # motions at once
+_GROWN = 1.5  # times its speed in the first quarter of a run, in the last
+_ROUNDING = 1e-10  # of the energy that flows
+
+
+@dataclass(frozen=True)
+class Challenge:
+    """What the adversaries came to in one loop."""
+
+    guarantee: str
+    loop: int  # the number of the draw
+    factor: float  # of what the guarantee asks for
+    motions: int  # tried
+    took: int  # motions that took more than they may
+    least_J: float  # the lowest energy balance of all, motions and hands, with what may be given added
+    hands: int  # tried, as many in each generation; 0 where no linear hand can be asked
+    grew: int  # hands that moved faster and faster, or took more than they may
+    limited: float  # the share of ticks that were limited, or in contact, in the motions that were limited most
+    holds: bool  # nothing was taken, or nothing is claimed
+
+
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """A loop and the devices that hold it, at so many times what its guarantee asks for."""
+
+    process: Callable[[int, int], Process]  # (simulations, ticks) -> without limits of the actuators
+    delta: Array  # (m,) [N s/m] of the devices
+    T: float
+    size: float  # [m] of a step of the motions
+    friction: Array | float = 0.0  # (m,) [N]
+    given: float = 0.0  # [J]
+    start: float = 0.0  # [m] where motions begin
+    hands: bool = True
+
+    def limited(self, buffer: StepBuffer, ticks: int) -> float:
+        """The share of the ticks in which forces were limited, or a wall touched."""
+        limiter = buffer.process.limiter
+        if limiter:
+            return float((limiter.slips(buffer.z)[:ticks] != 0).any(axis=1).mean())
+        if buffer.net:
+            part = buffer.net.part()
+            return part["limited_ticks"] / part["ticks"]
+        if buffer.process.contact:
+            return float((buffer.process.contact.depths(buffer.z)[:ticks] > 0).any(axis=1).mean())
+        return 0.0
+
+
+def challenges(
+    seed: int, loops: int = 3, hands: int = 60, seconds: float = 6.0, names: Sequence[str] | None = None
+) -> Iterator[Challenge]:
+    """Every guarantee at ENOUGH and at too little, on so many random loops."""
+    for name, (make, too_little) in GUARANTEES.items():
+        if names is not None and name not in names:
+            continue
+        for number in range(loops):
+            for factor in (ENOUGH, too_little):
+                yield _challenge(name, make, seed, number, factor, hands, seconds)
+
+
+def _challenge(
+    name: str, make: Callable[..., _Case], seed: int, number: int, factor: float, hands: int, seconds: float
+) -> Challenge:
+    case = make(np.random.default_rng((seed, number)), factor)
+    rng = np.random.default_rng((seed, number, 1))
+    balances, share = [], 0.0
+    for greed in (0.0, 0.5, 1.0):
+        balance, limited_share = _moved(case, _pushes(rng, len(case.delta), case.size, greed), greed)
+        balances.append(balance)
+        share = max(share, limited_share)
+    least = np.concatenate(balances)
+    took, tried, grew = int((least < 0).sum()), 0, 0
+    if case.hands:
+        grown, lowest = _held(case, rng, hands, seconds)
+        tried, grew, least = hands, grown, np.append(least, lowest)
+    holds = factor < 1 or (took == 0 and grew == 0)
+    return Challenge(name, number, factor, 3 * _PUSHED, took, float(least.min()), tried, grew, share, holds)
+
+
+# ---- the adversaries
+
+
+def _pushes(rng: np.random.Generator, m: int, size: float, greed: float, ticks: int = 700) -> Array:
+    """Waves and noise of three sizes, (ticks, m, _PUSHED); where greed takes over, nothing after a while."""
+    w, phase = np.exp(rng.uniform(-5, 1.1, (1, 1, _PUSHED))), rng.uniform(0, 6, (1, m, _PUSHED))
+    wave = np.sin(w * np.arange(ticks)[:, None, None] + phase) + 0.3 * rng.normal(size=(ticks, m, _PUSHED))
+    until = ticks if greed == 0 else 150
+    sizes = size * np.repeat([0.1, 1.0, 5.0], _PUSHED // 3)
+    return sizes * wave * (np.arange(ticks) < until)[:, None, None]
+
+
+def _moved(case: _Case, pushed: Array, greed: float) -> tuple[Array, float]:
+    """(the lowest balance of each motion with what may be given, 0 at rest; the largest share of limited ticks).
+
+    To `pushed` comes the step that takes the most in this tick, -f/(2 D), times `greed`.
+    """
+    ticks, _, nsim = pushed.shape
+    process, D = case.process(nsim, ticks + 1), case.delta[:, None] / case.T
+    buffer = StepBuffer(process, ticks + 1, len(case.delta), nsim=nsim)
+    friction = np.broadcast_to(case.friction, case.delta.shape)[:, None]
+    balance, flow, least = np.zeros(nsim), np.zeros(nsim), np.zeros(nsim)
+    buffer.x[0] = case.start
+    for k in range(ticks):
+        buffer.tick(k)
+        f = buffer.f[k]
+        dx = pushed[k] - greed * f / (2 * D)
+        buffer.x[k + 1] = buffer.x[k] + dx
+        work, spent = (f * dx).sum(axis=0), (D * dx**2 + friction * np.abs(dx)).sum(axis=0)
+        balance, flow = balance + work + spent, flow + np.abs(work) + spent
+        least = np.minimum(least, balance + case.given + _ROUNDING * flow)
+    return least, case.limited(buffer, ticks)
+
+
+def _held(case: _Case, rng: np.random.Generator, hands: int, seconds: float) -> tuple[int, float]:
+    """(hands that grew or took more than they may, the lowest balance) over three generations of lossless hands."""
+    m, grew, lowest = len(case.delta), 0, 0.0
+    mass = np.exp(rng.uniform(np.log(0.02), np.log(2.0), (hands, m, 2)))
+    stiff = np.exp(rng.uniform(np.log(30.0), np.log(1e4), (hands, m, 2)))
+    speed = rng.choice([0.03, 0.3, 1.0], hands) * rng.choice([-1.0, 1.0], (m, hands))
+    for _ in range(3):
+        ratio, least = _let_go(case, mass, stiff, speed, seconds)
+        # a budget lets a motion die as slowly as its share of the damping asks: only what was taken counts
+        bad = (least < 0) | (ratio > (np.inf if case.given else _GROWN))
+        grew, lowest = grew + int(bad.sum()), min(lowest, float(least.min()))
+        order = np.argsort(-np.where(least < 0, np.inf, ratio))[: max(1, hands // 6)]
+        parents = np.resize(order, hands)
+        mass, stiff = (v[parents] * np.exp(rng.normal(0, 0.2, v.shape)) for v in (mass, stiff))
+        speed = speed[:, parents] * np.exp(rng.normal(0, 0.3, speed.shape))
+    return grew, lowest
+
+
+def _let_go(case: _Case, mass: Array, stiff: Array, speed: Array, seconds: float) -> tuple[Array, Array]:
+    """(rms speed of the last quarter over the first, the lowest balance with what may be given) of each hand."""
+    hands, ticks = len(mass), round(seconds / case.T)
+    links = np.stack([mass, np.zeros_like(mass), stiff], axis=-1)
+    devices = tuple(RigidDevice(mass=0.1, damping=float(d)) for d in case.delta)
+    crowd = variants(devices, Crowd(links))
+    plants, process = hold(crowd.plants(), case.T), case.process(hands, ticks)
+    states, m = plants.A.shape[-1], len(case.delta)
+    start = np.zeros((states, hands))
+    start[states // 2 : states // 2 + m] = speed
+    D, (first, last) = case.delta[:, None] / case.T, np.zeros((2, hands))
+    balance, flow, least = np.zeros(hands), np.zeros(hands), np.zeros(hands)
+
+    def look(buffer: StepBuffer, begin: int, count: int) -> None:
+        nonlocal balance, flow, least
+        dx, f = np.diff(buffer.x[: count + 1], axis=0), buffer.f[:count]
+        work, spent = (f * dx).sum(axis=1), (D * dx**2).sum(axis=1)
+        run = balance + np.cumsum(work + spent, axis=0)
+        flow = flow + (np.abs(work) + spent).sum(axis=0)
+        least = np.minimum(least, run.min(axis=0) + case.given + _ROUNDING * flow)
+        balance, square = run[-1], (buffer.s[:count, states // 2 :] ** 2).mean(axis=1)
+        quarter = (begin + np.arange(count)) * 4 // ticks
+        first[...] += square[quarter == 0].sum(axis=0)
+        last[...] += square[quarter == 3].sum(axis=0)
+
+    engine = ExactBatchEngine(plants, process.force_limit)
+    outside = plants.B.shape[-1] - m
+    run_blocks(process, engine, lambda begin, count: np.zeros((count, outside)), ticks, start, look)
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.nan_to_num(np.sqrt(last / first), nan=np.inf), np.nan_to_num(least, nan=-np.inf)
+
+
+# ---- the guarantees
+
+
+def _pair(rng: np.random.Generator, stiffest: float = 9000.0) -> tuple[Loop, SpringDamper]:
+    """Two devices, a mass between them, and delays of up to three samples; no damping is declared yet."""
+    K, B = np.exp(rng.uniform(np.log(500), np.log(stiffest), 2)), rng.uniform(0, 2, 2)
+    one, two, ground = rng.uniform(100, 1500, 3).tolist()
+    springs = Spring(("a", "m"), one, 0.5), Spring(("m", "b"), two, 0.5), Spring(("m", GROUND), ground / 2, 0.1)
+    network, theta = Network(("a", "b"), springs, {"m": 0.2}), tuple(int(n) for n in rng.integers(0, 4, 2))
+    return Loop(1.2e-3, theta, (0, 0), theta, (1.0, 1.0), network), SpringDamper(K, B)
+
+
+def _free(m: int) -> tuple[Array, Array]:
+    return np.full(m, np.inf), np.zeros(m)
+
+
+def _limits(rng: np.random.Generator, factor: float) -> _Case:
+    loop, coupling = _pair(rng)
+    rho = limiter_lag(loop.delta, loop.T, BETA)
+    needed = limiter(loop.sent(coupling), loop.theta, loop.delta, rho).requirement.required
+    limit = limited(loop.network, coupling, loop.theta, loop.psi, loop.T, (2.0, 1.0), rho)
+    process = Process(limit.open, *_free(2), limit)
+    return _Case(lambda nsim, ticks: process, factor * np.array(needed), loop.T, 1e-3)
+
+
+def _budget(rng: np.random.Generator, factor: float) -> _Case:
+    """Behind the budget stands a loop that needs twice to four times the damping that there is."""
+    loop, coupling = _pair(rng)
+    delta = np.array(this_environment(loop.F(coupling), loop.delta).required) / rng.uniform(2, 4)
+    simulation = assemble(_scenario(loop, delta), coupling)
+
+    def process(nsim: int, ticks: int) -> Process:
+        made = netted(simulation, coupling, EnergyNet(_GIVEN), ticks).process
+        return replace(made, force_limit=np.full(2, np.inf))
+
+    return _Case(process, factor * delta, loop.T, 1e-3, given=_GIVEN)
+
+
+def _walls(rng: np.random.Generator, factor: float) -> _Case:
+    K, B, mass = (float(np.exp(rng.uniform(np.log(a), np.log(b)))) for a, b in ((800, 3000), (0.3, 1), (0.02, 0.1)))
+    springs = (Spring(("tip", "mass"), 800.0, 0.3), Spring(("mass", GROUND), 20.0, 0.3))
+    walls = Wall(("tip", GROUND), 3000.0, gap=1e-3), Wall((GROUND, "mass"), 2000.0, gap=2e-3)
+    network, theta = Network(("tip",), springs, {"mass": mass}, walls), (int(rng.integers(0, 3)),)
+    loop, coupling = Loop(1e-3, theta, (0,), theta, (1.0,), network), SpringDamper([K], [B])
+    needed = np.array(walls_of(loop, coupling).requirement.required)
+    made = assemble(_scenario(loop, needed), coupling).process
+    process = replace(made, force_limit=np.full(1, np.inf))
+    return _Case(lambda nsim, ticks: process, factor * needed, loop.T, 1e-3)
+
+
+def _friction(rng: np.random.Generator, factor: float) -> _Case:
+    """Encoders of 10 um; the friction is the claim, and the damping what the loop needs with ideal ones."""
+    loop, coupling = _pair(rng)
+    F, step = loop.F(coupling), 1e-5
+    needed = np.array(this_environment(F, loop.delta).required)
+    process = Process(F, np.full(2, np.inf), np.full(2, step))
+    pays = factor * encoder_friction(F, [step] * 2)
+    damping = needed * (1 + 1e-9)
+    return _Case(lambda nsim, ticks: process, damping, loop.T, step / 4, pays, start=step / 2, hands=False)
+
+
+def _scenario(loop: Loop, delta: Array) -> Scenario:
+    """The loop with rigid devices of this damping, held by somebody."""
+    devices = tuple(RigidDevice(mass=0.1, damping=float(d)) for d in delta)
+    people = tuple(Human((Link(0.5, 1.0, 100.0),)) for _ in devices)
+    return Scenario("drawn", loop.T, loop.theta, loop.psi, devices, people, loop.network)
+
+
+#: guarantee -> how a case of it is made, and how much is far too little of what it asks for
+GUARANTEES: dict[str, tuple[Callable[[np.random.Generator, float], _Case], float]] = {
+    "limited forces": (_limits, 0.5),
+    "energy budget": (_budget, 0.5),
+    "walls": (_walls, 0.6),
+    "encoder steps": (_friction, 0.1),
+}

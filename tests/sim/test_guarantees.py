@@ -1,0 +1,18 @@
+"""Guarantees beyond the linear loop, at their edge: a short form of `sim.suite --only guarantees`."""
+
+import pytest
+
+from sim.guarantees import ENOUGH, GUARANTEES, challenges
+
+
+@pytest.mark.parametrize("name", GUARANTEES)
+def test_what_a_guarantee_asks_is_enough_and_far_less_is_not(name):
+    """No motion and no lossless hand takes more than it may, at any tick; with too little some motion does."""
+    rows = list(challenges(0, loops=1, hands=12, seconds=1.0, names=[name]))
+    assert [row.factor for row in rows] == [ENOUGH, GUARANTEES[name][1]]
+    enough, less = rows
+    assert (enough.took, enough.grew) == (0, 0)
+    assert enough.least_J >= 0
+    assert less.took > 0
+    if name != "encoder steps":
+        assert enough.limited > 1 / 3
