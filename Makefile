@@ -4,13 +4,14 @@
 # make lint   ruff and pyright, without a finding: to be run, with make test, before anything is committed
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
 # make validate  every check that a verdict rests on: a report in out/validate/report.md, under five minutes
+# make oldest  the tests of models, blocks and files with the oldest packages that pyproject.toml allows, in .venv-oldest
 # make figures  the pictures that README and docs show, and the output in their blocks
 PYTHON ?= python3
 PY := .venv/bin/python
 # a file of tests stays on one core: its tests share fixtures, and those of the documentation files
 PARALLEL := -n auto --dist loadfile
 
-.PHONY: run test check validate lint coverage bench figures clean
+.PHONY: run test check validate lint coverage bench oldest figures clean
 
 run: .venv/ready
 	$(PY) -m sim.run --case I
@@ -53,6 +54,13 @@ figures: .venv/ready
 bench: .venv/ready
 	$(PY) -m pytest tests/benchmarks --benchmark-only -s
 
+# DeprecationWarning: what an old matplotlib says of a new pyparsing
+oldest:
+	$(PYTHON) -m venv .venv-oldest
+	.venv-oldest/bin/python tests/oldest.py >.venv-oldest/floors.txt
+	.venv-oldest/bin/python -m pip install --quiet --disable-pip-version-check -r .venv-oldest/floors.txt
+	.venv-oldest/bin/python -m pytest -W ignore::DeprecationWarning tests/models tests/controller tests/sim/test_scenario.py
+
 .venv/ready: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + \
 	  sys.version.split()[0] + ": make PYTHON=python3.11")'
@@ -62,4 +70,4 @@ bench: .venv/ready
 	@touch $@
 
 clean:
-	rm -rf .venv out build *.egg-info .pytest_cache .ruff_cache .hypothesis .coverage*
+	rm -rf .venv .venv-oldest out build *.egg-info .pytest_cache .ruff_cache .hypothesis .coverage*

@@ -15,6 +15,7 @@ from sim.run import Simulation, assemble
 from sim.scenario import InputError, require_even_ticks, require_linear
 from sim.stepping import NEUTRAL, default_substeps, step_radius
 
+MOST_STEPS = 3_000_000  # of a row: a minute or two
 HEADS = ("setting", "position", "growth", "verdict", "cycle N", "Hz", "real")
 LEGEND = (
     "position: relative rms error; growth: error [1/s], the larger of the loop with and without the coupling",
@@ -37,6 +38,9 @@ def main(argv: list[str]) -> int:
     coupled, uncoupled = assemble(scenario, chosen.coupling, lag), assemble(scenario, NoCoupling())
     default = max(default_substeps(loop, "RK4") for loop in (coupled, uncoupled))
 
+    if scenario.samples * default > MOST_STEPS:
+        longest = MOST_STEPS // default * scenario.T
+        raise InputError(f"--duration: RK4 needs {default} steps a tick here; allowed are up to {longest:.3g} s")
     rows, skipped, interrupted = _rows(coupled, uncoupled, default)
     mark_front(rows)
     outcome: dict[str, Any] = {

@@ -40,13 +40,13 @@ from cli.session_cli import (
     number,
 )
 from design.certificate import CAVEATS, CONDITIONS, LATE
+from design.files import write_json
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages
 from hw.recording import Recorder, outcome, save
 from hw.session import session_for
 from sim.couplings import NAMES
-from sim.files import write_json
 from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 from sim.trace import format_growth
 

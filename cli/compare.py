@@ -460,7 +460,9 @@ def _error(limit: dict[str, Any] | None, objective: str) -> str:
     if limit is None:
         return ""
     value = limit["rms_mismatch_db" if objective == "rms" else "relative_mismatch_db"]
-    return "infeasible" if value is None else compare.printed_decibels(value)
+    if value is None:
+        return "exact" if limit["proof"] else "infeasible"
+    return compare.printed_decibels(value)
 
 
 def _proofs(limits: dict[str, dict[str, Any] | None]) -> str:

@@ -35,13 +35,13 @@ from design.certificate import (
     switching_requirement,
 )
 from design.designs import KINDS, NO_LONGER, compare_methods, design_by_kind, usual_condition
-from design.optimal import OBJECTIVES, Optimal, box_around, robustness
+from design.files import out_file
+from design.optimal import OBJECTIVES, Optimal, Options, box_around, robustness, spread
 from design.ranges import SAMPLES, SetCheck, check_set, cost_part, price, set_part, set_rows
 from design.result import METHODS, Design, DesignFailed, listed
 from design.spring_damper import STIFFEST
 from design.transparency import BAND_HZ, transparency
 from sim import report
-from sim.files import out_file
 from sim.scenario import InputError, Scenario
 
 
@@ -54,12 +54,22 @@ def main(argv: list[str]) -> int:
     out = out_file(args.out, f"out/design-{args.case}.json", "the file of the coupling")
     scenario = options.scenario_from(args)
     loop = _loop(args, scenario)
+    if args.samples is not None and loop.box is None:
+        raise InputError("--samples without ranges: give --ranges, or a scenario with [box]")
     design = _design(args, loop)
     best = design if isinstance(design, Optimal) else None
     held = best and best.certificate
     requirements = assess(loop, design.coupling, design.phi, held)
     with render.progress("searching the ranges") as move:
-        whole = check_set(loop, design.coupling, args.seed, args.samples, move, best and best.searched, held)
+        whole = check_set(
+            loop,
+            design.coupling,
+            args.seed,
+            SAMPLES if args.samples is None else args.samples,
+            move,
+            best and best.searched,
+            held,
+        )
     certificates = report.certificates_part(requirements)
     limits = Limits(None, "as asked") if args.limiter is False else covered_limits(loop, design.coupling, requirements)
     outcome = {
@@ -79,6 +89,7 @@ def main(argv: list[str]) -> int:
         "stored": _store(loop, design, whole, out, limits.certificate),
         "limiter": limits.part([device.force_limit for device in scenario.device]),
         "jitter_proof": _switching_figures(loop, design),
+        "robustness": _robustness(loop, design),
     }
     if best:
         outcome |= _best_figures(args, loop, best)
@@ -102,9 +113,7 @@ def _parser() -> options.Parser:
     options.add_condition_option(parser, "what to certify")
     jitter = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"
     parser.add_argument("--jitter", type=options.delay_ranges, metavar="LO,HI", help=jitter)
-    limiter = (
-        "spring-damper for this-environment: proved also while forces are limited, or not made (default: if it can)"
-    )
+    limiter = "for this-environment: proved also while forces are limited, or not made (spring-damper: if it can)"
     parser.add_argument("--limiter", action="store_const", const=True, help=limiter)
     options.add_limiter_option(parser, "design and prove as if forces were never at their limits")
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
@@ -114,7 +123,7 @@ def _parser() -> options.Parser:
     optimal = parser.add_argument_group("optimal: the best filter of the environment's forces")
     add_optimal_options(optimal)
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"
-    parser.add_argument("--samples", type=options.whole(0, 10_000), default=SAMPLES, metavar="N", help=samples)
+    parser.add_argument("--samples", type=options.whole(0, 10_000), metavar="N", help=samples)
     ccl.add_argument("--full", action="store_true", help="across channels (default: diagonal)")
     options.add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case>.json)")
     return parser
@@ -141,6 +150,8 @@ def optimal_options(args: argparse.Namespace) -> tuple[dict[str, Any], tuple[str
     """What is asked of an optimal coupling, and a note where an option is given that it no longer has."""
     given = {name: getattr(args, name) for name in ("objective", "band_hz", "high_gain", "seconds")}
     given = {name: value for name, value in given.items() if value is not None}
+    if getattr(args, "limiter", False):
+        given["limiter"] = True
     if given.get("high_gain") == "none":
         given.pop("high_gain")
     retired = [f"--{name}" for name in (*RETIRED_WITH_VALUE, "full", "diagonal") if getattr(args, name, None)]
@@ -161,7 +172,7 @@ def _number_or_none(text: str) -> float | str:
 
 #: options of a design -> the couplings that take them
 OPTIONS = {
-    "limiter": ("spring-damper",),
+    "limiter": ("spring-damper", "optimal"),
     "order": ("ccl",),
     "method": ("ccl",),
     "compare": ("ccl",),
@@ -251,7 +262,7 @@ MOST_FOR_A_BOUND = 2  # devices: for more the bound takes minutes
 
 def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[str, Any]:
     """What an optimal coupling is reported with: how it was found, and how it stands to what is possible."""
-    there = robustness(loop, best.coupling)
+    price = None if loop.box else spread(loop, Options(**optimal_options(args)[0]))
     limit: dict[str, Any] = {"rms_mismatch_db": None}
     if loop.channels > MOST_FOR_A_BOUND:
         limit["reason"] = f"worked out for up to {MOST_FOR_A_BOUND} devices"
@@ -261,15 +272,23 @@ def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[s
         limit["rms_mismatch_db"] = bound(loop, args.band_hz or BAND_HZ).rms_db
     return {
         "bound": limit,
-        "robustness": {
-            "percent": there.percent,
-            "required_over_available": finite(there.worst),
-            "where": there.where,
-            "certified": there.kept,
-        },
+        "designed_for_it": price and {name: finite(value) for name, value in asdict(price).items()},
         "rendered_stiffness": finite(best.g),
         "ladder": [asdict(rung) for rung in best.ladder],
         "notes": list(optimal_options(args)[1]),
+    }
+
+
+def _robustness(loop: Loop, design: Design) -> dict[str, Any] | None:
+    """What the coupling needs where springs and masses are a little off; None with walls, and where that is covered."""
+    if loop.environment.walls or design.condition == "any-environment":
+        return None
+    there = robustness(loop, design.coupling)
+    return {
+        "percent": there.percent,
+        "required_over_available": finite(there.worst),
+        "where": there.where,
+        "certified": there.kept,
     }
 
 
@@ -372,6 +391,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("guarantee, delays", switching["promise"] if switching.get("proof") else None),
         (outcome["objective_name"], f"{outcome['objective']:.5g}"),
         ("transparency error", render.transparency_error(transparent)),
+        *_robustness_rows(outcome["robustness"]),
         *_best_rows(outcome),
         ("convex problems", f"{outcome['sdps']} in {outcome['wall_s']:.2f} s"),
         ("stored", f"{stored['file']} (proof: {stored['proof'] or stored['reason']})"),
@@ -383,16 +403,23 @@ def _best_rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
     """What only an optimal coupling has."""
     if "bound" not in outcome:
         return []
-    limit, there = outcome["bound"], outcome["robustness"]
+    limit, price = outcome["bound"], outcome["designed_for_it"]
     words = limit.get("reason") or f"no linear coupling can be better than {limit['rms_mismatch_db']:.2f} dB rms"
-    need = render.optional(there["required_over_available"], "{:.3f}", "infinite")
     climbed = ", ".join(f"{rung['mismatch_db']:.2f}" for rung in outcome["ladder"])
     return [
+        ("designed for that", price and f"{price['price_db']:.2f} dB worse over a small basis (--ranges)"),
         ("bound", words),
         ("rendered stiffness", render.optional(outcome["rendered_stiffness"], "{:.3f} of the environment's")),
-        ("robustness", f"{need} of the damping is needed at {there['where']}, the worst within {there['percent']:g} %"),
         ("ladder [dB]", climbed or None),
     ]
+
+
+def _robustness_rows(there: dict[str, Any] | None) -> list[tuple[str, str | None]]:
+    if there is None:
+        return []
+    need = render.optional(there["required_over_available"], "{:.3f}", "infinite")
+    words = f"{need} of the damping is needed at {there['where']}, the worst within {there['percent']:g} %"
+    return [("robustness", words)]
 
 
 def _switching_words(proof: dict[str, Any]) -> str:

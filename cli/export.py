@@ -27,9 +27,9 @@ from design.export import (
     process_block,
     trial,
 )
+from design.files import out_file, write
 from design.result import listed
 from sim.couplings import read_coupling
-from sim.files import out_file, write
 from sim.scenario import InputError
 
 SUFFIX = {"c": ".c", "json": ".json", "npz": ".npz", "control": ".py"}
@@ -99,6 +99,8 @@ def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> Block:
         block = process_block(stored, not args.without_theta, limit) if args.process else coupling_block(stored)
     except NothingToExport as error:
         raise InputError(f"{args.coupling}: {error} (--process)") from None
+    except ValueError as error:  # coefficients beyond floating point
+        raise InputError(f"{args.coupling}: {error}") from None
     origin = (
         f"Written by python -m design.export from {Path(args.coupling).name}: {_gains(stored)}",
         *block.about,
@@ -129,14 +131,11 @@ def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
 
 
 def _destination(args: argparse.Namespace, block: Block) -> Path:
-    path = out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}{SUFFIX[args.format]}")
-    if path.resolve() == Path(args.coupling).resolve():
-        raise InputError(f"--out {path}: is the coupling that is exported; name another file")
-    return path
+    return out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}{SUFFIX[args.format]}")
 
 
 def _content(kind: str, block: Block, test: Trial, file: str) -> Any:
-    """What `sim.files.write` takes."""
+    """What `design.files.write` takes."""
     if kind == "c":
         return c_source(block, test, file)
     if kind == "control":

@@ -30,13 +30,13 @@ from cli.options import (
 )
 from cli.render import console, progress
 from cli.session_cli import add_link_options, check_link, hold_session, measured_link, number
+from design.files import write, write_json
 from hw.identify import Estimate, Excitation, capped, chirp, estimate, held
 from hw.limits import Stage
 from hw.monitor import Ages
 from hw.recording import Recorder, outcome, result_of
 from hw.session import Session, session_for
 from models.device import RigidDevice
-from sim.files import write, write_json
 from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
 LIMITS = (

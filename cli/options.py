@@ -6,11 +6,16 @@ What depends on the scenario, such as one number per channel, is checked by `per
 
 from __future__ import annotations
 
+import _thread
 import argparse
+import io
 import math
 import os
 import re
+import signal
 import sys
+import threading
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -23,12 +28,12 @@ from controller.environment import RIGID_WALL
 from controller.loop import Loop
 from controller.lti import SingularLoop
 from controller.timing import Periods
+from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
 from design.result import OLDER_NAMES, DesignFailed
 from models.device import MOST_DAMPING
-from sim.files import check_file, folder, nobody_reads
 from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
 
-DONE, DOES_NOT_HOLD, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 
 Number = TypeVar("Number", int, float)
 OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # of the types below
@@ -45,6 +50,14 @@ class Parser(argparse.ArgumentParser):
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
+
+    def parse_known_args(self, *args: Any, **how: Any) -> Any:  # what parse_args calls
+        """As argparse's; an empty word is no name, number or choice, whatever the option is."""
+        found, rest = super().parse_known_args(*args, **how)
+        for action in self._actions:
+            if getattr(found, action.dest, None) == "":
+                raise InputError(f"{action.option_strings[-1] if action.option_strings else action.dest} is empty")
+        return found, rest
 
     def error(self, message: str) -> NoReturn:
         own = OWN_WORDS.fullmatch(message)
@@ -263,7 +276,7 @@ def add_json_option(parser: argparse._ActionsContainer) -> None:
 
 def check_json(args: argparse.Namespace) -> None:
     """Whether the file of --json can be written, before any work is done. Raises InputError."""
-    if args.json and args.json != "-":
+    if args.json is not None and args.json != "-":
         check_file("--json", Path(args.json), "a file or -")
 
 
@@ -394,12 +407,7 @@ def _pattern(name: str, channels: int) -> dict[str, Any]:
 
 def _recorded(name: str, channels: int) -> tuple[tuple[int, ...], ...]:
     """Rows of delays, separated by commas or blanks; one column serves all channels; # begins a comment."""
-    try:
-        text = Path(name).read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"--pattern {name}: {error.strerror}; give a file or one of: {', '.join(DRAWN)}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"--pattern {name}: not a text file in UTF-8") from None
+    text = read_text(name, f"--pattern {name}", f"; give a file or one of: {', '.join(DRAWN)}")
     rows = []
     for line_number, line in enumerate(text.splitlines(), start=1):
         words = line.split("#")[0].replace(",", " ").split()
@@ -418,27 +426,34 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
     """Run a command and leave with its exit code; bad input is one line on standard error.
 
     Whoever reads standard output may stop at any line (`| head -1`): the command's own exit code stays what it is,
-    also under `set -o pipefail`.
+    also under `set -o pipefail`. SIGTERM ends a command as Ctrl-C does: temporary files are removed.
     """
     code: str | int | None
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of processes that this one starts
+    os.environ["MPLBACKEND"] = "Agg"  # pictures are files; a name that matplotlib does not know would stop its import
+    _streams()
+    sys.unraisablehook = _not_lost
+    if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+        signal.signal(signal.SIGTERM, _terminated)
     try:
         # the matrices here are small: more BLAS threads only wait for each other, and the last digits depend on them
-        with threadpool_limits(1, user_api="blas"):
+        with threadpool_limits(1, user_api="blas"), one_command():
             code = main(sys.argv[1:] if argv is None else argv)
     except (InputError, SingularLoop) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        code = BAD_INPUT
+        code = _say(f"error: {error}", BAD_INPUT)
     except DesignFailed as error:
-        print(f"not possible: {' '.join(str(error).split())}", file=sys.stderr)
-        code = DOES_NOT_HOLD
+        code = _say(f"not possible: {error}", DOES_NOT_HOLD)
     except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        code = INTERRUPTED
-    except SystemExit as end:  # argparse, after --help
+        code = _say("interrupted", INTERRUPTED)
+    except SystemExit as end:  # argparse, after --help, and SIGTERM
         code = end.code
+    except MemoryError:
+        code = _say("error: there is not enough memory for this", UNFINISHED)
     except OSError as error:  # a full disk behind standard output, mostly
         code = _cannot(error)
+    except Exception:  # a mistake of ours: not 1, which says that what was asked does not hold
+        traceback.print_exc()
+        code = UNFINISHED
     try:
         sys.stdout.flush()
     except BrokenPipeError:
@@ -448,9 +463,34 @@ def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> 
     sys.exit(code)
 
 
+def _say(message: str, code: int) -> int:
+    print(one_line(message), file=sys.stderr)
+    return code
+
+
 def _cannot(error: OSError) -> int:
     """One line for what the system refused; what is still to be printed goes nowhere."""
-    place = error.filename or "standard output"
-    print(f"error: {place}: {error.strerror or error}", file=sys.stderr)
     nobody_reads()
-    return BAD_INPUT
+    return _say(f"error: {error.filename or 'standard output'}: {error.strerror or error}", BAD_INPUT)
+
+
+def _streams() -> None:
+    """A standard stream that is closed leads nowhere, and no character is one that a terminal cannot show."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115 - for as long as the command runs
+        elif mode == "w" and isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _terminated(number: int, frame: Any) -> NoReturn:
+    raise SystemExit(_say("terminated", 128 + number))
+
+
+def _not_lost(unraisable: Any) -> None:
+    """Ctrl-C that comes while Python clears something away would be swallowed there: it comes again."""
+    if issubclass(unraisable.exc_type, KeyboardInterrupt):
+        _thread.interrupt_main()
+    else:
+        sys.__unraisablehook__(unraisable)

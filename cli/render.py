@@ -21,8 +21,8 @@ from rich.progress import Progress
 from rich.table import Table
 from rich.text import Text
 
+from design.files import nobody_reads, printable, write_json
 from design.result import listed
-from sim.files import nobody_reads, write_json
 
 # ----------------------------------------------------------------------------------------------------
 # The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
@@ -49,7 +49,7 @@ class Screen(Console):
 
     def render_str(self, text: str, **how: Any) -> Text:
         """As rich's, but a file `[/b].npz` or a device that calls itself `:x:` is printed as it is."""
-        how |= {"emoji": False}
+        how, text = how | {"emoji": False}, printable(text)
         if how.get("markup") is not False:
             try:
                 return super().render_str(OTHER_BRACKET.sub(r"\\[", text), **how)

@@ -9,8 +9,8 @@ from rich.table import Table
 
 from cli.options import DOES_NOT_HOLD, DONE, Parser, check_json
 from cli.render import console
+from design.files import write_json
 from hw.recording import Comparison, load, replay
-from sim.files import write_json
 from sim.trace import Trace
 
 

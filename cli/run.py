@@ -11,6 +11,7 @@ from typing import Any
 from cli import options, render
 from controller.loop import Loop
 from design.certificate import assess, guarantee_of
+from design.files import write
 from design.ranges import SetCheck, check_set, set_part, set_rows
 from design.result import listed
 from design.transparency import transparency
@@ -19,7 +20,6 @@ from sim.accuracy import ForceError, credible_part, force_error, position_error
 from sim.alternatives import Alternative, alternatives
 from sim.couplings import NAMES, Chosen, choose, limits_of
 from sim.engines import INTEGRATORS, default_integrator
-from sim.files import write
 from sim.nets import BASELINES, Classic, EnergyNet, idle, netted
 from sim.run import ENGINES, Simulation, assemble, beginnings, make_engine, run
 from sim.scenario import InputError, Scenario, load_humans
@@ -151,6 +151,9 @@ class _Run:
 def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tuple[float, ...] | None) -> _Run:
     """Close the loop. Raises InputError for settings that cannot be."""
     simulation, period = assemble(scenario, chosen.coupling, lag, args.seed), None
+    for name in ("integrator", "substeps"):
+        if args.engine == "exact" and getattr(args, name) is not None:
+            raise InputError(f"--{name} with --engine exact: it takes no steps; leave it out")
     if args.engine == "exact" and simulation.friction:
         raise InputError("--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco")
     if scenario.switches:

@@ -27,11 +27,11 @@ from cli import options, render
 from controller.coupling import NoCoupling
 from controller.lti import SingularLoop
 from design.certificate import finite
+from design.files import folder, write, write_json
 from design.result import DesignFailed
 from hw.faults import rehearse_faults
 from sim.adversary import Attempt, attempts
 from sim.couplings import choose
-from sim.files import folder, write, write_json
 from sim.guarantees import challenges
 from sim.hard import cases, measure
 from sim.scenario import InputError, load

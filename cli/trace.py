@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cli import options, render
+from design.files import check_file
 from sim.scenario import InputError
 from sim.trace import Trace, format_growth, growths
 
@@ -14,6 +15,8 @@ ZOOM_HZ = 10.0  # the picture shows six periods of it where nothing oscillates
 def main(argv: list[str]) -> int:
     """Look at a trace. 0: done, whatever it shows."""
     args = _parser().parse_args(argv)
+    if args.plot is not None:
+        check_file("--plot", Path(args.plot))
     options.check_json(args)
     result = Trace.load_npz(Path(args.trace))
     found = growths(result)

@@ -98,7 +98,7 @@ def _parser() -> options.Parser:
     parser.add_argument("--dask", metavar="HOST:PORT", help="work on an existing Dask cluster; the result is the same")
     parser.add_argument("--adversary", action="store_true", help="also search for the worst passive human")
     generations = "of the adversary's search (default 150)"
-    parser.add_argument("--generations", type=options.whole(1, 10_000), default=150, metavar="N", help=generations)
+    parser.add_argument("--generations", type=options.whole(1, 10_000), metavar="N", help=generations)
     met = "nominal (default), or ranges: in turn all vertices of the scenario's ranges and as many others inside"
     parser.add_argument("--environments", choices=ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met)
     options.add_output_options(parser, picture=True)
@@ -111,6 +111,8 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     require_linear(scenario, "sim.validate")
     if args.dask is not None and args.shards > 1:
         raise InputError(f"--shards {args.shards} with --dask: the cluster decides who does what, give one of them")
+    if args.generations is not None and not args.adversary:
+        raise InputError("--generations without --adversary: it is how long that searches")
     if not (args.duration == 0 or 4 * scenario.T <= args.duration <= 1e5):
         allowed = f"allowed are 0 and {4 * scenario.T:g} to 100000 s"
         raise InputError(f"--duration is {args.duration:g}, {allowed}")
@@ -163,7 +165,9 @@ def _attack(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, outcom
     """The worst human, or None where the keyboard ends the search: what was found out before is kept."""
     try:
         with render.progress("searching the worst human") as move:
-            return search(scenario, assemble(scenario, chosen.coupling).F, args.seed, args.generations, progress=move)
+            return search(
+                scenario, assemble(scenario, chosen.coupling).F, args.seed, args.generations or 150, progress=move
+            )
     except KeyboardInterrupt:
         outcome["interrupted"] = True
         return None

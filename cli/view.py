@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from cli import options, render
-from sim.files import write_json
+from design.files import write_json
 from sim.scenario import InputError, require_even_ticks
 from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, Script, first_loop, parse_script
 from sim.view.film import Picture, check_film, painter, save_film

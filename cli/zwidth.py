@@ -21,10 +21,10 @@ from controller.environment import RIGID_WALL
 from controller.loop import Loop
 from controller.lti import Array
 from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, guarantee_of
+from design.files import write
 from design.ranges import check_set, set_part
 from sim import report
 from sim.couplings import NAMES, Chosen, choose
-from sim.files import write
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
 from sim.scenario import InputError, Scenario, require_constant_delay
 from sim.stability import MARGINAL

@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controller.lti import Array, Block, Complex, Lti, Number, Sampled, frozen, numbers, taps
+from controller.lti import Array, Block, Complex, Lti, Number, ReadOnly, Sampled, frozen, numbers, taps
 
 LARGEST_COEFFICIENT = 1e12  # of a stored coupling, SI units
 MOST_TERMS = 2000  # of a moving average; every one is a state
@@ -55,7 +55,7 @@ class NoCoupling:
 
 
 @dataclass(frozen=True, eq=False)
-class SpringDamper:
+class SpringDamper(ReadOnly):
     """V = [K + B (z-1)/(Tz)]^-1, one spring and damper per channel (26); many of them at once with leading axes.
 
     The damper may act on a filtered velocity: backward Euler of B s / (tau s + 1), a damper in series with a spring of
@@ -77,10 +77,12 @@ class SpringDamper:
             raise ValueError(
                 f"K has {self.K.shape[-1]} channels and B has {self.B.shape[-1]}; give one of each per device"
             )
-        if not (np.isfinite(self.K).all() and (self.K > 0).all()):
-            raise ValueError(f"K is {self.K.tolist()}, expected positive stiffnesses in N/m")
-        if not (np.isfinite(self.B).all() and (self.B >= 0).all()):
-            raise ValueError(f"B is {self.B.tolist()}, expected dampings >= 0 in N s/m")
+        if not self.K.shape[-1]:
+            raise ValueError("K has no channels, expected one stiffness per device")
+        if not ((self.K > 0) & (self.K <= LARGEST_COEFFICIENT)).all():
+            raise ValueError(f"K is {self.K.tolist()}, expected positive stiffnesses up to {LARGEST_COEFFICIENT:g} N/m")
+        if not ((self.B >= 0) & (self.B <= LARGEST_COEFFICIENT)).all():
+            raise ValueError(f"B is {self.B.tolist()}, expected dampings >= 0 up to {LARGEST_COEFFICIENT:g} N s/m")
         if self.cutoff is not None and not 0 < self.cutoff < np.inf:
             raise ValueError(f"cutoff is {self.cutoff}, expected a positive frequency in Hz")
 
@@ -133,7 +135,7 @@ def _scalar(value: Any) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class MovingAverage:
+class MovingAverage(ReadOnly):
     """V_i = weight_i (1 + 1/z + ... + z^-(terms_i - 1)) + constant_i: the sum of the last forces, and a plain spring.
 
     With weight T/(2 delta), as many terms as a force takes ticks to act and a constant however small it is the
@@ -205,7 +207,7 @@ class Compliance:
 
 
 @dataclass(frozen=True, eq=False)
-class InternalModel:
+class InternalModel(ReadOnly):
     """The pair of a parameter Q(z) and the environment itself: u = x - Q y, where y = Psi E x is the model's answer.
 
     G = Psi E - Psi E Q Psi E: the same as V = Q (I - Psi E Q)^-1 in feedback, but affine in Q, and stable whenever Q
@@ -255,7 +257,7 @@ class InternalModel:
 
 
 @dataclass(frozen=True, eq=False)
-class ForceFilter:
+class ForceFilter(ReadOnly):
     """R in F = Theta R Psi E: one copy of the environment, moved by the devices, then a filter R(z) of its forces.
 
     Nothing is fed back, so R and the environment are stable or not by themselves, and F is affine in R. R = I - Psi E Q

@@ -265,16 +265,22 @@ def _require_inside(field: str, limits: Range, own: float, unit: str) -> None:
 
 
 def _check_range(field: str, limits: Range | None, unit: str) -> None:
-    if limits is not None and not 0 <= limits[0] <= limits[1] < np.inf:
-        raise ValueError(f"{field} is {list(limits)}, expected [least, most] in {unit}, 0 <= least <= most")
+    if limits is not None and not 0 <= limits[0] <= limits[1] <= MOST[unit]:
+        expected = f"[least, most] in {unit}, 0 <= least <= most <= {MOST[unit]:g}"
+        raise ValueError(f"{field} is {list(limits)}, expected {expected}")
 
 
 GROUND = "ground"
 
 
-def _check_amount(what: str, value: float) -> None:
-    if not 0 <= value < np.inf:
-        raise ValueError(f"{what} is {value}, expected a finite number >= 0 (a passive network)")
+#: largest amounts, far from where arithmetic ends and beyond what anybody renders
+MOST = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
+MOST_NODES, MOST_PARTS = 200, 2000  # a mass is two states, and a proof has at most a few hundred
+
+
+def _check_amount(what: str, value: float, unit: str) -> None:
+    if not 0 <= value <= MOST[unit]:
+        raise ValueError(f"{what} is {value}, allowed are 0 to {MOST[unit]:g} {unit} (a passive network)")
 
 
 class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -285,8 +291,8 @@ class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     damping: float = 0.0  # [N s/m]
 
     def __post_init__(self) -> None:
-        for name in ("stiffness", "damping"):
-            _check_amount(f"{name} between {' and '.join(self.between)}", getattr(self, name))
+        for name, unit in (("stiffness", "N/m"), ("damping", "N s/m")):
+            _check_amount(f"{name} between {' and '.join(self.between)}", getattr(self, name), unit)
         if self.between[0] == self.between[1]:
             raise ValueError(f"between joins {self.between[0]!r} to itself; name two different nodes")
 
@@ -305,8 +311,8 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         ends = " and ".join(self.between)
-        for name in ("stiffness", "damping"):
-            _check_amount(f"{name} of the wall between {ends}", getattr(self, name))
+        for name, unit in (("stiffness", "N/m"), ("damping", "N s/m")):
+            _check_amount(f"{name} of the wall between {ends}", getattr(self, name), unit)
         if self.stiffness == 0:
             raise ValueError(f"stiffness of the wall between {ends} is 0, expected more (or no wall)")
         if not abs(self.gap) < np.inf:
@@ -391,8 +397,11 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         if len(set(self.contacts)) < len(self.contacts) or GROUND in self.contacts:
             raise ValueError(f"contacts must be different names other than {GROUND!r}, got {list(self.contacts)}")
         nodes = self.nodes()
+        for what, count, most in (("nodes", len(nodes), MOST_NODES), ("springs", len(self.springs), MOST_PARTS)):
+            if count > most:
+                raise ValueError(f"the network has {count} {what}, allowed are {most}")
         for name, mass in self.masses.items():
-            _check_amount(f"mass of {name!r}", mass)
+            _check_amount(f"mass of {name!r}", mass, "kg")
             if name not in nodes:
                 raise ValueError(f"masses names {name!r}, which no spring reaches; nodes: {', '.join(nodes)}")
         held = {node for part in (*self.springs, *self.walls) for node in part.between} | set(self.masses)

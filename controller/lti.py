@@ -62,8 +62,18 @@ def _unlike(name: str, value: ArrayLike, ndim: int, got: str = "") -> ValueError
     return ValueError(f"{name} is {value!r}, expected {expected}{got}" if name else f"expected {expected}{got}")
 
 
+class ReadOnly:
+    """A record of arrays that nobody writes to, also after it was pickled or copied, where NumPy forgets that."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        for value in state.values():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+        self.__dict__.update(state)
+
+
 @dataclass(frozen=True, eq=False)
-class Lti:
+class Lti(ReadOnly):
     """A state-space block with n states, m inputs and p outputs; `...` are the axes of a stack, none for one system."""
 
     A: Array  # (..., n, n)

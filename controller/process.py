@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from controller.coupling import Coupling
 from controller.delay import HeldLine, Ticks, delay, packet_delays
 from controller.environment import Network, Wall, walled_environment, walled_force_map
-from controller.lti import Array, Lti, SingularLoop, frozen, taps
+from controller.lti import Array, Lti, ReadOnly, SingularLoop, frozen, taps
 
 # ----------------------------------------------------------------------------------------------------
 # Walls: springs that push and never pull, so that contact is made and broken.
@@ -132,7 +132,7 @@ def contact(network: Network, coupling: Coupling, theta: Sequence[int], psi: Seq
 
 
 @dataclass(frozen=True, eq=False)
-class Complementarity:
+class Complementarity(ReadOnly):
     """p >= 0, M p - q >= 0, p'(M p - q) = 0: one solution for every q if M has positive principal minors.
 
     Raises SingularLoop where it has not.
@@ -198,7 +198,7 @@ PIVOT_ROUNDING = 1e-12  # of the numbers that are subtracted
 
 
 @dataclass(frozen=True, eq=False)
-class BoxProblem:
+class BoxProblem(ReadOnly):
     """f = q - M v with lower <= f <= upper, v >= 0 where f is at its upper limit, <= 0 at its lower, 0 in between.
 
     There is exactly one solution for every q where M has positive principal minors. Sets on which M is singular, as of
@@ -316,7 +316,7 @@ class BoxProblem:
 
 
 @dataclass(frozen=True, eq=False)
-class Limiter:
+class Limiter(ReadOnly):
     """The forces of a loop before Theta, [x; p] -> [f_e; y], limited by a slip e; walls turn y into p.
 
     Its state is [that of `sent`, e [m] at the tick before, the lines of Theta, h [m] of the walls as in Contact].
@@ -519,7 +519,7 @@ class Net(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Process:
+class Process(ReadOnly):
     """The linear block F with what wraps around it: force limits, encoder steps, delays that vary, and a net."""
 
     F: Lti

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
 import platform
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -60,6 +59,7 @@ from design.conditions import (
     walls_proof,
 )
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
+from design.files import InputError, read, write
 from design.frequency import frequencies, on_circle, rounding
 from design.result import OLDER_NAMES
 
@@ -72,10 +72,6 @@ from design.result import OLDER_NAMES
 
 Rows = tuple[tuple[float, ...], ...]
 Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=1000)]
-
-
-class BadFile(ValueError):
-    """A file that is no stored coupling; the message is one line that names the field."""
 
 
 class SwitchingProof(Strict, frozen=True):
@@ -158,35 +154,20 @@ def sealed(certificate: Certificate) -> Certificate:
 
 
 def load(path: str | Path) -> Stored:
-    """Read a stored coupling. Raises BadFile with one line that names the field, OSError if there is no file."""
-    content = _content(Path(path))
+    """Read a stored coupling. Raises InputError, one line that names the field or the file."""
+    content = read(path)
     if not content.strip():
-        raise BadFile(f"{path}: is empty, expected a coupling as python -m design stores it")
+        raise InputError(f"{path}: is empty, expected a coupling as python -m design stores it")
     try:
         stored = msgspec.json.decode(_renamed(content), type=Stored)
         json.loads(content, object_pairs_hook=_once)
         return stored
     except _Twice as error:
-        raise BadFile(f"{path}: names {str(error)!r} twice in one object") from None
+        raise InputError(f"{path}: names {str(error)!r} twice in one object") from None
     except msgspec.ValidationError as error:
-        raise BadFile(f"{path}: is no stored coupling: {' '.join(str(error).split())}") from None
+        raise InputError(f"{path}: is no stored coupling: {' '.join(str(error).split())}") from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise BadFile(f"{path}: {_place(content, str(error))}{' '.join(str(error).split())}") from None
-
-
-MOST_BYTES = 50_000_000  # of a file: a proof over 200 states takes a tenth of it
-
-
-def _content(path: Path) -> bytes:
-    """The bytes of a regular file of at most MOST_BYTES. Raises BadFile, OSError."""
-    if path.exists() and not path.is_file():
-        kind = "a directory" if path.is_dir() else "no regular file"
-        raise BadFile(f"{path}: is {kind}, expected a coupling as python -m design stores it")
-    with path.open("rb") as file:
-        content = file.read(MOST_BYTES + 1)
-    if len(content) > MOST_BYTES:
-        raise BadFile(f"{path}: is larger than {MOST_BYTES // 10**6} MB, expected a coupling as design stores it")
-    return content
+        raise InputError(f"{path}: {_place(content, str(error))}{' '.join(str(error).split())}") from None
 
 
 def _renamed(content: bytes) -> bytes:
@@ -224,14 +205,8 @@ def _place(content: bytes, message: str) -> str:
 
 
 def save(stored: Stored, path: str | Path) -> None:
-    """Write through a temporary file beside `path`, so that a reader never sees half of it."""
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(msgspec.json.format(msgspec.json.encode(stored), indent=1) + b"\n")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    """Write through a temporary file beside `path`, so that a reader never sees half of it. Raises InputError."""
+    write(Path(path), msgspec.json.format(msgspec.json.encode(stored), indent=1) + b"\n")
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -55,6 +55,7 @@ from design.result import METHODS, Design, DesignFailed, Row, of_kind, one_of, w
 
 
 #: Poles given to states beyond the first of a channel, which a spring-damper does not have.
+MOST_STATES = 10  # per channel: each adds a row and a column to every cone
 SPARE_POLE = 0.5
 
 
@@ -460,7 +461,7 @@ def design(
 
     Raises Infeasible if Theorem 4 admits no spring-damper to start from, DesignFailed if no result is certified.
     """
-    whole("order", order, 1)
+    whole("order", order, 1, MOST_STATES)
     of_kind("diagonal", diagonal, bool, "True or False")
     one_of("method", method, METHODS)
     if method == "fixed-poles" and (order, diagonal) != (1, True):

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -26,28 +26,51 @@ from controller.loop import DelayRange, Loop
 from controller.lti import Array, Complex, Lti, Sampled, as_like
 from design import ranges
 from design.barrier import Block, Program, centre, towards
-from design.certificate import Certificate, NotProved, in_each, prove, worst
-from design.conditions import least_multiple, switching_block, this_environment_demand
+from design.certificate import (
+    Certificate,
+    LimiterCertificate,
+    NotProved,
+    in_each,
+    limiter_refusal,
+    limiter_requirement,
+    prove,
+    prove_limiter,
+    worst,
+)
+from design.conditions import (
+    BETA,
+    SPARE,
+    Demand,
+    even_damping,
+    least_multiple,
+    limiter_demand,
+    limiter_lag,
+    switching_block,
+    this_environment_demand,
+)
 from design.conditions import this_environment as requirement_of
-from design.exact import LARGEST as MOST_STATES
 from design.frequency import frequencies, hermitian, on_circle, peaks, supremum
 from design.result import Design, DesignFailed, number, one_of
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
 OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # share of the damping that stays unused: what an exact proof always finds room in
-LADDER = ((4, 3), (8, 6), (14, 10), (22, 16), (32, 24))  # taps and real poles of the rungs
+LADDER = ((4, 3), (8, 6), (14, 10), (22, 16))  # taps and real poles of the rungs
 SETTLED_DB = 0.05  # a rung that gains less ends the climb
 FEWEST_RUNGS = 3
 FASTEST, SLOWEST = 0.5, 0.008  # distance to 1 of the real poles' ends
 FASTER = 0.25  # modes of smaller radius are left to the filter of the sum of all forces
 SLOWER = 0.999  # modes of larger radius get no section
+RICH, RIPPLED = 2, 14  # channels up to which, and taps from which on, there are sections within the band
+RIPPLES, RIPPLE_DAMPING = (0.1, 0.215, 0.464, 1.0), 0.1  # their frequencies beside the band's end, their damping ratio
 FULL = 4  # channels up to which every force has a filter to every device
-STATIC = 0.35  # weight of g - 1 beside the relative mismatch
+STATIC, STATIC_OF_MANY = 0.2, 0.35  # weight of g - 1 beside the relative mismatch; for more than RICH channels
 HIGH_HZ = 100.0  # above it the force is kept low by a soft row, or capped
-SOFT = 0.15, 0.3  # the soft row's weight: the first number times the mismatch so far, which counts up to the second
+SOFT = 0.05, 0.3  # the soft row's weight: the first number times the mismatch so far, which counts up to the second
+LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # (beta, c) of a limiter to begin with: without psi the first alone
 HOPELESS = 0.9  # relative mismatch from which on the climb is compared with other couplings
 TOLERATED = 0.02  # by which a further environment may be short before it enters the design: scaling does the rest
+MOST_STATES = 200  # of the loop, up to which a rung is tried: half a minute with five devices
 MOST_WORK = 7e6  # (channels x unknowns)^2 up to which a rung is tried
 SMALL = 1e-5  # weight of the coefficients themselves: some have no effect where the environment has no inverse
 DECIMALS = 10
@@ -85,6 +108,7 @@ class Options:
     objective: Literal["rms", "sup"] = "rms"  # of the mismatch relative to the environment, over the band
     band_hz: tuple[float, float] = BAND_HZ
     high_gain: float | None = None  # largest |F|/|E| above 100 Hz; None: kept low by a soft row
+    limiter: bool = False  # covered also while forces are limited
     seconds: float = 60.0  # no rung is begun later than this; the sizes of rungs end most climbs far earlier
     margin: float = MARGIN  # share of the damping that stays unused
     ladder: tuple[tuple[int, int], ...] = LADDER  # (taps, real poles)
@@ -147,25 +171,54 @@ def this_environment(loop: Loop, margin: float = MARGIN) -> Constraint:
     """design.conditions.this_environment_demand with this share of the damping unused, in units of Delta/T."""
 
     def block(G: Sampled, own: Array) -> Sampled:
-        demand = this_environment_demand(_late(loop, G), loop.delta)
+        demand = _demand(loop, _late(loop, G))
         return demand.free + demand.gain * (1 - margin)
 
-    return Constraint("this-environment", block, np.sqrt(loop.T / np.asarray(loop.delta)))
+    gain = _demand(loop, Lti.constant(np.zeros((loop.channels, loop.channels)), loop.T)).gain
+    return Constraint("this-environment", block, 1 / np.sqrt(np.diag(gain.D)))
+
+
+def _demand(loop: Loop, F: Lti | Sampled) -> Demand[Any]:
+    return this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
 
 
 def switching(loop: Loop, span: DelayRange, margin: float = MARGIN) -> Constraint:
     """design.conditions.switching_block for delays that switch within the span; alpha T/Delta are its unknowns."""
-    scale = np.asarray(loop.delta) / loop.T
+    scale = even_damping(loop.delta, loop.T, loop.T_max) / loop.T
     moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))
 
     def block(G: Sampled, own: Array) -> Sampled:
         alpha = np.zeros(scale.size)
         alpha[moves] = own * scale[moves]
         usable = [(1 - margin) * d for d in loop.delta]
-        return switching_block(G, span.lo, span.hi, usable, alpha.tolist())[0]
+        return switching_block(G, span.lo, span.hi, usable, alpha.tolist(), loop.T_max)[0]
 
     unit = 1 / np.sqrt(np.concatenate([scale, scale[moves]]))
     return Constraint("switching delays", block, unit, start=(0.5,) * moves.size, cost=(0.0,) * moves.size)
+
+
+@dataclass(frozen=True)
+class Slip:
+    """The limiter's lag and multiplier: its block is affine in the forces for given ones."""
+
+    beta: float  # rho = beta delta/T
+    c: tuple[tuple[float, ...], ...]  # (m, lags)
+
+    @classmethod
+    def even(cls, loop: Loop, beta: float, c: float) -> Slip:
+        return cls(beta, ((c,),) * loop.channels)
+
+
+def limiter(loop: Loop, slip: Slip, margin: float = MARGIN) -> Constraint:
+    """design.conditions.limiter_demand: forces that are limited. A little of rho stays unused, as of the damping."""
+    rho = limiter_lag(loop.delta, loop.T, slip.beta)
+    spare = np.diag([*rho, *rho]) * SPARE
+
+    def block(G: Sampled, own: Array) -> Sampled:
+        demand = limiter_demand(G, loop.theta, loop.delta, rho, slip.c, loop.T_max)
+        return demand.free + demand.gain * (1 - margin) - spare
+
+    return Constraint("limiter", block, np.tile(1 / np.sqrt(even_damping(loop.delta, loop.T, loop.T_max) / loop.T), 2))
 
 
 def most_gain(loop: Loop, cap: float) -> Constraint:
@@ -269,6 +322,9 @@ def span_of(E: Lti, taps: int, poles: int) -> Span:
             fast.append(float(mode.real))
         elif not any(abs(mode.real - a) < 0.02 * (1 - abs(a)) for a in real):
             real.append(float(mode.real))
+    if m <= RICH and taps >= RIPPLED:
+        q = np.exp(np.array(RIPPLES) * 2 * np.pi * BAND_HZ[1] * E.T * (1j - RIPPLE_DAMPING))
+        pairs += [(-2 * mode.real, abs(mode) ** 2) for mode in q if mode.imag > 0]
     own = len(real) + taps - 1 + 2 * len(pairs)
     fast += [0.0] * (len(fast) % 2)
     pairs += [(-(a + b), a * b) for a, b in zip(fast[::2], fast[1::2], strict=True)]  # last: own chains end before
@@ -320,7 +376,7 @@ class Case:
 
         def needed(w: Array) -> Array:
             F = _late(self.loop, coupling.around(self.delayed(on_circle(w))))
-            demand = this_environment_demand(F, self.loop.delta)
+            demand = _demand(self.loop, F)
             return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
 
         chain = Span(coupling.poles, coupling.pairs, np.ones((len(coupling.R) - 1, 1, 1), dtype=bool)).chain(self.E.T)
@@ -374,11 +430,11 @@ class Problem:
                 w = np.geomspace(edge, np.pi, 20)
                 self._force_rows(case, w, np.full(20, self.soft * np.sqrt(case.weight / 20)), None, rows, right)
         static = np.zeros((1, self.unknowns))
-        static[0, 0] = STATIC
+        static[0, 0] = held = _static(self.cases[0].loop)
         cost = np.zeros(self.unknowns)
         cost[self.span.unknowns :] = [v for case in self.cases for c in case.constraints for v in c.cost]
         small = SMALL * np.eye(self.span.unknowns, self.unknowns)
-        return np.vstack([*rows, static, small]), np.concatenate([*right, [STATIC], np.zeros(len(small))]), cost
+        return np.vstack([*rows, static, small]), np.concatenate([*right, [held], np.zeros(len(small))]), cost
 
     def _force_rows(
         self, case: Case, w: Array, weight: Array, lam: Sequence[int] | None, rows: list[Array], right: list[Array]
@@ -516,6 +572,10 @@ class Problem:
         return start
 
 
+def _static(loop: Loop) -> float:
+    return STATIC if loop.channels <= RICH else STATIC_OF_MANY
+
+
 def _band(loop: Loop, band_hz: tuple[float, float]) -> tuple[float, float]:
     """The band in rad/sample."""
     return 2 * np.pi * band_hz[0] * loop.T, min(2 * np.pi * band_hz[1] * loop.T, np.pi)
@@ -593,6 +653,8 @@ class _Climb:
             if options.objective == "sup" and not cases:
                 asked.append(worst_mismatch(there, options.band_hz))
             cases.append(Case(there, there.E(), tuple(asked), weight=0.0 if cases else 1.0))
+        if options.limiter and (reason := limiter_refusal(loop)):
+            raise ValueError(reason)
         needs = in_each(loop, NoCoupling(), loop.members())
         if not np.isfinite(bare := max(need.ratio for need in needs)):
             raise ValueError(f"no coupling is safe here: {next(n.reason for n in needs if n.reason)}")
@@ -605,25 +667,47 @@ class _Climb:
     @property
     def constrained(self) -> bool:
         """Whether anything but this-environment is asked."""
-        return any(len(case.constraints) > 1 for case in self.cases)
+        return self.options.limiter or any(len(case.constraints) > 1 for case in self.cases)
+
+    def slips(self, before: Optimal | None) -> tuple[Slip | None, ...]:
+        """The limiters that a rung is solved for: that of the rung before, with the best multiplier that it has."""
+        if not self.options.limiter:
+            return (None,)
+        if before and before.certificate:
+            proof = before.certificate.limiter
+            assert isinstance(proof, LimiterCertificate)
+            return (Slip(proof.beta, proof.c),)
+        return tuple(Slip.even(self.loop, *some) for some in (LAGS if any(self.loop.psi) else LAGS[:1]))
+
+    def asked(self, slip: Slip | None) -> tuple[Case, ...]:
+        """The environments with all that holds in each."""
+        if slip is None:
+            return self.cases
+        here = limiter(self.loop, slip, self.options.margin)
+        return tuple(replace(case, constraints=(*case.constraints, here)) for case in self.cases)
 
     def mismatch(self, found: Optimal) -> float:
         """What is minimised, relative to the environment."""
         figures = found.figures
         return figures.rms_mismatch if self.options.objective == "rms" else figures.relative_mismatch
 
+    def decibels(self, found: Optimal) -> float:
+        return decibels(self.mismatch(found))
+
     def merit(self, found: Optimal) -> float:
         """The objective of the climb: mismatch and lost static stiffness, as a ratio."""
-        static = STATIC * (found.g - 1) if np.isfinite(found.g) else 0.0
+        static = _static(self.loop) * (found.g - 1) if np.isfinite(found.g) else 0.0
         return float(np.hypot(self.mismatch(found), static))
 
     def nothing(self) -> Optimal | None:
         """No coupling, where that is exact and safe."""
         loop = self.loop
         exact_delay = all(n == t + p for n, t, p in zip(loop.lam, loop.theta, loop.psi, strict=True))
-        if self.constrained or not exact_delay or self.bare > 1 - self.options.margin:
+        more = any(len(case.constraints) > 1 for case in self.cases)
+        if more or not exact_delay or self.bare > 1 - self.options.margin:
             return None
-        return self._proved(self._assessed(NoCoupling(), 1.0))
+        found = self._proved(self._assessed(NoCoupling(), 1.0), self.slips(None)[0])
+        return found if found.proved or not self.options.limiter else None
 
     def room(self, taps: int, poles: int) -> bool:
         """Whether a rung is tried: by its size, which is the same on a busy machine."""
@@ -636,60 +720,71 @@ class _Climb:
 
     def rung(self, taps: int, poles: int, before: Optimal | None) -> tuple[Optimal, Rung]:
         """The optimum over a basis, scaled until every sweep passes, and proved where there are no ranges."""
+        tried = [self._solved(taps, poles, before, slip) for slip in self.slips(before)]
+        found = min(tried, key=lambda one: (one.reason is not None, self.merit(one)))
+        return found, Rung(taps, poles, found.states, self.decibels(found), found.g, found.reason, self.elapsed)
+
+    def _solved(self, taps: int, poles: int, before: Optimal | None, slip: Slip | None) -> Optimal:
         share = self.mismatch(before) if before else 1.0
-        span = span_of(self.cases[0].E, taps, poles)
+        span, cases = span_of(self.cases[0].E, taps, poles), self.asked(slip)
         active = [0]
         while True:
-            chosen = tuple(self.cases[i] for i in active)
+            chosen = tuple(cases[i] for i in active)
             problem = Problem(span, chosen, self.options, SOFT[0] * min(share, SOFT[1]))
-            start = self._start(problem)
-            coupling = span.filter(problem.solve(start))
-            needs = [case.need(coupling) for case in self.cases]
+            coupling = span.filter(problem.solve(self._start(problem)))
+            needs = [case.need(coupling) for case in cases]
             missed = [int(i) for i in np.argsort(needs)[::-1] if needs[i] > 1 + TOLERATED and i not in active]
             if not missed:
                 break
             active += missed[:2]
+        if slip:
+            needs.append(min(limiter_requirement(self.loop, coupling, slip.beta).requirement.ratio, 1 + TOLERATED))
         for limit in (1 - 0.95 * self.options.margin, 1 - 2.5 * self.options.margin):
             scale = min(1.0, (1 - self.options.margin) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))
             found = self._assessed(scaled, scaled.g)
-            if self.loop.box or (found := self._proved(found)).proved:
+            if self.loop.box or (found := self._proved(found, slip)).proved:
                 break
-        mismatch = decibels(self.mismatch(found))
-        return found, Rung(taps, poles, found.states, mismatch, found.g, found.reason, self.elapsed)
+        return found
 
     def between(self, found: Optimal) -> Optimal:
         """The coupling for a box after the search between the vertices, and proved at each of them.
 
         Where the worst environment that was found asks for more damping than there is, the forces are scaled down.
         """
-        coupling = found.coupling
-        assert isinstance(coupling, ForceFilter)
-        searched = ranges.search_box(self.loop, coupling)
-        if (ratio := searched.worst[0].ratio) > (limit := 1 - self.options.margin / 2):
-            coupling = _scaled(coupling, limit / ratio)
-            found = self._assessed(coupling, coupling.g)
-            lower = tuple(replace(one, ratio=one.ratio * limit / ratio) for one in searched.worst)  # each need scales
-            searched = replace(searched, worst=lower)
-        return replace(self._proved(found), searched=searched)
+        whole = found.coupling
+        assert isinstance(whole, ForceFilter)
+        searched = ranges.search_box(self.loop, whole)
+        ratio, last = searched.worst[0].ratio, found
+        for limit in (1 - self.options.margin / 2, 1 - 2.5 * self.options.margin):
+            share = min(1.0, limit / ratio)
+            coupling = _scaled(whole, share)
+            lower = tuple(replace(one, ratio=one.ratio * share) for one in searched.worst)  # each need scales
+            last = self._proved(self._assessed(coupling, coupling.g), None)
+            last = replace(last, searched=replace(searched, worst=lower))
+            if last.proved:
+                break
+        return last
 
     def scaled(self) -> Optimal:
         """The environment itself, scaled down until it is safe."""
         span = Span(np.zeros(0), NO_PAIRS, np.zeros((0, self.loop.channels, self.loop.channels), dtype=bool))
         simple = (1 - self.options.margin) / self.bare if self.bare > 0 else 1.0
-        kappa = self._start(Problem(span, self.cases, self.options, 0.0))[0] if self.constrained else min(1.0, simple)
+        (slip, *_) = self.slips(None)
+        problem = Problem(span, self.asked(slip), self.options, 0.0)
+        kappa = self._start(problem)[0] if self.constrained else min(1.0, simple)
         kappa = np.floor(kappa * 1e6) / 1e6
-        return self._proved(self._assessed(span.filter(np.array([kappa])), kappa))
+        return self._proved(self._assessed(span.filter(np.array([kappa])), kappa), slip)
 
     def spring_damper(self) -> Optimal | None:
         """The best spring-damper of this-environment, where nothing else is asked and one is found."""
-        if len(self.cases) > 1 or self.constrained:
+        if len(self.cases) > 1 or self.constrained or self.loop.latency:
             return None
         from design import spring_damper  # its solvers load slowly, and most designs end before
 
         try:
             gains = spring_damper.design(self.loop, "this-environment").coupling
-            return self._proved(self._assessed(gains, np.nan))
+            return self._proved(self._assessed(gains, np.nan), None)
         except (DesignFailed, ValueError):
             return None
 
@@ -708,7 +803,7 @@ class _Climb:
         """The coupling with its figures, and what a sweep of it alone asks for."""
         loop, members = self.loop, self.loop.members()
         F = loop.F(coupling)
-        requirements = [requirement_of(F, loop.delta), *in_each(loop, coupling, members[1:])]
+        requirements = [requirement_of(F, loop.delta, loop.T_max, loop.latency), *in_each(loop, coupling, members[1:])]
         requirement = requirements[worst(requirements)]
         figures = transparency(F, self.cases[0].E, loop.lam, self.options.band_hz)
         objective = self.options.objective
@@ -727,10 +822,12 @@ class _Climb:
             reason=None if requirement.certified else requirement.reason or "the sweep does not certify it",
         )
 
-    def _proved(self, found: Optimal) -> Optimal:
+    def _proved(self, found: Optimal, slip: Slip | None) -> Optimal:
         """The same with its certificate, or why it has none."""
+        loop, coupling = self.loop, found.coupling
         try:
-            certificate = prove(self.loop, found.coupling, "this-environment", swept=found.requirement)
+            limited = prove_limiter(loop, coupling, slip.beta) if slip else None
+            certificate = prove(loop, coupling, "this-environment", limiter=limited, swept=found.requirement)
         except NotProved as error:
             return replace(found, wall_s=self.elapsed, reason=str(error))
         requirement = replace(found.requirement, proof="rational")
@@ -793,10 +890,35 @@ def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> Robustn
         if isinstance(coupling, ForceFilter):
             ratio = Case(there, there.E()).need(coupling)
         else:
-            ratio = requirement_of(there.F(coupling), loop.delta).ratio
+            ratio = requirement_of(there.F(coupling), loop.delta, loop.T_max, loop.latency).ratio
         if ratio > worst:
             worst, where = ratio, name
     return Robustness(percent, worst, where, worst < 1)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """What it costs to keep the condition over `vertices`, too: two designs over one small basis."""
+
+    mismatch_db: float  # of the design for the vertices, in the nominal environment
+    price_db: float  # beside the design for the nominal environment alone
+    g: float
+    worst: float  # times the damping that there is, over the vertices
+
+
+def spread(loop: Loop, options: Options = Options(), percent: float = 10.0) -> Spread | None:
+    """The design for `vertices` beside the nominal one, by sweeps: a price, not a coupling to run. None without one."""
+    taps, poles = options.ladder[: 2 if loop.channels <= RICH else 1][-1]
+    climb = _Climb.of(loop.at(loop.environment), options, ())
+    around = [_at(loop, network) for network in vertices(loop.environment, percent).values()]
+    more = tuple(Case(there, there.E(), (this_environment(there, options.margin),), 0.0) for there in around)
+    try:
+        alone, wide = (each.rung(taps, poles, None)[0] for each in (climb, replace(climb, cases=climb.cases + more)))
+    except DesignFailed:
+        return None
+    mismatch = climb.decibels(wide)
+    worst = robustness(loop, wide.coupling, percent).worst
+    return Spread(mismatch, mismatch - climb.decibels(alone), wide.g, worst)
 
 
 def box_around(network: Network, percent: float) -> Box:

@@ -23,14 +23,14 @@ from numpy.typing import NDArray
 
 from controller.coupling import Form
 from controller.lti import Array
+from design.files import read_arrays, write, write_json
 from hw.control import BudgetPlan, CertifiedCoupling, Controller, Program, SentBudget, TraceRow, host_controller
 from hw.limits import Fault, Limits, Units, shape
 from hw.protocol import NO_MARGIN, Config
 from hw.session import Session
 from models.device import require
-from sim.files import write, write_json
 from sim.scenario import InputError, Scenario
-from sim.trace import DAMAGED, Trace, growths
+from sim.trace import Trace, growths
 
 #: what the link adds, one entry per tick: name -> axes of the array
 _LINK = {"tick": 1, "arming": 1, "received": 1, "asked": 2, "gain": 1, "sent": 2, "margin_us": 1, "status": 1}
@@ -133,13 +133,12 @@ def digest(arrays: Mapping[str, Array]) -> str:
 
 def load(path: Path) -> tuple[Trace, dict[str, Array]]:
     """A trace with its link arrays. Raises InputError where the file holds no session of a bridge."""
-    result = Trace.load_npz(path)
+    arrays = read_arrays(path, "a trace of this program")
+    result = Trace.of_arrays(path, arrays)
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-            link = {name: arrays[f"link_{name}"] for name in _LINK}
-            link |= {name: arrays.get(f"link_{name}", np.zeros(arrays["x"].shape)) for name in _LATER}
-    except (OSError, *DAMAGED):
+        link = {name: arrays[f"link_{name}"] for name in _LINK}
+        link |= {name: arrays.get(f"link_{name}", np.zeros(arrays["x"].shape)) for name in _LATER}
+    except KeyError:
         raise InputError(f"{path}: a trace, but not of a bridge's session; hw.bridge writes one") from None
     n, m = result.x.shape
     for name, axes in (_LINK | _LATER).items():

@@ -89,12 +89,12 @@ def limits_of(
 
 def read_coupling(path: str | Path) -> Stored:
     """A stored coupling. Raises InputError where there is none that can be read."""
+    stored = store.load(path)
     try:
-        return store.load(path)
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from None
-    except store.BadFile as error:
-        raise InputError(str(error)) from None
+        stored.built()
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
+    return stored
 
 
 def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:

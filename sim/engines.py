@@ -35,8 +35,8 @@ from scipy.sparse.csgraph import connected_components
 from controller.lti import Array
 from controller.process import StepBuffer
 from controller.timing import Timing
+from design.files import InputError
 from models.scene import Plant, Scene, Variants, impeded, plant
-from sim.files import InputError
 
 #: the integrator of ours, which reads MuJoCo's accelerations
 EXPONENTIAL = "exponential"

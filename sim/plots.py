@@ -17,12 +17,14 @@ from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.text import Text
 from matplotlib.ticker import NullFormatter
 
 from controller.lti import Array
-from sim.files import write
+from design.files import printable, write
 from sim.limit_cycles import UNDECIDED
 from sim.stability import MARGINAL
 from sim.trace import Trace
@@ -70,10 +72,22 @@ def _entries(axis: Axes) -> dict[str, Any]:
 
 
 def _save(figure: Figure, path: Path, dpi: int = 130) -> Path:
+    _literal(figure)
     try:
         return write(path, lambda file: figure.savefig(file, format="png", dpi=dpi))
     finally:
         plt.close(figure)
+
+
+def _literal(figure: Figure) -> None:
+    """Names that users gave as they are: no mathematics between dollars, and a mark for what the font cannot show."""
+    glyphs = get_font(findfont(FontProperties())).get_charmap()
+    axes = [axis for panel in figure.axes for axis in (panel.xaxis, panel.yaxis)]
+    ticks = {label for axis in axes for label in (*axis.get_ticklabels(which="both"), axis.get_offset_text())}
+    for text in set(figure.findobj(Text)) - ticks:
+        text.set_parse_math(False)
+        shown = printable(text.get_text())
+        text.set_text("".join(c if ord(c) in glyphs or c == "\n" else "\N{REPLACEMENT CHARACTER}" for c in shown))
 
 
 def _plain_numbers(axes: Any) -> None:
@@ -525,12 +539,18 @@ def _here(name: str, outcome: dict[str, Any]) -> float:
     return (each | {"order": len(outcome["wish"]["ladder"])})[name]
 
 
+def _level(row: dict[str, Any], figure: str) -> float | None:
+    """The mismatch [dB]; of a coupling that is exact the least that is drawn, None where there is no coupling."""
+    return _EXACT if row[figure] is None and row["proof"] else row[figure]
+
+
 def _draw_sweep(axis: Axes, name: str, sweep: dict[str, Any], figure: str, here: float) -> dict[str, Any]:
     """Draw one sweep; what belongs into the legend by its words."""
     scale, unit = (1e3, "ms") if sweep["unit"] == "s" else (1.0, sweep["unit"])
     entries: dict[str, Any] = {}
     for kind, (words, style) in _CURVES.items():
-        known = [(scale * row["value"], row[figure]) for row in sweep.get(kind, []) if row[figure] is not None]
+        levels = [(scale * row["value"], _level(row, figure)) for row in sweep.get(kind, [])]
+        known = [(x, y) for x, y in levels if y is not None]
         if known:
             points = [(x, max(y, _EXACT)) for x, y in known]
             (entries[words],) = axis.plot(*zip(*points, strict=True), markersize=5, **style)
@@ -539,7 +559,7 @@ def _draw_sweep(axis: Axes, name: str, sweep: dict[str, Any], figure: str, here:
             low = [_EXACT] * len(exact)
             (entries[f"{_EXACT:g} dB or less"],) = axis.plot(exact, low, "v", color="black", markersize=9, zorder=3)
     top = axis.get_xaxis_transform()
-    nothing = [scale * row["value"] for row in sweep["optimal"] if row[figure] is None]
+    nothing = [scale * row["value"] for row in sweep["optimal"] if _level(row, figure) is None]
     if nothing:
         (entries["no such optimal coupling"],) = axis.plot(
             nothing, [0.96] * len(nothing), "kx", markersize=8, transform=top, clip_on=False

@@ -10,7 +10,6 @@ import difflib
 import hashlib
 import re
 import runpy
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self, get_args
@@ -22,15 +21,16 @@ from controller.delay import Jitter
 from controller.environment import Box, Network, Spring, UncertainSpring, Wall, environment
 from controller.loop import DelayRange, Loop
 from controller.timing import Periods, Timing, drawn
+from design.files import InputError, read_text, toml, write
 from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
-from models.human import Cross, Human, Link, Person, Population, Voluntary, check_holds
-from sim.files import InputError, write
+from models.human import Cross, Human, Link, Person, Population, Port, Voluntary, check_holds
 
 CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
 LONGEST_DELAY = 1000  # [samples]; every one is a state
+LONGEST_NAME = 200  # characters, that a table and a picture can show
 _TIMING_STREAM = 6  # keeps these draws apart from those of the humans with the same seed
 _Delays = tuple[int, ...]
 
@@ -71,6 +71,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     latency: tuple[tuple[float, float], ...] | None = None  # [s] least and most by which a channel's force latches late
 
     def __post_init__(self) -> None:
+        if len(self.name) > LONGEST_NAME:
+            raise ValueError(f"name has {len(self.name)} characters, allowed are {LONGEST_NAME}")
         require("T", self.T, 1e-6, 0.1, "s")
         require("duration", self.duration, self.T, 1e6, "s")
         for name in ("theta", "psi", "device", "human", "lam"):
@@ -219,7 +221,7 @@ def load(source: str | Path = DEFAULT) -> Scenario:
         kind = type(source).__name__
         raise InputError(f"scenario is {source!r} ({kind}), expected a TOML file or one of: {', '.join(built_in())}")
     path = SCENARIOS / f"{source}.toml" if str(source) in built_in() else Path(source)
-    text = _read(path, f"scenario {source}", f"; give a TOML file or one of: {', '.join(built_in())}")
+    text = read_text(path, f"scenario {source}", f"; give a TOML file or one of: {', '.join(built_in())}")
     return parse(text, str(source))
 
 
@@ -282,10 +284,9 @@ def load_humans(path: str | Path, channels: int) -> HumanFile:
     """
     what = "[[human]] tables"
     if Path(path).suffix == ".py":
-        names, what = _run_file(path), "`humans`"
-        people = HumanFile(tuple(names.get("humans", ())), tuple(names.get("persons", ())))
+        people, what = _run_file(path), "`humans`"
     else:
-        people = _converted(_read(Path(path), f"--human {path}"), HumanFile, f"--human {path}")
+        people = _converted(read_text(path, f"--human {path}"), HumanFile, f"--human {path}")
     if len(people.human) != channels:
         raise InputError(f"--human {path} has {len(people.human)} {what}, expected {channels} (one per channel)")
     try:
@@ -295,12 +296,14 @@ def load_humans(path: str | Path, channels: int) -> HumanFile:
     return people
 
 
-def _run_file(path: str | Path) -> dict[str, Any]:
-    """The names that a Python file defines. Raises InputError where it cannot be read."""
+def _run_file(path: str | Path) -> HumanFile:
+    """The people that a Python file defines. Raises InputError where it cannot be read or run, or they hold nothing."""
+    read_text(path, f"--human {path}")
     try:
-        return runpy.run_path(str(path))
-    except OSError as error:
-        raise InputError(f"--human {path}: {error.strerror}") from None
+        names = runpy.run_path(str(path))
+        return HumanFile(_kept(tuple(names.get("humans", ()))), tuple(names.get("persons", ())))
+    except (Exception, SystemExit) as error:
+        raise InputError(f"--human {path}: {type(error).__name__}: {error}") from None
 
 
 def save_humans(path: Path, humans: tuple[Any, ...], remark: str, persons: tuple[Person, ...] = ()) -> Path:
@@ -324,22 +327,9 @@ def save_humans(path: Path, humans: tuple[Any, ...], remark: str, persons: tuple
 # ---- strictness: what a file may hold, and how its errors are worded
 
 
-def _read(path: Path, name: str, hint: str = "") -> str:
-    """The text of a file that the user named. Raises InputError."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{name}: {error.strerror}{hint}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{name}: not a text file in UTF-8") from None
-
-
 def _converted(text: str, kind: Any, source: str) -> Any:
     """TOML text as `kind`. Raises InputError with the path of the field and the value that came."""
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{source}: not valid TOML: {error}") from None
+    raw = toml(text, source)
     try:
         return msgspec.convert(_with_catalogue(raw), kind)
     except msgspec.ValidationError as error:
@@ -416,7 +406,8 @@ def _kept(value: Any) -> Any:
     for i, human in enumerate(value):
         if not (callable(getattr(human, "port", None)) and callable(getattr(human, "voluntary_force", None))):
             raise ValueError(f"human[{i}] is {human!r}, expected a Human, or what has port() and voluntary_force(t)")
-        human.port()  # raises ValueError where it is not passive
+        if not isinstance(port := human.port(), Port):  # which raises ValueError where it is not passive
+            raise ValueError(f"human[{i}].port() is {port!r}, expected a models.human.Port")
     return tuple(value)
 
 

@@ -165,6 +165,10 @@ def exact_growth(simulation: Simulation) -> float:
     return float(worst_mode(simulation).growth)
 
 
+NOT_EXCITED = "not excited: nothing in this run moves the dominant mode; the verdict is that of the eigenvalues"
+_UNLIKE = 0.05  # rms of what y does beside the mode, relative to it: above, it is no such mode but noise
+
+
 def measured_growth(
     loop: ClosedLoop, trace: Trace, force_limit: Array, ahead: int = 0
 ) -> tuple[float | None, str | None]:
@@ -183,9 +187,12 @@ def measured_growth(
     y = np.concatenate([trace.s[: usable + 1], trace.z[: usable + 1]], axis=1) @ left
     pushed = trace.w[:usable] @ (loop.B.T @ left)
     weight = float(np.vdot(y[:-1], y[:-1]).real)
-    if weight == 0:
-        return None, "nothing excites the mode"
-    eigenvalue = np.array(np.vdot(y[:-1], y[1:] - pushed) / weight, dtype=np.complex128)
+    states = np.concatenate([trace.s[:usable], trace.z[:usable]], axis=1)
+    summed = np.abs(states) @ np.abs(left)  # what rounding is relative to, where large parts cancel in y
+    eigenvalue = np.array(np.vdot(y[:-1], y[1:] - pushed) / weight if weight else 0.0, dtype=np.complex128)
+    rest = y[1:] - pushed - eigenvalue * y[:-1]
+    if weight <= _NOISE_FLOOR**2 * float(summed @ summed) or float(np.vdot(rest, rest).real) > _UNLIKE**2 * weight:
+        return None, NOT_EXCITED
     return float(Mode(eigenvalue, loop.T).growth), None
 
 
@@ -213,6 +220,8 @@ def stability_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
         "frequency_hz": trace.dominant_frequency_hz(),
         **eigenvalue_part(worst_mode(simulation)),
     }
+    if reason == NOT_EXCITED:
+        part["verdict"] = part["exact_verdict"]
     part |= {"contact": contact} if contact else {}
     return part | ({"reason": reason} if reason else {})
 

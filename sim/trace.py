@@ -17,28 +17,31 @@ growth        how fast does it grow? An oscillation that grows like exp(g t) is 
 from __future__ import annotations
 
 import json
-import zlib
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.lti import Array, frozen
+from controller.lti import Array, ReadOnly, frozen
 from controller.process import Net
-from sim.files import InputError, write
+from design.files import InputError, read_arrays, write
 
 _MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # axes of what files keep
 _STATES = {"z": 2, "s": 2}
 
-#: what NumPy and zipfile raise of a file that is no npz, is damaged, or holds something else
-DAMAGED = (KeyError, ValueError, TypeError, AttributeError, EOFError, RuntimeError, BadZipFile, zlib.error)
+
+def _real(name: str, values: NDArray[Any]) -> Array:
+    """Raises ValueError for an array that holds anything but real numbers."""
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"{name} is of type {values.dtype}, expected real numbers")
+    return values
 
 
 @dataclass(frozen=True, eq=False)
-class Trace:
+class Trace(ReadOnly):
     """What every tick saw, and under which settings. Arrays are read-only.
 
     The states z and s have no columns where nobody recorded them, as in a file or on a real device.
@@ -99,12 +102,15 @@ class Trace:
     @classmethod
     def load_npz(cls, path: Path) -> Self:
         """A trace written by `save_npz`. Raises InputError where it is none."""
+        return cls.of_arrays(path, read_arrays(path, "a trace of this program"))
+
+    @classmethod
+    def of_arrays(cls, path: Path, arrays: Mapping[str, NDArray[Any]]) -> Self:
+        """A trace from the arrays of its file. Raises InputError where they are none."""
         try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                return cls(**{name: archive[name] for name in _MEASURED}, meta=json.loads(str(archive["meta"])))
-        except OSError as error:
-            raise InputError(f"{path}: {error.strerror or error}") from None
-        except DAMAGED as error:
+            measured: dict[str, Any] = {name: _real(name, arrays[name]) for name in _MEASURED}
+            return cls(**measured, meta=json.loads(str(arrays["meta"])))
+        except (KeyError, ValueError, TypeError, RecursionError) as error:
             raise InputError(f"{path}: not a trace of this program ({error})") from None
 
     def save_csv(self, path: Path) -> Path:
@@ -194,6 +200,8 @@ _NEEDED = 4  # of them, one after the other, that an oscillation is seen in
 _SHORTEST = 200  # ticks
 _FLOOR = 3.0  # times what the encoders' rounding puts into an octave: less is not an oscillation
 _CLEAR = 4.0  # standard errors, of a line through as few as four points
+_FARTHEST = 1e100  # [m] more has no square
+_EVEN = 1e-3  # of a period that t may stray from its first step: rounding of long times does less
 _FINEST = 1e-9  # [m] step taken for an ideal encoder: floating-point noise is no oscillation
 
 
@@ -294,15 +302,21 @@ def growths(trace: Trace) -> list[Growth]:
     try:
         ends = np.array([(int(first), int(stop)) for first, stop in stretches], dtype=int).reshape(-1, 2)
         steps = np.maximum(np.array(step, dtype=float).reshape(m), _FINEST)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise InputError("the trace's run.steady_ticks or run.encoder_step_m are no numbers for its channels") from None
     if np.any(ends[:, 0] < 0) or np.any(ends[:, 1] > n) or np.any(ends[:, 0] > ends[:, 1]):
         raise InputError(f"the trace's run.steady_ticks are {ends.tolist()}, it has {n} ticks")
-    if not np.isfinite(trace.x).all() or not np.isfinite(steps).all():
-        raise InputError("the trace has displacements or encoder steps that are not finite")
+    if not all(np.isfinite(values).all() for values in (trace.t, trace.x, steps)):
+        raise InputError("the trace has times, displacements or encoder steps that are not finite")
+    if not m or np.abs(trace.x).max(initial=0.0) > _FARTHEST:
+        raise InputError(
+            f"the trace has {m} channels" if not m else f"the trace has displacements above {_FARTHEST:g} m"
+        )
     T = float(trace.t[1] - trace.t[0]) if n > 1 else 0.0
     if n > 1 and not 0 < T < np.inf:
         raise InputError(f"the trace's samples are {T:g} s apart")
+    if not np.abs(np.diff(trace.t) - T).max(initial=0.0) <= _EVEN * T:
+        raise InputError(f"the trace's samples are not evenly spaced: t steps by {T:g} s at first, not everywhere")
     return [growth(trace.x[first:stop], T, steps, first) for first, stop in ends.tolist()]
 
 

@@ -1,6 +1,10 @@
 """What holds for every test: one BLAS thread, and no verdict on how fast the machine is."""
 
 import os
+import signal
+
+# `make test &` has SIGINT ignored, and whoever is started inherits that: tests that send it would wait for ever.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # The matrices here are small: a pool of BLAS threads costs more than it saves, most of all on a busy machine.
 # To be set before NumPy is loaded; the commands that tests start inherit it.

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from controller.lti import Array
+from design.files import check_file, write
 from models.scene import Scene
-from sim.files import write
 from sim.graphics import asked
 from sim.scenario import InputError
 from sim.view.session import HISTORY, Frame
@@ -243,15 +243,7 @@ def check_film(path: Path) -> None:
     """Whether such a film can be written, before any work is done. Raises InputError."""
     if path.suffix not in _FORMATS:
         raise InputError(f"--video {path}: the name must end in {' or '.join(_FORMATS)}")
-    if path.is_dir():
-        raise InputError(f"--video {path}: is a folder, expected a file")
-    if not path.parent.is_dir():
-        raise InputError(f"--video {path}: the folder {path.parent} does not exist")
-    try:
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass
-    except OSError as error:
-        raise InputError(f"--video {path}: cannot write to {path.parent}: {error.strerror}") from None
+    check_file("--video", path)
     if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
         raise InputError(f"--video {path}: MP4 needs ffmpeg, which is not on the PATH; a .gif needs nothing")
 

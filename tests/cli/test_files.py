@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sim.files import check_file, write
+from design.files import check_file, write
 from sim.scenario import InputError
 
 

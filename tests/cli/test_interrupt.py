@@ -11,7 +11,7 @@ import pytest
 from cli.options import execute
 from controller.coupling import SpringDamper
 from design.certificate import Stored, save
-from sim.files import check_file, out_file
+from design.files import check_file, out_file
 from sim.scenario import InputError, load
 
 ROOT = Path(__file__).parents[2]

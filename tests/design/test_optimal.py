@@ -397,3 +397,59 @@ def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
     assert "no linear coupling can be better than" in text
     assert "without effect: --margin" in text
     assert verify(load_file(tmp_path / "c.json")).proved
+
+
+# the period, the latency and the limiter ------------------------------------------------------------------------------
+
+
+def test_a_longer_period_is_a_smaller_damping():
+    """Periods up to T_max count as the damping times T/T_max: the same coupling, and the proof carries T_max."""
+    loop = msgspec.structs.replace(loop_of("n3"), T_max=0.0012)
+    found = design(loop, SHORT)
+    assert found.proved
+    assert this_environment(force(loop, found.coupling), loop.delta).ratio == pytest.approx(0.998 / 1.2, rel=2e-3)
+    less = msgspec.structs.replace(loop_of("n3"), delta=tuple(d / 1.2 for d in loop.delta))
+    assert found.figures.rms_mismatch_db == pytest.approx(design(less, SHORT).figures.rms_mismatch_db, abs=0.02)
+
+
+def test_a_wall_whose_force_latches_late_is_as_stiff_as_the_closed_form_says():
+    """K of (delta/t2 - 3K/2)(delta/(T - t1) - K/2) = K^2, theta = 0: a plain share is found, and filters beat it."""
+    T, t2, delta = 1.2e-3, 0.13e-3, 0.5
+    K = 1000 * delta / 0.841354  # switching in [0, t2]: this wall needs all of delta
+    loop = msgspec.structs.replace(wall(2 * K, 0, delta, T), latency=((0.0, t2),))
+    case = Case(loop, loop.E())
+    assert case.need(ForceFilter([], [], [[[0.5]]])) == pytest.approx(1.0, rel=1e-5)
+    found = design(loop, Options(ladder=((4, 3),)))
+    assert found.proved
+    assert found.g >= 0.49
+
+
+@pytest.mark.parametrize("name", ["n0", "n2", "n4"])
+def test_forces_that_are_limited_are_part_of_the_design(name):
+    """By matrices of our own: [[Theta G/(z-1) + D, -rho z^-n], [N G + 2 D, D - rho z^-n + rho M/z]] on a dense grid."""
+    loop = loop_of(name)
+    found = design(loop, replace(SHORT, limiter=True))
+    assert found.proved
+    proof = found.certificate.limiter
+    assert verify(Stored.of(loop, found.coupling, found.certificate)).proved
+    D, rho, m = np.diag(loop.delta) / loop.T, np.diag(proof.rho), loop.channels
+    z = on_circle(dense()[::8])
+    G = loop.sent(found.coupling).at(z)
+    for k, x in enumerate(z):
+        theta = np.diag([x**-t for t in loop.theta])
+        c = [row[0] for row in proof.c]
+        N = np.diag([-sum(x**-j for j in range(t + 1)) - ci for t, ci in zip(loop.theta, c, strict=True)])
+        M = theta - (x - 1) * N
+        late = rho @ theta / x
+        block = np.block([[theta @ G[k] / (x - 1) + D, -late], [N @ G[k] + 2 * D, D - late + rho @ M / x]])
+        assert np.linalg.eigvalsh(block + block.conj().T)[0] > 0
+    assert found.figures.rms_mismatch_db < best(name).figures.rms_mismatch_db + 2.0
+    assert best(name).figures.rms_mismatch_db < found.figures.rms_mismatch_db + 0.05
+    assert m == len(proof.c)
+
+
+def test_limited_forces_are_not_proved_for_ranges():
+    loop = loop_of("n3")
+    ranged = msgspec.structs.replace(loop, box=box_around(loop.environment, 10.0))
+    with pytest.raises(ValueError, match="limited forces are proved for one environment"):
+        design(ranged, replace(SHORT, limiter=True))

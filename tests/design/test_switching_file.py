@@ -22,7 +22,6 @@ from controller.lti import Sampled
 from design import certify
 from design import exact as positive_real
 from design.certificate import (
-    BadFile,
     Certificate,
     NotProved,
     Stored,
@@ -37,6 +36,7 @@ from design.certificate import (
 )
 from design.conditions import jitter_proof, switching_block, this_environment
 from design.exact import Matrix
+from design.files import InputError
 from design.frequency import hermitian
 from hw.control import certified_couplings
 from sim.scenario import load as scenario_of
@@ -197,7 +197,7 @@ def test_a_range_that_makes_no_sense_is_no_file(file, tmp_path, fields, message)
     text = json.loads((tmp_path / "proof.json").read_text())
     text["loop"]["jitter"] = fields
     (tmp_path / "bad.json").write_text(json.dumps(text))
-    with pytest.raises(BadFile) as error:
+    with pytest.raises(InputError) as error:
         load(tmp_path / "bad.json")
     assert message in str(error.value)
 

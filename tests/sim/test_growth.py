@@ -8,9 +8,10 @@ import pytest
 from cli import run as command
 from cli import trace
 from controller.coupling import NoCoupling
-from sim.run import assemble, run
+from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, load
-from sim.stability import close, dominant_mode
+from sim.stability import close, dominant_mode, stability_part
+from sim.stepping import settle
 from sim.trace import Trace, growth, growths
 
 T, STEP = 1.2e-3, np.full(2, 1e-6)
@@ -132,8 +133,39 @@ def test_an_empty_trace_or_none_is_one_line(tmp_path):
     with pytest.raises(InputError, match="has no ticks"):
         trace.main([str(tmp_path / "empty.npz")])
     made(motion(1.0), {}).save_npz(tmp_path / "whole.npz")
-    with pytest.raises(InputError, match=r"cannot write .*: Is a directory"):
+    with pytest.raises(InputError, match=r"--plot .*: is a folder, expected a file"):
         trace.main([str(tmp_path / "whole.npz"), "--plot", str(tmp_path)])
     (tmp_path / "text.npz").write_text("no trace")
     with pytest.raises(InputError, match="not a trace of this program"):
         trace.main([str(tmp_path / "text.npz")])
+
+
+# a mode that nothing excites
+
+
+def alike(duration=2.0):
+    """Two devices and hands alike that move alike, joined so stiffly that they buzz against each other."""
+    one = load("omega-pair")
+    link = {"between": ["contact 1", "contact 2"], "stiffness": 2000.0}
+    ground = [{"between": [f"contact {i}", "ground"], "stiffness": 100.0} for i in (1, 2)]
+    network = {"contacts": ["contact 1", "contact 2"], "springs": [link, *ground]}
+    changes = {"theta": (1, 1), "human": (one.human[0],) * 2, "tap": None, "environment": network}
+    return one.replace(duration=duration, **changes)
+
+
+@pytest.mark.parametrize("engine", ["exact", "mujoco"])
+def test_a_mode_that_nothing_excites_is_called_so_and_the_verdict_is_the_exact_one(engine):
+    """By symmetry the hands, which move alike, do no work on the mode in which the devices move against each other."""
+    scenario = alike()
+    quiet = stability_part(*ran(scenario, engine))
+    assert quiet["exact_verdict"] == quiet["verdict"] == "unstable"
+    assert quiet["growth_rate_per_s"] is None
+    assert "not excited" in quiet["reason"]
+    loud = stability_part(*ran(scenario.replace(tap=load("omega-pair").tap), engine))
+    assert loud["verdict"] == "unstable"
+    assert loud["growth_rate_per_s"] == pytest.approx(quiet["exact_growth_rate_per_s"], rel=1e-2)
+
+
+def ran(scenario, engine):
+    simulation = assemble(scenario, NoCoupling())
+    return simulation, run(simulation, make_engine(simulation, engine, *settle(simulation, engine)[:2]))

@@ -46,7 +46,10 @@ def test_a_bad_scenario_gets_one_line_that_names_the_field(old, new, message):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("nix.toml", "No such file or directory; give a TOML file or one of: omega-pair"), (".", "Is a directory")],
+    [
+        ("nix.toml", "No such file or directory; give a TOML file or one of: omega-pair"),
+        (".", "is a folder, expected a file"),
+    ],
 )
 def test_a_missing_file_names_what_there_is(name, message):
     with pytest.raises(InputError, match=message):

@@ -7,7 +7,7 @@ from controller.coupling import NoCoupling
 from design.result import CASE_I, CASE_II
 from sim.run import assemble, run
 from sim.scenario import load
-from sim.stability import Mode, close, dominant_mode, left_eigenvector, measured_growth, verdict
+from sim.stability import NOT_EXCITED, Mode, close, dominant_mode, left_eigenvector, measured_growth, verdict
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def test_a_trace_that_says_nothing_gives_a_reason():
     assert growth is None
     assert "only 82 ticks" in reason
     still = run(assembly, "exact", lambda first, ticks: np.zeros((ticks, assembly.scene.outside)), 300)
-    assert measured_growth(loop, still, limit) == (None, "nothing excites the mode")
+    assert measured_growth(loop, still, limit) == (None, NOT_EXCITED)
 
 
 def test_verdicts():

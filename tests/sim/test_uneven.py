@@ -11,9 +11,9 @@ from cli.validate import main as validate
 from controller.coupling import SpringDamper
 from controller.delay import Jitter
 from controller.timing import Periods, Timing
+from design.files import InputError
 from models.scene import plant
 from sim import load, uneven
-from sim.files import InputError
 from sim.run import assemble, make_engine, run
 from sim.stability import close, dominant_mode
 

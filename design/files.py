@@ -1,0 +1,309 @@
+"""Files: a reader that takes no more than it can hold, a writer that never shows half a file, and words for messages.
+
+A folder is made where the user names a folder (--out DIR) or names nothing (out/..); the folder of a file that the user
+names (--json, --video, --out FILE) must exist, for a typing error must not make one. Within `one_command` a file is
+either read or written, and written for one option only: whoever comes second is told so.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import sys
+import tempfile
+import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from io import BytesIO
+from math import prod
+from pathlib import Path
+from typing import Any, BinaryIO
+from zipfile import ZipFile, ZipInfo
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+MOST_TEXT = 2_000_000  # bytes: scenarios, humans, recorded delays
+MOST_STORED = 50_000_000  # bytes: a proof over 200 states takes a tenth of it
+MOST_TRACE = 1_000_000_000  # bytes, packed: an hour of two channels takes a fifth of it
+MOST_UNPACKED = 4_000_000_000  # bytes
+MOST_WORDS = 1000  # characters of one message
+
+DEEPEST_KEY = 20  # names joined by dots: tomllib takes time and memory that grow with their square
+_KEY_PART = r"""(?:(?<![\w-])[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DEEP_KEY = re.compile(rf"(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{DEEPEST_KEY}}}")
+
+
+class InputError(ValueError):
+    """Something that the user gave and can put right: one line, naming the field."""
+
+
+# ----------------------------------------------------------------------------------------------------
+# Words that others wrote, in what we say.
+
+
+def printable(text: str) -> str:
+    """What can change neither a terminal nor the direction of writing: everything else as Python escapes it."""
+    return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
+
+
+def one_line(text: object) -> str:
+    """A message in one line of at most MOST_WORDS characters."""
+    words = printable(" ".join(str(text).split()))
+    half = MOST_WORDS // 2 - 3
+    return words if len(words) <= MOST_WORDS else f"{words[:half]} [..] {words[-half:]}"
+
+
+# ----------------------------------------------------------------------------------------------------
+# Which files a command has read, and which its options name as output.
+
+
+@dataclass
+class _Ledger:
+    """By device and inode where a file exists, and by its path without links."""
+
+    read: dict[Any, str] = field(default_factory=dict)  # place -> what it was read as
+    named: dict[Any, str] = field(default_factory=dict)  # place -> the option that names it as output
+    done: set[Any] = field(default_factory=set)  # written
+
+
+_ledger: ContextVar[_Ledger | None] = ContextVar("ledger", default=None)
+
+
+@contextmanager
+def one_command() -> Iterator[None]:
+    """What is read or written from here on belongs together."""
+    token = _ledger.set(_Ledger())
+    try:
+        yield
+    finally:
+        _ledger.reset(token)
+
+
+def _places(path: Path) -> set[Any]:
+    """What a file is known by; nothing for what is no file, such as a terminal, of which nothing can be destroyed."""
+    place = _target(path)
+    if not place.exists():
+        return {place}
+    status = place.stat()
+    return {place, (status.st_dev, status.st_ino)} if place.is_file() else set()
+
+
+def _target(path: Path) -> Path:
+    """A file without the links that lead to it. Raises OSError for links that lead to themselves."""
+    place = Path(os.path.realpath(path))
+    if place.is_symlink():
+        raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
+    return place
+
+
+def _met(places: set[Any], known: dict[Any, str]) -> str | None:
+    return next((known[place] for place in places if place in known), None)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Reading.
+
+
+def read(path: str | Path, named: str | None = None, most: int = MOST_STORED, hint: str = "") -> bytes:
+    """The bytes of a regular file of at most `most` bytes, called `named` in messages. Raises InputError."""
+    named, path = str(path) if named is None else named, Path(path)
+    try:
+        if path.exists() and not path.is_file():
+            kind = "a folder" if path.is_dir() else "not a regular file"
+            raise InputError(f"{named}: is {kind}, expected a file")
+        if ledger := _ledger.get():
+            places = _places(path)
+            if option := _met(places, ledger.named):
+                raise InputError(f"{named}: is also the file of {option}; name another one there")
+            ledger.read |= dict.fromkeys(places, named)
+        with path.open("rb") as file:
+            content = file.read(most + 1)
+    except OSError as error:
+        raise InputError(f"{named}: {error.strerror or error}{hint}") from None
+    except InputError:
+        raise
+    except ValueError as error:  # a name with a zero byte in it
+        raise InputError(f"{named}: {error}{hint}") from None
+    if len(content) > most:
+        raise InputError(f"{named}: is larger than {most / 1e6:g} MB, which is the most")
+    return content
+
+
+def read_text(path: str | Path, named: str | None = None, hint: str = "") -> str:
+    """The text of a file in UTF-8. Raises InputError."""
+    try:
+        return read(path, named, MOST_TEXT, hint).decode()
+    except UnicodeDecodeError:
+        raise InputError(f"{path if named is None else named}: not a text file in UTF-8") from None
+
+
+def toml(text: str, named: str) -> dict[str, Any]:
+    """What TOML text says. Raises InputError."""
+    if found := _DEEP_KEY.search(text):
+        line = text.count("\n", 0, found.start()) + 1
+        raise InputError(f"{named}: line {line}: a key of more than {DEEPEST_KEY} names joined by dots")
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InputError(f"{named}: not valid TOML: nested too deeply") from None
+    except ValueError as error:  # tomllib's own, and an integer of thousands of digits
+        raise InputError(f"{named}: not valid TOML: {error}") from None
+
+
+def read_arrays(path: str | Path, expected: str) -> dict[str, NDArray[Any]]:
+    """The arrays of an npz file, in which no object is unpickled. Raises InputError where it is none."""
+    content = read(path, most=MOST_TRACE)
+    try:
+        with ZipFile(BytesIO(content)) as archive:
+            entries = archive.infolist()
+            size = sum(entry.file_size for entry in entries)  # zipfile unpacks no byte more
+            if size > MOST_UNPACKED:
+                raise ValueError(f"unpacks to {size / 1e9:.3g} GB, allowed are {MOST_UNPACKED / 1e9:g} GB")
+            return {entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in entries}
+    except MemoryError:
+        raise
+    except Exception as error:  # a damaged archive makes zipfile, zlib and NumPy raise whatever they come upon
+        raise InputError(f"{path}: not {expected} ({error})") from None
+
+
+def _array(archive: ZipFile, entry: ZipInfo) -> NDArray[Any]:
+    """One array; what it declares must be what is there, before any memory is taken."""
+    with archive.open(entry) as member:
+        version = npy.read_magic(member)
+        header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}[version]
+        shape, fortran, dtype = header(member)
+        there = entry.file_size - member.tell()
+        if dtype.hasobject or min(shape, default=0) < 0 or prod(shape) * dtype.itemsize != there:
+            raise ValueError(f"{entry.filename} declares {shape} of {dtype}, and holds {there} bytes")
+        return np.frombuffer(member.read(), dtype).reshape(shape, order="F" if fortran else "C")
+
+
+# ----------------------------------------------------------------------------------------------------
+# Writing.
+
+
+def check_file(option: str, path: Path, expected: str = "a file") -> Path:
+    """Whether a file that the user named can be written, before any work is done. Raises InputError."""
+    try:
+        if path.is_dir():
+            raise InputError(f"{option} {path}: is a folder, expected {expected}")
+        if not path.parent.is_dir():
+            raise InputError(f"{option} {path}: the folder {path.parent} does not exist")
+        place = _target(path)
+        if place.exists() and not place.is_file():
+            if not os.access(place, os.W_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+            return path
+        _try(place.parent, place.name)
+    except OSError as error:
+        raise InputError(f"{option} {path}: cannot write to {path.parent}: {error.strerror or error}") from None
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{option} {path!s}: {error}") from None
+    if ledger := _ledger.get():
+        places = _places(path)
+        if known := _met(places, ledger.read):
+            raise InputError(f"{option} {path}: is also read, as {known}; name another file")
+        other = _met(places, ledger.named)
+        if other not in (None, option):
+            raise InputError(f"{option} {path}: is also the file of {other}; name another file")
+        ledger.named |= dict.fromkeys(places, option)
+    return path
+
+
+def out_file(named: str | None, default: str, expected: str = "a file") -> Path:
+    """The file of --out, by the rule above. Raises InputError."""
+    if named is None:
+        folder(Path(default).parent)
+    return check_file("--out", Path(default if named is None else named), expected)
+
+
+def folder(path: Path) -> Path:
+    """Make a folder that files can be written to. Raises InputError where that cannot be."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        _try(path)
+    except OSError as error:
+        raise InputError(f"--out {path}: {error.strerror or error}") from None
+    except ValueError as error:
+        raise InputError(f"--out {path}: {error}") from None
+    return path
+
+
+def _try(place: Path, name: str = "") -> None:
+    """Make a temporary file in a folder, with a name as long as `write` needs for the file `name`."""
+    handle, temporary = tempfile.mkstemp(dir=place, prefix=f".{name}.")
+    os.close(handle)
+    os.unlink(temporary)
+
+
+def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path:
+    """Write a file under a temporary name and rename it into place; what is no file, a device or a pipe, as it is.
+
+    A link stays a link: the file that it points to is written. Raises InputError where that cannot be, and where the
+    command has read the file or has written it for another option.
+    """
+    try:
+        place = _target(path)
+        if place.exists() and not place.is_file():
+            with place.open("wb") as device:
+                _fill(device, content)
+            return path
+        _spare(path)
+        handle, name = tempfile.mkstemp(dir=place.parent, prefix=f".{place.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                _fill(file, content)
+            os.chmod(name, 0o644)
+            os.replace(name, place)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from None
+    return path
+
+
+def _spare(path: Path) -> None:
+    """Raises InputError where a file must stay as it is."""
+    if ledger := _ledger.get():
+        places = _places(path)
+        if known := _met(places, ledger.read):
+            raise InputError(f"cannot write {path}: it was read, as {known}")
+        if not places.isdisjoint(ledger.done) and (option := _met(places, ledger.named)):
+            raise InputError(f"cannot write {path} twice: it is the file of {option}, and one of the command's own")
+        ledger.done |= places
+
+
+def _fill(file: BinaryIO, content: Callable[[BinaryIO], None] | bytes | str) -> None:
+    if callable(content):
+        content(file)
+    else:
+        file.write(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
+
+
+def write_json(destination: str | Path, data: dict[str, Any]) -> None:
+    """JSON to a file, or to standard output for '-'. Not-a-number and infinity are refused by construction."""
+    text = json.dumps(data, indent=2, allow_nan=False) + "\n"
+    if str(destination) == "-":
+        try:
+            sys.stdout.write(text)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            nobody_reads()
+    else:
+        write(Path(destination), text)
+
+
+def nobody_reads() -> None:
+    """What is still written to standard output goes nowhere: its reader has left."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, sys.stdout.fileno())
+    os.close(nowhere)

@@ -1,0 +1,28 @@
+"""A thousand command lines and files that nobody should write; hostile.py says how each must end."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+
+
+def driven(*options: str) -> int:
+    """The number of cases that the driver runs, in one process, forked for each; all are answered well."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    words = [sys.executable, str(Path(__file__).with_name("hostile.py")), *options]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-1000:]
+    number = re.match(r"(\d+) cases, 0 answered badly", done.stdout.splitlines()[-1])
+    assert number
+    return int(number[1])
+
+
+def test_every_hostile_case_is_answered_well():
+    assert driven() >= 500
+
+
+def test_ctrl_c_and_sigterm_at_any_moment_end_in_one_line_and_leave_no_temporary_file():
+    assert driven("--signals") == 46
