@@ -53,7 +53,7 @@ def main(argv: list[str]) -> int:
         "skipped": skipped,
         "interrupted": interrupted,
     }
-    title = f"speed against error · {scenario.name}, case {args.case}, {chosen.kind}"
+    title = f"speed against error · {scenario.title(args.case)}, {chosen.kind}"
     table = render.grid(title, HEADS, map(_cells, rows))
     lines = [*(f"not measured: {reason}" for reason in skipped), *LEGEND]
     render.publish(args, outcome, [table], lines, out, _picture(args, rows, out))

@@ -16,8 +16,9 @@ from cli import options, render
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY, report
+from design.certificate import check_set
+from design.coverage import set_rows
 from design.designs import KINDS
-from design.ranges import check_set, set_rows
 from design.result import OLDER_NAMES, listed
 from models.device import CATALOGUE, Listed, listed_device
 from sim.couplings import check_stored, fitted, read_coupling
@@ -44,7 +45,7 @@ def main(argv: list[str]) -> int:
     out = options.out_folder(args, "audit")
 
     begin = time.perf_counter()
-    with render.progress("searching the ranges") as move:
+    with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:
         whole = check_set(loop, coupling, args.seed, progress=move)
     try:
         judged = report(loop, coupling, switching, whole)
@@ -266,15 +267,25 @@ def _remarks(outcome: dict[str, Any]) -> list[str]:
         sensitivity = part["sensitivity"].get("reason") if part["certified"] else None
         reasons = {"": part.get("reason"), ", stiffest K": part["stiffest"].get("reason"), ", sensitivity": sensitivity}
         lines += [f"{condition}{of}: {reason}." for of, reason in reasons.items() if reason]
-    for helping in outcome["helps"]:
-        enough = "enough" if helping["certified"] else "not enough alone"
-        need = f"{helping['condition']} then needs {listed(helping['required_damping'])} N s/m, {enough}"
-        lines.append(f"What helps: {helping['change']} ({need}).")
+    if not outcome["certified"]:
+        lines += _proposed(outcome["helps"])
     if (part := outcome["jitter-proof"]) is not None:
         lines += _switching_remarks(part)
     if part := outcome["encoder"]:
         lines.append(f"{part['words'][0].upper()}{part['words'][1:]}.")
     return [*lines, outcome["not_covered"]]
+
+
+def _proposed(helps: Sequence[dict[str, Any]]) -> list[str]:
+    """Changes that were certified, the one that leaves most damping over first."""
+    enough = sorted((each for each in helps if each["certified"]), key=lambda each: max(each["required_damping"]))
+    if not enough:
+        return ["What helps: no single change of delay, damper or period was certified; a design finds other gains."]
+    return [
+        f"What helps: {each['change']} ({each['condition']} then needs "
+        f"{listed(each['required_damping'])} N s/m, certified)."
+        for each in enough
+    ]
 
 
 def _switching_remarks(part: dict[str, Any]) -> list[str]:

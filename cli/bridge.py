@@ -36,11 +36,13 @@ from cli.session_cli import (
     add_safety_options,
     check_link,
     hold_session,
+    host_clocked,
     limits_from,
     number,
 )
-from design.certificate import CAVEATS, CONDITIONS, LATE
+from design.certificate import CONDITIONS
 from design.files import write_json
+from design.guarantee import CAVEATS, LATE
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages
@@ -63,19 +65,21 @@ def main(argv: list[str]) -> int:
     seconds = number(args, "duration", 0.1, LONGEST, scenario.duration)
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
-    if args.latch == "arrival" and args.condition == "any-environment":
+    at_once = args.latch == "arrival" or host_clocked(args)  # a host that is the clock writes a force when it has it
+    if at_once and args.condition == "any-environment":
         raise InputError(f"--latch arrival with --condition {args.condition}: {LATE}")
-    if args.energy_budget and args.latch == "arrival":
+    if args.energy_budget and at_once:
         raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
     if args.energy_budget and not args.energy_budget[0]:
         raise InputError("--energy-budget is 0 J: encoders are tested by a small force at arming, give it 0.01 or so")
     settings = replace(settings, rereference=not args.no_rereference, energy_budget=args.energy_budget)
+    settings = replace(settings, deadman=args.deadman == "device")
     session = session_for(scenario, settings, **limits_from(args, scenario))
     session.record = recorder = Recorder(scenario.channels)
     out = out_folder(args, "bridge")
 
     def plan(ages: Ages) -> Sequence[CertifiedCoupling]:
-        met, link = timed(scenario, ages, float(args.quantile), 1e6 * float(args.guard), args.latch == "arrival")
+        met, link = timed(scenario, ages, float(args.quantile), 1e6 * float(args.guard), at_once)
         asked = args.case, args.coupling, args.condition
         programs = certified_couplings(met, *asked, link, limiter=args.limiter)
         print_certificate(ages, link, programs, session.limits.cap, console(args))

@@ -22,10 +22,10 @@ from cli.design import RETIRED_WITH_VALUE, add_optimal_options, optimal_options
 from controller.loop import Loop
 from controller.lti import Array
 from design import compare
-from design.certificate import CONDITIONS, certificate_part, finite
+from design.certificate import CONDITIONS
 from design.compare import AXES, FEEL_HZ, LADDERS, Judged, Limit, Perceived, Setting, optimum, settings
 from design.optimal import Options
-from design.result import OLDER_NAMES, DesignFailed
+from design.result import OLDER_NAMES, DesignFailed, certificate_part, finite
 from design.transparency import transparency
 from sim import report
 from sim.baselines import PAIRS, SECONDS, SLOW, Rival, rivals
@@ -336,7 +336,7 @@ def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
         files.append(plot_baselines(outcome, out / "baselines.png"))
     heads = ("", "error %", "> 40 Hz N", "peak N", "acted %", "hands", "m/s", "guarantee")
     cells = [_rival(row) for row in rows]
-    shown = [render.grid(f"on the same runs · {scenario.name}, case {args.case}", heads, cells, left=(0, 7))]
+    shown = [render.grid(f"on the same runs · {scenario.title(args.case)}", heads, cells, left=(0, 7))]
     lines = [f"* baseline {row.name}: {row.source}." for row in rows if row.source]
     lines.append(f"hands: of {PAIRS} lossless pairs, faster after {SECONDS:g} s than the {SLOW:g} m/s they began with.")
     lines += sorted({f"error: {row.reason}." for row in rows if row.reason})

@@ -14,32 +14,15 @@ from cli import options, render
 from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY
 from design.bound import bound
-from design.certificate import (
-    ANY,
-    HERE,
-    Certificate,
-    LimiterCertificate,
-    Limits,
-    NotProved,
-    Stored,
-    assess,
-    covered_limits,
-    digest,
-    finite,
-    guarantee_of,
-    lag,
-    prove,
-    save,
-    switching_guarantee,
-    switching_part,
-    switching_requirement,
-)
-from design.designs import KINDS, NO_LONGER, compare_methods, design_by_kind, usual_condition
+from design.certificate import SAMPLES, SetCheck, assess, check_set, lag, prove, switching_requirement
+from design.coverage import Limits, cost_part, covered_limits, price, set_part, set_rows, switching_part
+from design.designs import KINDS, NO_LONGER, design_by_kind, usual_condition
 from design.files import out_file
+from design.guarantee import ANY, HERE, guarantee_of, switching_guarantee
 from design.optimal import OBJECTIVES, Optimal, Options, box_around, robustness, spread
-from design.ranges import SAMPLES, SetCheck, check_set, cost_part, price, set_part, set_rows
-from design.result import METHODS, Design, DesignFailed, listed
+from design.result import METHODS, Design, DesignFailed, NotProved, finite, listed
 from design.spring_damper import STIFFEST
+from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
 from sim import report
 from sim.scenario import InputError, Scenario
@@ -51,7 +34,7 @@ def main(argv: list[str]) -> int:
     if args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
     options.check_json(args)
-    out = out_file(args.out, f"out/design-{args.case}.json", "the file of the coupling")
+    out = out_file(args.out, f"out/design-{options.place(args)}.json", "the file of the coupling")
     scenario = options.scenario_from(args)
     loop = _loop(args, scenario)
     if args.samples is not None and loop.box is None:
@@ -60,7 +43,7 @@ def main(argv: list[str]) -> int:
     best = design if isinstance(design, Optimal) else None
     held = best and best.certificate
     requirements = assess(loop, design.coupling, design.phi, held)
-    with render.progress("searching the ranges") as move:
+    with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:
         whole = check_set(
             loop,
             design.coupling,
@@ -81,7 +64,9 @@ def main(argv: list[str]) -> int:
         "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
         "set": whole and set_part(whole),
         "price": _robustness_loss(args, loop, design) if whole else None,
-        "transparency": report.transparency_part(transparency(loop.F(design.coupling), loop.E(), loop.lam)),
+        "transparency": report.transparency_part(
+            transparency(loop.F(design.coupling), loop.E(), loop.lam, args.band_hz or BAND_HZ)
+        ),
         "objective": design.objective,
         "objective_name": design.figure,
         "sdps": design.sdps,
@@ -94,8 +79,10 @@ def main(argv: list[str]) -> int:
     if best:
         outcome |= _best_figures(args, loop, best)
     if args.compare:
-        outcome["comparison"] = [asdict(row) for row in compare_methods(loop)]
-    render.publish(args, outcome, _tables(outcome), outcome.get("notes", ()))
+        from design import fixed_order  # cvxpy takes a second to import
+
+        outcome["comparison"] = [asdict(row) for row in fixed_order.compare(loop)]
+    render.publish(args, outcome, _tables(scenario, outcome), outcome.get("notes", ()))
     holds = outcome["certificate"]["certified"] and (outcome["promise"] == ANY or not whole or whole.proved)
     switching = outcome["jitter_proof"]
     return options.DONE if holds and (switching is None or switching["certified"]) else options.DOES_NOT_HOLD
@@ -125,7 +112,7 @@ def _parser() -> options.Parser:
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"
     parser.add_argument("--samples", type=options.whole(0, 10_000), metavar="N", help=samples)
     ccl.add_argument("--full", action="store_true", help="across channels (default: diagonal)")
-    options.add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case>.json)")
+    options.add_output_options(parser, "FILE.json", "the stored coupling (default out/design-<case or scenario>.json)")
     return parser
 
 
@@ -133,8 +120,7 @@ def add_optimal_options(group: argparse._ActionsContainer) -> None:
     """What is asked of an optimal coupling; options that are not given are None."""
     error = "which transparency error is minimised (default rms)"
     group.add_argument("--objective", choices=OBJECTIVES, help=error)
-    band = "frequencies where it counts [Hz] (default 0.5,80)"
-    group.add_argument("--band", dest="band_hz", type=options.pair, metavar="LOW,HIGH", help=band)
+    options.add_band_option(group)
     gain = "limit of |F|/|E| above 100 Hz (default none: the force there is kept low, not limited)"
     group.add_argument("--high-gain", type=_number_or_none, metavar="G", help=gain)
     limit = "begin no larger basis after this time [s] (default 60)"
@@ -178,7 +164,7 @@ OPTIONS = {
     "compare": ("ccl",),
     "full": ("ccl", "optimal"),
     "objective": ("optimal",),
-    "band_hz": ("optimal",),
+    "band_hz": ("optimal", "spring-damper"),
     "high_gain": ("optimal",),
     "seconds": ("optimal",),
     **dict.fromkeys(RETIRED_WITH_VALUE, ("optimal",)),
@@ -358,10 +344,10 @@ def _proved(loop: Loop, design: Design, limiter: LimiterCertificate | None) -> t
 # The report as tables.
 
 
-def _tables(outcome: dict[str, Any]) -> list[Table]:
+def _tables(scenario: Scenario, outcome: dict[str, Any]) -> list[Table]:
     condition = outcome["certificate"]["condition"]
-    title = f"{outcome['coupling']['kind']}, case {outcome['case']}, {condition}"
-    shown = [render.facts(title, _rows(outcome))]
+    title = f"{scenario.title(outcome['case'])}: {outcome['coupling']['kind']} for {condition}"
+    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(outcome)])]
     if outcome["price"]:
         shown.append(_over_the_ranges(outcome["price"]))
     if "comparison" in outcome:
@@ -389,7 +375,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("guarantee", outcome["promise"] or "none"),
         ("guarantee, forces", outcome["limiter"]["words"]),
         ("guarantee, delays", switching["promise"] if switching.get("proof") else None),
-        (outcome["objective_name"], f"{outcome['objective']:.5g}"),
+        ("designed for", f"{OBJECTIVE_WORDS[outcome['objective_name']]}: {outcome['objective']:.5g}"),
         ("transparency error", render.transparency_error(transparent)),
         *_robustness_rows(outcome["robustness"]),
         *_best_rows(outcome),
@@ -397,6 +383,15 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("stored", f"{stored['file']} (proof: {stored['proof'] or stored['reason']})"),
         ("", f"for constant delays only: {switching['reason']}" if switching and not switching["proof"] else None),
     ]
+
+
+#: what a design minimised or maximised -> in words
+OBJECTIVE_WORDS = {
+    "loop-norm": "the least norm of W1 L W2, (23) of the paper",
+    "rms": "the least rms transparency error, a ratio",
+    "sup": "the least largest transparency error, a ratio",
+    "stiffness": "the most stiffness, of all channels together [N/m]",
+}
 
 
 def _best_rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:

@@ -31,7 +31,7 @@ from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
 from design.result import OLDER_NAMES, DesignFailed
 from models.device import MOST_DAMPING
-from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load
+from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load, load_humans
 
 DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -101,6 +101,14 @@ def pair(text: str) -> tuple[float, float]:
     except ValueError:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected two numbers separated by a comma") from None
     return first, second
+
+
+def band_of(text: str) -> tuple[float, float]:
+    """Two rising frequencies [Hz]."""
+    low, high = pair(text)
+    if not 0 < low < high < math.inf:
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected two rising frequencies in Hz, the first above 0")
+    return low, high
 
 
 def energy_budget(text: str) -> tuple[float, float]:
@@ -228,6 +236,29 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
     return scenario.replace(delta, **changes) if changes or delta else scenario
 
 
+def add_band_option(parser: argparse._ActionsContainer) -> None:
+    """--band."""
+    band = "frequencies over which the transparency error counts [Hz] (default 0.5,80)"
+    parser.add_argument("--band", dest="band_hz", type=band_of, metavar="LOW,HIGH", help=band)
+
+
+def add_human_option(parser: argparse.ArgumentParser, more: str = "") -> None:
+    """--human."""
+    who = f"other humans: [[human]] per channel in a .toml, or `humans`{more} in a .py"
+    parser.add_argument("--human", metavar="FILE", help=who)
+
+
+def with_humans(args: argparse.Namespace, scenario: Scenario) -> Scenario:
+    """The scenario in the hands that --human names. Raises InputError."""
+    if args.human is None:
+        return scenario
+    people = load_humans(args.human, scenario.channels)
+    who: dict[str, Any] = {"human": people.human, "person": people.person} if people.human else {}
+    if people.population is not None:
+        who["population"] = people.population
+    return scenario.replace(**who)
+
+
 def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: str = "spring-damper") -> None:
     """Which coupling, and the condition that it is designed for or judged by."""
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default {default})")
@@ -256,7 +287,7 @@ def add_energy_budget_option(parser: argparse._ActionsContainer) -> None:
 def add_output_options(
     parser: argparse.ArgumentParser,
     out: str = "DIR",
-    what: str = "folder for files, made if it is not there (default out/<command>-<case>)",
+    what: str = "folder for files, made if it is not there (default out/<command>-<case or scenario>)",
     picture: bool = False,
 ) -> None:
     """Where results go, and the seed."""
@@ -283,7 +314,14 @@ def check_json(args: argparse.Namespace) -> None:
 def out_folder(args: argparse.Namespace, command: str) -> Path:
     """The folder for the files of a command, made before any work is done. Raises InputError."""
     check_json(args)
-    return folder(Path(args.out or f"out/{command}{f'-{args.case}' if 'case' in args else ''}"))
+    return folder(Path(args.out or f"out/{command}{f'-{place(args)}' if 'case' in args else ''}"))
+
+
+def place(args: argparse.Namespace) -> str:
+    """The case, or of a scenario of one's own its name, for the names of files."""
+    if args.scenario == DEFAULT:
+        return args.case
+    return Path(args.scenario).stem + ("" if args.case == "I" else f"-{args.case}")
 
 
 def seed_from(args: argparse.Namespace) -> int:

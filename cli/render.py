@@ -208,6 +208,11 @@ def certificate_rows(certificates: Mapping[str, dict[str, Any]], digits: int = 6
             yield f"damping, {name}", f"needs {needs(part, digits)}: {word}"
 
 
+def channel_row(contacts: Sequence[str]) -> tuple[str, str | None]:
+    """Which contact each number of a list in the table belongs to, where there are several."""
+    return "channels", ", ".join(contacts) if len(contacts) > 1 else None
+
+
 def optional(value: float | None, form: str, absent: str = "-") -> str:
     """A figure that may not exist."""
     return absent if value is None else form.format(value)

@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from cli import options, render
+from controller.environment import GROUND
 from controller.loop import Loop
-from design.certificate import assess, guarantee_of
+from design.certificate import SetCheck, assess, check_set
+from design.coverage import set_part, set_rows
 from design.files import write
-from design.ranges import SetCheck, check_set, set_part, set_rows
+from design.guarantee import guarantee_of
 from design.result import listed
-from design.transparency import transparency
+from design.transparency import BAND_HZ, transparency
 from sim import report
 from sim.accuracy import ForceError, credible_part, force_error, position_error
 from sim.alternatives import Alternative, alternatives
@@ -22,7 +24,7 @@ from sim.couplings import NAMES, Chosen, choose, limits_of
 from sim.engines import INTEGRATORS, default_integrator
 from sim.nets import BASELINES, Classic, EnergyNet, idle, netted
 from sim.run import ENGINES, Simulation, assemble, beginnings, make_engine, run
-from sim.scenario import InputError, Scenario, load_humans
+from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, stability_part
 from sim.stepping import MOST, check_substeps, default_substeps
 from sim.switching import Period, switching
@@ -36,7 +38,7 @@ def main(argv: list[str]) -> int:
     loop = scenario.loop(args.case)
     chosen = _chosen(args, scenario)
     environment, simulated = _environment(args, scenario)
-    with render.progress("searching the ranges") as move:
+    with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)
 
     requirements = assess(simulated.loop(args.case), chosen.coupling, chosen.phi)
@@ -48,7 +50,9 @@ def main(argv: list[str]) -> int:
         "coupling": report.coupling_part(chosen.kind, chosen.coupling, scenario.T),
         **_certified(chosen, requirements, done.loop(args.case), whole),
         "encoder": report.encoder_steps(scenario, args.case, chosen.coupling),
-        "transparency": report.transparency_part(transparency(done.simulation.felt, done.simulation.E, loop.lam)),
+        "transparency": report.transparency_part(
+            transparency(done.simulation.felt, done.simulation.E, loop.lam, args.band_hz or BAND_HZ)
+        ),
         **_stability(chosen, done, any(requirement.certified for requirement in requirements.values())),
         "run": _settings(args, done, loop.lam) | {"environment": environment},
         "limiter": limits.part([device.force_limit for device in simulated.device]),
@@ -64,8 +68,8 @@ def main(argv: list[str]) -> int:
     outcome["remarks"] = [*done.warnings, *chosen.notes, *report.remarks(outcome)]
     files = _save(args, out, done, alike, outcome)
     if args.side_by_side:
-        files.append(_side_by_side(others, out / "couplings.png"))
-    render.publish(args, outcome, _tables(outcome, others), outcome["remarks"], out, files)
+        files.append(_side_by_side(others, out / "couplings.png", scenario.environment.contacts))
+    render.publish(args, outcome, _tables(scenario, outcome, others), outcome["remarks"], out, files)
     return options.INTERRUPTED if done.trace.interrupted else options.DONE
 
 
@@ -83,8 +87,8 @@ def _parser() -> options.Parser:
     steps = "MuJoCo steps per period (default: what the plant asks)"
     parser.add_argument("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
     parser.add_argument("--duration", type=options.number(), metavar="SECONDS", help="default: the scenario's")
-    who = "other humans: [[human]] per channel in a .toml, or `humans` in a .py"
-    parser.add_argument("--human", metavar="FILE", help=who)
+    options.add_human_option(parser)
+    options.add_band_option(parser)
     options.add_limiter_option(parser)
     vertex = "simulate at this vertex of the scenario's ranges (default 0: nominal)"
     parser.add_argument("--vertex", type=options.whole(), default=0, metavar="N", help=vertex)
@@ -110,10 +114,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     scenario = options.with_varying_delays(args, options.scenario_from(args))
     if args.duration is not None:
         scenario = scenario.replace(duration=args.duration)
-    if args.human is not None:
-        people = load_humans(args.human, scenario.channels)
-        scenario = scenario.replace(human=people.human, person=people.person)
-    return scenario
+    return options.with_humans(args, scenario)
 
 
 def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Scenario]:
@@ -217,7 +218,7 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario, run: _Run) -> li
     return made
 
 
-def _side_by_side(others: list[Alternative], path: Path) -> Path:
+def _side_by_side(others: list[Alternative], path: Path, names: tuple[str, ...]) -> Path:
     from sim.plots import Panel, plot_side_by_side
 
     shown = [other for other in others if other.trace is not None and other.kind != "published"]
@@ -226,7 +227,7 @@ def _side_by_side(others: list[Alternative], path: Path) -> Path:
         assert other.trace is not None
         assert other.ideal is not None
         panels.append(Panel(_panel_title(other), other.trace, other.ideal, other.until_s))
-    return plot_side_by_side(panels, path)
+    return plot_side_by_side(panels, path, names)
 
 
 def _panel_title(other: Alternative) -> str:
@@ -290,34 +291,53 @@ def _save(args: argparse.Namespace, out: Path, run: _Run, alike: ForceError, out
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
     files.append(write(out / "scene.xml", run.simulation.scene.xml))
     if not args.no_plot and result.t.size:
-        from sim.plots import Onset, plot_run
+        from sim.plots import Onset, Surroundings, plot_run
 
         apart, hertz = outcome["ideal_force"]["error_percent"], outcome["stability"]["exact_frequency_hz"]
         ideal = None if apart is None else (alike.ideal, apart)
         grows = outcome["stability"]["exact_verdict"] == "unstable" and run.exact is not None
         growth = outcome["stability"]["exact_growth_rate_per_s"] if grows and _unstable(outcome) is None else None
         onset = Onset(growth, outcome["run"]["steady_ticks"][0][1], outcome["credible"]["until_s"])
-        files.append(plot_run(result, out / "figure.png", _title(args, outcome), hertz, ideal, onset))
+        around = Surroundings(run.simulation.scenario.environment.contacts, *_walls(run))
+        title = _title(run.simulation.scenario.title(args.case), outcome)
+        files.append(plot_run(result, out / "figure.png", title, hertz, ideal, onset, around))
     return files
 
 
-def _title(args: argparse.Namespace, outcome: dict[str, Any]) -> str:
+def _walls(run: _Run) -> tuple[list[tuple[int, float, str]], Any]:
+    """Walls between a contact and ground, (channel, place, name), and in which ticks any wall was touched, (N,)."""
+    contact, network = run.simulation.process.contact, run.simulation.scenario.environment
+    if not network.walls or contact is None:
+        return [], None
+    found = []
+    for number, wall in enumerate(network.walls, start=1):
+        (first, second), sign = wall.between, 1.0
+        if first == GROUND:
+            (first, second), sign = (second, first), -1.0
+        if second == GROUND and first in network.contacts:
+            name = f"wall {number}, {1e3 * wall.gap:g} mm from {first} at rest"
+            found.append((network.contacts.index(first), sign * wall.gap, name))
+    return found, (contact.depths(run.trace.z)[:, : len(network.walls)] > 0).any(axis=1)
+
+
+def _title(what: str, outcome: dict[str, Any]) -> str:
     """Of the picture."""
-    stability = outcome["stability"]
-    coupling = "no virtual coupling" if args.case == "none" else f"{outcome['coupling']['kind']} coupling"
+    stability, kind = outcome["stability"], outcome["coupling"]["kind"]
+    coupling = "no virtual coupling" if kind == "none" else f"{kind} coupling"
     growth = f"growth {stability['exact_growth_rate_per_s']:+.3f} 1/s at {stability['exact_frequency_hz']:.1f} Hz"
     if _unstable(outcome) is not None:
         growth = f"{outcome['jitter']['pattern']} delays, {stability['verdict']}"
-    return f"{outcome['scenario']}, case {args.case}, {coupling}: {growth}"
+    return f"{what.removesuffix(', no coupling')}, {coupling}: {growth}"
 
 
 # ----------------------------------------------------------------------------------------------------
 # The report as tables.
 
 
-def _tables(outcome: dict[str, Any], others: list[Alternative]) -> list[Any]:
-    title = f"case {outcome['case']} · {outcome['scenario']} · coupling {outcome['coupling']['kind']}"
-    shown = [render.facts(title, _rows(outcome), ("", ""))]
+def _tables(scenario: Scenario, outcome: dict[str, Any], others: list[Alternative]) -> list[Any]:
+    title = f"{scenario.title(outcome['case'])}: coupling {outcome['coupling']['kind']}"
+    rows = [render.channel_row(scenario.environment.contacts), *_rows(outcome)]
+    shown = [render.facts(title, rows, ("", ""))]
     if others:
         shown.append(_beside(others, outcome))
     if rows := outcome["reproducibility"]:

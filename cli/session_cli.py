@@ -22,8 +22,9 @@ from hw.emulator import nobody as without_hands
 from hw.monitor import Ages, LinkSettings
 from hw.recording import IncidentLog
 from hw.rehearsal import Rehearsal
+from hw.seam import FORCE_DIMENSION, DeviceWire, ForceDimension
 from hw.session import Operator, Session
-from hw.transport import Live, SerialPort, preflight
+from hw.transport import Live, SerialPort, Wire, preflight
 from sim.scenario import InputError, Scenario
 
 USUAL_BAUD = 921_600
@@ -34,7 +35,8 @@ PASSED_ON = ("case", "scenario", "theta", "psi", "lam", "delta", "T")
 def add_link_options(parser: argparse.ArgumentParser) -> None:
     """Which device, over which line, and how its delay is judged."""
     link = parser.add_argument_group("the link")
-    link.add_argument("--port", metavar="PATH", help="serial port of the device, /dev/ttyACM0 or an emulator's")
+    port = f"serial port of the device, /dev/ttyACM0 or an emulator's; or {FORCE_DIMENSION}[:0x,1x], devices and axes"
+    link.add_argument("--port", metavar="PATH", help=port)
     link.add_argument("--emulate", action="store_true", help="start hw.emulator and drive that; it arms by itself")
     rehearse = (
         "the whole session in virtual time with an emulated device: no port, no waiting, the same on every machine"
@@ -65,8 +67,8 @@ def add_safety_options(parser: argparse.ArgumentParser) -> None:
     safety.add_argument("--thermal-time", default="10", metavar="SECONDS", help="of the motors' heating (default 10)")
     absolute = "count positions from the encoders' zero, not from where the handles are at arming"
     safety.add_argument("--no-rereference", action="store_true", help=absolute)
-    who = "forces act only while a key is pressed, or FILE is touched, once a second"
-    safety.add_argument("--deadman", metavar="key|FILE", help=who)
+    who = "forces act only while a key is pressed, or FILE is touched, once a second, or the device's own one is held"
+    safety.add_argument("--deadman", metavar="key|device|FILE", help=who)
     safety.add_argument("--no-preflight", action="store_true", help="do not look at this machine for two seconds first")
 
 
@@ -124,7 +126,7 @@ def _baud(args: argparse.Namespace) -> int | None:
     A pseudo-terminal has none. Of /dev/ttyACM0 nobody can tell: native USB, or a chip with a UART behind it.
     """
     if args.baud is None:
-        pseudo = not args.port or os.path.realpath(args.port).startswith("/dev/pts/")
+        pseudo = not args.port or host_clocked(args) or os.path.realpath(args.port).startswith("/dev/pts/")
         return None if pseudo else USUAL_BAUD
     if args.baud == "none":
         return None
@@ -132,6 +134,11 @@ def _baud(args: argparse.Namespace) -> int | None:
     if not 1200 <= baud <= 20_000_000:
         raise InputError(f"--baud is {baud}, allowed are 1200 to 20000000, or none for a link without UART")
     return baud
+
+
+def host_clocked(args: argparse.Namespace) -> bool:
+    """Whether the device has no clock, so that the host is it."""
+    return (args.port or "").split(":")[0] == FORCE_DIMENSION
 
 
 def number(args: argparse.Namespace, name: str, low: float, high: float, default: float | None = None) -> float:
@@ -185,11 +192,22 @@ def hold_session(
         incidents.attach(session)
         if args.rehearse:
             return _rehearsed(args, session, plan, seconds, seed, incidents, nobody, coulomb)
-        options = [*_emulator_options(args, seed, seconds), *["--nobody"][:nobody], f"--coulomb={coulomb}"]
-        path = args.port or stack.enter_context(spawned(options))
-        port = stack.enter_context(SerialPort(path, session.settings.baud))
+        port: Wire
+        if host_clocked(args):
+            axes = args.port.partition(":")[2] or None
+            device = stack.enter_context(ForceDimension(session.scenario, axes))
+            port = DeviceWire(device)
+            stack.callback(port.close)
+            if not device.guarded:
+                console(args).print(
+                    "the device has no watchdog of its own: were this program killed, its force would stay"
+                )
+        else:
+            options = [*_emulator_options(args, seed, seconds), *["--nobody"][:nobody], f"--coulomb={coulomb}"]
+            path = args.port or stack.enter_context(spawned(options))
+            port = stack.enter_context(SerialPort(path, session.settings.baud))
         if args.port and not getattr(args, "no_preflight", True):
-            console(args).print(preflight(path).line(), soft_wrap=True, highlight=False)
+            console(args).print(preflight(args.port).line(), soft_wrap=True, highlight=False)
         keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
         show = _view(stack)
 
@@ -198,9 +216,19 @@ def hold_session(
             show(session)
 
         named = getattr(args, "deadman", None)
-        deadman = None if named is None else touched(named) if named != "key" else lambda: False
+        deadman = None if named in (None, "device") else touched(named) if named != "key" else lambda: False
         auto_arm = args.arm or args.emulate
-        live = Live(session, port, plan, auto_arm, seconds, keyboard, glance, float(args.pace), deadman)
+        live = Live(
+            session,
+            port,
+            plan,
+            auto_arm,
+            seconds,
+            keyboard,
+            glance,
+            float(args.pace),
+            deadman,
+        )
         live.run()
     return Held(live.signals, live.dropped)
 

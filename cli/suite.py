@@ -26,9 +26,8 @@ import numpy as np
 from cli import options, render
 from controller.coupling import NoCoupling
 from controller.lti import SingularLoop
-from design.certificate import finite
 from design.files import folder, write, write_json
-from design.result import DesignFailed
+from design.result import DesignFailed, finite
 from hw.faults import rehearse_faults
 from sim.adversary import Attempt, attempts
 from sim.couplings import choose

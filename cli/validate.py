@@ -11,8 +11,11 @@ import numpy as np
 
 from cli import options, render
 from controller.environment import Member
-from design.certificate import ANY, assess, guarantee_of
-from design.ranges import SetCheck, check_set, set_part
+from design.certificate import SetCheck, assess, check_set
+from design.conditions import this_environment
+from design.coverage import set_part
+from design.guarantee import ANY, guarantee_of
+from models.human import Human
 from sim import report
 from sim.adversary import Worst, search
 from sim.couplings import NAMES, Chosen, choose, limits_of
@@ -31,7 +34,7 @@ def main(argv: list[str]) -> int:
     scenario, out = _scenario(args), options.out_folder(args, "validate")
     chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter)
     loop = scenario.loop(args.case)
-    with render.progress("searching the ranges") as move:
+    with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)
     environments = _environments(args, whole)
     requirements = assess(loop, chosen.coupling, chosen.phi)
@@ -70,7 +73,7 @@ def main(argv: list[str]) -> int:
         if worst:
             _add(outcome, "adversary", report.adversary_part(worst, ratio, certified))
     files = _save(args, out, question, findings, worst, outcome)
-    title = f"case {args.case} · {scenario.name} · coupling {chosen.kind}"
+    title = f"{scenario.title(args.case)}: coupling {chosen.kind}"
     render.publish(args, outcome, [render.facts(title, _rows(outcome), ("", ""))], _lines(outcome), out, files)
     if outcome["interrupted"]:
         return options.INTERRUPTED
@@ -86,6 +89,7 @@ def _parser() -> options.Parser:
     options.add_loop_options(parser)
     options.add_varying_delay_options(parser)
     options.add_coupling_options(parser, ", ".join(NAMES))
+    options.add_human_option(parser, " and `population`, whose draw(rng, n) gives n hands,")
     options.add_limiter_option(parser)
     humans, count = "random humans per device (default 1000)", options.whole(1, 1_000_000)
     parser.add_argument("--humans", type=count, default=1000, metavar="N", help=humans)
@@ -107,8 +111,8 @@ def _parser() -> options.Parser:
 
 def _scenario(args: argparse.Namespace) -> Scenario:
     """The scenario, which must be linear. Raises InputError."""
-    scenario = options.with_varying_delays(args, options.scenario_from(args))
-    require_linear(scenario, "sim.validate")
+    scenario = options.with_humans(args, options.with_varying_delays(args, options.scenario_from(args)))
+    require_linear(scenario, "sim.validate", walls=True)
     if args.dask is not None and args.shards > 1:
         raise InputError(f"--shards {args.shards} with --dask: the cluster decides who does what, give one of them")
     if args.generations is not None and not args.adversary:
@@ -139,7 +143,7 @@ def _question(
     environments: tuple[Member, ...],
     lag: tuple[float, ...] | None,
 ) -> Validation:
-    links = LINKS[args.links] if args.links else scenario.population.links
+    links = LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)  # a user's own has none
     work = args.humans, links, args.engine, args.duration
     return Validation(scenario, chosen.coupling, args.seed, *work, environments=environments, lag=lag)
 
@@ -165,9 +169,9 @@ def _attack(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, outcom
     """The worst human, or None where the keyboard ends the search: what was found out before is kept."""
     try:
         with render.progress("searching the worst human") as move:
-            return search(
-                scenario, assemble(scenario, chosen.coupling).F, args.seed, args.generations or 150, progress=move
-            )
+            frozen = assemble(scenario, chosen.coupling).process.frozen().values()
+            F = max(frozen, key=lambda F: this_environment(F, scenario.delta).ratio)  # the contact state that asks most
+            return search(scenario, F, args.seed, args.generations or 150, progress=move)
     except KeyboardInterrupt:
         outcome["interrupted"] = True
         return None
@@ -188,6 +192,8 @@ def _save(
         named |= {"worst-human.toml": int(findings.index[np.argmax(findings.radius)])}
     for name, i in named.items():
         crowd = question.crowd(i)
+        if not isinstance(crowd.humans(0)[0], Human):  # a user's own class, which draws this hand again
+            continue
         remark = f"seed {question.seed}, index {i}"
         files.append(save_humans(out / name, crowd.humans(0), remark, crowd.persons(0)))
     if adversary:
@@ -197,7 +203,8 @@ def _save(
         from sim.plots import plot_population
 
         kind = "no coupling" if args.case == "none" else f"{outcome['coupling']['kind']} coupling"
-        title = f"{scenario.name}, case {args.case}, {kind}: {outcome['humans']} random humans"
+        what = scenario.title(args.case).removesuffix(", no coupling")
+        title = f"{what}, {kind}: {outcome['humans']} random humans"
         files.append(plot_population(findings.mass, findings.damping, findings.exact, out / "population.png", title))
     return files
 
@@ -224,6 +231,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
             render.optional(outcome["largest_difference_per_s"], "within {:.1e} 1/s of the exact ones", "") or None,
         ),
         ("traces", traces and f"{traces['duration_s']:g} s each, {traces['clipped_runs']} reached a force limit"),
+        ("contacts made", f"{traces['contacts']} on these traces" if traces and traces["contacts"] else None),
         ("force limits", outcome["limiter"]["words"]),
         ("handles come to rest", traces and _settled(traces)),
         ("energy audit W >= 0", audit and _audited(audit)),

@@ -42,6 +42,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from controller.lti import Array, Lti
 
+EPS = 0.05  # the share of the damping that a budget leaves alone, if nobody says otherwise
 UNTOLD = 4096  # ticks that wait for the device's word; older ones stay booked as their largest loss
 HUGE = 1e12  # [N], from which a force is no number any more
 SHAVE = 1 - 1e-12  # of a scaled force, so that rounding takes nothing from the reserve
@@ -87,7 +88,7 @@ class EnergyBudget(_Net):
         *,
         hold: int = 0,
         encoder_step: ArrayLike = 0.0,
-        eps: float = 0.05,
+        eps: float = EPS,
         start: float = 0.0,
         cap: float = np.inf,
         nsim: int = 1,

@@ -1,6 +1,6 @@
 """Spring-damper couplings (26): the best under either condition, the stiffest, and the moving average.
 
-Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT/d, b = B/d (design.gains.gain_set).
+Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT/d, b = B/d (gain_set).
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import cast
+from typing import Any, cast
 
 import cvxpy as cp
 import numpy as np
@@ -18,25 +18,22 @@ from controller.coupling import MovingAverage, SpringDamper
 from controller.delay import delay
 from controller.loop import Loop, force_map
 from controller.lti import Array, Lti, Sampled
-from design.conditions import (
+from design.conditions import any_environment, any_environment_delayed, even_damping, this_environment
+from design.frequency import frequencies, hermitian, on_circle, peaks
+from design.lmi import RESERVE, Complex, Shaping, affine_lmis, gain_lmi, least_phi, solve, solved, usable
+from design.multipliers import (
     BETA,
     Lags,
     LimiterProof,
-    Requirement,
-    any_environment,
-    any_environment_delayed,
-    even_damping,
     half_widths,
     jitter_proof,
     limiter_demand,
     limiter_lag,
+    limiter_refusal,
     switching_block,
-    this_environment,
 )
-from design.conditions import limiter as limiter_proof
-from design.frequency import frequencies, hermitian, on_circle, peaks
-from design.lmi import RESERVE, Complex, Shaping, affine_lmis, gain_lmi, least_phi, solve, solved, usable
-from design.result import Design, DesignFailed, Infeasible
+from design.multipliers import limiter as limiter_proof
+from design.result import Design, DesignFailed, Infeasible, Requirement
 from design.transparency import BAND_HZ, transparency
 
 # ----------------------------------------------------------------------------------------------------
@@ -202,7 +199,7 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> tuple[Comple
 # Spring-damper gains under the this-environment condition, for one environment: a local search from several starts.
 #
 # The set is not convex in (K, B), so nothing here is proved best. The rms mismatch is minimised by sequential
-# quadratic programming with the condition at sampled frequencies; where the refined sweep of design.margin finds it
+# quadratic programming with the condition at sampled frequencies; where the refined sweep of design.conditions finds it
 # violated in between, that frequency is added and the search resumed. What is returned passes that sweep.
 
 
@@ -218,10 +215,10 @@ MOST_ROUNDS_FROZEN_ENVIRONMENT = 8
 class SampledLoop:
     """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta), shape (2N,)."""
 
-    def __init__(self, loop: Loop) -> None:
+    def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.loop, self.E = loop, loop.E()
         per_hz = 2 * np.pi * loop.T
-        low, high = (per_hz * f for f in BAND_HZ)
+        low, high = (per_hz * f for f in band_hz)
         self.band = frequencies(self.E, low=low, high=min(high, np.pi), points=80)
         self.conditions = frequencies(self.E, low=1e-3, points=80)
         self.loop_in_band, self.loop_at_conditions = self._responses(self.band), self._responses(self.conditions)
@@ -295,28 +292,33 @@ Optimum = Callable[[SpringDamper], tuple[SpringDamper | None, int]]  # start -> 
 
 
 def least_rms(
-    loop: Loop, starts: Iterable[SpringDamper], optimum: Optimum | None = None
+    loop: Loop,
+    starts: Iterable[SpringDamper],
+    optimum: Optimum | None = None,
+    band_hz: tuple[float, float] = BAND_HZ,
 ) -> tuple[SpringDamper | None, float, int]:
     """(gains, rms mismatch as a ratio, searches) of the best local optimum; gains None if none was found.
 
     `optimum` searches from one start; the default finds what this-environment certifies.
     """
-    optimum = optimum or partial(_certified_optimum, loop)
+    optimum = optimum or partial(_certified_optimum, loop, band_hz)
     E, best, least, searches = loop.E(), None, np.inf, 0
     for start in starts:
         coupling, runs = optimum(start)
         searches += runs
         if coupling is None:
             continue
-        rms = transparency(loop.F(coupling), E, loop.lam).rms_mismatch
+        rms = transparency(loop.F(coupling), E, loop.lam, band_hz).rms_mismatch
         if rms < least:
             best, least = coupling, rms
     return best, least, searches
 
 
-def _certified_optimum(loop: Loop, start: SpringDamper) -> tuple[SpringDamper | None, int]:
+def _certified_optimum(
+    loop: Loop, band_hz: tuple[float, float], start: SpringDamper
+) -> tuple[SpringDamper | None, int]:
     """(a local optimum that passes the refined sweep or None, searches), adding the frequencies where one fails."""
-    sampled = SampledLoop(loop)
+    sampled = SampledLoop(loop, band_hz)
     x = sampled.point(start)
     for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
@@ -415,9 +417,9 @@ def _safe_optimum(sampled: SwitchingLoop, start: SpringDamper) -> tuple[SpringDa
 class LimiterLoop(SampledLoop):
     """As Sampled, with x = (log K, B/delta, c) and one weight c per channel, of the lag 1."""
 
-    def __init__(self, loop: Loop) -> None:
+    def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.rho = limiter_lag(loop.delta, loop.T, BETA)
-        super().__init__(loop)
+        super().__init__(loop, band_hz)
 
     def coupling(self, x: Array) -> SpringDamper:
         return super().coupling(self._gains(x))
@@ -457,9 +459,9 @@ class LimiterLoop(SampledLoop):
         return x[: 2 * self.loop.channels]
 
 
-def _limited_optimum(loop: Loop, start: SpringDamper) -> tuple[SpringDamper | None, int]:
+def _limited_optimum(loop: Loop, band_hz: tuple[float, float], start: SpringDamper) -> tuple[SpringDamper | None, int]:
     """(a local optimum that passes the limiter's refined sweep or None, searches)."""
-    sampled = LimiterLoop(loop)
+    sampled = LimiterLoop(loop, band_hz)
     x = sampled.point(start)
     for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
@@ -486,6 +488,7 @@ def design(
     starts: Sequence[SpringDamper] = (),
     switching: tuple[Sequence[int], Sequence[int]] | None = None,
     limiter: bool = False,
+    band_hz: tuple[float, float] | None = None,
     W1: Lti | None = None,
     W2: Lti | None = None,
 ) -> Design:
@@ -495,6 +498,8 @@ def design(
     this-environment: minimises the rms mismatch in this environment from every start, local optima only; with
     `switching` = (lo, hi) [samples] also safe under any switching of the forces' delays within it, with `limiter` also
     while forces are limited (any-environment is anyway, at no cost).
+    `band_hz` is where the mismatch counts.
+
     Raises Infeasible where Theorem 4 admits no gains, DesignFailed where the search finds none for this-environment.
     """
     if condition == "any-environment" and switching is None:
@@ -502,10 +507,27 @@ def design(
     if condition == "this-environment":
         if switching and limiter:
             raise ValueError("limiter and switching: limited forces are proved for constant delays, ask for one")
-        return _for_this_environment(loop, starts, switching, limiter)
+        return _for_this_environment(loop, starts, switching, limiter, band_hz)
     if switching:
         raise ValueError("delays that vary are designed for by the this-environment condition only")
     raise ValueError(f"condition is {condition!r}, expected 'any-environment' or 'this-environment'")
+
+
+def design_with(loop: Loop, condition: str, limiter: bool | None = None, **options: Any) -> Design:
+    """A spring-damper, with the limiter's block in the place of the linear one where that is asked for or usual."""
+    if limiter is False or condition == "any-environment":  # with rho = 0 any-environment covers limited forces anyway
+        return design(loop, condition, **options)
+    refusal = limiter_refusal(loop)
+    if limiter and refusal:
+        raise ValueError(refusal)
+    if refusal or options.get("switching"):
+        return design(loop, condition, **options)
+    try:
+        return design(loop, condition, limiter=True, **options)
+    except DesignFailed:
+        if limiter:
+            raise
+        return design(loop, condition, **options)
 
 
 def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design:
@@ -532,12 +554,18 @@ def _for_this_environment(
     starts: Sequence[SpringDamper],
     switching: tuple[Sequence[int], Sequence[int]] | None,
     limiter: bool,
+    band_hz: tuple[float, float] | None,
 ) -> Design:
     started, starts = time.perf_counter(), starts or _default_starts(loop)
-    search = partial(least_rms_switching, loop, *switching) if switching else partial(least_rms, loop)
+    band = band_hz or BAND_HZ
+    if band_hz and switching:
+        raise ValueError("band_hz: designs for delays that vary count 0.5 to 80 Hz, ask for one of them")
+    search = partial(least_rms, loop, band_hz=band)
+    if switching:
+        search = partial(least_rms_switching, loop, *switching)
     coupling, rms, searches = search(starts)
     if limiter:  # a little softer than without limits: nearly always found from there
-        search = partial(least_rms, loop, optimum=partial(_limited_optimum, loop))
+        search = partial(least_rms, loop, optimum=partial(_limited_optimum, loop, band), band_hz=band)
         linear, before = coupling, searches
         coupling, rms, searches = search([linear] if linear else starts)
         if coupling is None and linear:

@@ -17,16 +17,16 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from controller.budget import EnergyBudget
+from controller.budget import EPS, EnergyBudget
 from controller.coupling import Coupling
 from controller.environment import environment
 from controller.loop import force_map
 from controller.lti import Array, Lti
 from controller.process import Limiter, limited
-from design.certificate import Limits as ForceLimits
-from design.certificate import assess, certificate_part, guarantee_of
-from design.conditions import Requirement
-from design.result import DesignFailed
+from design.certificate import assess
+from design.coverage import Limits as ForceLimits
+from design.guarantee import guarantee_of
+from design.result import DesignFailed, Requirement, certificate_part
 from hw.limits import Fault, Gain, Heat, Limits, Units, check_jolt, check_jump, check_range, check_speed, shape
 from hw.monitor import Ages, ClockMonitor, CommandMonitor, Counters, EncoderMonitor, EncoderTest, LinkSettings
 from hw.protocol import MAX_THETA, Config, State
@@ -173,7 +173,7 @@ class SentBudget:
         return {
             "start_J": self.plan.start,
             "cap_J": self.plan.cap,
-            "eps": 0.05,
+            "eps": EPS,
             "guarantee": f"no passive hand is given {given} in an arming beyond what the devices dissipate, "
             "whatever computes the forces",
             "ticks": budget.ticks,
@@ -348,6 +348,11 @@ class Program(Protocol):
         """For the log."""
         ...
 
+    @property
+    def margin_us(self) -> float:
+        """How long before its latch, or the end of its tick, a force must come; one that comes later is late [us]."""
+        ...
+
     def controller(self, cap: Sequence[float]) -> Controller:
         """A fresh one, at rest, for forces of up to `cap` (m,) [N]."""
         ...
@@ -375,6 +380,11 @@ class CertifiedCoupling:
         return f"{self.chosen.kind} for theta = {list(self.scenario.theta)}{late}"
 
     @property
+    def margin_us(self) -> float:
+        latency = self.scenario.latency
+        return 1e6 * (self.scenario.T - max(most for _, most in latency)) if latency else 0.0
+
+    @property
     def held(self) -> int:
         """Missed answers in a row through which the device may hold a force: so much the coupling's file proves."""
         span = self.chosen.switching
@@ -399,7 +409,12 @@ class CertifiedCoupling:
         }
 
     def remarks(self) -> list[str]:
-        """What a reader should know of the coupling's file."""
+        """What a reader should know of the coupling's file, and of the clock."""
+        if self.scenario.latency:
+            least, most = (1e6 * t for t in self.scenario.latency[0])
+            kept = f"periods up to {1e6 * (self.scenario.T_max or self.scenario.T):.0f} us"
+            kept += f" and forces that act {least:.0f} to {most:.0f} us after their sample"
+            return [*self.chosen.notes, f"forces act as they come: certified for {kept}, as measured"]
         if self.held < 1:
             return list(self.chosen.notes)
         answers = "1 missed answer" if self.held == 1 else f"{self.held} missed answers in a row"
@@ -415,7 +430,7 @@ def certified_coupling(
     given: Coupling | None = None,
     limiter: bool | None = None,
 ) -> CertifiedCoupling:
-    """The coupling `name`, or the one that is `given`, for a link of `link` ticks, with its certificates.
+    """The coupling `name`, or the one that is `given`, for a link of `link` ticks (0: the host is the clock).
 
     Forces leave through the limiter that these cover, unless `limiter` is False.
 

@@ -7,6 +7,7 @@ rules are in docs/protocol.md. Forces are in steps, per axis, as tuples.
 """
 
 from hw.protocol import (
+    DEADMAN,
     MAX_RELEASE_NS,
     MAX_THETA,
     NO_MARGIN,
@@ -42,6 +43,7 @@ class Device:
         self.info_frame = encode(info)
         self.decoder = Decoder()
         self.unexpected = 0  # well-formed frames that this device has no use for
+        self.deadman = False  # whether somebody holds it: yours to set, where the device has one
         self.phase, self.cause = Phase.SILENT, Cause.NONE
         self.config: Config | None = None
         self.k, self.now = 0, 0  # this tick, and the clock at it [us]
@@ -59,7 +61,7 @@ class Device:
 
     @property
     def _status(self) -> int:
-        return self.phase | self.cause << 4
+        return self.phase | self.cause << 4 | DEADMAN * self.deadman
 
     def tick(self, now_us: int, counts: tuple[int, ...]) -> tuple[tuple[int, ...], bytes]:
         """A period begins: the forces that act from now on, and the bytes to send. `counts` was sampled just before."""

@@ -76,6 +76,7 @@ DEVICE = {
     "period": ("length of a tick in T", 0.5, 4.0, 2.0),
     "estop": ("no value: the emergency stop at the device", 0.0, 0.0, 0.0),
     "trip": ("no value: a fault that the firmware found", 0.0, 0.0, 0.0),
+    "letgo": ("no value: nobody holds the deadman at the device any more", 0.0, 0.0, 0.0),
 }
 #: kind -> the same, for one axis of it
 AXIS = {
@@ -273,6 +274,7 @@ class Emulator:
     ) -> None:
         self.info = info or info_of(scenario)
         self.device = Device(self.info)
+        self.device.deadman = True
         self.plant = EmulatedPlant(scenario, 1e-12 * np.array(self.info.encoder_step, dtype=float), coulomb)
         self.force_step = 1e-6 * np.array(self.info.force_step, dtype=float)
         self.armed_at: int | None = None  # [us] of the first arming: faults are timed from here
@@ -392,6 +394,8 @@ class Emulator:
                     self.device.estop()
                 case "trip":
                     self.device.fault()
+                case "letgo":
+                    self.device.deadman = False
 
 
 def _wilful(device: Device, axis: int, force: int) -> Device:

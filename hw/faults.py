@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -55,16 +56,17 @@ class Case:
     designed: bool = False  # the coupling for the measured delay, in place of one made beforehand
     counted: tuple[str, ...] = ()  # counters that must not be zero
     first_tick: int = 0
+    deadman: bool = False  # forces act only while the device's own is held
     period: float = 1.0  # of the device's clock, in T
     lasts: float = _LASTS  # [s] after arming
 
 
-def spoiled(force: float) -> Call:
-    """A controller that from now on asks for `force` [N]."""
+def spoiled(force: float | None) -> Call:
+    """A controller that from now on asks for `force` [N]; one that raises where that is None."""
 
     def call(session: Session, now: int) -> bytes:
         def step(x: Sequence[float]) -> Array:
-            if np.isneginf(force):
+            if force is None:
                 raise ZeroDivisionError("division by zero")
             return np.full(len(x), force)
 
@@ -83,6 +85,19 @@ def person(what: str) -> Call:
 def at(text: str) -> tuple[str, ...]:
     """The fault `text` from WHEN on."""
     return tuple(f"{part}@{WHEN}" for part in text.split())
+
+
+def _signed(
+    name: str, kind: str, value: float, cause: str, within: float | None, when: str = f"@{WHEN}", **more: Any
+) -> list[Case]:
+    """One case for each axis and each sign of `value`."""
+    cases = []
+    for axis in (1, 2):
+        for sign in ("", "-"):
+            fault = f"axis{axis}:{kind}={sign}{value}{when}"
+            words = cause.format(axis=axis, sign=sign)
+            cases.append(Case(name.format(f"{sign}{value}", axis), Stage.STOPPED, words, (fault,), within, **more))
+    return cases
 
 
 G, A = Stage, Stage.ARMED
@@ -139,8 +154,9 @@ CASES = (
     # the device
     Case("tick number leaps by 300", G.STOPPED, "leapt by 301", at("leap=300"), _STOP),
     Case("tick number leaps by 3", G.STOPPED, "by its own clock", at("leap=3"), _STOP),
-    Case("a force of its own", G.STOPPED, "it was told .*, and so for 5 ticks", at("own=2"), _STOP + 6 * _T_MS),
-    Case("the other force of axis 2", G.STOPPED, "it was told", at("axis2:own=-2"), _STOP + 6 * _T_MS),
+    *_signed(
+        "a force of {} N of its own on axis {}", "own", 2, "it was told .*, and so for 5 ticks", _STOP + 6 * _T_MS
+    ),
     Case("a force of its own in ramp-in", G.STOPPED, "it was told", ("own=2@0.05",), _AT_ONCE),
     Case("a tick lasts twice as long", G.STOPPED, "by its own clock", at("period=2"), 2 * _STOP + 6 * _T_MS),
     Case("clock drifts by 2 %", G.STOPPED, "lasts 12.. us by its own clock", at("period=1.02"), 250.0),
@@ -148,39 +164,52 @@ CASES = (
     Case("device freezes for 20 ms", G.LOST, "no new STATE", at("stall=0.02"), 20.0 + _WATCHDOG),
     Case("device resets", G.LOST, "no new STATE", at("reset"), _AT_ONCE),
     Case("encoder jumps by 2 mm", A, faults=at("jump=2")),
-    Case("encoder jumps by 5 mm", G.STOPPED, "encoder 1 jumped by", at("jump=5"), _STOP),
-    Case("encoder jumps by -5 mm", G.STOPPED, "encoder 1 jumped by", at("jump=-5"), _STOP),
-    Case("encoder 2 jumps by 5 mm", G.STOPPED, "encoder 2 jumped by", at("axis2:jump=5"), _STOP),
-    Case("encoder 2 jumps by -5 mm", G.STOPPED, "encoder 2 jumped by", at("axis2:jump=-5"), _STOP),
-    Case("encoder shakes by 2 mm", G.STOPPED, "encoder 1 shakes", at("shake=2"), _STOP + 2 * _T_MS),
-    Case("encoder 2 shakes by -2 mm", G.STOPPED, "encoder 2 shakes", at("axis2:shake=-2"), _STOP + 2 * _T_MS),
-    Case("a handle at 1.5 m/s", G.STOPPED, "axis 1 moves at 1", at("drift=1.5"), _STOP + 12 * _T_MS),
-    Case("handle 2 at -1.5 m/s", G.STOPPED, "axis 2 moves at 1", at("axis2:drift=-1.5"), _STOP + 12 * _T_MS),
-    Case("encoder out of its range", G.STOPPED, r"encoder 1 is at \d.*its range is", ("jump=200",)),
-    Case("encoder 2 out of its range", G.STOPPED, "encoder 2 is at -.*its range is", ("axis2:jump=-200",)),
+    *_signed("jump of {} mm, encoder {}", "jump", 5, "encoder {axis} jumped by", _STOP),
+    *_signed("shaking by {} mm, encoder {}", "shake", 2, "encoder {axis} shakes", _STOP + 2 * _T_MS),
+    *_signed("{} m/s, handle {}", "drift", 1.5, "axis {axis} moves at 1", _STOP + 12 * _T_MS),
+    *_signed(
+        "{} mm, out of the range of encoder {}", "jump", 200, r"encoder {axis} is at {sign}\d.*its range is", None, ""
+    ),
     Case("encoder dead before", G.STOPPED, "axis 1 does not follow: it moved by 0 counts", ("freeze",), _AT_ONCE),
     Case("encoder 2 dead before", G.STOPPED, "axis 2 does not follow: it moved by 0", ("axis2:freeze",), _AT_ONCE),
     Case("a channel of it dead before", G.STOPPED, "axis 1 does not follow", ("toggle",), _AT_ONCE),
+    Case("a channel of encoder 2 dead before", G.STOPPED, "axis 2 does not follow", ("axis2:toggle",), _AT_ONCE),
     Case("encoder dies", G.STOPPED, "axis 1 does not follow", at("freeze"), _DEAD),
     Case("encoder 2 dies", G.STOPPED, "axis 2 does not follow", at("axis2:freeze"), _DEAD),
     Case("both encoders die", G.STOPPED, "axis . does not follow", at("freeze axis2:freeze"), _DEAD, lasts=1.5),
+    Case("a channel of encoder 1 dies", G.STOPPED, "axis 1 does not follow", at("toggle"), _DEAD),
     Case("a channel of encoder 2 dies", G.STOPPED, "axis 2 does not follow", at("axis2:toggle"), _DEAD),
-    Case("encoder 2 saturates", G.STOPPED, "axis 2 does not follow|2 jumped", at("axis2:saturate=1"), lasts=2.0),
+    *_signed(
+        "saturated at {} mm, encoder {}",
+        "saturate",
+        4,
+        "axis {axis} does not follow",
+        None,
+        "@0.3",
+        lasts=2.0,
+    ),
     Case("e-stop at the device", G.ESTOP, "estop_device", at("estop"), _AT_ONCE),
     Case("e-stop at the device before", G.REFUSED, "refuses the configuration: estop", ("estop",)),
-    Case("a motor gets hot", G.STOPPED, "motor . gets hot", within=1500.0, continuous=(0.2, 0.2), lasts=2.5),
+    Case("motor 1 gets hot", G.STOPPED, "motor 1 gets hot", within=1500.0, continuous=(0.2, 12.0), lasts=2.5),
+    Case("motor 2 gets hot", G.STOPPED, "motor 2 gets hot", within=1500.0, continuous=(12.0, 0.2), lasts=2.5),
     Case("firmware finds a fault", G.STOPPED, "cause device", at("trip"), _STOP),
     Case("device clock runs 5 % fast", G.REFUSED, "by its own clock", period=1.05),
     # the controller
     Case("controller asks for nan", G.STOPPED, "nan, nan N, which is no force", within=_STOP, action=spoiled(np.nan)),
     Case("controller asks for inf", G.STOPPED, "inf, inf N, which is no force", within=_STOP, action=spoiled(np.inf)),
-    Case("controller raises", G.STOPPED, "ZeroDivisionError", within=_STOP, action=spoiled(-np.inf)),
-    Case("controller asks for 100 N", A, action=spoiled(100.0), counted=("clipped", "slowed")),
+    Case("controller raises", G.STOPPED, "ZeroDivisionError", within=_STOP, action=spoiled(None)),
+    Case(
+        "controller asks for -inf", G.STOPPED, "-inf, -inf N, which is no force", within=_STOP, action=spoiled(-np.inf)
+    ),
+    Case("controller asks for 100 N", A, action=spoiled(100.0), counted=("clipped", "slowed"), lasts=0.48),
+    Case("controller asks for -100 N", A, action=spoiled(-100.0), counted=("clipped", "slowed"), lasts=0.48),
     # people
     Case("planned stop", G.FINISHED, "asked to", within=100.0 + _STOP, action=person("stop")),
+    Case("deadman let go", G.FINISHED, "deadman at the device", at("letgo"), 100.0 + _STOP, deadman=True),
     Case("e-stop at the host", G.ESTOP, "asked to", within=_AT_ONCE, action=person("estop")),
     # the handshake
-    Case("another protocol", G.REFUSED, "version 2", info=lambda i: i._replace(version=2)),
+    Case("an older protocol", G.REFUSED, "version 1 .*give it the firmware", info=lambda i: i._replace(version=1)),
+    Case("a newer protocol", G.REFUSED, "version 3 of the protocol", info=lambda i: i._replace(version=3)),
     Case(
         "one axis",
         G.REFUSED,
@@ -250,7 +279,9 @@ def rehearse_case(
     info = info_of(scenario)
     cap = tuple(d.force_limit for d in scenario.device)
     session = Session(
-        scenario, Limits(cap, continuous=case.continuous, thermal=1.0), LinkSettings(case.baud, _MEASURED)
+        scenario,
+        Limits(cap, continuous=case.continuous, thermal=1.0),
+        LinkSettings(case.baud, _MEASURED, deadman=case.deadman),
     )
     faults = tuple(FaultInjection.parse(text) for text in case.faults)
     emulator = Emulator(scenario, faults, case.info(info) if case.info else info)

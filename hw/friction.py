@@ -50,6 +50,7 @@ _FEW = 200  # rows
 _ALMOST = 4.0  # by which a log likelihood ratio may be worse than the best law's
 _ROUNDS = 3  # in which the transmission's part of friction is found
 _PERIODS = np.geomspace(5e-4, 0.08, 60)  # [m] where a periodic disturbance is looked for
+_NEAR = np.geomspace(0.92, 1.09, 24)  # times the best one of these, once more
 _PERIODIC = 4  # at most so many
 _GAIN = 0.05  # of the sum of squares, that a periodic one has to explain
 _MASS, _VISCOUS, _CONSTANT, _SLOPE, _SPRING, _TAU, _MODE, _LOSS, _STIFF, _DRAG, _DRY, _STATIC = range(12)
@@ -216,13 +217,15 @@ def _disturbances(balance: _Balance, fit: _Fit) -> tuple[list[Array], tuple[floa
         q, _r = np.linalg.qr(np.stack([*fit.columns.T, *found], axis=1))
         left = fit.residual - q @ (q.T @ fit.residual)
         best = (0.0, 0.0, list[Array]())
-        for period in _PERIODS[np.ptp(balance.x) > _PERIODS]:
-            for pair in balance.waves(float(period)):
-                own = np.stack(pair, axis=1)
-                own = np.linalg.qr(own - q @ (q.T @ own))[0]
-                gain = float(np.sum((own.T @ left) ** 2) / (left @ left))
-                if gain > best[0]:
-                    best = (gain, float(period), pair)
+        for fine in (False, True):  # between two of the grid a long record loses count of the periods
+            periods_near = best[1] * _NEAR if fine else _PERIODS[np.ptp(balance.x) > _PERIODS]
+            for period in periods_near if best[1] or not fine else ():
+                for pair in balance.waves(float(period)):
+                    own = np.stack(pair, axis=1)
+                    own = np.linalg.qr(own - q @ (q.T @ own))[0]
+                    gain = float(np.sum((own.T @ left) ** 2) / (left @ left))
+                    if gain > best[0]:
+                        best = (gain, float(period), pair)
         if best[0] < _GAIN:
             break
         found += best[2]

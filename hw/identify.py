@@ -63,6 +63,7 @@ class Excitation:
     signal: Array  # (ticks, m) [N]
     T: float  # [s]
     link: int  # [ticks]
+    margin_us: float = 0.0  # forces are late after their latch, not before
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "signal", frozen(self.signal, 2))

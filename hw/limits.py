@@ -242,7 +242,8 @@ def _wire_time(baud: int, axes: int) -> tuple[float, str]:
 def objections(info: Info, scenario: Scenario, limits: Limits, baud: int | None) -> list[str]:
     """Why this device may not run this scenario over this line; empty where nothing is wrong. baud None: no UART."""
     if info.version != PROTOCOL:
-        return [f"the device speaks version {info.version} of the protocol, this host version {PROTOCOL}"]
+        spoken = f"the device speaks version {info.version} of the protocol, this host version {PROTOCOL}"
+        return [f"{spoken}: give it the firmware of this version (hw/firmware)"]
     m = scenario.channels
     if info.axes != m:
         return [f"the device has {info.axes} ax{'i' if info.axes == 1 else 'e'}s, the scenario {m} channels"]

@@ -46,6 +46,7 @@ class LinkSettings:
     test_encoders: bool = True  # by a small force at every arming
     energy_budget: tuple[float, float] | None = None  # W0 and cap [J]
     rereference: bool = True  # positions count from where the handles are at arming
+    deadman: bool = False  # forces act only while the deadman at the device is held
 
 
 # the delay, timed at zero force
@@ -159,6 +160,7 @@ class LinkMonitor:
 
     def __init__(self, settings: LinkSettings, counters: Counters) -> None:
         self.settings, self.counters = settings, counters
+        self.needed = 0.0  # [us] least margin of an answer that is not late
         self.restart()
 
     def restart(self) -> None:
@@ -181,7 +183,8 @@ class LinkMonitor:
             self.missed = (state.misses - self.last.misses) & 0xFF
             self.counters.device_errors += (state.crc_errors - self.last.crc_errors) & 0xFF
         self.margin = None if state.margin_us == NO_MARGIN else state.margin_us
-        tick = _Tick(self.margin, self.missed, ahead - 1)
+        late = self.margin is not None and self.margin < self.needed
+        tick = _Tick(self.margin, self.missed, ahead - 1, late)
         self.counters.states += 1
         self.counters.gaps += tick.gap
         self.counters.misses += tick.missed
@@ -231,10 +234,7 @@ class _Tick(NamedTuple):
     margin: int | None  # [us]
     missed: int
     gap: int  # ticks before it of which no STATE came
-
-    @property
-    def late(self) -> bool:
-        return self.margin is not None and self.margin < 0
+    late: bool
 
 
 # the clock: two are compared with the number of the tick, the device's own and the host's, since a device that

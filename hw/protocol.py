@@ -15,11 +15,12 @@ from struct import Struct, error
 from typing import Any, NamedTuple
 from zlib import crc32
 
-PROTOCOL = 1
+PROTOCOL = 2
 MAX_AXES = 8
 MAX_THETA = 15
 MAX_RELEASE_NS = 20_000_000  # longest hold and ramp together: 12 N for 20 ms bring a free 0.25 kg to 1 m/s
 NO_MARGIN = -32768  # in State.margin_us: no FORCE came since the STATE before
+DEADMAN = 0x80  # in State.status: the deadman at the device is held
 
 
 class Phase(IntEnum):
@@ -35,7 +36,7 @@ class Phase(IntEnum):
 
 
 class Cause(IntEnum):
-    """Why the device is where it is, the high four bits of a status."""
+    """Why the device is where it is, bits 4 to 6 of a status."""
 
     NONE = 0
     HOST = 1  # a STOP from the host
@@ -134,7 +135,7 @@ class Ack(NamedTuple):
 class State(NamedTuple):
     """Device to host, every tick."""
 
-    status: int  # phase and cause
+    status: int  # phase, cause and deadman
     tick: int
     echo: int  # the source of the last FORCE that came
     margin_us: int  # how long before its latch it came, negative: too late; NO_MARGIN: none came since the last STATE
@@ -154,7 +155,12 @@ class State(NamedTuple):
 
     @property
     def cause(self) -> Cause:
-        return _CAUSES[self.status >> 4]
+        return _CAUSES[self.status >> 4 & 7]
+
+    @property
+    def deadman(self) -> bool:
+        """Whether somebody holds the deadman at the device."""
+        return self.status >= DEADMAN
 
 
 class Force(NamedTuple):
@@ -233,7 +239,7 @@ READ = {(LAYOUTS[kind].code, f.struct.size): f for (kind, _), f in _FORMS.items(
 _OVERHEAD = 6  # CRC-32, the COBS byte, the delimiter
 _MAX_WIRE = max(f.struct.size for f in _FORMS.values()) + _OVERHEAD
 _RESIDUE = crc32(bytes(4) + crc32(bytes(4)).to_bytes(4, "little"))  # CRC-32 over anything followed by its own CRC-32
-_STATUSES = frozenset(phase | cause << 4 for phase in Phase for cause in Cause)
+_STATUSES = frozenset(phase | cause << 4 | held for phase in Phase for cause in Cause for held in (0, DEADMAN))
 _CHECKED = (Hello, Info, Config, Ack, Stop)  # seldom sent: every field looked at; State and Force leave it to struct
 
 

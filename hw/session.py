@@ -99,6 +99,11 @@ class Session:
         return self.drive.gain.value if self.drive else 0.0
 
     @property
+    def held(self) -> bool:
+        """Whether forces may act, by the deadman at the device."""
+        return not self.settings.deadman or (self.link.last is not None and self.link.last.deadman)
+
+    @property
     def units(self) -> Units:
         """The device's units, once it is known."""
         assert self._units
@@ -128,9 +133,11 @@ class Session:
         return b"" if self.stage in ENDED else self._end(Stage.REFUSED, cause)
 
     def arm(self, now: int) -> bytes:
-        """A person's wish to feel forces; does nothing unless the session is disarmed."""
+        """A person's wish to feel forces; does nothing unless the session is disarmed, and a deadman is held."""
         self.now = now
-        if self.stage == Stage.DISARMED:
+        if self.stage == Stage.DISARMED and not self.held:
+            self._log("the deadman at the device is not held")
+        elif self.stage == Stage.DISARMED:
             assert self.program
             assert self.config
             self.drive = Drive(
@@ -279,6 +286,7 @@ class Session:
 
     def _take(self, index: int, cause: str) -> bytes:
         self.program = self.programs[index]
+        self.link.needed = self.program.margin_us
         return self._configure(self.program.link, f"{self.program.name}: {cause}")
 
     # the stream of STATEs
@@ -306,7 +314,8 @@ class Session:
         assert self.config is not None
         check_state(state, self.config, self.stage, self.gain)
         if self.stage in DRIVING:
-            return self._on_driving(state, ticks)
+            ended = b"" if self.held else self.stop("the deadman at the device was let go", self.now)
+            return ended or self._on_driving(state, ticks)
         if self.stage == Stage.MEASURING:
             return self._measure(state)
         return self._answer(state, Command.IDLE)
@@ -469,7 +478,7 @@ class Operator:
         """What is to be said at `now` [us] because of where the session stands."""
         if session.stage == Stage.DISARMED:
             self._armed_at = None
-            if self.auto_arm:
+            if self.auto_arm and session.held:
                 return self._arm_once(session, now)
         if session.stage == Stage.ARMED and self._armed_at is None:
             self._armed_at = now

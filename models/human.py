@@ -275,6 +275,31 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.links[-1].stiffness * position + self.links[-1].damping * velocity
 
 
+class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A hand as a transfer function, `mass` s + C (s I - A)^-1 B + D from velocity to force; see `state_space`.
+
+    It has no bodies: the exact engine simulates it, MuJoCo does not.
+    """
+
+    A: tuple[tuple[float, ...], ...]
+    B: tuple[tuple[float, ...], ...]
+    C: tuple[tuple[float, ...], ...]
+    D: tuple[tuple[float, ...], ...]
+    mass: float = 0.0  # [kg]
+
+    def __post_init__(self) -> None:
+        require("mass", self.mass, 0.0, 1e3, "kg")
+        self.port()
+
+    def port(self) -> Port:
+        """Raises ValueError where it is not passive."""
+        return state_space(self.A, self.B, self.C, self.D, self.mass)
+
+    def voluntary_force(self, t: Array) -> Array:
+        """None of its own."""
+        return np.zeros_like(t)
+
+
 class Cross(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A spring-damper from hand to hand of one person."""
 

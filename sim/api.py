@@ -108,12 +108,14 @@ def validate(
     Returns Findings, n = humans: `exact` and `mujoco` (n,) growth rates [1/s], positive where a human makes the loop
     unstable, `radius` (n,) of the exact loop, `frequency` (n,) [Hz], `disagreements` (n,) of the engines, and more.
 
-    Raises InputError for walls or Coulomb friction (verdicts are of linear loops), ValueError for numbers out of range,
+    Walls: a verdict is that of the worst frozen contact state, and the traces make and break contact.
+
+    Raises InputError for Coulomb friction (verdicts are of linear loops), ValueError for numbers out of range,
     TypeError for an argument of another type.
     """
     of_kind("scenario", scenario, Scenario, _SCENARIO)
     alone = _bare(coupling)
-    require_linear(scenario, "validate")
+    require_linear(scenario, "validate", walls=True)
     humans, seed = whole("humans", humans, 1, _MOST_HUMANS), whole("seed", seed, 0)
     shards = whole("shards", shards, 1)
     one_of("engine", engine, crowds.ENGINES)

@@ -36,6 +36,7 @@ from sim.scenario import InputError, Scenario
 from sim.stability import (
     ClosedLoop,
     ImpulseTest,
+    Mode,
     disagree,
     dominant_mode,
     exact_loops,
@@ -174,6 +175,7 @@ class Findings:
     energy: Array  # (n,) [J] least W(N) on the exact trace
     audited: Array  # (n,) [J] magnitudes that W adds up
     settling: Array  # (n,) rms speed of the handles, last quarter over second quarter, exact trace
+    contacts: NDArray[np.int64]  # (n,) how often a wall was touched on the exact trace
     mass: Array  # (n,) [kg] per set: geometric mean over channels of all mass
     damping: Array  # (n,) [N s/m] likewise of the least damping
     switching: Array  # (n,) [1/s] growth of the linear loop under delays or ticks that vary; nan where they do not
@@ -225,11 +227,13 @@ def _group(
 ) -> Findings:
     scenario, nowhere = validation.scenario, np.full(len(crowd), np.nan)
     held_by = variants(scenario.device, crowd)
-    late = scenario.usual_latency
+    late, mujoco = scenario.usual_latency, nowhere
     loops = exact_loops(held_by, simulation.F, late=late)
-    mode, mujoco = dominant_mode(loops), nowhere
+    frozen = [replace(simulation.process, F=F, contact=None) for F in simulation.process.frozen().values()]
+    mode = Mode.worst([dominant_mode(exact_loops(held_by, process.F, late=late)) for process in frozen])
     if validation.engine != "exact":
-        mujoco = dominant_mode(mujoco_loops(held_by, simulation.process, nthread=validation.threads, late=late)).growth
+        maps = (mujoco_loops(held_by, process, nthread=validation.threads, late=late) for process in frozen)
+        mujoco = Mode.worst([dominant_mode(loop) for loop in maps]).growth
     exact, last = _tests(validation, simulation, held_by, loops, ticked) if validation.ticks else (None, None)
     switched = Switched(nowhere, nowhere)
     if scenario.switches or scenario.uneven:
@@ -247,6 +251,7 @@ def _group(
         energy=exact.least_energy if exact else nowhere,
         audited=exact.audited if exact else nowhere,
         settling=exact.settling if exact else nowhere,
+        contacts=exact.contacts if exact else np.zeros(len(crowd), dtype=int),
         mass=_geometric_mean(np.stack([port.mass.sum(axis=1) for port in crowd.ports], axis=1)),
         damping=_geometric_mean(np.stack([port.damping.min(axis=1) for port in crowd.ports], axis=1)),
         switching=switched.exact,

@@ -16,18 +16,17 @@ from typing import Any
 
 import numpy as np
 
-from controller.budget import EnergyBounding, EnergyBudget, PassivityControl, Shell
+from controller.budget import EPS, EnergyBounding, EnergyBudget, PassivityControl, Shell
 from controller.coupling import Coupling
 from controller.delay import LOST, Ticks, ages
 from controller.loop import DelayRange
 from controller.lti import Array, Lti
 from controller.process import Limiter, Net, Process, contact, limited
-from design.conditions import Requirement
+from design.result import Requirement
 from sim.run import Simulation
 from sim.scenario import Scenario
 from sim.switching import with_delays
 
-EPS = 0.05  # the share of the damping that the budget leaves alone
 HELD = 4  # ticks for which a device goes on holding a force, beyond the largest delay, where packets are lost
 
 _HANNAFORD = "Hannaford and Ryu, IEEE Trans. Robotics and Automation 18 (2002)"

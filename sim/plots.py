@@ -22,6 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 from matplotlib.ticker import NullFormatter
+from numpy.typing import NDArray
 
 from controller.lti import Array
 from design.files import printable, write
@@ -108,6 +109,18 @@ def _array(values: Any) -> Array:
 _SAME = 1e-6  # [%] what rounding leaves between two forces that are one
 
 
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """What a picture says of the scenario: the contacts' names, where walls stand and when they were touched."""
+
+    names: Sequence[str] = ()  # (m,) of the channels; "device 1", .. where there are none
+    walls: Sequence[tuple[int, float, str]] = ()  # channel from 0, place [m] and name of each wall on ground
+    touching: NDArray[np.bool_] | None = None  # (N,) whether any wall is
+
+    def name(self, i: int) -> str:
+        return self.names[i] if self.names else f"device {i + 1}"
+
+
 @dataclass(frozen=True)
 class Onset:
     """How an oscillation begins: what is predicted, and up to when the run says something about a device."""
@@ -124,32 +137,38 @@ def plot_run(
     frequency_hz: float,
     ideal: tuple[Array, float | None] | None = None,
     onset: Onset | None = None,
+    around: Surroundings | None = None,
 ) -> Path:
     """Displacements and forces over the whole run, and six periods of `frequency_hz` where forces turn most sharply.
+
+    The zoom is left out of a run whose forces turn as sharply everywhere. `around` names the curves and shows walls.
 
     Handles are thick, encoders thin where the two differ. `ideal`: forces (N, m) [N] of the ideal environment, drawn
     behind the others, and how far they are from it [%]. `onset`: what is not credible is greyed, and of a loop that
     grows the oscillation's amplitude is drawn over time beside its prediction, in place of the displacements' zoom.
     """
     last, growth = result.t.size, onset.growth if onset else None
+    around = around or Surroundings()
     if onset and onset.until is not None:
         last = int(np.searchsorted(result.t, onset.until))
     if onset and growth is not None:
         last = min(last, onset.steady)
     near = _sharpest(result, frequency_hz, last if last > 1 else result.t.size)
-    zoomed = growth is not None or near != slice(0, result.t.size)
+    zoomed = growth is not None or _stands_out(result, near, last)
     shape: dict[str, Any] = {"width_ratios": (2, 1)} if zoomed else {}
     figure, axes = _panels(title, 2, 1 + zoomed, (11, 6.4), sharex=False if growth is not None else "col", **shape)
     if growth is not None:
         axes[0, 0].sharex(axes[1, 0])
     parts = (slice(None), near)[: 1 + zoomed]
-    _draw_displacements(axes[0] if growth is None else axes[0, :1], result, parts)
+    _draw_displacements(axes[0] if growth is None else axes[0, :1], result, parts, around)
+    _draw_walls(axes[:, 0], result, around)
+    two, alike = _two_points(result), _coinciding(result.f, around)
     # a calm curve stays visible on an agitated one
     for axis, part, width in zip(axes[1], parts, (0.9, 1.4), strict=False):
         for i in _calmest_last(result.f):
             style = _STYLES[i % len(_STYLES)]
-            label = f"device {i + 1}, force" if _two_points(result) else f"device {i + 1}"
-            axis.plot(result.t[part], result.f[part, i], label=label, linewidth=width, **style)
+            label = f"{around.name(i)}, force" if two or alike[i] else around.name(i)
+            axis.plot(result.t[part], result.f[part, i], label=label + alike[i], linewidth=width, **style)
     axes[0, 0].set_ylabel("displacement [mm]")
     axes[1, 0].set_ylabel("force fed back [N]")
     if ideal:
@@ -157,9 +176,9 @@ def plot_run(
     if onset and onset.until is not None:
         _grey_out(axes[:, 0], result, onset.until)
     if onset and growth is not None:
-        _draw_onset(axes[0, 1], result, frequency_hz, onset)
+        _draw_onset(axes[0, 1], result, frequency_hz, onset, around)
     entries = _entries(axes[0, 0]) | _entries(axes[1, 0])
-    _legend(figure, dict(sorted(entries.items())), 3 if len(entries) > 6 else 6, fontsize=9)
+    _legend(figure, _ordered(entries, around), 3 if len(entries) > 6 else 6, fontsize=9)
     if zoomed:
         zoom = axes[0, 1] if growth is None else axes[1, 1]
         zoom.set_title("zoom: where the forces turn most sharply", fontsize=10)
@@ -167,6 +186,17 @@ def plot_run(
         axis.set_xlabel("time [s]")
         axis.margins(x=0.01)
     return _save(figure, path)
+
+
+def _ordered(entries: dict[str, Any], around: Surroundings) -> dict[str, Any]:
+    """Channel by channel, and then the rest."""
+    names = around.names or [f"device {i}" for i in range(1, 100)]
+
+    def place(label: str) -> tuple[int, str]:
+        mine = [i for i, name in enumerate(names) if label == name or label.startswith((f"{name},", f"{name} ("))]
+        return (mine[0] if mine else len(names), label)
+
+    return dict(sorted(entries.items(), key=lambda entry: place(entry[0])))
 
 
 def _two_points(result: Trace) -> bool:
@@ -178,19 +208,60 @@ def _calmest_last(values: Array) -> list[int]:
     return np.argsort(-np.square(np.diff(values, axis=0)).sum(axis=0)).tolist()
 
 
-def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...]) -> None:
+_ALIKE = 0.005  # of the largest value: curves that differ by less cannot be told apart
+
+
+def _coinciding(values: Array, around: Surroundings) -> list[str]:
+    """Per curve of (N, m) which earlier one it lies on, as the end of its label."""
+    scale = np.abs(values).max(initial=0.0)
+    ends = [""] * values.shape[1]
+    for i in range(1, values.shape[1]):
+        on = [j for j in range(i) if np.abs(values[:, i] - values[:, j]).max(initial=0.0) <= _ALIKE * scale]
+        ends[i] = f" (the same curve as {around.name(on[0])})" if on and scale else ""
+    return ends
+
+
+_SHARPER = 4.0  # times the run's mean: what is to be seen in a zoom
+
+
+def _stands_out(result: Trace, near: slice, ticks: int) -> bool:
+    """Whether the forces turn more sharply in this part than in the whole of the first `ticks`."""
+    if near == slice(0, result.t.size):
+        return False
+    bend = np.square(np.diff(result.f[:ticks], n=2, axis=0)).sum(axis=1)
+    return bool(bend[near.start : near.stop].mean() > _SHARPER * bend.mean())
+
+
+def _draw_walls(axes: Array, result: Trace, around: Surroundings) -> None:
+    """Where walls stand, in the panel of displacements, and when they were touched, in both."""
+    for i, place, name in around.walls:
+        colour = _STYLES[i % len(_STYLES)]["color"]
+        axes[0].axhline(1e3 * place, color=colour, linestyle=(0, (2, 2)), linewidth=1.0, label=name)
+    if around.touching is None or not around.touching.any():
+        return
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], around.touching.astype(int), [0]])))
+    for axis in axes:
+        for k, (first, stop) in enumerate(edges.reshape(-1, 2)):
+            label = "in contact with a wall" if k == 0 and axis is axes[0] else None
+            span = result.t[first], result.t[min(stop, result.t.size - 1)]
+            axis.axvspan(*span, color="#F0E442", alpha=0.35, zorder=0, linewidth=0, label=label)
+
+
+def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...], around: Surroundings) -> None:
     """Handles over encoders, in millimetres; one curve where they are one point."""
-    two = _two_points(result)
+    two, alike = _two_points(result), _coinciding(result.x, around)
     for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
         for i in _calmest_last(result.x):
             style = _STYLES[i % len(_STYLES)]
-            label = f"device {i + 1}, encoder (thin)" if two else f"device {i + 1}"
+            label = f"{around.name(i)}, encoder (thin)" if two else around.name(i)
+            if alike[i] and not two:
+                label += f", displacement{alike[i]}"
             thin = 0.5 * width if two else width
             axis.plot(result.t[part], 1e3 * result.x[part, i], label=label, linewidth=thin, **style)
         if two:
             for i in _calmest_last(result.x_handle):
                 style = _STYLES[i % len(_STYLES)]
-                label, handle = f"device {i + 1}, handle (thick)", 1e3 * result.x_handle[part, i]
+                label, handle = f"{around.name(i)}, handle (thick)", 1e3 * result.x_handle[part, i]
                 axis.plot(result.t[part], handle, label=label, linewidth=2.2 * width, **style)
 
 
@@ -203,7 +274,7 @@ def _grey_out(axes: Array | list[Axes], result: Trace, until: float) -> None:
     axes[0].annotate(text, (1.0, 1.0), (-6, -5), fontsize=8, zorder=6, **where)
 
 
-def _draw_onset(axis: Axes, result: Trace, hertz: float, onset: Onset) -> None:
+def _draw_onset(axis: Axes, result: Trace, hertz: float, onset: Onset, around: Surroundings) -> None:
     """The amplitude of the oscillation at the encoders over time, up to the first clipped tick, and its prediction."""
     assert onset.growth is not None
     t, sizes = _amplitudes(result, hertz, onset.steady)
@@ -212,7 +283,7 @@ def _draw_onset(axis: Axes, result: Trace, hertz: float, onset: Onset) -> None:
     if not t.size:
         return
     for i, column in enumerate(1e3 * sizes.T):
-        axis.plot(t, column, label=f"device {i + 1}", linewidth=1.6, **_STYLES[i % len(_STYLES)])
+        axis.plot(t, column, label=around.name(i), linewidth=1.6, **_STYLES[i % len(_STYLES)])
     loudest = int(np.argmax(sizes[-1]))
     # the last third: by then the slower modes have died away
     late = slice(2 * t.size // 3, None)
@@ -287,12 +358,12 @@ class Panel:
     until: float | None = None  # [s] as of an onset
 
 
-def plot_side_by_side(panels: Sequence[Panel], path: Path) -> Path:
+def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] = ()) -> Path:
     """The forces of several couplings on the same axes, each over the force that should be felt (pale).
 
     The axes are those of the forces that should be felt, as far as they are credible; what oscillates leaves them.
     """
-    columns = 2 if len(panels) > 1 else 1
+    columns, around = 2 if len(panels) > 1 else 1, Surroundings(names)
     rows = -(-len(panels) // columns)
     figure, axes = _panels(
         "the same devices and hands", rows, columns, (11, 3.1 * rows + 0.6), sharex=True, sharey=True
@@ -305,7 +376,7 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path) -> Path:
             style = _STYLES[i % len(_STYLES)]
             ideal = panel.ideal[:, i]
             axis.plot(panel.trace.t, ideal, color=style["color"], alpha=0.3, linewidth=5, zorder=1)
-            axis.plot(panel.trace.t, panel.trace.f[:, i], label=f"device {i + 1}", linewidth=1.1, **style)
+            axis.plot(panel.trace.t, panel.trace.f[:, i], label=around.name(i), linewidth=1.1, **style)
         if panel.until is not None:
             _grey_out([axis], panel.trace, panel.until)
         axis.set_title(panel.title, fontsize=10)
@@ -317,7 +388,7 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path) -> Path:
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
     axes[0, 0].plot([], [], color="#BBBBBB", linewidth=5, label="pale: the force that should be felt")
-    _legend(figure, dict(sorted(_entries(axes[0, 0]).items())), 6)
+    _legend(figure, _ordered(_entries(axes[0, 0]), around), 6)
     return _save(figure, path)
 
 
@@ -357,7 +428,7 @@ def plot_population(mass: Array, damping: Array, growth: Array, path: Path, titl
             count = f"{name}: {int(chosen.sum())}"
             axis.scatter(values[chosen], growth[chosen], s=10, marker=marker, color=style["color"], label=count)
         axis.axhline(0.0, color="black", linewidth=0.8)
-        axis.set(xscale="log", xlabel=label)
+        axis.set(xscale="log" if (values > 0).any() else "linear", xlabel=label)
         axis.set_yscale("symlog", linthresh=1e-1)
     axes[0, 0].set_ylabel("growth rate [1/s]")
     _plain_numbers(axes)

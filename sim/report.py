@@ -14,11 +14,11 @@ from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel
 from controller.delay import LOST, Jitter, Ticks, ages
 from controller.lti import Array
 from controller.timing import Timing
-from design.certificate import ANY, CAVEATS, MAKING, assess, certificate_part, encoder_part, finite
-from design.conditions import Requirement
-from design.result import OLDER_NAMES, PRINTED_TAU_DB, PUBLISHED, listed
+from design.certificate import assess
+from design.guarantee import ANY, CAVEATS, MAKING, encoder_part
+from design.result import OLDER_NAMES, PRINTED_TAU_DB, PUBLISHED, Requirement, certificate_part, finite, listed
 from design.transparency import Transparency, decibels
-from models.human import Person
+from models.human import Human, Person
 from sim.adversary import Worst
 from sim.couplings import Chosen
 from sim.crowds import MIXED, Findings, Validation
@@ -342,7 +342,15 @@ def adversary_part(worst: Worst, ratio: float, certified: bool) -> dict[str, Any
 def _humans(humans: tuple[Any, ...]) -> list[dict[str, Any]]:
     """Links of each channel's human."""
     names = ("mass", "damping", "stiffness")
-    return [{"links": [{name: getattr(link, name) for name in names} for link in human.links]} for human in humans]
+
+    def plain(human: Any) -> dict[str, Any]:
+        if isinstance(human, Human):
+            return {"links": [{name: getattr(link, name) for name in names} for link in human.links]}
+        port = human.port()  # a user's own class: what the handle feels of it
+        parts = ("mass", "across", "damping", "stiffness")
+        return {"class": type(human).__name__} | {name: getattr(port, name).tolist() for name in parts}
+
+    return [plain(human) for human in humans]
 
 
 def _persons(persons: tuple[Person, ...]) -> list[dict[str, Any]]:
@@ -393,6 +401,7 @@ def _traces(question: Validation, findings: Findings) -> dict[str, Any] | None:
     part = {
         "duration_s": duration,
         "clipped_runs": int((findings.clipped > 0).sum()),
+        "contacts": int(findings.contacts.sum()),
         "measured": int(measured.sum()),
         "largest_difference_per_s": _largest(np.abs(findings.trace - findings.exact)),
         "stable_and_settling": int((stable & (findings.settling < 1)).sum()),

@@ -23,7 +23,7 @@ from controller.loop import DelayRange, Loop
 from controller.timing import Periods, Timing, drawn
 from design.files import InputError, read_text, toml, write
 from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
-from models.human import Cross, Human, Link, Person, Population, Port, Voluntary, check_holds
+from models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
 
 CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"
@@ -179,6 +179,12 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             return (0,) * self.channels
         return tuple(t + p for t, p in zip(self.theta, self.psi, strict=True))
 
+    def title(self, case: str) -> str:
+        """What reports and pictures are headed with: the paper's cases have names for its own loop only."""
+        if (case == "none" or self.jitter is None) and self.loop(case) == load().loop(case):
+            return f"{self.name}, case {case}"
+        return self.name + {"none": ", no coupling", "II": ", reference without delay"}.get(case, "")
+
     def loop(self, case: str) -> Loop:
         """All that a design may know: no device but its damping, no human. `case` is "none", "I" or "II".
 
@@ -242,13 +248,13 @@ def built_in() -> list[str]:
     return sorted(path.stem for path in SCENARIOS.glob("*.toml"))
 
 
-def require_linear(scenario: Scenario, what: str) -> None:
-    """Raises InputError where a loop has walls or Coulomb friction, for what decides linear loops only."""
+def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
+    """Raises InputError where a loop has Coulomb friction or, unless `walls` are decided too, walls."""
     for i, device in enumerate(scenario.device):
         if device.friction:
             instead = "sim.run and sim.zwidth simulate it"
             raise InputError(f"device[{i}].friction is {device.friction:g} N: {what} decides linear loops; {instead}")
-    if scenario.environment.walls:
+    if scenario.environment.walls and not walls:
         raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
 
 
@@ -272,8 +278,9 @@ def require_even_ticks(scenario: Scenario, what: str) -> None:
 class HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The whole file."""
 
-    human: tuple[Human, ...]
+    human: tuple[Any, ...]  # Human, MeasuredHand, or a user's own
     person: tuple[Person, ...] = ()
+    population: Any = None  # of a Python file: who else is drawn, what has draw(rng, n)
 
 
 def load_humans(path: str | Path, channels: int) -> HumanFile:
@@ -286,8 +293,8 @@ def load_humans(path: str | Path, channels: int) -> HumanFile:
     if Path(path).suffix == ".py":
         people, what = _run_file(path), "`humans`"
     else:
-        people = _converted(read_text(path, f"--human {path}"), HumanFile, f"--human {path}")
-    if len(people.human) != channels:
+        people = _humans_of(read_text(path, f"--human {path}"), f"--human {path}")
+    if len(people.human) != channels and not (people.population and not people.human):
         raise InputError(f"--human {path} has {len(people.human)} {what}, expected {channels} (one per channel)")
     try:
         check_holds([person.holds for person in people.person], channels)
@@ -296,12 +303,30 @@ def load_humans(path: str | Path, channels: int) -> HumanFile:
     return people
 
 
+def _humans_of(text: str, source: str) -> HumanFile:
+    """A file of humans; a [[human]] with A, B, C and D is a measured transfer function, any other a chain."""
+    people: HumanFile = _converted(text, HumanFile, source)
+    made = []
+    for i, human in enumerate(people.human):
+        kind = MeasuredHand if isinstance(human, dict) and "A" in human else Human
+        try:
+            made.append(msgspec.convert(human, kind))
+        except msgspec.ValidationError as error:
+            joint = "." if re.search(r" - at `\$\.", str(error)) else ": "
+            place = _located(str(error), human if isinstance(human, dict) else {})
+            raise InputError(f"{source}: human[{i}]{joint}{place}") from None
+        except ValueError as error:
+            raise InputError(f"{source}: human[{i}]: {error}") from None
+    return HumanFile(tuple(made), people.person)
+
+
 def _run_file(path: str | Path) -> HumanFile:
     """The people that a Python file defines. Raises InputError where it cannot be read or run, or they hold nothing."""
     read_text(path, f"--human {path}")
     try:
         names = runpy.run_path(str(path))
-        return HumanFile(_kept(tuple(names.get("humans", ()))), tuple(names.get("persons", ())))
+        hands, persons = _kept(tuple(names.get("humans", ()))), tuple(names.get("persons", ()))
+        return HumanFile(hands, persons, names.get("population"))
     except (Exception, SystemExit) as error:
         raise InputError(f"--human {path}: {type(error).__name__}: {error}") from None
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from controller.lti import Array, Lti
 from controller.process import Limiter, Process, State, StepBuffer
 from controller.timing import Timing
-from design.certificate import finite
+from design.result import finite
 from models.scene import Scene, Variants
 from sim.engines import Engine, HeldPlant, MujocoBatchEngine, hold, profiler_off, quiet_warnings
 from sim.run import Simulation, beginnings, make_engine, run_blocks
@@ -63,6 +63,13 @@ class Mode:
 
     eigenvalue: NDArray[np.complex128]  # (...,)
     T: float  # [s]
+
+    @classmethod
+    def worst(cls, modes: Sequence[Mode]) -> Mode:
+        """Of several modes of each loop, the one of the largest modulus."""
+        values = np.stack([mode.eigenvalue for mode in modes])
+        largest = np.argmax(np.abs(values), axis=0)[None]
+        return cls(np.take_along_axis(values, largest, axis=0)[0], modes[0].T)
 
     @property
     def spectral_radius(self) -> Array:
@@ -259,6 +266,7 @@ def _contact_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
 # summed up while the simulation runs, so that no trace is kept.
 
 _IMPULSE = 10e-3  # [s]
+TO_THE_WALL = 20.0  # [N] so that a hand of 0.3 kg swings over a few centimetres
 _NOISE_FLOOR = 1e-8  # a mode weaker than this beside the whole state is noise of the engine
 
 
@@ -271,15 +279,16 @@ class ImpulseTest:
     least_energy: Array  # (nsim,) [J] least W(N), with a limiter at any tick, else up to the first clipped one
     audited: Array  # (nsim,) [J] sum of the magnitudes of what W adds up: the scale of its rounding
     settling: Array  # (nsim,) rms of the handles' speeds in the last quarter over that in the second
+    contacts: NDArray[np.int64]  # (nsim,) how often a wall was touched
     simulated: float  # [s] of all simulations together
 
 
-def impulse_forces(scene: Scene, T: float, first: int, ticks: int) -> Array:
-    """Forces [N] of the impulse, (ticks, outside): 1 N on handle 1, -1/2 N on handle 2, 1/3 N on handle 3, ..."""
+def impulse_forces(scene: Scene, T: float, first: int, ticks: int, size: float = 1.0) -> Array:
+    """Forces [N] of the impulse, (ticks, outside): `size` on handle 1, -1/2 of it on handle 2, 1/3 on handle 3, ..."""
     w = np.zeros((ticks, scene.outside))
     until = max(1, round(_IMPULSE / T)) - first
     for i, column in enumerate(scene.tapped):
-        w[: max(until, 0), column] = (-1) ** i / (i + 1)
+        w[: max(until, 0), column] = size * (-1) ** i / (i + 1)
     return w
 
 
@@ -292,15 +301,19 @@ def impulse_test(
     ticks: int,
     tick_done: Callable[[int], None] = lambda ticks: None,
 ) -> ImpulseTest:
-    """Simulate `ticks` periods with every set of humans and measure them. `loops` are the exact ones."""
+    """Simulate `ticks` periods with every set of humans and measure them. `loops` are the exact ones.
+
+    Where there are walls the impulse is large enough to reach them, and no growth is read from the trace.
+    """
     nsim, states = loops.A.shape[0], loops.A.shape[1] - process.F.order
     audit = _Audit(process, scene, loops, delta, ticks)
+    push = partial(impulse_forces, scene, loops.T, size=TO_THE_WALL if process.walls else 1.0)
 
     def look(buffer: StepBuffer, first: int, count: int) -> None:
         audit.see(buffer, first, count)
         tick_done(count)
 
-    run_blocks(process, engine, partial(impulse_forces, scene, loops.T), ticks, np.zeros((states, nsim)), look)
+    run_blocks(process, engine, push, ticks, np.zeros((states, nsim)), look)
     return audit.result(ticks * loops.T * nsim)
 
 
@@ -373,6 +386,8 @@ class _Audit:
     def __init__(self, process: Process, scene: Scene, loops: ClosedLoop, delta: Array, ticks: int) -> None:
         nsim = loops.A.shape[0]
         self._limit, self._limiter = process.force_limit[:, None], process.limiter
+        self._contact = process.contact if process.walls else None
+        self._made, self._touching = np.zeros(nsim, dtype=int), np.zeros((len(process.walls), nsim), dtype=bool)
         self._B, self._T, self._damping = loops.B, loops.T, delta[:, None] / loops.T
         self._left = left_eigenvector(loops)  # (nsim, n)
         self._speeds = _Speeds(scene, nsim, (ticks // 4, ticks // 2), (ticks - ticks // 4, ticks))
@@ -386,6 +401,10 @@ class _Audit:
         z, s, w, f = (rows[: count + 1] for rows in (buffer.z, buffer.s, buffer.w, buffer.f))
         limiter = self._limiter  # acts before its force arrives
         clipped = (limiter.slips(z) != 0 if limiter else np.abs(f[:count]) >= self._limit).any(axis=1)  # (ticks, nsim)
+        if self._contact:
+            touching = np.concatenate([self._touching[None], self._contact.depths(z) > 0])
+            self._made += (touching[1:] & ~touching[:-1]).sum(axis=(0, 1))
+            self._touching = touching[-1]
         linear = self._linear & ~np.logical_or.accumulate(clipped, axis=0)
         self._clipped += clipped.sum(axis=0)
         self._usable += linear.sum(axis=0)
@@ -400,6 +419,9 @@ class _Audit:
         self._energy = energy[-1]
         self._size += (np.abs(work) + spent).sum(axis=0)
 
+        self._speeds.see(buffer, first, count)
+        if self._contact:  # no one linear loop whose mode could be followed
+            return
         xi = np.concatenate([s, z], axis=1)
         y = np.einsum("ns,ksn->kn", self._left.conj(), xi)
         pushed = np.einsum("ns,nsw,kwn->kn", self._left.conj(), self._B, w[:count], optimize=True)
@@ -407,11 +429,10 @@ class _Audit:
         self._across += (y.conj() * after).sum(axis=0)
         self._weight += (np.abs(y) ** 2).sum(axis=0)
         self._whole += np.where(linear[:, None], xi[:-1] ** 2, 0.0).sum(axis=(0, 1))
-        self._speeds.see(buffer, first, count)
 
     def result(self, simulated: float) -> ImpulseTest:
         above_noise = (self._usable >= _SHORTEST_TRACE) & (self._weight > _NOISE_FLOOR**2 * self._whole)
         with np.errstate(divide="ignore", invalid="ignore"):
             growth = np.where(above_noise, np.log(np.abs(self._across / self._weight)) / self._T, np.nan)
             settling = np.sqrt(self._speeds.late / self._speeds.early)
-        return ImpulseTest(growth, self._clipped, self._least, self._size, settling, simulated)
+        return ImpulseTest(growth, self._clipped, self._least, self._size, settling, self._made, simulated)

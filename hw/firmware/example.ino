@@ -18,6 +18,7 @@ static const uint8_t ENCODER_A[AXES] = {2, 4}, ENCODER_B[AXES] = {3, 5};
 static const uint8_t MOTOR_PWM[AXES] = {9, 10}, MOTOR_DIRECTION[AXES] = {7, 8};
 static const uint8_t ENABLE = 6;       /* of both drivers; pulled down outside: an unpowered board means no force */
 static const uint8_t STOP_BUTTON = 11; /* normally closed, to ground: pressed, unplugged and broken all read HIGH */
+static const uint8_t DEADMAN = 12;     /* closed to ground while it is held: let go, unplugged and broken all read HIGH */
 /* A step of force is a step of the PWM, no finer: what INFO says of it, the host's limits rest on. Teensy 4 has up to 15
  * bits; a board whose analogWrite knows no more than 8 has steps of 47 mN at 12 N, and no analogWriteResolution(). */
 static const uint8_t PWM_BITS = 12;
@@ -129,6 +130,7 @@ void setup()
   pinMode(ENABLE, OUTPUT);
   digitalWrite(ENABLE, LOW);
   pinMode(STOP_BUTTON, INPUT_PULLUP);
+  pinMode(DEADMAN, INPUT_PULLUP);
   attachInterrupt(digitalPinToInterrupt(ENCODER_A[0]), edge0, CHANGE);
   attachInterrupt(digitalPinToInterrupt(ENCODER_A[1]), edge1, CHANGE);
   if (PWM_BITS > 8) analogWriteResolution(PWM_BITS);
@@ -162,6 +164,7 @@ void loop()
   int16_t force[AXES];
   uint8_t out[HL_MAX_OUT];
   readEncoders(counts);
+  hl_deadman(&device, digitalRead(DEADMAN) == LOW); /* --deadman device: without it the host ramps forces out */
   size_t n = hl_tick(&device, timeUs(), counts, force, out);
   writeForces(force);
   watchdogFeed(); /* here and nowhere else: a loop that turns without ticks must not feed it */

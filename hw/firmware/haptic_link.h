@@ -5,7 +5,7 @@
  *   hl_init     once; the device is silent and its motors carry nothing
  *   hl_receive  for every byte that comes; where it returns true, give the motors d->applied at once (theta = 0)
  *   hl_tick     once per period: what the motors carry from now on, and the bytes to send
- *   hl_estop, hl_fault   at any time, from the context that calls hl_tick (not from an interrupt)
+ *   hl_estop, hl_fault, hl_deadman   at any time, from the context that calls hl_tick (not from an interrupt)
  *
  * Where memory is scarce, define HL_MAX_AXES (1 to 8) before including this file. */
 #ifndef HAPTIC_LINK_H
@@ -21,7 +21,7 @@
 #if HL_MAX_AXES < 1 || HL_MAX_AXES > 8
 #error "HL_MAX_AXES: 1 to 8"
 #endif
-#define HL_PROTOCOL 1
+#define HL_PROTOCOL 2
 #define HL_MAX_THETA 15
 #define HL_SLOTS 16                 /* forces that wait for their tick: a power of two above HL_MAX_THETA */
 #define HL_MAX_RELEASE_NS 20000000u /* longest hold and ramp together */
@@ -65,7 +65,7 @@ typedef struct {
 typedef struct {
     hl_info info;
     hl_config config;
-    bool configured, asked, answered, latched;
+    bool configured, asked, answered, latched, deadman;
     uint8_t phase, cause, refused, rejected, misses, held, ramp_left;
     uint16_t k, echo, run;
     uint32_t now, config_crc;
@@ -111,6 +111,8 @@ static inline void hl_latch_estop(hl_device *d, uint8_t cause)
 
 static inline void hl_fault(hl_device *d) { hl_halt(d, HL_BY_DEVICE); }
 static inline void hl_estop(hl_device *d) { hl_latch_estop(d, HL_ESTOP_DEVICE); }
+/* Whether somebody holds the deadman; a device that never says so has none. */
+static inline void hl_deadman(hl_device *d, bool held) { d->deadman = held; }
 
 /* False, and a device that never runs, where the info cannot be right. */
 static inline bool hl_init(hl_device *d, const hl_info *info)
@@ -295,7 +297,7 @@ static inline size_t hl_write_state(const hl_device *d, const int32_t *counts, u
 {
     uint8_t *p = out + 1, a;
     *p++ = HL_STATE;
-    *p++ = (uint8_t)(d->phase | d->cause << 4);
+    *p++ = (uint8_t)(d->phase | d->cause << 4 | d->deadman << 7);
     p = hl_put16(hl_put16(hl_put16(p, d->k), d->echo), (uint16_t)d->margin);
     *p++ = d->rejected;
     *p++ = d->misses;

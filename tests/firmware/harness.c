@@ -41,6 +41,7 @@ size_t harness_tick(hl_device *d, uint32_t now, const int32_t *counts, int16_t *
 
 void harness_estop(hl_device *d) { hl_estop(d); }
 void harness_fault(hl_device *d) { hl_fault(d); }
+void harness_deadman(hl_device *d, int held) { hl_deadman(d, held != 0); }
 
 #ifdef HARNESS_MAIN
 static uint32_t word(void)
@@ -50,7 +51,7 @@ static uint32_t word(void)
     return (uint32_t)b[0] | (uint32_t)b[1] << 8 | (uint32_t)b[2] << 16 | (uint32_t)b[3] << 24;
 }
 
-/* Operations of 32-bit words: R now n bytes.. | T now counts.. | E | F; every tick answers: n, n bytes, axes forces */
+/* Operations of 32-bit words: R now n bytes.. | T now counts.. | E | F | D held; every tick answers: n, n bytes, axes forces */
 int main(void)
 {
     uint32_t values[5 * HL_MAX_AXES], serial = word(), period_ns = word(), axes = word(), a;
@@ -61,6 +62,7 @@ int main(void)
         uint32_t operation = word();
         if (operation == 'E') harness_estop(d);
         else if (operation == 'F') harness_fault(d);
+        else if (operation == 'D') harness_deadman(d, (int)word());
         else if (operation == 'R') {
             uint32_t now = word(), n = word();
             uint8_t *data = (uint8_t *)malloc(n ? n : 1); /* of its exact size, so that the sanitizer sees one byte too many */

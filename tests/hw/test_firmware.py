@@ -61,7 +61,7 @@ def library(tmp_path_factory):
 def info(axes: int, period_ns: int = 1_200_000) -> Info:
     limits = tuple(24000 - 1000 * a for a in range(axes))
     return Info(
-        1,
+        2,
         "harness",
         SERIAL,
         period_ns,
@@ -102,12 +102,17 @@ class Firmware:
     def fault(self):
         self.lib.harness_fault(self.memory)
 
+    def set_deadman(self, held):
+        self.lib.harness_deadman(self.memory, held)
+
+    deadman = property(fset=set_deadman)
+
 
 class Traffic:
     """A host with lapses and a line with faults: what is done to a device between two of its ticks, from a seed."""
 
     def __init__(self, seed: int, device: Device) -> None:
-        self.rng, self.device = random.Random(seed), device
+        self.rng, self.hand, self.device = random.Random(seed), random.Random(~seed), device
         self.theta = self.rng.choice((0, 1, 1, 2, 3, 15))
         self.loss, self.trouble = self.rng.choice((0.0, 0.05, 0.5)), self.rng.choice((0.0, 0.02, 0.2))
         self.recent: list[bytes] = []
@@ -162,7 +167,7 @@ class Traffic:
         return rng.choice(choices)()
 
     def between_ticks(self, now: int) -> list[tuple]:
-        """Operations ("R", now, bytes), ("E",), ("F",)."""
+        """Operations ("R", now, bytes), ("E",), ("F",), ("D", held)."""
         rng, d, ops, data = self.rng, self.device, [], b""
         if d.phase in (Phase.SILENT, Phase.STOPPED, Phase.ESTOP) and rng.random() < 0.3:
             data += encode(self.config())
@@ -172,6 +177,8 @@ class Traffic:
             data += self.oddity() if rng.random() < 0.9 else encode(Stop(rng.choice((0, 1, 2, 77))))
         if rng.random() < (0.2 if d.phase == Phase.ESTOP else self.trouble / 10):
             ops.append(rng.choice([("E",), ("F",), ("F",), ("F",), ("R", now, encode(Stop(Reason.ESTOP)))]))
+        if self.hand.random() < 0.05:
+            ops.append(("D", self.hand.random() < 0.5))
         cut = rng.randint(0, len(data))
         return [("R", now + rng.randint(0, 300), data[:cut]), *ops, ("R", now + rng.randint(300, 3000), data[cut:])]
 
@@ -238,6 +245,8 @@ def play(device, op: tuple):
             device.estop()
         case ("F",):
             device.fault()
+        case ("D", held):
+            device.deadman = held
     return None
 
 
@@ -264,6 +273,7 @@ def test_the_traffic_visits_every_state_cause_and_refusal(episodes):
     assert {m.refused for m in messages if isinstance(m, Ack)} == set(Refused)
     states = [m for m in messages if isinstance(m, State)]
     assert any(m.margin_us > 0 for m in states)
+    assert {m.deadman for m in states if m.phase == Phase.ARMED} == {True, False}
     assert any(-0x7FFF < m.margin_us < 0 for m in states)
     last = [m for _, sent in episodes[-1][2] for m in Decoder().feed(sent) if isinstance(m, State)]
     ticks = [m.tick for m in last if m.phase == Phase.ARMED]
@@ -315,6 +325,8 @@ def written(about: Info, script: list[tuple]) -> bytes:
         out.append(struct.pack("<I", ord(op[0])))
         if op[0] == "R":
             out.append(struct.pack("<II", op[1] & 0xFFFFFFFF, len(op[2])) + op[2])
+        elif op[0] == "D":
+            out.append(struct.pack("<I", op[1]))
         elif op[0] == "T":
             out.append(struct.pack(f"<I{about.axes}i", op[1], *op[2]))
     return b"".join(out)
@@ -365,7 +377,15 @@ def test_the_headers_need_no_library_no_float_and_no_heap(tmp_path):
     assert not re.search(r"\b(float|double)\b", text.split("#include", 1)[1])
 
 
-SKETCH_PINS = {"encoder A": 2, "encoder B": 3, "pwm": (9, 10), "direction": (7, 8), "enable": 6, "stop": 11}
+SKETCH_PINS = {
+    "encoder A": 2,
+    "encoder B": 3,
+    "pwm": (9, 10),
+    "direction": (7, 8),
+    "enable": 6,
+    "stop": 11,
+    "deadman": 12,
+}
 
 
 class Sketch:
@@ -426,7 +446,7 @@ def test_the_example_sketch_arms_follows_and_stops(sketch):
     for command, force in [(Command.ARM, (0, 0)), *[(Command.RUN, (2048, -4095))] * 3]:
         sketch.feed(Force(command, (state.tick + 1) & 0xFFFF, state.tick, force))
         (state,) = sketch.run(1200)
-    assert (state.phase, state.applied) == (Phase.ARMED, (2048, -4095))
+    assert (state.phase, state.applied, state.deadman) == (Phase.ARMED, (2048, -4095), True)
     assert [sketch.pin(p) for p in SKETCH_PINS["pwm"]] == [2048, 4095]
     assert [sketch.pin(p) for p in SKETCH_PINS["direction"]] == [0, 1]
     assert sketch.pin(SKETCH_PINS["enable"]) == 1
@@ -449,7 +469,10 @@ def test_the_example_sketch_counts_edges_and_obeys_its_button(sketch):
     assert (state.phase, state.cause) == (Phase.ESTOP, Cause.ESTOP_DEVICE)
     sketch.lib.stub_set_pin(SKETCH_PINS["stop"], 0)
     (state,) = sketch.run(1200)
-    assert state.phase == Phase.ESTOP
+    assert (state.phase, state.deadman) == (Phase.ESTOP, True)
+    sketch.lib.stub_set_pin(SKETCH_PINS["deadman"], 1)  # let go, or the wire is broken
+    (state,) = sketch.run(1200)
+    assert not state.deadman
 
 
 @needs_gxx
@@ -602,7 +625,21 @@ def test_a_hello_of_another_version_is_answered(device):
     """It is for the host to refuse; so it can say why."""
     device.tell(Hello(9))
     (about,) = device.tick()
-    assert (type(about), about.version) == (Info, 1)
+    assert (type(about), about.version) == (Info, 2)
+
+
+def test_the_deadman_is_told_in_every_state_and_changes_nothing_else(device):
+    device.armed()
+    assert not device.state().deadman
+    for held in (True, False, True):
+        device.device.deadman = held
+        device.answer(Command.RUN, (1000, -1000), 2)
+        state = device.state()
+        assert (state.deadman, state.phase in (Phase.ARMED, Phase.HOLDING), state.applied) == (
+            held,
+            True,
+            (1000, -1000),
+        )
 
 
 def test_a_config_leaves_the_counters_and_forgets_the_forces(device):

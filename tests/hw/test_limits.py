@@ -27,13 +27,13 @@ from hw.limits import (
     watchdog_for,
 )
 from hw.monitor import CommandMonitor, check_state
-from hw.protocol import MAX_RELEASE_NS, Config, Force, Info, Phase, State, encode
+from hw.protocol import MAX_RELEASE_NS, PROTOCOL, Config, Force, Info, Phase, State, encode
 from sim.scenario import load
 
 LIMITS = Limits((12.0, 6.0))
 T = 1.2e-3
 numbers = st.floats(allow_nan=True, allow_infinity=True)
-INFO = Info(1, "test", 7, 1_200_000, (1_370_000,) * 2, (10**6,) * 2, (400,) * 2, (30000,) * 2, (10**5,) * 2)
+INFO = Info(PROTOCOL, "test", 7, 1_200_000, (1_370_000,) * 2, (10**6,) * 2, (400,) * 2, (30000,) * 2, (10**5,) * 2)
 
 
 @given(st.tuples(numbers, numbers), st.tuples(numbers, numbers), st.floats(0, 1))

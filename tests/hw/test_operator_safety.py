@@ -9,13 +9,14 @@ import time
 from dataclasses import replace as changed
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cli import bridge, identify, replay
 from cli.bridge import _parser
 from cli.session_cli import limits_from, touched
 from hw.control import certified_couplings
-from hw.emulator import Emulator
+from hw.emulator import Emulator, FaultInjection
 from hw.faults import lively
 from hw.limits import Limits, Stage
 from hw.monitor import LinkSettings
@@ -71,6 +72,33 @@ def test_a_deadman_that_is_let_go_ramps_the_forces_out(scenario, rungs, until):
 def test_a_deadman_that_is_held_lets_the_session_go_on(scenario, rungs):
     session = rehearsal_of(scenario, rungs, Operator(True, 1.5, lambda: True)).run_until_armed(3.0)
     assert (session.stage, session.cause) == (Stage.FINISHED, "the time is over")
+
+
+def test_the_deadman_at_the_device(scenario, rungs):
+    """It arms while the switch is held only, and ramps out at the first STATE that says it is not."""
+    faults = (FaultInjection.parse("letgo@0.5"),)
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60, deadman=True))
+    rehearsal = Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, operator=Operator(True, 9.0))
+    rehearsal.emulator.device.deadman = False
+    rehearsal.run(1.0)
+    assert session.stage == Stage.DISARMED
+    assert session.arm(session.now) == b""
+    assert session.log[-1][1:] == (Stage.DISARMED, "the deadman at the device is not held")
+    assert not any(np.any(m.applied) for m in rehearsal.moments)
+    rehearsal.emulator.device.deadman = True
+    rehearsal.run_until_armed(2.0)
+    assert (session.stage, session.cause) == (Stage.FINISHED, "the deadman at the device was let go")
+    assert rehearsal.zero_after(0.5) < 0.110
+    assert [event.stage for event in session.log[-3:]] == [Stage.ARMED, Stage.DISARMING, Stage.FINISHED]
+
+
+def test_a_deadman_let_go_before_the_gain_rises_ends_at_once(scenario, rungs):
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60, deadman=True))
+    faults = (FaultInjection.parse("letgo@0"),)
+    rehearsal = Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults)
+    rehearsal.run_until_armed(0.5)
+    assert (session.stage, session.cause) == (Stage.FINISHED, "the deadman at the device was let go")
+    assert Stage.ARMED not in [event.stage for event in session.log]
 
 
 def test_any_key_is_somebody(scenario, rungs):

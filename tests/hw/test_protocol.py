@@ -66,7 +66,9 @@ def integers(bits: int, signed: bool = False):
 
 def states(axes: int):
     u8, u16, i16, u32 = integers(8), integers(16), integers(16, True), integers(32)
-    status = st.builds(lambda p, c: p | c << 4, st.sampled_from(Phase), st.sampled_from(Cause))
+    status = st.builds(
+        lambda p, c, held: p | c << 4 | held << 7, st.sampled_from(Phase), st.sampled_from(Cause), st.booleans()
+    )
     return st.builds(
         State, status, u16, u16, i16, u8, u8, u32, st.tuples(*[integers(32, True)] * axes), st.tuples(*[i16] * axes)
     )
@@ -246,9 +248,9 @@ def test_a_status_without_a_name_is_malformed():
     for status in range(256):
         got = Decoder().feed(encode(STATE._replace(status=status)))
         if got:
-            assert got[0].phase | got[0].cause << 4 == status
+            assert got[0].phase | got[0].cause << 4 | got[0].deadman << 7 == status
         else:
-            assert status & 15 not in set(Phase) or status >> 4 not in set(Cause)
+            assert status & 15 not in set(Phase) or status >> 4 & 7 not in set(Cause)
 
 
 def test_ticks_are_counted_modulo_65536():

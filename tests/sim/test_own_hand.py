@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from cli.run import main
+from design import design_coupling
 from design.result import CASE_I
 from models.human import Human, Link, Person, Port, state_space
+from models.scene import variants
 from sim import load, simulate, validate
 from sim.crowds import Validation
+from sim.engines import hold
 from sim.run import assemble
-from sim.scenario import InputError
+from sim.scenario import InputError, load_humans
 from sim.stability import close, dominant_mode
 
 AGREE = 1e-6  # RK4 at 0.2 rad of the fastest mode in a step: 0.2^5/120 in each, of which most decays
@@ -172,3 +175,51 @@ def test_the_command_takes_hands_from_a_python_file(tmp_path, capsys):
     hands.write_text("humans = ()")
     with pytest.raises(InputError, match="has 0 `humans`, expected 2"):
         main([*words, "--human", str(hands)])
+
+
+def test_a_measured_hand_and_a_population_from_files(tmp_path):
+    """A transfer function in TOML is checked and run; a Python file may say who is drawn."""
+    file = tmp_path / "hands.toml"
+    space = "[[human]]\nmass = 0.2\nA = [[-30.0]]\nB = [[1.0]]\nC = [[{C}]]\nD = [[2.0]]\n"
+    chain = "[[human]]\nlinks = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]\n"
+    file.write_text(space.format(C=200.0) + chain)
+    people = load_humans(file, 2).human
+    assert people[0].port().impedance.order == 1
+    run = simulate(SCENARIO.replace(human=people, duration=0.5), CASE_I, engine="exact")
+    assert run.meta["stability"]["exact_verdict"] == "stable"
+    for text, message in [
+        (space.format(C=-200.0) + chain, "human[0]: impedance: not passive"),
+        (space.format(C='"x"') + chain, "human[0].C[0][0] = 'x': expected `float`"),
+        (chain.replace("mass", "mas") + chain, "human[0].links[0]: object contains unknown field `mas`"),
+    ]:
+        file.write_text(text)
+        with pytest.raises(InputError) as caught:
+            load_humans(file, 2)
+        assert message in str(caught.value)
+    python = tmp_path / "who.py"
+    python.write_text("class Draw:\n    def draw(self, rng, n):\n        return []\npopulation = Draw()\n")
+    assert callable(load_humans(python, 2).population.draw)
+
+
+def test_a_state_space_is_no_coupling():
+    with pytest.raises(TypeError, match=r"wrap it in Compliance\(\.\.\.\)"):
+        simulate(SCENARIO, CASE_I.compliance(SCENARIO.T))
+
+
+def test_a_population_on_a_wall():
+    """Verdicts are of the worst frozen contact state, by both engines; contact is made and energy kept account of."""
+    scenario = load("one-wall")
+    coupling = design_coupling(scenario.loop("I"), "spring-damper", "any-environment")
+    found = validate(scenario, coupling, humans=20, duration=2.0)
+    assert (found.exact < 0).all()
+    assert not found.disagreements.any()
+    assert found.contacts.sum() > 10
+    assert (found.energy >= -1e-9 * found.audited).all()
+    # by the loops themselves: open and touching, each with this human
+    simulation = assemble(scenario, coupling.coupling)
+    crowd = Validation(scenario, coupling.coupling, 0, 20, 1, "exact", 0.0).crowd(7)
+    plant = hold(variants(scenario.device, crowd).plants(), scenario.T)
+    states = simulation.process.frozen().values()
+    growth = max(float(dominant_mode(close(plant, F)).growth[0]) for F in states)
+    assert found.exact[7] == pytest.approx(growth, rel=1e-9)
+    assert (validate(scenario, None, humans=20, duration=0.0).exact > 0).any()

@@ -61,7 +61,9 @@ def test_a_run_is_drawn_whole_and_where_it_turns():
 
 
 def test_every_sample_of_a_run_is_on_the_picture(drawn):
-    f = np.random.default_rng(0).normal(size=(400, 3)).cumsum(axis=0)
+    steps = np.random.default_rng(0).normal(size=(400, 3))
+    steps[60:] *= 1e-3
+    f = steps.cumsum(axis=0)  # turns sharply in its first ticks only: there is something to zoom into
     f[:, 1] = 0.01 * np.arange(400)  # calm: drawn last, so that it stays visible
     figure = drawn(plots.plot_run, trace(f), title="t", frequency_hz=80.0, ideal=(2 * f, 12.34))
     whole = lines(figure.axes[2])
@@ -70,6 +72,30 @@ def test_every_sample_of_a_run_is_on_the_picture(drawn):
         np.testing.assert_allclose(lines(figure.axes[0])[f"device {i + 1}"][:, 1], f[:, i])  # mm of 1e-3 m a newton
     assert [line.get_label() for line in figure.axes[2].lines][2] == "device 2"
     assert legend(figure) == ["device 1", "device 2", "device 3", "pale: ideal environment (asked force 12 % off)"]
+
+
+def test_names_walls_and_curves_that_coincide(drawn):
+    """A calm run has no zoom; walls are where they stand; a curve that lies on another one says so."""
+    t = np.arange(3000)
+    wave = np.sin(t / 300)
+    f = np.stack([wave, wave, 2 * wave], axis=1)
+    touching = wave > 0.5
+    around = plots.Surroundings(("left", "right", "top"), [(0, 0.0005, "wall 1")], touching)
+    figure = drawn(plots.plot_run, trace(f), title="t", frequency_hz=80.0, around=around)
+    displacement, force = figure.axes
+    assert legend(figure) == [
+        "left",
+        "right, displacement (the same curve as left)",
+        "right, force (the same curve as left)",
+        "top",
+        "in contact with a wall",
+        "wall 1",
+    ]
+    assert set(lines(displacement)["wall 1"][:, 1]) == {0.5}
+    edges = T * np.flatnonzero(np.diff(touching.astype(int)) != 0).reshape(-1, 2)
+    for axis in (displacement, force):
+        spans = [(part.get_x(), part.get_x() + part.get_width()) for part in axis.patches]
+        np.testing.assert_allclose(spans, edges + T)
 
 
 def test_an_onset_is_drawn_at_its_size_and_slope_and_what_is_not_credible_is_grey(drawn):

@@ -1,0 +1,389 @@
+"""The seam for devices: the Force Dimension SDK by a stand-in that plays a device, and the serial link."""
+
+import sys
+from types import ModuleType
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from cli import bridge, replay
+from cli.session_cli import check_link
+from controller.coupling import SpringDamper
+from hw.control import certified_coupling, certified_couplings, timed
+from hw.limits import Limits, Stage
+from hw.monitor import Ages, LinkSettings
+from hw.protocol import Command, Config, Force, Phase, Reason, Refused, State
+from hw.recording import Recorder, save
+from hw.seam import DeviceWire, ForceDimension, SerialDevice, library
+from hw.session import Session
+from hw.transport import Live, PortLost
+from models.scene import build, plant
+from sim.scenario import InputError
+from sim.scenario import load as scenario_of
+
+T = 1.2e-3
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return scenario_of()
+
+
+class StandIn:
+    """The calls of forcedimension_core.dhd over the scenario's own devices and hands, in time that only it moves.
+
+    The plant is integrated exactly between any two calls, so that a force acts from the instant it is written.
+    """
+
+    def __init__(self, scenario, read_us=40, write_us=50):
+        self.read, self.write = 1e-6 * read_us, 1e-6 * write_us
+        scene = build(scenario.device, scenario.human, scenario.person)
+        self.plant, self.channels, self.pushing = plant(scene.model), scenario.channels, scene.outside
+        self.s = np.zeros(self.plant.A.shape[0])
+        self.force, self.now, self.done = np.zeros(self.channels), 0.0, 0.0
+        self.enabled, self.open, self.log, self.watchdogs = {}, [], [], []
+        self.broken, self.saturated, self.push = False, False, lambda t: 0.0
+        self.steps = {}
+
+    # the clock
+
+    def clock(self):
+        self.now += 1e-6  # looking takes time, so that waiting awake ends
+        return self.now
+
+    def sleep(self, seconds):
+        self.now += max(seconds, 0.0)
+
+    def _advance(self):
+        if (dt := round(self.now - self.done, 9)) > 0:
+            if dt not in self.steps:
+                A, B = self.plant.A, self.plant.B
+                n, m = A.shape[0], B.shape[1]
+                whole = expm(np.block([[A, B], [np.zeros((m, n + m))]]) * dt)
+                self.steps[dt] = whole[:n, :n], whole[:n, n:]
+            a, b = self.steps[dt]
+            outside = np.full(self.pushing, self.push(self.now))
+            self.s = a @ self.s + b @ np.concatenate(
+                [outside, -self.force * [self.enabled.get(i, False) for i in (0, 1)]]
+            )
+            self.done = self.now
+
+    # the library
+
+    def openID(self, index):
+        if index >= self.channels or self.broken:
+            return -1
+        self.open.append(index)
+        return index
+
+    def close(self, ID):
+        self.open.remove(ID)
+        return 0
+
+    def getSystemName(self, ID):
+        return "omega.3"
+
+    def getSerialNumber(self, ID):
+        return 4711
+
+    def getPosition(self, out, ID):
+        self.now += self.read / self.channels
+        self._advance()
+        out[:] = [float(self.s[ID]), 0.0, 0.0]
+        return -1 if self.broken else 0
+
+    def setForce(self, f, ID):
+        self.now += self.write / self.channels
+        self._advance()
+        self.force[ID] = f[0]
+        self.log.append((self.now, ID, f[0]))
+        return -1 if self.broken else 2 if self.saturated else 0
+
+    def enableForce(self, enable, ID):
+        self._advance()
+        self.enabled[ID] = enable
+        return 0
+
+    def setWatchdog(self, duration, ID):
+        self.watchdogs.append(duration)
+        return 0
+
+    def errorGetLastStr(self):
+        return "no device found"
+
+
+def held_session(scenario, sdk, seconds=0.5, cap=12.0, glance=lambda session: None):
+    """A session of Live with the stand-in, from the handshake to the end."""
+    session = Session(scenario, Limits((cap,) * 2), LinkSettings(measure=150))
+    session.record = recorder = Recorder(2)
+    with ForceDimension(scenario, None, sdk, sdk.clock, sdk.sleep) as device:
+        wire, made = DeviceWire(device), []
+
+        def plan(ages):
+            judged, link = timed(scenario, ages, 0.99, 50.0, at_once=True)
+            made.extend(certified_couplings(judged, "I", None, None, link, spare=0))
+            return made
+
+        live = Live(session, wire, plan, True, seconds, glance=glance)
+        live.now = lambda: round(1e6 * sdk.now)
+        live.run()
+        wire.close()
+    return session, recorder, made
+
+
+def test_a_session_with_a_device_that_the_host_clocks(scenario, tmp_path):
+    """Handshake, delay, certificate, forces, ramp, replay: the same session as over the serial link."""
+    sdk = StandIn(scenario)
+    sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * t)
+    session, recorder, (made,) = held_session(scenario, sdk)
+    assert (session.stage, session.cause) == (Stage.FINISHED, "the time is over")
+    assert session.info.firmware == "omega.3"
+    assert session.info.serial == 4711
+    # forces acted, and each within the latency that is certified
+    (t1, t2), _ = made.scenario.latency
+    assert 0 < t1 < 93e-6 < t2 < 300e-6  # 40 us to read, 50 to write, 3 to look at the clock
+    assert T <= (made.scenario.T_max or T) < 1.2 * T
+    link = recorder.link()
+    assert np.abs(link["applied"]).max() > 1000
+    age = 1e6 * T - link["margin_us"][link["received"]]
+    assert np.mean(age <= 1e6 * t2) > 0.98
+    # the force that answers a sample acts before the next one, not a period later
+    sent = {round(force / 4e-4) for _, ID, force in sdk.log if ID == 0}
+    assert set(link["sent"][:, 0].tolist()) <= sent | {0}
+    # zero force and motors off at the end, whatever was open is closed
+    assert sdk.force.tolist() == [0.0, 0.0]
+    assert sdk.enabled == {0: False, 1: False}
+    assert sdk.open == []
+    assert sdk.watchdogs == [160, 160]
+    report = {"scenario": "s", "case": "I"}
+    save(tmp_path, session, recorder, report, plot=False)
+    assert replay.main([str(tmp_path / "trace.npz")]) == 0
+
+
+def test_the_certificate_says_what_changes_when_the_host_is_the_clock(scenario):
+    """T at most T_max, and a latency of part of a sample where a link of a whole tick is charged otherwise."""
+    _, _, (made,) = held_session(scenario, StandIn(scenario), seconds=0.1)
+    part = made.part((12.0, 12.0))
+    assert part["theta"] == list(scenario.theta)  # no tick is added for the link
+    assert part["link_delay"] == 0
+    assert part["certificate"]["certified"]
+    (said,) = [remark for remark in part["remarks"] if "act as they come" in remark]
+    T_max, (t1, t2) = made.scenario.T_max or made.scenario.T, made.scenario.latency[0]
+    kept = (
+        f"periods up to {1e6 * T_max:.0f} us and forces that act {1e6 * t1:.0f} to {1e6 * t2:.0f} us after their sample"
+    )
+    assert said == f"forces act as they come: certified for {kept}, as measured"
+
+
+def test_microseconds_are_charged_where_a_link_costs_a_tick(scenario):
+    """The same coupling: 0.13 ms after a sample, and a tick after it."""
+    judged, link = timed(scenario.replace(theta=(0, 1)), Ages((50,) * 50 + (130,) * 50), 1.0, 0.0, at_once=True)
+    assert judged.latency[1] == pytest.approx((50e-6, 130e-6))
+    assert link == 0
+    judged = judged.replace(latency=((0.0, 130e-6),) * 2)
+    given = SpringDamper([879.0, 552.0], [0.39, 0.52])
+    host = certified_coupling(judged, "I", None, None, 0, given)
+    link = certified_coupling(scenario.replace(theta=(1, 2)), "I", None, None, 1, given)
+    assert max(host.requirements["this-environment"].required) == pytest.approx(
+        0.637433, rel=1e-4
+    )  # switching in [0, 0.13] ms
+    assert max(link.requirements["this-environment"].required) == pytest.approx(0.714344, rel=1e-4)
+
+
+@pytest.mark.parametrize(("read", "write", "holds"), [(40, 50, True), (500, 500, False)])
+def test_a_force_that_takes_too_long_is_refused(scenario, read, write, holds):
+    session, *_ = held_session(scenario, StandIn(scenario, read, write), seconds=0.05)
+    if holds:
+        assert session.stage == Stage.FINISHED
+    else:
+        assert session.stage == Stage.REFUSED
+        assert "answers come up to" in session.cause
+        assert "T is 1200 us: latch at ticks" in session.cause
+
+
+def test_forces_later_than_certified_end_in_a_ramp(scenario):
+    """0.4 ms in place of 0.1, still within the tick: late, for the certificate is for less."""
+    sdk = StandIn(scenario)
+
+    def glance(session):
+        if session.stage == Stage.ARMED:
+            sdk.write = 0.4e-3
+
+    session, *_ = held_session(scenario, sdk, seconds=3.0, glance=glance)
+    assert session.stage == Stage.STOPPED
+    assert "answers were late, and nothing softer is left" in session.cause
+    assert session.counters.late > 20
+    assert sdk.force.tolist() == [0.0, 0.0]
+
+
+def test_a_host_that_cannot_keep_the_period_stops(scenario):
+    sdk = StandIn(scenario)
+
+    def glance(session):
+        if session.stage == Stage.ARMED:
+            sdk.read = 1.6e-3
+
+    session, *_ = held_session(scenario, sdk, seconds=3.0, glance=glance)
+    assert session.stage == Stage.STOPPED
+    assert "no answer in time" in session.cause or "by its own clock" in session.cause
+    assert sdk.force.tolist() == [0.0, 0.0]
+
+
+def test_a_device_that_is_unplugged_is_lost(scenario):
+    sdk = StandIn(scenario)
+
+    def glance(session):
+        sdk.broken |= session.stage == Stage.ARMED
+
+    session, *_ = held_session(scenario, sdk, glance=glance)
+    assert (session.stage, session.cause) == (Stage.LOST, "the device is gone: no device found")
+    assert sdk.force.tolist() == [0.0, 0.0]
+
+
+def test_motors_that_saturate_are_a_fault_of_the_device(scenario):
+    """What they then push is not what was certified."""
+    sdk = StandIn(scenario)
+
+    def glance(session):
+        sdk.saturated |= session.stage == Stage.ARMED
+
+    session, *_ = held_session(scenario, sdk, glance=glance)
+    assert session.stage == Stage.STOPPED
+    assert session.cause == "the device is in ramp, cause device"
+
+
+def test_the_emergency_stop_is_at_once(scenario):
+    sdk = StandIn(scenario)
+    sdk.push = lambda t: 3.0 * np.sin(2 * np.pi * 1.5 * t)
+    held = []
+
+    def glance(session):
+        if session.stage == Stage.ARMED and np.abs(sdk.force).max() > 0.2:
+            held.append(np.abs(sdk.force).max())
+            wire.write(session.estop("asked to", session.now))
+            assert sdk.force.tolist() == [0.0, 0.0]
+
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=150))
+    with ForceDimension(scenario, "1x,0x", sdk, sdk.clock, sdk.sleep) as device:
+        wire = DeviceWire(device)
+
+        def plan(ages):
+            return certified_couplings(timed(scenario, ages, 0.99, 50.0, True)[0], "I", None, None, 0, spare=0)
+
+        live = Live(session, wire, plan, True, 3.0, glance=glance)
+        live.now = lambda: round(1e6 * sdk.now)
+        live.run()
+        wire.close()
+    assert (session.stage, session.cause) == (Stage.ESTOP, "asked to")
+    assert held
+
+
+# without the maker's library, and bad input
+
+
+def test_without_the_library_the_import_fails_with_one_clear_line(monkeypatch):
+    monkeypatch.setitem(sys.modules, "forcedimension_core", None)
+    with pytest.raises(InputError) as error:
+        bridge.main(["--port", "force-dimension", "--arm", "--no-preflight"])
+    assert str(error.value).startswith(
+        "--port force-dimension needs the Python package forcedimension_core and Force Dimension's SDK"
+    )
+    assert "\n" not in str(error.value)
+
+
+def test_the_package_without_the_makers_sdk_says_so(monkeypatch):
+    """The package is there and raises, as it does where libdrd is not found."""
+
+    class Finder:
+        @staticmethod
+        def find_spec(name, path=None, target=None):
+            if name == "forcedimension_core.dhd":
+                raise ImportError("There were problems loading libdrd.")
+
+    package = ModuleType("forcedimension_core")
+    package.__path__ = []
+    monkeypatch.setitem(sys.modules, "forcedimension_core", package)
+    monkeypatch.setattr(sys, "meta_path", [Finder, *sys.meta_path])
+    with pytest.raises(InputError, match=r"SDK .*: There were problems loading libdrd"):
+        library()
+
+
+@pytest.mark.parametrize(
+    ("axes", "words"),
+    [
+        ("0x", "each of 2 channels"),
+        ("0x,0x", "same axis"),
+        ("0w,1x", "as in force-dimension:0x,1x"),
+        ("0x,7x", "device 7"),
+    ],
+)
+def test_axes_that_are_none_are_refused(scenario, axes, words):
+    with pytest.raises(InputError) as error:
+        ForceDimension(scenario, axes, StandIn(scenario))
+    assert words in str(error.value)
+
+
+def test_two_axes_of_one_device(scenario):
+    sdk = StandIn(scenario)
+    with ForceDimension(scenario, "0x,0y", sdk, sdk.clock, sdk.sleep):
+        assert sdk.open == [0]
+
+
+def test_a_host_clock_has_no_baud_rate(scenario):
+    args = bridge._parser().parse_args(["--port", "force-dimension:0x,1y", "--arm"])
+    assert check_link(args).baud is None
+
+
+# the same four calls over the serial link
+
+
+class Line:
+    """An emulated device at the end of a pipe-like port: it ticks when it is waited for."""
+
+    def __init__(self, device):
+        self.device, self.now, self.out = device, 0, b""
+
+    def fileno(self):
+        return self.ready
+
+    def write(self, data):
+        self.device.receive(data, self.now + 200)
+        return len(data)
+
+    def read(self):
+        self.now += 1200
+        return self.device.tick(self.now, (7, -7))[1]
+
+
+def test_the_serial_link_has_the_same_four_calls(monkeypatch):
+    from hw.device import Device
+    from hw.emulator import info_of
+
+    about = info_of(scenario_of())
+    line = Line(Device(about))
+    monkeypatch.setattr("hw.seam.select.select", lambda *_: ([line], [], []))
+    device = SerialDevice(line)
+    assert device.info() == about
+    assert device.configure(Config(1, 4, 4, 0, (32767, 1), (1, 1))) == Refused.CAP
+    assert device.configure(Config(1, 4, 4, 0, (9000, 9000), (9000, 9000))) == Refused.ACCEPTED
+    state = device.exchange(None)
+    for command, force in [(Command.ARM, (0, 0)), (Command.RUN, (50, -60)), (Command.RUN, (70, -80))]:
+        state = device.exchange(Force(command, (state.tick + 1) & 0xFFFF, state.tick, force))
+        assert isinstance(state, State)
+        assert state.counts == (7, -7)
+    assert (state.phase, state.applied) == (Phase.ARMED, (70, -80))
+    device.stop(Reason.DONE)
+    assert device.exchange(None).phase == Phase.RAMP
+
+
+def test_a_silent_line_is_lost(monkeypatch):
+    monkeypatch.setattr("hw.seam.select.select", lambda *_: ([], [], []))
+    monkeypatch.setattr("hw.seam._PATIENCE", 0.01)
+    line = Line(None)
+    line.write = len
+    device = SerialDevice(line)
+    with pytest.raises(PortLost, match="no answer within"):
+        device.info()
+    with pytest.raises(PortLost, match=r"no answer within 0\.01 s, 0 unreadable frames"):
+        device.exchange(None)
