@@ -16,8 +16,9 @@ from cli import options, render
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY, report
+from design.certificate import check_set
+from design.coverage import set_rows
 from design.designs import KINDS
-from design.ranges import check_set, set_rows
 from design.result import OLDER_NAMES, listed
 from models.device import CATALOGUE, Listed, listed_device
 from sim.couplings import check_stored, fitted, read_coupling

@@ -40,8 +40,9 @@ from cli.session_cli import (
     limits_from,
     number,
 )
-from design.certificate import CAVEATS, CONDITIONS
+from design.certificate import CONDITIONS
 from design.files import write_json
+from design.guarantee import CAVEATS
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages

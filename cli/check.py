@@ -10,9 +10,12 @@ from typing import Any
 from rich.table import Table
 
 from cli import options, render
-from design.certificate import HERE, SET, Stored, SwitchingProof, Verdict, lag, switching_guarantee, verify
-from design.ranges import Searched, search_box, search_part, search_words, violated_between
+from design.certificate import Verdict, lag, verify, violated_between
+from design.coverage import search_part, search_words
+from design.environments import Searched, search_box
+from design.guarantee import HERE, SET, switching_guarantee
 from design.result import listed
+from design.stored import Stored, SwitchingProof
 from sim.couplings import read_coupling
 from sim.scenario import InputError
 

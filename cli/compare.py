@@ -22,10 +22,10 @@ from cli.design import RETIRED_WITH_VALUE, add_optimal_options, optimal_options
 from controller.loop import Loop
 from controller.lti import Array
 from design import compare
-from design.certificate import CONDITIONS, certificate_part, finite
+from design.certificate import CONDITIONS
 from design.compare import AXES, FEEL_HZ, LADDERS, Judged, Limit, Perceived, Setting, optimum, settings
 from design.optimal import Options
-from design.result import OLDER_NAMES, DesignFailed
+from design.result import OLDER_NAMES, DesignFailed, certificate_part, finite
 from design.transparency import transparency
 from sim import report
 from sim.baselines import PAIRS, SECONDS, SLOW, Rival, rivals

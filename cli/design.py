@@ -14,32 +14,15 @@ from cli import options, render
 from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY
 from design.bound import bound
-from design.certificate import (
-    ANY,
-    HERE,
-    Certificate,
-    LimiterCertificate,
-    Limits,
-    NotProved,
-    Stored,
-    assess,
-    covered_limits,
-    digest,
-    finite,
-    guarantee_of,
-    lag,
-    prove,
-    save,
-    switching_guarantee,
-    switching_part,
-    switching_requirement,
-)
-from design.designs import KINDS, NO_LONGER, compare_methods, design_by_kind, usual_condition
+from design.certificate import SAMPLES, SetCheck, assess, check_set, lag, prove, switching_requirement
+from design.coverage import Limits, cost_part, covered_limits, price, set_part, set_rows, switching_part
+from design.designs import KINDS, NO_LONGER, design_by_kind, usual_condition
 from design.files import out_file
+from design.guarantee import ANY, HERE, guarantee_of, switching_guarantee
 from design.optimal import OBJECTIVES, Optimal, Options, box_around, robustness, spread
-from design.ranges import SAMPLES, SetCheck, check_set, cost_part, price, set_part, set_rows
-from design.result import METHODS, Design, DesignFailed, listed
+from design.result import METHODS, Design, DesignFailed, NotProved, finite, listed
 from design.spring_damper import STIFFEST
+from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
 from sim import report
 from sim.scenario import InputError, Scenario
@@ -96,7 +79,9 @@ def main(argv: list[str]) -> int:
     if best:
         outcome |= _best_figures(args, loop, best)
     if args.compare:
-        outcome["comparison"] = [asdict(row) for row in compare_methods(loop)]
+        from design import fixed_order  # cvxpy takes a second to import
+
+        outcome["comparison"] = [asdict(row) for row in fixed_order.compare(loop)]
     render.publish(args, outcome, _tables(scenario, outcome), outcome.get("notes", ()))
     holds = outcome["certificate"]["certified"] and (outcome["promise"] == ANY or not whole or whole.proved)
     switching = outcome["jitter_proof"]

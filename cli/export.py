@@ -15,7 +15,7 @@ import numpy as np
 
 from cli import options, render
 from controller.coupling import SpringDamperForm
-from design.certificate import HERE, SET, Stored, Verdict, switching_guarantee, verify
+from design.certificate import Verdict, verify
 from design.export import (
     Block,
     NothingToExport,
@@ -28,7 +28,9 @@ from design.export import (
     trial,
 )
 from design.files import out_file, write
+from design.guarantee import HERE, SET, switching_guarantee
 from design.result import listed
+from design.stored import Stored
 from sim.couplings import read_coupling
 from sim.scenario import InputError
 

@@ -11,9 +11,10 @@ from typing import Any
 from cli import options, render
 from controller.environment import GROUND
 from controller.loop import Loop
-from design.certificate import assess, guarantee_of
+from design.certificate import SetCheck, assess, check_set
+from design.coverage import set_part, set_rows
 from design.files import write
-from design.ranges import SetCheck, check_set, set_part, set_rows
+from design.guarantee import guarantee_of
 from design.result import listed
 from design.transparency import BAND_HZ, transparency
 from sim import report

@@ -31,9 +31,8 @@ import numpy as np
 from cli import options, render
 from controller.coupling import NoCoupling
 from controller.lti import SingularLoop
-from design.certificate import finite
 from design.files import folder, write, write_json
-from design.result import DesignFailed
+from design.result import DesignFailed, finite
 from hw.control import certified_couplings
 from hw.emulator import Emulator
 from hw.faults import person, rehearse_faults

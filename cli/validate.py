@@ -11,9 +11,10 @@ import numpy as np
 
 from cli import options, render
 from controller.environment import Member
-from design.certificate import ANY, assess, guarantee_of
+from design.certificate import SetCheck, assess, check_set
 from design.conditions import this_environment
-from design.ranges import SetCheck, check_set, set_part
+from design.coverage import set_part
+from design.guarantee import ANY, guarantee_of
 from models.human import Human
 from sim import report
 from sim.adversary import Worst, search

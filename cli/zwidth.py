@@ -20,9 +20,11 @@ from cli import options, render
 from controller.environment import RIGID_WALL
 from controller.loop import Loop
 from controller.lti import Array
-from design.certificate import CAVEATS, CONDITIONS, assess, certificate_part, finite, guarantee_of
+from design.certificate import CONDITIONS, assess, check_set
+from design.coverage import set_part
 from design.files import write
-from design.ranges import check_set, set_part
+from design.guarantee import CAVEATS, guarantee_of
+from design.result import certificate_part, finite
 from sim import report
 from sim.couplings import NAMES, Chosen, choose
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
@@ -260,7 +262,7 @@ def _simulation(sweep: Sweep, drawn: Map, plan: Plan) -> dict[str, Any]:
 
 
 def add_errors(outcome: dict[str, Any], found: dict[str, MapError | None]) -> None:
-    """How far the map is from design.margin."""
+    """How far the map is from design.conditions."""
     outcome["error"] = {
         name: error
         and {"figure_relative": error.ratio, "edge_relative_in_K": error.edge, "columns_compared": error.columns}

@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from controller.loop import Loop
-    from design.conditions import Requirement
-    from design.designs import Options, certify, design_coupling, guarantee, transparency_of
-    from design.result import Design, DesignFailed
+    from design.api import Options, certify, design_coupling, guarantee, transparency_of
+    from design.result import Design, DesignFailed, Requirement
     from design.transparency import Transparency
 
 __all__ = [
@@ -40,8 +39,8 @@ __all__ = [
 _HOMES = {
     "Design": "design.result",
     "DesignFailed": "design.result",
-    "Loop": "design.certificate",
-    "Requirement": "design.conditions",
+    "Loop": "controller.loop",
+    "Requirement": "design.result",
     "Transparency": "design.transparency",
 }
 
@@ -49,7 +48,7 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'design' has no attribute {name!r}")
-    return getattr(import_module(_HOMES.get(name, "design.designs")), name)
+    return getattr(import_module(_HOMES.get(name, "design.api")), name)
 
 
 def __dir__() -> list[str]:

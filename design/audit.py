@@ -24,25 +24,11 @@ from controller.coupling import (
 )
 from controller.environment import RIGID_WALL
 from controller.loop import DelayRange, Loop
-from design.certificate import (
-    ANY,
-    CAVEATS,
-    LATE,
-    any_environment_of,
-    certificate_part,
-    guarantee_of,
-    switching_part,
-    switching_requirement,
-    this_environment_of,
-)
-from design.conditions import (
-    Condition,
-    Requirement,
-    any_environment,
-    refusal,
-)
-from design.ranges import SetCheck, set_part
-from design.result import listed
+from design.certificate import SetCheck, any_environment_of, switching_requirement, this_environment_of
+from design.conditions import any_environment
+from design.coverage import set_part, switching_part
+from design.guarantee import ANY, CAVEATS, LATE, guarantee_of
+from design.result import Condition, Requirement, certificate_part, listed, refusal
 
 # ----------------------------------------------------------------------------------------------------
 # A coupling in its loop, judged by either condition.

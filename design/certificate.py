@@ -1,17 +1,13 @@
-"""What both conditions ask of a coupling in its loop, proved exactly wherever that is possible."""
+"""What conditions ask of a coupling in its loop, proved over the rationals, and proved again from a file."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import platform
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -19,304 +15,43 @@ import scipy
 
 from controller.coupling import (
     Coupling,
-    ForceFilter,
-    Form,
-    InternalModel,
     MovingAverage,
     SpringDamper,
-    Strict,
-    require_channels,
 )
 from controller.delay import delay
-from controller.environment import Member
-from controller.loop import DelayRange, Loop
+from controller.environment import Member, inside
+from controller.loop import Loop
 from controller.lti import Array, Lti, SingularLoop, rational
 from design.conditions import (
-    BETA,
-    Condition,
-    JitterProof,
-    Lags,
-    LimiterProof,
-    Requirement,
-    WallsProof,
     any_environment,
     any_environment_delayed,
     any_environment_demand,
     any_environment_per_channel,
     delayed_coupling_block,
     delayed_environment_block,
-    encoder_friction,
-    jitter_proof,
-    jitter_refusal,
-    limiter,
-    limiter_demand,
-    limiter_lag,
-    refusal,
-    switching_block,
     this_environment,
     this_environment_demand,
-    walls_demand,
-    walls_proof,
 )
+from design.environments import Progress, Searched, in_each, search_box, worst
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
-from design.files import InputError, read, write
 from design.frequency import frequencies, on_circle, rounding
-from design.result import OLDER_NAMES
-
-# ----------------------------------------------------------------------------------------------------
-# The file in which a coupling is kept: the loop it was made for, its coefficients and its certificate, as JSON.
-#
-# Numbers are plain decimals, rationals are strings "p/q". Reading is strict: an unknown or ill-typed field is an
-# error that names it.
-
-
-Rows = tuple[tuple[float, ...], ...]
-Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=1000)]
-
-
-class SwitchingProof(Strict, frozen=True):
-    """What proves that the delays may switch within the loop's range (design.jitter.proof)."""
-
-    required: tuple[float, ...]  # (m,) [N s/m] with this multiplier, from a refined sweep
-    margin: float  # available / required
-    alpha: tuple[float, ...]  # (m,) multiplier [N/m], 0 where the delay does not vary
-    P: tuple[tuple[Rational, ...], ...]  # rationals "p/q"
-
-
-class LimiterCertificate(Strict, frozen=True):
-    """What proves this-environment also while forces are limited, by the limiter of controller.process."""
-
-    beta: float  # rho = beta delta/T, to six digits
-    rho: tuple[float, ...]  # (m,) lag of the limiter [N/m]; the tick must use these
-    c: tuple[tuple[float, ...], ...]  # (m, lags) multiplier
-    required: tuple[float, ...]  # (m,) [N s/m] with this multiplier, from a refined sweep
-    margin: float  # available / required
-    P: tuple[tuple[Rational, ...], ...]  # rationals "p/q"
-
-
-class Certificate(Strict, frozen=True):
-    """What is claimed of a coupling in its loop, and what proves it."""
-
-    condition: Condition
-    required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep
-    available: tuple[float, ...]  # (m,) [N s/m], the damping for which it is proved
-    margin: float  # available / required
-    guarantee: Literal["any passive environment", "a set", "this environment"] = msgspec.field(name="promise")
-    proof: Literal["sampled", "kyp", "rational"]
-    matrices: dict[str, tuple[tuple[Rational, ...], ...]]  # rationals "p/q"
-    scenario: str  # digest of the loop and the coupling
-    versions: dict[str, str]
-    seal: str = ""  # digest of all other fields
-    switching: SwitchingProof | msgspec.UnsetType = msgspec.UNSET  # of a loop with jitter; left out of other files
-    limiter: LimiterCertificate | msgspec.UnsetType = msgspec.UNSET  # where it was proved; left out of other files
-
-
-class Stored(Strict, frozen=True):
-    """A coupling with its loop and, once it is proved, its certificate."""
-
-    loop: Loop
-    coupling: Form
-    certificate: Certificate | None = None
-    version: Literal[1, 2] = 2  # 2: force filters
-
-    def __post_init__(self) -> None:
-        require_channels(self.coupling, self.loop.channels)
-
-    @classmethod
-    def of(cls, loop: Loop, coupling: Coupling, certificate: Certificate | None = None) -> Stored:
-        """What a file keeps of a coupling in its loop."""
-        return cls(loop, coupling.form(), certificate)
-
-    def built(self) -> Coupling:
-        """The coupling."""
-        return self.coupling.build(self.loop.T)
-
-
-def digest(*parts: msgspec.Struct) -> str:
-    """sha256 over the canonical JSON (sorted keys, shortest decimals, 7 as 7.0 where it is a float) of the parts."""
-    return _sha256([_plain(part) for part in parts])
-
-
-def _plain(part: msgspec.Struct) -> Any:
-    return msgspec.to_builtins(msgspec.json.decode(msgspec.json.encode(part), type=type(part)))
-
-
-def _sha256(plain: list[Any]) -> str:
-    return hashlib.sha256(msgspec.json.encode(plain, order="deterministic")).hexdigest()
-
-
-def sealed(certificate: Certificate) -> Certificate:
-    """The certificate with the digest of all its other fields, its condition by the name of the first files."""
-    older = {name: before for before, name in OLDER_NAMES.items()}
-    plain = _plain(msgspec.structs.replace(certificate, seal=""))
-    seal = _sha256([plain | {"condition": older[certificate.condition]}])
-    return msgspec.structs.replace(certificate, seal=seal)
-
-
-def load(path: str | Path) -> Stored:
-    """Read a stored coupling. Raises InputError, one line that names the field or the file."""
-    content = read(path)
-    if not content.strip():
-        raise InputError(f"{path}: is empty, expected a coupling as python -m design stores it")
-    try:
-        stored = msgspec.json.decode(_renamed(content), type=Stored)
-        json.loads(content, object_pairs_hook=_once)
-        return stored
-    except _Twice as error:
-        raise InputError(f"{path}: names {str(error)!r} twice in one object") from None
-    except msgspec.ValidationError as error:
-        raise InputError(f"{path}: is no stored coupling: {' '.join(str(error).split())}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: {_place(content, str(error))}{' '.join(str(error).split())}") from None
-
-
-def _renamed(content: bytes) -> bytes:
-    """The content with the condition by its name of today; as it is where it has that, or is no certificate."""
-    try:
-        whole = msgspec.json.decode(content)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return content
-    match whole:
-        case {"certificate": {"condition": str(name)} as claim} if name in OLDER_NAMES:
-            return msgspec.json.encode(whole | {"certificate": claim | {"condition": OLDER_NAMES[name]}})
-    return content
-
-
-class _Twice(Exception):
-    """A name that an object of a file gives two values."""
-
-
-def _once(pairs: list[tuple[str, Any]]) -> None:
-    """Of the last value JSON readers speak, of the first one a person who reads the file."""
-    names: set[str] = set()
-    for name, _ in pairs:
-        if name in names:
-            raise _Twice(name)
-        names.add(name)
-
-
-def _place(content: bytes, message: str) -> str:
-    """Number and beginning of the line that a message points to as "(byte N)", or nothing."""
-    found = re.search(r"\(byte (\d+)\)", message)
-    if not found:
-        return ""
-    above = content[: int(found[1])].count(b"\n")
-    return f"line {above + 1}, {content.splitlines()[above].decode(errors='replace').strip()[:40]!r}: "
-
-
-def save(stored: Stored, path: str | Path) -> None:
-    """Write through a temporary file beside `path`, so that a reader never sees half of it. Raises InputError."""
-    write(Path(path), msgspec.json.format(msgspec.json.encode(stored), indent=1) + b"\n")
-
-
-# ----------------------------------------------------------------------------------------------------
-# What may be said of a coupling: required against available damping, for which environments, and what is left out.
-
-
-ANY, SET, HERE = "any passive environment", "a set", "this environment"
-FROZEN = "each frozen contact state of this environment (contact that makes and breaks is not covered)"
-
-MAKING = "this environment, with walls up to their stiffness that make and break contact"
-
-#: What no certificate covers.
-CAVEATS = (
-    "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted) "
-    "or leave through the limiter that a report names, "
-    "not for walls with dampers that make and break contact (except under any-environment without delay in the "
-    "environment), periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb "
-    "friction pays for, velocity filters or friction compensation."
+from design.guarantee import LATE, making_covered, no_compliance, switching_guarantee
+from design.multipliers import (
+    BETA,
+    WALL_MULTIPLIER,
+    JitterProof,
+    Lags,
+    limiter_demand,
+    limiter_lag,
+    limiter_refusal,
+    limiter_requirement,
+    swept,
+    switching_block,
+    walls_demand,
+    walls_of,
 )
-
-
-def finite(value: float) -> float | None:
-    """JSON knows neither infinity nor not-a-number."""
-    return float(value) if math.isfinite(value) else None
-
-
-def certificate_part(requirement: Requirement) -> dict[str, Any]:
-    """Required against available damping."""
-    part = {
-        "condition": requirement.condition,
-        "required_damping": [finite(b) for b in requirement.required],
-        "available_damping": list(requirement.available),
-        "margin": finite(1 / requirement.ratio) if requirement.ratio > 0 else None,
-        "binding_frequency_hz": requirement.frequency_hz,
-        "certified": requirement.certified,
-        "proof": requirement.proof,
-    }
-    return part | ({"reason": requirement.reason} if requirement.reason else {})
-
-
-def switching_guarantee(span: DelayRange) -> str:
-    """Which delays of the forces a coupling is certified for that bears switching, in the environment of its loop."""
-    return f"delays switching within {span}"
-
-
-def guarantee_of(requirements: Mapping[str, Requirement], loop: Loop, whole_set: bool = False) -> str | None:
-    """For which environments a coupling is certified, by its requirements; None for none.
-
-    The multiplier that any-environment takes for psi >= 1 is of one environment. `whole_set`: this-environment is
-    proved at every vertex of the loop's box, and a search has found no violation between them.
-    """
-    if requirements["any-environment"].certified and not any(loop.psi):
-        return ANY
-    if whole_set:
-        return SET
-    if not any(requirement.certified for requirement in requirements.values()):
-        return None
-    if loop.environment.walls:
-        return MAKING if making_covered(loop) else FROZEN
-    return loop.environment.here
-
-
-def encoder_part(
-    loop: Loop, coupling: Coupling, steps: Sequence[float], friction: Sequence[float]
-) -> dict[str, Any] | None:
-    """Whether declared Coulomb friction (m,) [N] pays for encoder steps (m,) [m]; None where encoders are ideal."""
-    if not any(steps):
-        return None
-    widths = ", ".join(f"{1e6 * q:.4g}" for q in steps)
-    part: dict[str, Any] = {"encoder_step": list(steps), "friction": list(friction)}
-    if loop.environment.walls:
-        words = f"encoder steps of {widths} um: with walls nothing is proved of them"
-        return part | {"friction_needed": None, "covered": False, "words": words}
-    needed = encoder_friction(loop.F(coupling), steps)
-    covered = bool((needed <= np.asarray(friction)).all())
-    has = ", ".join(f"{f:.4g}" for f in friction)
-    enough = (
-        f"friction of {', '.join(f'{f:.4g}' for f in needed)} N is enough for {widths} um, the devices declare {has} N"
-    )
-    words = f"encoder steps {'are covered' if covered else 'are not covered'}: {enough}"
-    return part | {"friction_needed": [finite(f) for f in needed], "covered": covered, "words": words}
-
-
-# ----------------------------------------------------------------------------------------------------
-# A coupling in every environment of a set: what the this-environment condition asks at each vertex of a box.
-
-
-def making_covered(loop: Loop) -> bool:
-    """Whether this-environment covers walls that make and break contact: those without dampers."""
-    walls = loop.environment.walls
-    return bool(walls) and not loop.box and not any(wall.damping for wall in walls)
-
-
-def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[Requirement]:
-    """The this-environment condition of this coupling around each of the members, every one frozen."""
-    return [_required(loop, coupling, member) for member in members]
-
-
-def worst(requirements: Sequence[Requirement]) -> int:
-    """Which of them asks the most."""
-    return max(range(len(requirements)), key=lambda i: requirements[i].ratio)
-
-
-def _required(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
-    try:
-        F = loop.at(member.network).F(coupling)
-    except SingularLoop as error:
-        return refusal("this-environment", loop.delta, str(error))
-    return this_environment(F, loop.delta, loop.T_max, loop.latency)
-
+from design.result import Condition, NotProved, Requirement, refusal
+from design.stored import Certificate, LimiterCertificate, Stored, SwitchingProof, digest, sealed
 
 # ----------------------------------------------------------------------------------------------------
 # An exact proof that no switching of the delays within a loop's range is dangerous: made, stored, proved again.
@@ -324,21 +59,11 @@ def _required(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
 # With G the forces as they leave, F = Theta_nom G, F(z) = F(1) + (z - 1) R(z) and F(1) exactly symmetric and positive
 # semidefinite, the block
 #     [[R + Delta_D/T - diag(alpha)/2 - F(1)/2,  0], [2 h G,  2 diag(alpha)]]
-# is strictly positive real (design.proof.positive_real): its Hermitian part on |z| = 1 is the matrix of condition.py.
+# is strictly positive real (design.exact).
 # Channels whose delay does not vary have no row and column of the second kind, and alpha = 0.
 
 
 CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
-
-
-def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) -> JitterProof:
-    """What switching within the loop's range asks, by a sweep; with the multiplier `alpha` [N/m] where it is given."""
-    span = loop.delays
-    try:
-        G = loop.sent(coupling)
-    except SingularLoop as error:
-        return jitter_refusal(loop.delta, str(error))
-    return jitter_proof(G, span.lo, span.hi, loop.delta, alpha, loop.T_max)
 
 
 def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
@@ -351,7 +76,7 @@ def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
     P = storage(loop, coupling, found.alpha)
     if isinstance(P, str):
         return P
-    return SwitchingProof(requirement.required, _margin(found), found.alpha, rows_of(P))
+    return SwitchingProof(requirement.required, _margin(found.requirement), found.alpha, rows_of(P))
 
 
 def storage(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Matrix | str:
@@ -381,8 +106,8 @@ def _refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof) -> str | Non
     required = found.requirement.required
     if len(proof.required) != len(required) or not np.allclose(proof.required, required, rtol=CLAIM_TOLERANCE):
         return f"required is {list(proof.required)}, the sweep finds {list(required)}"
-    if not np.isclose(proof.margin, _margin(found), rtol=CLAIM_TOLERANCE):
-        return f"margin is {proof.margin:.9g}, the sweep finds {_margin(found):.9g}"
+    if not np.isclose(proof.margin, _margin(found.requirement), rtol=CLAIM_TOLERANCE):
+        return f"margin is {proof.margin:.9g}, the sweep finds {_margin(found.requirement):.9g}"
     return refuted_rows("P", condition, proof.P)
 
 
@@ -406,43 +131,8 @@ def condition_block(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> L
     return block
 
 
-def _margin(found: JitterProof) -> float:
-    return 1 / max(found.requirement.ratio, 1e-12)
-
-
-# ----------------------------------------------------------------------------------------------------
-# An exact proof that a coupling is safe in this environment also while its forces are limited: made, stored, proved
-# again. F(1) is exactly symmetric and positive semidefinite, and design.conditions.limiter_demand is strictly
-# positive real. any-environment without delay in the environment needs no proof of its own: with rho = 0 the limiter
-# and the environment together are a passive environment.
-
-
-def limiter_refusal(loop: Loop) -> str | None:
-    """Why the limiter's own condition has nothing to say of a loop, or None."""
-    if loop.jitter:
-        return "limiter: forces that are limited are proved for constant delays, not for delays that switch"
-    if loop.environment.walls:
-        return "limiter: with walls only any-environment covers limited forces (no delay in the environment)"
-    if loop.box:
-        return "limiter: limited forces are proved for one environment, not for ranges"
-    if loop.latency:
-        return "limiter: limited forces are proved for forces that latch at ticks, not for a latency"
-    return None
-
-
-def limiter_requirement(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | None = None) -> LimiterProof:
-    """What this-environment asks with the limiter of rho = beta delta/T, at the multiplier `c` or the best one.
-
-    `proof` of the requirement is "sampled"; `prove` gives the exact one.
-    """
-    rho = limiter_lag(loop.delta, loop.T, beta)
-    reason = limiter_refusal(loop)
-    try:
-        if reason is None:
-            return limiter(loop.sent(coupling), loop.theta, loop.delta, rho, c, T_max=loop.T_max)
-    except SingularLoop as error:
-        reason = str(error)
-    return LimiterProof(refusal("limiter", loop.delta, reason), rho, ((),) * loop.channels, math.inf)
+def _margin(requirement: Requirement) -> float:
+    return 1 / max(requirement.ratio, 1e-12)
 
 
 def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None:
@@ -453,69 +143,6 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
         return certificate.limiter.rho
     covered = certificate.condition == "any-environment" and not any(loop.psi) and loop.jitter is None
     return (0.0,) * loop.channels if covered else None
-
-
-@dataclass(frozen=True)
-class Limits:
-    """Whether a guarantee holds while forces are at their limits, and the limiter that it is about."""
-
-    rho: tuple[float, ...] | None  # (m,) [N/m] of the limiter; None: no guarantee, so the tick clips
-    reason: str  # why it holds, or why it does not
-    requirement: Requirement | None = None  # by the condition `limiter`, where it was asked
-    c: tuple[tuple[float, ...], ...] = ()  # its multiplier
-    certificate: LimiterCertificate | None = None  # its proof
-
-    def words(self, force_limit: Sequence[float]) -> str:
-        """In one line, for forces limited to so many N."""
-        amounts = [f"{f:.4g}" for f in force_limit]
-        limit = f"{', '.join(amounts if len(set(amounts)) > 1 else amounts[:1])} N"
-        if self.rho is None:
-            return f"clipped at {limit}: a guarantee holds while forces stay below ({self.reason})"
-        if not self.proved:
-            return f"certified, also while forces are limited to {limit} ({self.reason})"
-        return f"proved, also while forces are limited to {limit}"
-
-    @property
-    def proved(self) -> bool:
-        """In exact arithmetic."""
-        return self.rho is not None and (self.requirement is None or self.requirement.proof == "rational")
-
-    def part(self, force_limit: Sequence[float]) -> dict[str, Any]:
-        """As plain data."""
-        return {
-            "rho": None if self.rho is None else list(self.rho),
-            "force_limit": [finite(f) for f in force_limit],
-            "reason": self.reason,
-            "words": self.words(force_limit),
-            "certificate": self.requirement and certificate_part(self.requirement),
-            "c": self.c,
-        }
-
-
-def covered_limits(loop: Loop, coupling: Coupling, requirements: Mapping[str, Requirement]) -> Limits:
-    """The limiter that a coupling may have: of no lag under any-environment, else that of its own condition."""
-    if loop.jitter:
-        return Limits(None, str(limiter_refusal(loop)))
-    if requirements["any-environment"].certified and not any(loop.psi):
-        return Limits((0.0,) * loop.channels, "any-environment covers limited forces")
-    if not requirements["this-environment"].certified:
-        return Limits(None, "no guarantee that it could extend")
-    found = limiter_requirement(loop, coupling)
-    requirement = found.requirement
-    if not requirement.certified:
-        needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
-        return Limits(None, requirement.reason or needs, requirement, found.c)
-    try:
-        proved = prove_limiter(loop, coupling, c=found.c)
-    except NotProved as refused:
-        return Limits(found.rho, f"swept, not proved: {refused}", requirement, found.c)
-    return Limits(
-        found.rho,
-        "by a proof of its own, for this environment",
-        replace(requirement, proof="rational"),
-        found.c,
-        proved,
-    )
 
 
 def prove_limiter(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | None = None) -> LimiterCertificate:
@@ -529,7 +156,7 @@ def prove_limiter(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | 
     P, refused = find_storage(limiter_block(loop, coupling, found.rho, found.c))
     if P is None:
         raise NotProved(f"limiter: {refused}; the sweep asks {requirement.ratio:.9f} of the damping", requirement)
-    return LimiterCertificate(beta, found.rho, found.c, requirement.required, _limiter_margin(found), rows_of(P))
+    return LimiterCertificate(beta, found.rho, found.c, requirement.required, _margin(found.requirement), rows_of(P))
 
 
 def limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: Lags) -> Lti:
@@ -561,24 +188,10 @@ def _refuted_limiter(loop: Loop, coupling: Coupling, certificate: Certificate) -
     required = found.requirement.required
     if len(proof.required) != len(required) or not np.allclose(proof.required, required, rtol=CLAIM_TOLERANCE):
         return f"limiter: required is {list(proof.required)}, the sweep finds {list(required)}"
-    if not np.isclose(proof.margin, _limiter_margin(found), rtol=CLAIM_TOLERANCE):
-        return f"limiter: margin is {proof.margin:.9g}, the sweep finds {_limiter_margin(found):.9g}"
+    if not np.isclose(proof.margin, _margin(found.requirement), rtol=CLAIM_TOLERANCE):
+        return f"limiter: margin is {proof.margin:.9g}, the sweep finds {_margin(found.requirement):.9g}"
     reason = refuted_rows("P", limiter_block(loop, coupling, proof.rho, proof.c), proof.P)
     return reason and f"limiter: {reason}"
-
-
-def _limiter_margin(found: LimiterProof) -> float:
-    return 1 / max(found.requirement.ratio, 1e-12)
-
-
-# ----------------------------------------------------------------------------------------------------
-# What a report says of delays that vary: the jitter-proof requirement beside that of the playout buffer.
-
-
-NOT_COVERED = (
-    "Covered: any ages of the forces within the range, at every tick and on every channel. Not covered: jitter on the "
-    "measured positions, periods longer than T_max, or forces older than the range, which lost packets make."
-)
 
 
 def switching_requirement(loop: Loop, coupling: Coupling) -> JitterProof:
@@ -589,31 +202,12 @@ def switching_requirement(loop: Loop, coupling: Coupling) -> JitterProof:
     return replace(found, requirement=replace(found.requirement, proof="rational"))
 
 
-def switching_part(found: JitterProof, G: Lti, span: DelayRange, T_max: float | None = None) -> dict[str, Any]:
-    """The requirement with its multiplier, and what a playout buffer to the constant delay hi would need.
-
-    G is the force map without Theta.
-    """
-    buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available, T_max)
-    return certificate_part(found.requirement) | {
-        "lo": list(span.lo),
-        "hi": list(span.hi),
-        "alpha": [finite(a) for a in found.alpha],
-        "playout": {
-            "theta": list(span.hi),
-            "required_damping": [finite(d) for d in buffered.required],
-            "certified": buffered.certified,
-        },
-        "not_covered": NOT_COVERED,
-    }
-
-
 # ----------------------------------------------------------------------------------------------------
 # Certificates of couplings: proved once, stored, and proved again from the file alone without a solver.
 #
 # this-environment: F(1) is exactly symmetric and positive semidefinite, and with F(z) = F(1) + (z - 1) R(z) the block
 #     R + Delta_D/T - F(1)/2
-# is strictly positive real (design.proof.positive_real). On |z| = 1 the Hermitian part of F(1)/(z - 1) is -F(1)/2, so
+# is strictly positive real (design.exact). On |z| = 1 the Hermitian part of F(1)/(z - 1) is -F(1)/2, so
 # He[F/(z-1)] > -Delta_D/T there; the same certificate shows that F is stable.
 #
 # this-environment, forces that latch late, or walls without dampers: the blocks of latency_demand and walls_demand, the
@@ -630,22 +224,9 @@ def switching_part(found: JitterProof, G: Lti, span: DelayRange, T_max: float | 
 # With a box around the environment the same is proved for the environment (P) and for every vertex (P1, P2, ..);
 # nothing is proved of the environments in between, or of one that changes.
 #
-# A loop whose delays may switch within a range carries a second proof, of any switching (design.jitter.proof).
+# A loop whose delays may switch within a range carries a second proof, of any switching.
 #
 # any-environment, psi >= 1: a multiplier Phi, stored too, and two blocks (delayed_blocks); it is of this environment.
-
-
-CLAIM_TOLERANCE_CERTIFICATE = (
-    1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
-)
-
-
-class NotProved(ValueError):
-    """No proof of the condition was found; carries the requirement that the sweep found, if there is one."""
-
-    def __init__(self, reason: str, requirement: Requirement | None = None) -> None:
-        super().__init__(reason)
-        self.requirement = requirement
 
 
 @dataclass(frozen=True)
@@ -824,33 +405,6 @@ def required_damping(
     return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, values, loop.T_max)
 
 
-#: What a certificate calls the multipliers of walls that make and break contact, one each.
-WALL_MULTIPLIER = "g"
-
-
-def walls_of(loop: Loop, coupling: Coupling, g: Sequence[Fraction] | None = None) -> WallsProof:
-    """What this-environment asks where walls make and break contact, with the multipliers g (w,) or the best found.
-
-    Raises NotProved for walls that nothing is proved of.
-    """
-    walls = loop.environment.walls
-    if any(wall.damping for wall in walls):
-        raise NotProved(
-            "of walls with dampers only each frozen contact state is judged, and any-environment proves all"
-        )
-    if loop.box:
-        raise NotProved("walls and a box: walls are proved in one environment")
-    try:
-        G = loop.walled(coupling)
-    except (SingularLoop, ValueError) as error:
-        raise NotProved(str(error)) from None
-    stiffness = [wall.stiffness for wall in walls]
-    values = None if g is None else [float(value) for value in g]
-    if values is not None and (len(values) != len(walls) or min(values) < 0):
-        raise NotProved(f"{WALL_MULTIPLIER} is {values}, expected a number >= 0 for each of {len(walls)} walls")
-    return walls_proof(G, loop.delta, stiffness, values, loop.T_max)
-
-
 def _walls_block(loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Lti:
     """The block of this-environment with walls, after the exact tests at z = 1. Raises NotProved."""
     try:
@@ -867,21 +421,10 @@ def _walls_block(loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Lti:
     return demand.gain + demand.free
 
 
-#: Why any-environment says nothing of forces that latch between ticks.
-LATE = "a latency of a fraction of a sample is derived for this environment only: count it as a whole sample of theta"
-
-
-def no_compliance(coupling: Coupling) -> str:
-    """Why Theorem 4 has nothing to say of a coupling that is no V of its own."""
-    if isinstance(coupling, InternalModel | ForceFilter):
-        return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
-    return "without a coupling there is nothing that Theorem 4 could use"
-
-
 def _guarantee(loop: Loop, condition: Condition) -> Literal["any passive environment", "a set", "this environment"]:
     if condition == "any-environment":
         return "this environment" if any(loop.psi) else "any passive environment"
-    # proved at every vertex; whether it is kept between them is searched by design.box.check and design.check
+    # proved at every vertex; whether it is kept between them is searched by check_set and design.check
     return "a set" if loop.box else "this environment"
 
 
@@ -959,10 +502,10 @@ def _refuted_claims(loop: Loop, coupling: Coupling, certificate: Certificate) ->
     _require_limits(loop, coupling, certificate.condition)
     requirement = required_damping(loop, coupling, certificate.condition, _multiplier(loop, certificate))
     if len(certificate.required) != len(loop.delta) or not np.allclose(
-        certificate.required, requirement.required, rtol=CLAIM_TOLERANCE_CERTIFICATE
+        certificate.required, requirement.required, rtol=CLAIM_TOLERANCE
     ):
         return f"required is {list(certificate.required)}, the sweep finds {list(requirement.required)}"
-    if not np.isclose(certificate.margin, 1 / max(requirement.ratio, 1e-12), rtol=CLAIM_TOLERANCE_CERTIFICATE):
+    if not np.isclose(certificate.margin, 1 / max(requirement.ratio, 1e-12), rtol=CLAIM_TOLERANCE):
         return f"margin is {certificate.margin:.9g}, the sweep finds {1 / max(requirement.ratio, 1e-12):.9g}"
     if not requirement.certified:
         return f"the sweep asks {requirement.ratio:.6g} times the available damping, whatever the matrices prove"
@@ -1069,3 +612,79 @@ def _proved(loop: Loop, coupling: Coupling, requirement: Requirement, phi: Array
     except NotProved:
         return requirement
     return replace(requirement, proof="rational")
+
+
+SAMPLES = 64  # environments drawn evenly from inside the box, beside what the search looks at
+
+
+@dataclass(frozen=True, eq=False)
+class SetCheck:
+    """The this-environment condition over a box. `members` and `at_members` are the environment and the vertices."""
+
+    members: tuple[Member, ...]
+    at_members: tuple[Requirement, ...]
+    samples: tuple[Member, ...]
+    at_samples: tuple[Requirement, ...]
+    searched: Searched
+    at_found: Requirement  # at the worst environment that the search has found
+    seed: int
+    certificate: Certificate | None  # of the whole set, with the guarantee "a set"
+    reason: str | None  # why the set is not guaranteed
+
+    @property
+    def proved(self) -> bool:
+        """At the environment and every vertex, in exact arithmetic, and no violation was found between them."""
+        return self.certificate is not None and self.worst_found[1].certified
+
+    @property
+    def worst(self) -> tuple[Member, Requirement]:
+        """Where among the members the most damping is asked."""
+        i = worst(self.at_members)
+        return self.members[i], self.at_members[i]
+
+    @property
+    def worst_found(self) -> tuple[Member, Requirement]:
+        """Where of all that was looked at, members, search and samples, the most damping is asked."""
+        places = (*self.members, self.searched.worst[0].member, *self.samples)
+        requirements = (*self.at_members, self.at_found, *self.at_samples)
+        i = worst(requirements)
+        return places[i], requirements[i]
+
+
+def check_set(
+    loop: Loop,
+    coupling: Coupling,
+    seed: int = 0,
+    samples: int = SAMPLES,
+    progress: Progress = lambda done, total: None,
+    searched: Searched | None = None,
+    certificate: Certificate | None = None,
+) -> SetCheck | None:
+    """The coupling over the box of its loop, None where it has none.
+
+    The search is the same every time; `samples` more points are drawn from inside, from the seed. `searched` and
+    `certificate` are those of a design that has made them.
+    """
+    if loop.box is None:
+        return None
+    searched = searched or search_box(loop, coupling, progress)
+    members, drawn = loop.members(), inside(loop.network, loop.box, samples, seed)
+    try:
+        certificate, reason = certificate or prove(loop, coupling, "this-environment"), None
+    except NotProved as error:
+        certificate, reason = None, str(error)
+    at_members, at_samples = in_each(loop, coupling, members), in_each(loop, coupling, drawn)
+    (at_found,) = in_each(loop, coupling, [searched.worst[0].member])
+    check = SetCheck(
+        members, tuple(at_members), drawn, tuple(at_samples), searched, at_found, seed, certificate, reason
+    )
+    if certificate and not check.proved:
+        place, requirement = check.worst_found
+        check = replace(check, reason=violated_between(place, requirement.ratio))
+    return check
+
+
+def violated_between(place: Member, ratio: float) -> str:
+    """Why a coupling that is proved at every vertex has no guarantee for the set."""
+    needs = f"{ratio:.4f} of the damping is needed" if np.isfinite(ratio) else "no damping is enough"
+    return f"proved at the vertices, but violated between them: {needs} at {place.name}"

@@ -18,10 +18,8 @@ from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.bound import bound
-from design.certificate import NotProved, any_environment_of, digest, finite, prove
+from design.certificate import any_environment_of, prove
 from design.conditions import (
-    Condition,
-    Requirement,
     any_environment_demand,
     delayed_demand,
     even_damping,
@@ -32,7 +30,8 @@ from design.conditions import (
 from design.designs import design_by_kind
 from design.frequency import Response, frequencies, on_circle
 from design.optimal import LADDER, Options
-from design.result import PUBLISHED, Design, DesignFailed
+from design.result import PUBLISHED, Condition, Design, DesignFailed, NotProved, Requirement, finite
+from design.stored import digest
 from design.transparency import decibels, transparency
 
 # ----------------------------------------------------------------------------------------------------

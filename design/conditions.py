@@ -9,10 +9,10 @@ stacks and over sampled responses (maps and designs). docs/theory.md derives the
 this-environment   He[F/(z-1)] > -Delta_D/T,  F stable,  F(1) symmetric positive semidefinite
 any-environment    Lemma 4 of the paper for Psi = I and any passive environment under backward Euler:
                    He[(z-1) V/(Tz)] >= diag((1 - cos n_i w) / (2 delta_i)),   n_i = theta_i + 1
-switching          this-environment for delays of the forces that vary within lo..hi at every tick
 latency            this-environment for forces that latch a fraction of a sample after the tick, anew at every tick
-walls              this-environment for walls that make and break contact
-limiter            this-environment for forces that leave through the limiter of controller.process
+
+design/multipliers.py has those of this-environment that weigh an error with a multiplier: walls that make and break
+contact, delays that switch, forces that leave through the limiter of controller.process.
 
 The period may vary from tick to tick, up to T_max, in all of them: `even_damping` is where it enters.
 """
@@ -20,13 +20,12 @@ The period may vary from tick to tick, up to T_max, in all of them: `even_dampin
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from fractions import Fraction
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic
 
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
-from scipy.optimize import linprog, minimize, minimize_scalar
 
 from controller.delay import delay, moving_sum
 from controller.lti import (
@@ -41,7 +40,6 @@ from controller.lti import (
     constant_like,
     hstack,
     numbers,
-    taps,
     vstack,
 )
 from design.frequency import (
@@ -55,13 +53,7 @@ from design.frequency import (
     suprema,
     supremum,
 )
-
-Condition = Literal["this-environment", "any-environment"]
-
-C = TypeVar("C", bound=str)  # a Condition, "jitter-proof" or "limiter"
-
-#: c_ij >= 0 of the limiter's multiplier: for every channel i a weight per lag j = 1, 2, ..; none is zero
-Lags = Sequence[Sequence[Any]]
+from design.result import Requirement, from_ratio, refusal
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,36 +120,6 @@ def latency_demand(F: Block, delta: Sequence[Any], latency: Latency, T_max: floa
     return Demand(R - E1 / 2, constant_like(F, np.diag(gain)), {"F(1)": E1[..., len(late) :, len(late) :]}, ("F(1)",))
 
 
-def walls_demand(
-    G: Block,
-    delta: Sequence[Any],
-    stiffness: Sequence[Any],
-    g: Any,
-    lam: Sequence[Any] | None = None,
-    T_max: float | None = None,
-) -> Demand[Block]:
-    """this-environment for walls p = k max(0, y - gap) of any slope k up to `stiffness` (w,) [N/m] and any gap.
-
-    G takes [x; p] to [f; y], displacements (m,) and wall forces to the forces of the devices and the ways into the
-    walls, [[F, J], [H, Y]]. With a multiplier g >= 0 and a weight lam > 0 for each wall (1 if not given) and
-    M = g (z-1) - 1 the block is, on (dx, dp),
-        [[F, J], [-lam M H, -lam M Y]]/(z-1) + diag(s Delta_D/T, lam g/stiffness),
-    whose static part must be symmetric, J(1) = H(1)' lam and lam Y(1) = Y(1)' lam, with F(1) >= 0 >= lam Y(1).
-    """
-    T, m, w = G.T, len(delta), len(stiffness)
-    gains, one = numbers(g, T), numbers(np.eye(m + w), T)
-    weights = numbers([1] * w if lam is None else lam, T)
-    weigh = np.diag(np.concatenate([numbers([1] * m, T), weights]))
-    S1, R = (weigh @ G).split_at_one()
-    slopes = np.diag(np.concatenate([numbers([0] * m, T), weights * gains]))
-    limits = np.concatenate([numbers([0] * m, T), weights * gains / numbers(stiffness, T)])
-    free = np.hstack([one, -slopes]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
-    damping = np.concatenate([even_damping(delta, T, T_max) / T, numbers([0] * w, T)])
-    F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]
-    static = {"F(1)": F1, "-Y(1)": -Y1, "the static map of devices and walls": S1}
-    return Demand(free, constant_like(G, np.diag(damping)), static, ("F(1)", "-Y(1)"))
-
-
 def any_environment_demand(
     V: Block, theta: Sequence[int], delta: Sequence[Any], T_max: float | None = None
 ) -> Demand[Block]:
@@ -169,79 +131,6 @@ def any_environment_demand(
     window = np.diag(V.T / (2 * even_damping(delta, V.T, T_max))) @ as_like(V, moving_sum(theta, V.T))
     (V1, R), (W1, S) = V.split_at_one(), window.split_at_one()
     return Demand(S - W1 / 2, V1 / 2 - R, {"V(1)": V1})
-
-
-def switching_block(
-    G: Block,
-    lo: Sequence[int],
-    hi: Sequence[int],
-    delta: Any,
-    alpha: Any,
-    T_max: float | None = None,
-) -> tuple[Block, Array]:
-    """[[F/(z-1) + Delta_D/T - diag(alpha)/2, 0], [2 h G, 2 diag(alpha)]], which must be positive real; and F(1).
-
-    F = Theta_nom G with Theta_nom = (z^-lo + z^-hi)/2 and 2 h = hi - lo; G are the forces as they leave,
-    alpha (m,) [N/m] is a multiplier, positive where the delay varies. Channels whose delay does not vary have no row
-    and column of the second kind.
-
-    A force that is late by n in [lo, hi] differs from the nominal one by at most h times the sum of the steps in
-    between; the multiplier weighs that error against the displacement (an S-procedure, channel by channel).
-    """
-    T, widths = G.T, [b - a for a, b in zip(lo, hi, strict=True)]
-    varying = [i for i, width in enumerate(widths) if width]
-    a = numbers(alpha, T)
-    half = Lti.diag(*(taps(_halves(p, q), T) for p, q in zip(lo, hi, strict=True)))
-    spread = Lti.constant(
-        np.array([[widths[i] * (i == j) for j in range(len(lo))] for i in varying]).reshape(-1, len(lo)), T
-    )
-    both: Any = as_like(G, vstack(half, spread)) @ G
-    m = len(lo)
-    F1, R = both.rows(slice(None, m)).split_at_one()
-    upper = R - F1 / 2 + np.diag(even_damping(delta, T, T_max) / T - a / 2)
-    if not varying:
-        return upper, F1
-    lower = np.zeros((m + len(varying), len(varying)), dtype=object)
-    lower[m:] = np.diag(2 * a[varying])
-    return hstack(vstack(upper, both.rows(slice(m, None))), constant_like(G, numbers(lower, T))), F1
-
-
-def _halves(lo: int, hi: int) -> list[Number]:
-    return [Fraction((i == lo) + (i == hi), 2) for i in range(hi + 1)]
-
-
-def limiter_demand(
-    G: Block, theta: Sequence[int], delta: Any, rho: Sequence[Any], c: Lags, T_max: float | None = None
-) -> Demand[Block]:
-    """The limiter's block on (dx - de, de), the steps of what the environment follows and of the slip.
-
-    G are the forces as they leave without the limiter, rho (m,) [N/m] its lag, fixed numbers that the damping does
-    not scale, and c the multiplier. With df_e = G (dx - de) - rho (1 - 1/z) de, the steps of the limited forces, the
-    block is [Theta/(z-1); N] df_e + s Delta_D/T [1, 0; 2, 1], where
-    N_i = -(1 + .. + z^-theta_i) - sum_j c_ij (j + (j-1)/z + .. + z^-(j-1)).
-    """
-    m, T = len(theta), G.T
-    damping = np.diag(even_damping(delta, T, T_max) / T)
-    lines = Lti.diag(*(_delay_and_weights(n, row, T) for n, row in zip(theta, c, strict=True)))
-    lines = lines.rows([*range(0, 2 * m, 2), *range(1, 2 * m, 2)])
-    difference = Lti.diag(*(taps([1, -1], T) for _ in theta))
-    steps: Any = hstack(G, as_like(G, difference @ np.diag(-numbers(rho, T))))
-    both = as_like(G, lines) @ steps
-    static, ramp = both.rows(slice(None, m)).split_at_one()  # [F(1), 0]: the slip's steps have no mean
-    zero = np.zeros((m, m), dtype=int)
-    free = vstack(ramp - static / 2, both.rows(slice(m, None)))
-    gain = np.block([[damping, zero], [2 * damping, damping]])
-    return Demand(free, constant_like(G, gain), {"F(1)": static[..., :m]}, ("F(1)",))
-
-
-def _delay_and_weights(theta: int, c: Sequence[Any], T: Number) -> Lti:
-    """[z^-theta; N] of one channel, over one line of delays."""
-    lags = range(1, len(c) + 1)
-    size = max(theta + 1, len(c))
-    late = [int(k == theta) for k in range(size)]
-    weights = [-sum([numbers(c[j - 1], T) * (j - k) for j in lags if j > k], int(k <= theta)) for k in range(size)]
-    first, second = taps(late, T), taps(weights, T)
-    return Lti(first.A, first.B, np.vstack([first.C, second.C]), np.vstack([first.D, second.D]), T)
 
 
 def delayed_environment_block(delayed: Lti, phi: Sequence[Any]) -> tuple[Array, Lti]:
@@ -280,31 +169,6 @@ def delayed_coupling_block(
     m = len(delta)
     right = np.vstack([np.zeros((m, m), dtype=object), np.diag(numbers(excess, T))])
     return H1, hstack(vstack(T * (H1 / 2 - R), 2 * H), Lti.constant(right, T))
-
-
-# How much damping a condition asks: sweeps, without a solver.
-
-
-@dataclass(frozen=True)
-class Requirement(Generic[C]):
-    """The damping that a condition asks of the devices, against what they have."""
-
-    condition: C
-    required: tuple[float, ...]  # (m,) [N s/m]; inf when no damping helps
-    available: tuple[float, ...]  # (m,) [N s/m]
-    frequency_hz: float | None  # where it binds
-    reason: str | None = None  # why the figure is infinite
-    proof: str = "sampled"
-
-    @property
-    def ratio(self) -> float:
-        """s: required / available on the worst channel."""
-        pairs = zip(self.required, self.available, strict=True)
-        return max(need / have if have > 0 else np.inf for need, have in pairs)
-
-    @property
-    def certified(self) -> bool:
-        return self.ratio < 1
 
 
 def least_scale(demand: Demand[Any], w: Array) -> Array:
@@ -459,16 +323,6 @@ def any_environment_per_channel(
     return Requirement("any-environment", required, available, worst.frequency_hz, worst.reason)
 
 
-def from_ratio(condition: C, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement[C]:
-    """The requirement of `ratio` times what is available, on every channel."""
-    return Requirement(condition, tuple(ratio * delta for delta in available), available, frequency_hz)
-
-
-def refusal(condition: C, available: tuple[float, ...], reason: str) -> Requirement[C]:
-    """The requirement that no damping satisfies."""
-    return Requirement(condition, (np.inf,) * len(available), available, None, reason)
-
-
 def dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
     """`delta` as floats, one positive damping per channel [N s/m]."""
     values = tuple(float(d) for d in delta)
@@ -477,92 +331,6 @@ def dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
     if not all(0 <= d < np.inf for d in values):
         raise ValueError(f"delta is {list(values)}, expected dampings >= 0 in N s/m")
     return values
-
-
-# this-environment with walls: the best multiplier. The least s is convex in g, because the block is affine in both.
-
-
-#: Where the multiplier of a wall is looked for [samples], and the digits that are kept of it.
-LEAST_G, MOST_G, G_DIGITS = 1e-3, 1e3, 4
-
-
-@dataclass(frozen=True)
-class WallsProof:
-    """What walls that make and break contact ask of the devices."""
-
-    requirement: Requirement  # condition "this-environment"
-    g: tuple[float, ...]  # (w,) the multiplier that shows it
-
-
-def walls_proof(
-    G: Lti,
-    delta: Sequence[float],
-    stiffness: Sequence[float],
-    g: Sequence[float] | None = None,
-    T_max: float | None = None,
-) -> WallsProof:
-    """The damping that `walls_demand` asks with the best multiplier found, or with g (w,) where it is given.
-
-    G takes [x; p] to [f; y] while no wall touches.
-    """
-    m, w = len(delta), len(stiffness)
-    available = dampings(delta, m)
-
-    def refused(reason: str) -> WallsProof:
-        return WallsProof(refusal("this-environment", available, reason), tuple(g or (1.0,) * w))
-
-    if min(available) == 0:
-        return refused("a device guarantees no damping, so no coupling is safe for every passive human")
-    radius = float(np.abs(G.poles()).max(initial=0.0))
-    if radius >= 1:
-        return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
-    S1 = G.dc()
-    # rounding, relative to what each channel and wall is elsewhere
-    own = np.abs([np.diag(S1), np.diag(G.D), np.diag(G.at(-1.0))]).max(axis=0)
-    if (np.abs(S1 - S1.T) > 1e-9 * np.sqrt(np.outer(own, own))).any():
-        return refused("the static map of devices and walls is not symmetric: a slow closed path could extract energy")
-    for name, part, size in (("F(1)", S1[:m, :m], own[:m]), ("-Y(1)", -S1[m:, m:], own[m:])):
-        if np.linalg.eigvalsh((part + part.T) / 2).min() < -1e-9 * size.max():
-            return refused(f"{name} has a negative direction: it pushes outwards")
-    grid = np.concatenate([[0.0], frequencies(G)])
-    z = on_circle(frequencies(G, points=100))
-    sampled = Sampled(z[None], G.at(z)[None], G.T)
-
-    def needed(values: Array) -> float:
-        demand = walls_demand(sampled, available, stiffness, values, None, T_max)
-        return float(least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G)).max())
-
-    found = _best_g(needed, w) if g is None else np.asarray(g, dtype=float)
-    demand = walls_demand(G, available, stiffness, found, None, T_max)
-    ratio, at = supremum(lambda w: least_scale(demand, w), grid)
-    if np.isinf(ratio):
-        return refused("no multiplier was found with which the walls are covered, whatever the damping")
-    return WallsProof(
-        from_ratio("this-environment", max(ratio, 0.0), available, at / (2 * np.pi * G.T)), tuple(found.tolist())
-    )
-
-
-def _best_g(needed: Callable[[Array], float], walls: int) -> Array:
-    """g (walls,) with about the least `needed`: one for all of them, then one by one, each by a search in log g."""
-    g = np.ones(walls)
-    turns = [np.ones(walls, dtype=bool), *(np.eye(walls, dtype=bool) if walls > 1 else ())]
-
-    def moved(which: Array, value: float) -> Array:
-        return np.where(which, value, g)
-
-    for which in turns:
-        grid = np.geomspace(LEAST_G, MOST_G, 13)
-        values = [needed(moved(which, value)) for value in grid]
-        best = int(np.argmin(values))
-        ends = np.log(grid[max(best - 1, 0)]), np.log(grid[min(best + 1, grid.size - 1)])
-        finer = minimize_scalar(
-            lambda x, which=which: min(needed(moved(which, np.exp(x))), 1e300),
-            bounds=ends,
-            method="bounded",
-            options={"xatol": 1e-2},
-        )
-        g = moved(which, float(np.exp(finer.x)) if finer.fun < values[best] else float(grid[best]))
-    return np.array([float(f"{value:.{G_DIGITS}g}") for value in g])
 
 
 # Encoder steps under Coulomb friction
@@ -739,327 +507,6 @@ def any_environment_ratios(
 
 def _least_scales(demand: Demand[Sampled]) -> Array:
     return least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G))
-
-
-# delays that switch within [lo, hi]: the best multiplier
-#
-# With a = alpha T/delta the least factor s on delta is the supremum over frequency of an eigenvalue that is convex in
-# a: at every frequency and direction u it is at least u*(..)u, a sum n + p.a + q.(1/a), and that bounds s from below
-# for all a. The worst of these bounds are collected until their least a attains them. No convex solver is needed.
-
-SETTLED = 1e-7  # relative gap between the sweep of a multiplier and the bound that no multiplier beats
-MOST_ROUNDS = 60
-FIRST = 0.1  # the a that a search begins with
-SMALLEST, LARGEST = 1e-8, 1e6  # .. and what it may become
-NEAR, MOST_PEAKS = 0.3, 8  # of the peaks within 30 % of the highest, so many give a bound
-
-
-@dataclass(frozen=True)
-class JitterProof:
-    """What switching within a range asks of the devices."""
-
-    requirement: Requirement  # condition "jitter-proof"
-    alpha: tuple[float, ...]  # (m,) [N/m] the multiplier that shows it, at the available damping; 0 where lo = hi
-    bound: float  # no multiplier shows less than this times the available damping (on the frequencies looked at)
-
-
-def jitter_proof(
-    G: Lti,
-    lo: Sequence[int],
-    hi: Sequence[int],
-    delta: Sequence[float],
-    alpha: Sequence[float] | None = None,
-    T_max: float | None = None,
-) -> JitterProof:
-    """The least common factor on `delta` [N s/m] with which some multiplier satisfies the condition, and which does.
-
-    G is the force map without Theta. The factor is that of the refined sweep (design.frequency.sweep) at the multiplier
-    found, or at `alpha` (m,) [N/m] where it is given, positive where lo < hi; `bound` is then that factor.
-    """
-    available, h = dampings(delta, G.inputs), half_widths(lo, hi)
-    if len(h) != G.inputs:
-        raise ValueError(f"delays are given for {len(h)} channels, expected {G.inputs}")
-    constant = this_environment(nominal(lo, hi, G.T) @ G, delta, T_max)
-    if not np.isfinite(constant.ratio):
-        return jitter_refusal(available, constant.reason or "no constant delay is safe")
-    damping = even_damping(available, G.T, T_max)
-    search, unit = _Search(G, lo, hi, damping), damping / G.T
-    given = None if alpha is None else (np.asarray(alpha) / unit)[search.active]
-    a, ratio, w, bound = search.least() if given is None else search.only(given)
-    multiplier = np.zeros(h.size)
-    multiplier[search.active] = a
-    requirement = from_ratio("jitter-proof", max(ratio, 0.0), available, w / (2 * np.pi * G.T))
-    return JitterProof(requirement, tuple((multiplier * unit).tolist()), bound)
-
-
-def jitter_refusal(available: tuple[float, ...], reason: str) -> JitterProof:
-    """That no damping is enough, and why."""
-    return JitterProof(refusal("jitter-proof", available, reason), (np.inf,) * len(available), np.inf)
-
-
-Found = tuple[Array, float, float, float]  # a, s(a), where it binds [rad/sample], a lower bound on s over all a
-
-
-class _Search:
-    """s(a) = sup over w of the largest eigenvalue of N + diag(a)/2 + Y* diag(1/2a) Y, over the channels that vary.
-
-    A Schur complement of `switching_block`, scaled by W = diag(sqrt(T/delta)): N = -W He[F/(z-1)] W,
-    F = Theta_nom G, Y = h W G W.
-    """
-
-    def __init__(self, G: Lti, lo: Sequence[int], hi: Sequence[int], delta: Array) -> None:
-        F = nominal(lo, hi, G.T) @ G
-        self._G, self._demand = G, this_environment_demand(F, delta.tolist())
-        self._weight, self._h = np.sqrt(G.T / delta), half_widths(lo, hi)
-        self.active = np.flatnonzero(self._h)
-        self._grid = np.concatenate([[0.0], frequencies(G)])
-        none = np.zeros((0, self.active.size))
-        self._n, self._p, self._q = np.zeros(0), none, none  # the bounds collected
-
-    def only(self, a: Array) -> Found:
-        """s at this a."""
-        ratio, w = self._swept(a)
-        return a, ratio, w, ratio
-
-    def least(self) -> Found:
-        """The least s over all a."""
-        a, bound = np.full(self.active.size, FIRST), -np.inf
-        if not a.size:
-            return self.only(a)
-        N, Y = self._parts(self._grid)
-        best: tuple[Array, float, float] = (a, np.inf, 0.0)
-        for _ in range(MOST_ROUNDS):
-            if self._cut(a, N, Y) <= bound + SETTLED * abs(bound):  # settled on the samples: look between them
-                ratio, w = self._swept(a)
-                best = min(best, (a, ratio, w), key=lambda found: found[1])
-                if best[1] <= bound + 10 * SETTLED * abs(bound):
-                    return *best, bound
-                between = self._parts(np.array([w]))
-                N, Y = np.concatenate([N, between[0]]), np.concatenate([Y, between[1]])
-                self._cut(a, *between)
-            a, bound = self._bound(a)
-        return *min(best, (a, *self._swept(a)), key=lambda found: found[1]), bound
-
-    def _swept(self, a: Array) -> tuple[float, float]:
-        """(s(a), w) by a sweep that is refined between its samples."""
-        return supremum(lambda w: self._largest(a, *self._parts(w)), self._grid)
-
-    def _parts(self, w: Array) -> tuple[Complex, Complex]:
-        """N (k, m, m) and the rows of Y with h > 0, at the frequencies w (k,) [rad/sample]."""
-        z, W = on_circle(w), self._weight
-        N = -W[:, None] * hermitian(self._demand.free.at(z)) * W
-        Y = (self._h * W)[:, None] * self._G.at(z) * W
-        return N, Y[:, self.active]
-
-    def _matrices(self, a: Array, N: Complex, Y: Complex) -> Complex:
-        """N + diag(a)/2 + Y* diag(1/2a) Y, (k, m, m)."""
-        diagonal = np.zeros(self._h.size)
-        diagonal[self.active] = a / 2
-        return N + np.diag(diagonal) + np.conj(np.swapaxes(Y, 1, 2)) @ (Y / (2 * a[:, None]))
-
-    def _largest(self, a: Array, N: Complex, Y: Complex) -> Array:
-        return np.linalg.eigvalsh(self._matrices(a, N, Y))[:, -1].astype(float)
-
-    def _cut(self, a: Array, N: Complex, Y: Complex) -> float:
-        """Collect the bounds at the local peaks near the worst sampled frequency; the worst value."""
-        values = self._largest(a, N, Y)
-        top, padded = float(values.max()), np.concatenate([[-np.inf], values, [-np.inf]])
-        peaks = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]) & (values >= top - NEAR * abs(top)))
-        peaks = peaks[np.argsort(values[peaks])[-MOST_PEAKS:]]
-        u = np.linalg.eigh(self._matrices(a, N[peaks], Y[peaks]))[1][:, :, -1]
-        self._n = np.append(self._n, np.einsum("ki,kij,kj->k", u.conj(), N[peaks], u).real)
-        self._p = np.concatenate([self._p, np.abs(u[:, self.active]) ** 2 / 2])
-        self._q = np.concatenate([self._q, np.abs(np.einsum("kij,kj->ki", Y[peaks], u)) ** 2 / 2])
-        return top
-
-    def _bound(self, a: Array) -> tuple[Array, float]:
-        """(a, value): the least maximum over a of the bounds n + p.a + q.(1/a), convex in log a."""
-
-        def below(x: Array) -> Array:
-            return x[0] - self._n - self._p @ np.exp(x[1:]) - self._q @ np.exp(-x[1:])
-
-        def slope(x: Array) -> Array:
-            return np.column_stack([np.ones(self._n.size), -self._p * np.exp(x[1:]) + self._q * np.exp(-x[1:])])
-
-        start = np.concatenate([[0.0], np.log(a)])
-        start[0] = -below(start).min()
-        limits = [(None, None)] + [(np.log(SMALLEST), np.log(LARGEST))] * a.size
-        gradient = np.eye(1 + a.size)[0]
-        found = minimize(
-            lambda x: x[0],
-            start,
-            jac=lambda x: gradient,
-            bounds=limits,
-            method="SLSQP",
-            constraints={"type": "ineq", "fun": below, "jac": slope},
-            options={"maxiter": 200, "ftol": 1e-12},
-        )
-        return np.exp(found.x[1:]), float(found.x[0])
-
-
-# the limiter: the best multiplier
-#
-# The block is affine in (s, c), so s(c) is convex, and each direction u at a frequency gives a linear bound:
-# u*(free(c) + s gain)u >= 0. The worst of them are collected, a linear program finds the least s that they allow, and
-# the search ends where the sweep attains it (Kelley's cutting planes).
-
-BETA = 0.01  # of a limiter's lag under this-environment unless another is asked for
-LARGEST_WEIGHT = 10.0  # that a search gives a c_ij
-HOPELESS = 1e6  # times the available damping
-SPARE = 0.02  # of rho: what the block keeps, however large the damping, so that c may be rounded and the proof exact
-LIMITER_SETTLED = 1e-6  # relative gap between the sweep at the best c and the bound that no c beats
-
-
-@dataclass(frozen=True)
-class LimiterProof:
-    """What the limiter asks of the devices."""
-
-    requirement: Requirement  # condition "limiter"
-    rho: tuple[float, ...]  # (m,) [N/m] the lag of the limiter that is asked about
-    c: tuple[tuple[float, ...], ...]  # (m, lags) the multiplier that shows it
-    bound: float  # what the search proved of all c that keep SPARE of rho; the ratio itself where c was given
-
-
-def limiter_lag(delta: Sequence[float], T: float, beta: float) -> tuple[float, ...]:
-    """rho = beta delta/T [N/m] of a limiter under this-environment, to six digits."""
-    return tuple(float(f"{beta * d / T:.6g}") for d in delta)
-
-
-def limiter(
-    G: Lti,
-    theta: Sequence[int],
-    delta: Sequence[float],
-    rho: Sequence[float],
-    c: Lags | None = None,
-    lags: int = 1,
-    T_max: float | None = None,
-) -> LimiterProof:
-    """The least common factor on `delta` [N s/m] with which the limiter's block is positive real, at the best c.
-
-    G is the force map without Theta, rho (m,) [N/m] the limiter's lag. With `c` given its figure is that of the
-    refined sweep at this multiplier; otherwise the best with so many lags per channel is searched.
-    """
-    available, m = dampings(delta, G.inputs), G.inputs
-    if len(theta) != m or len(rho) != m or (c is not None and len(c) != m):
-        raise ValueError(f"theta, rho and c need one entry for each of {m} channels")
-    if not all(0 <= r < np.inf for r in rho) or any(not 0 <= v < np.inf for row in c or () for v in row):
-        raise ValueError(f"rho is {list(rho)} and c is {c}, expected numbers >= 0")
-    none = tuple((0.0,) * lags for _ in theta) if c is None else tuple(tuple(float(v) for v in row) for row in c)
-    # the slip at rest: its rows are among the block's
-    linear = this_environment(delay(theta, G.T) @ G, available, T_max)
-    if not np.isfinite(linear.ratio):
-        reason = linear.reason or "the loop without limiter is not covered"
-        return LimiterProof(refusal("limiter", available, reason), tuple(rho), none, np.inf)
-    search = _LimiterSearch(G, theta, available, rho, lags, T_max)
-    if c is not None:
-        ratio, w = search.swept(none)
-        return LimiterProof(search.requirement(ratio, w), tuple(rho), none, ratio)
-    best, ratio, w, bound = search.least()
-    return LimiterProof(search.requirement(ratio, w), tuple(rho), best, bound)
-
-
-class _LimiterSearch:
-    """s(c) by the refined sweep, and its least over c >= 0."""
-
-    def __init__(
-        self,
-        G: Lti,
-        theta: Sequence[int],
-        delta: tuple[float, ...],
-        rho: Sequence[float],
-        lags: int,
-        T_max: float | None = None,
-    ) -> None:
-        self._T_max = T_max
-        self._loop, self._delta, self._shape = (G, theta, delta, rho), delta, (len(theta), lags)
-        self._grid, self._lag = np.concatenate([[0.0], frequencies(G)]), np.diag([*rho, *rho])
-
-    def requirement(self, ratio: float, w: float) -> Requirement:
-        T = self._loop[0].T
-        if np.isinf(ratio):
-            reason = f"no damping is enough for the limiter at {w / (2 * np.pi * T):.4g} Hz with this multiplier"
-            return refusal("limiter", self._delta, reason)
-        return from_ratio("limiter", max(ratio, 0.0), self._delta, w / (2 * np.pi * T))
-
-    def demand(self, c: Lags) -> Demand[Lti]:
-        G, theta, delta, rho = self._loop
-        return limiter_demand(G, theta, delta, rho, c, self._T_max)
-
-    def swept(self, c: Lags, spare: float = 0.0) -> tuple[float, float]:
-        """(s(c), w [rad/sample]) by a sweep that is refined between its samples, with so much of rho to spare."""
-        demand = self.demand(c)
-        demand = replace(demand, free=demand.free - spare * self._lag)
-        return supremum(lambda w: least_scale(demand, w), self._grid)
-
-    def least(self) -> tuple[tuple[tuple[float, ...], ...], float, float, float]:
-        """(c, s(c), where it binds, a lower bound on s over all c that have something to spare)."""
-        m, lags = self._shape
-        c, bound = np.zeros(m * lags), -np.inf
-        best: tuple[Array, float, float] = (c, np.inf, 0.0)
-        parts, cuts = self._parts(self._grid), np.zeros((0, m * lags + 2))
-        for _ in range(MOST_ROUNDS):
-            found, top = self._cuts(c, *parts)
-            if top <= bound + LIMITER_SETTLED * abs(bound):  # settled on the samples: look between them
-                ratio, w = self.swept(self._rows(c), SPARE)
-                best = min(best, (c, ratio, w), key=lambda found: found[1])
-                if best[1] <= bound + 10 * LIMITER_SETTLED * abs(bound):
-                    break
-                between = self._parts(np.array([w]))
-                parts = tuple(np.concatenate(pair, axis=-3) for pair in zip(parts, between, strict=True))
-                found = np.concatenate([found, self._cuts(c, *between)[0]])
-            cuts = np.concatenate([cuts, found])
-            lowest = linprog(
-                np.eye(c.size + 1)[-1],
-                A_ub=-cuts[:, 1:],
-                b_ub=cuts[:, 0],
-                bounds=[*[(0.0, LARGEST_WEIGHT)] * c.size, (0.0, None)],
-            )
-            if lowest.x is None:  # no c within the bounds makes the block positive, however large the damping
-                return self._rows(c), np.inf, self.swept(self._rows(c), SPARE)[1], np.inf
-            c, bound = np.maximum(lowest.x[:-1], 0.0), float(lowest.x[-1])
-        if np.isinf(best[1]):
-            best = (c, *self.swept(self._rows(c), SPARE))
-        c = np.round(best[0], 6)
-        return self._rows(c), *self.swept(self._rows(c)), bound
-
-    def _rows(self, c: Array) -> tuple[tuple[float, ...], ...]:
-        """c (m lags,) as a row per channel."""
-        return tuple(tuple(row) for row in c.reshape(self._shape).tolist())
-
-    def _parts(self, w: Array) -> tuple[Complex, Complex, Complex]:
-        """The Hermitian parts at w (k,) of the block without c, (1, k, p, p), of its slopes in c, and of the gain."""
-        z, m = on_circle(w), len(self._delta)
-        none = self.demand(np.zeros(self._shape).tolist())
-        free, gain = hermitian(none.free.at(z)), hermitian(none.gain.at(z))
-        units = np.eye(int(np.prod(self._shape)))
-        slopes = [hermitian(self.demand(self._rows(unit)).free.at(z)) - free for unit in units]
-        return (free - SPARE * self._lag)[None], np.array(slopes).reshape(-1, w.size, 2 * m, 2 * m), gain[None]
-
-    def _cuts(self, c: Array, free: Complex, slopes: Complex, gain: Complex) -> tuple[Array, float]:
-        """(rows, s): the bounds value + slope.c + s gain >= 0 at the worst peaks, and the worst s there."""
-        block, gain = free[0] + np.tensordot(c, slopes, axes=1), gain[0]
-        needed = least_multiple(block, gain)
-        padded = np.concatenate([[-np.inf], needed, [-np.inf]])
-        peaks = np.flatnonzero((needed >= padded[:-2]) & (needed >= padded[2:]))
-        peaks = peaks[np.argsort(needed[peaks])[-MOST_PEAKS:]]
-        # beyond any damping the worst direction is sought at one so large that only the null space of the gain counts
-        s = np.where(np.isinf(needed[peaks]), HOPELESS, needed[peaks])
-        u = np.linalg.eigh(block[peaks] + s[:, None, None] * gain[peaks])[1][:, :, 0]
-        terms = np.concatenate([free, slopes, gain[None]])[:, peaks]
-        rows = np.einsum("ka,tkab,kb->kt", u.conj(), terms, u).real
-        return rows / np.abs(rows).max(axis=1, keepdims=True), float(needed.max())
-
-
-def half_widths(lo: Sequence[int], hi: Sequence[int]) -> Array:
-    """h = (hi - lo)/2, (m,). Raises ValueError unless 0 <= lo <= hi."""
-    if len(lo) != len(hi) or any(not 0 <= a <= b for a, b in zip(lo, hi, strict=False)):
-        raise ValueError(f"delays from {list(lo)} to {list(hi)}, expected 0 <= lo <= hi on every channel")
-    return (np.asarray(hi) - np.asarray(lo)) / 2
-
-
-def nominal(lo: Sequence[int], hi: Sequence[int], T: float) -> Lti:
-    """Theta_nom = (z^-lo + z^-hi)/2, diagonal."""
-    return Lti.diag(*(taps(_halves(p, q), T) for p, q in zip(lo, hi, strict=True)))
 
 
 def regular_part(E: Lti) -> Lti:

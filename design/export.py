@@ -14,7 +14,8 @@ from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from controller.process import GROUNDED, PIVOT_ROUNDING, Limiter
-from design.certificate import Stored, lag
+from design.certificate import lag
+from design.stored import Stored
 
 # ----------------------------------------------------------------------------------------------------
 # What is exported: one state-space block, the order in which its sums are taken, and a test vector in that order.

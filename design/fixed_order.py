@@ -23,7 +23,6 @@ from controller.coupling import Compliance, SpringDamper
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design import spring_damper
-from design.conditions import Requirement
 from design.frequency import on_circle
 from design.lmi import (
     Ports,
@@ -43,7 +42,7 @@ from design.lmi import (
     symmetric_from,
     theta_hat,
 )
-from design.result import METHODS, Design, DesignFailed, Row, of_kind, one_of, whole
+from design.result import METHODS, Design, DesignFailed, Requirement, Row, of_kind, one_of, whole
 
 # ----------------------------------------------------------------------------------------------------
 # State-space couplings of fixed order, in a realisation where both conditions are affine.

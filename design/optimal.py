@@ -24,33 +24,23 @@ from controller.delay import delay
 from controller.environment import Box, Network, UncertainSpring
 from controller.loop import DelayRange, Loop
 from controller.lti import Array, Complex, Lti, Sampled, as_like
-from design import ranges
 from design.barrier import Block, Program, centre, towards
-from design.certificate import (
-    Certificate,
-    LimiterCertificate,
-    NotProved,
-    in_each,
-    limiter_refusal,
-    limiter_requirement,
-    prove,
-    prove_limiter,
-    worst,
-)
-from design.conditions import (
+from design.certificate import prove, prove_limiter
+from design.conditions import Demand, even_damping, least_multiple, this_environment_demand
+from design.conditions import this_environment as requirement_of
+from design.environments import Searched, in_each, search_box, worst
+from design.frequency import frequencies, hermitian, on_circle, peaks, supremum
+from design.multipliers import (
     BETA,
     SPARE,
-    Demand,
-    even_damping,
-    least_multiple,
     limiter_demand,
     limiter_lag,
+    limiter_refusal,
+    limiter_requirement,
     switching_block,
-    this_environment_demand,
 )
-from design.conditions import this_environment as requirement_of
-from design.frequency import frequencies, hermitian, on_circle, peaks, supremum
-from design.result import Design, DesignFailed, number, one_of
+from design.result import Design, DesignFailed, NotProved, number, one_of
+from design.stored import Certificate, LimiterCertificate
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
 OBJECTIVES = ("rms", "sup")
@@ -153,7 +143,7 @@ class Optimal(Design):
     certificate: Certificate | None = field(kw_only=True)  # of the loop with its ranges and its switching delays
     ladder: tuple[Rung, ...] = field(kw_only=True, default=())
     reason: str | None = field(kw_only=True, default=None)  # why nothing is proved, where nothing is
-    searched: ranges.Searched | None = field(kw_only=True, default=None)  # between the vertices of ranges
+    searched: Searched | None = field(kw_only=True, default=None)  # between the vertices of ranges
 
     @property
     def proved(self) -> bool:
@@ -178,7 +168,7 @@ def this_environment(loop: Loop, margin: float = MARGIN) -> Constraint:
     return Constraint("this-environment", block, 1 / np.sqrt(np.diag(gain.D)))
 
 
-def _demand(loop: Loop, F: Lti | Sampled) -> Demand[Any]:
+def _demand(loop: Loop, F: Any) -> Demand[Any]:
     return this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
 
 
@@ -584,6 +574,27 @@ def _band(loop: Loop, band_hz: tuple[float, float]) -> tuple[float, float]:
 # the climb -------------------------------------------------------------------------------------------------------
 
 
+def design_with(
+    loop: Loop,
+    progress: Callable[[str, int, int], None] = lambda what, done, total: None,
+    switching: tuple[Sequence[int], Sequence[int]] | None = None,
+    **options: Any,
+) -> Optimal:
+    """The optimal coupling for Options(**options), also safe while delays vary within `switching`, (lo, hi) [samples].
+
+    The rungs of its ladder are the steps that `progress` hears of.
+    """
+    asked, done = Options(**options), 0
+
+    def heard(rung: Rung) -> None:
+        nonlocal done
+        done += 1
+        progress(f"{rung.mismatch_db:.2f} dB after {rung.seconds:.1f} s", done, len(asked.ladder))
+
+    span = None if switching is None else DelayRange(*(tuple(map(int, end)) for end in switching))
+    return design(loop.switching(span), asked, progress=heard)
+
+
 def design(
     loop: Loop,
     options: Options = Options(),
@@ -754,7 +765,7 @@ class _Climb:
         """
         whole = found.coupling
         assert isinstance(whole, ForceFilter)
-        searched = ranges.search_box(self.loop, whole)
+        searched = search_box(self.loop, whole)
         ratio, last = searched.worst[0].ratio, found
         for limit in (1 - self.options.margin / 2, 1 - 2.5 * self.options.margin):
             share = min(1.0, limit / ratio)
@@ -910,7 +921,7 @@ def spread(loop: Loop, options: Options = Options(), percent: float = 10.0) -> S
     """The design for `vertices` beside the nominal one, by sweeps: a price, not a coupling to run. None without one."""
     taps, poles = options.ladder[: 2 if loop.channels <= RICH else 1][-1]
     climb = _Climb.of(loop.at(loop.environment), options, ())
-    around = [_at(loop, network) for network in vertices(loop.environment, percent).values()]
+    around = [_at(loop, network) for network in vertices(loop.network, percent).values()]
     more = tuple(Case(there, there.E(), (this_environment(there, options.margin),), 0.0) for there in around)
     try:
         alone, wide = (each.rung(taps, poles, None)[0] for each in (climb, replace(climb, cases=climb.cases + more)))

@@ -7,11 +7,80 @@ import math
 import operator
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Generic, Literal, TypeVar
+
+import numpy as np
 
 from controller.coupling import Coupling, SpringDamper
 from controller.lti import Array, Lti
-from design.conditions import Condition, Requirement
+
+Condition = Literal["this-environment", "any-environment"]
+
+
+C = TypeVar("C", bound=str)  # a Condition, "jitter-proof" or "limiter"
+
+
+# How much damping a condition asks: sweeps, without a solver.
+
+
+@dataclass(frozen=True)
+class Requirement(Generic[C]):
+    """The damping that a condition asks of the devices, against what they have."""
+
+    condition: C
+    required: tuple[float, ...]  # (m,) [N s/m]; inf when no damping helps
+    available: tuple[float, ...]  # (m,) [N s/m]
+    frequency_hz: float | None  # where it binds
+    reason: str | None = None  # why the figure is infinite
+    proof: str = "sampled"
+
+    @property
+    def ratio(self) -> float:
+        """s: required / available on the worst channel."""
+        pairs = zip(self.required, self.available, strict=True)
+        return max(need / have if have > 0 else np.inf for need, have in pairs)
+
+    @property
+    def certified(self) -> bool:
+        return self.ratio < 1
+
+
+def from_ratio(condition: C, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement[C]:
+    """The requirement of `ratio` times what is available, on every channel."""
+    return Requirement(condition, tuple(ratio * delta for delta in available), available, frequency_hz)
+
+
+def refusal(condition: C, available: tuple[float, ...], reason: str) -> Requirement[C]:
+    """The requirement that no damping satisfies."""
+    return Requirement(condition, (np.inf,) * len(available), available, None, reason)
+
+
+def finite(value: float) -> float | None:
+    """JSON knows neither infinity nor not-a-number."""
+    return float(value) if math.isfinite(value) else None
+
+
+def certificate_part(requirement: Requirement) -> dict[str, Any]:
+    """Required against available damping."""
+    part = {
+        "condition": requirement.condition,
+        "required_damping": [finite(b) for b in requirement.required],
+        "available_damping": list(requirement.available),
+        "margin": finite(1 / requirement.ratio) if requirement.ratio > 0 else None,
+        "binding_frequency_hz": requirement.frequency_hz,
+        "certified": requirement.certified,
+        "proof": requirement.proof,
+    }
+    return part | ({"reason": requirement.reason} if requirement.reason else {})
+
+
+class NotProved(ValueError):
+    """No proof of the condition was found; carries the requirement that the sweep found, if there is one."""
+
+    def __init__(self, reason: str, requirement: Requirement | None = None) -> None:
+        super().__init__(reason)
+        self.requirement = requirement
+
 
 # ----------------------------------------------------------------------------------------------------
 # What a design raises when it has nothing to return.

@@ -1,6 +1,6 @@
 """Spring-damper couplings (26): the best under either condition, the stiffest, and the moving average.
 
-Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT/d, b = B/d (design.gains.gain_set).
+Gains are handled in units of the usable damping d = (1 - RESERVE) delta: k = KT/d, b = B/d (gain_set).
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import cast
+from typing import Any, cast
 
 import cvxpy as cp
 import numpy as np
@@ -18,25 +18,22 @@ from controller.coupling import MovingAverage, SpringDamper
 from controller.delay import delay
 from controller.loop import Loop, force_map
 from controller.lti import Array, Lti, Sampled
-from design.conditions import (
+from design.conditions import any_environment, any_environment_delayed, even_damping, this_environment
+from design.frequency import frequencies, hermitian, on_circle, peaks
+from design.lmi import RESERVE, Complex, Shaping, affine_lmis, gain_lmi, least_phi, solve, solved, usable
+from design.multipliers import (
     BETA,
     Lags,
     LimiterProof,
-    Requirement,
-    any_environment,
-    any_environment_delayed,
-    even_damping,
     half_widths,
     jitter_proof,
     limiter_demand,
     limiter_lag,
+    limiter_refusal,
     switching_block,
-    this_environment,
 )
-from design.conditions import limiter as limiter_proof
-from design.frequency import frequencies, hermitian, on_circle, peaks
-from design.lmi import RESERVE, Complex, Shaping, affine_lmis, gain_lmi, least_phi, solve, solved, usable
-from design.result import Design, DesignFailed, Infeasible
+from design.multipliers import limiter as limiter_proof
+from design.result import Design, DesignFailed, Infeasible, Requirement
 from design.transparency import BAND_HZ, transparency
 
 # ----------------------------------------------------------------------------------------------------
@@ -202,7 +199,7 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> tuple[Comple
 # Spring-damper gains under the this-environment condition, for one environment: a local search from several starts.
 #
 # The set is not convex in (K, B), so nothing here is proved best. The rms mismatch is minimised by sequential
-# quadratic programming with the condition at sampled frequencies; where the refined sweep of design.margin finds it
+# quadratic programming with the condition at sampled frequencies; where the refined sweep of design.conditions finds it
 # violated in between, that frequency is added and the search resumed. What is returned passes that sweep.
 
 
@@ -514,6 +511,23 @@ def design(
     if switching:
         raise ValueError("delays that vary are designed for by the this-environment condition only")
     raise ValueError(f"condition is {condition!r}, expected 'any-environment' or 'this-environment'")
+
+
+def design_with(loop: Loop, condition: str, limiter: bool | None = None, **options: Any) -> Design:
+    """A spring-damper, with the limiter's block in the place of the linear one where that is asked for or usual."""
+    if limiter is False or condition == "any-environment":  # with rho = 0 any-environment covers limited forces anyway
+        return design(loop, condition, **options)
+    refusal = limiter_refusal(loop)
+    if limiter and refusal:
+        raise ValueError(refusal)
+    if refusal or options.get("switching"):
+        return design(loop, condition, **options)
+    try:
+        return design(loop, condition, limiter=True, **options)
+    except DesignFailed:
+        if limiter:
+            raise
+        return design(loop, condition, **options)
 
 
 def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design:

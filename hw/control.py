@@ -23,10 +23,10 @@ from controller.environment import environment
 from controller.loop import force_map
 from controller.lti import Array, Lti
 from controller.process import Limiter, limited
-from design.certificate import Limits as ForceLimits
-from design.certificate import assess, certificate_part, guarantee_of
-from design.conditions import Requirement
-from design.result import DesignFailed
+from design.certificate import assess
+from design.coverage import Limits as ForceLimits
+from design.guarantee import guarantee_of
+from design.result import DesignFailed, Requirement, certificate_part
 from hw.limits import Fault, Gain, Heat, Limits, Units, check_jolt, check_jump, check_range, check_speed, shape
 from hw.monitor import Ages, ClockMonitor, CommandMonitor, Counters, EncoderMonitor, EncoderTest, LinkSettings
 from hw.protocol import MAX_THETA, Config, State

@@ -14,8 +14,9 @@ from typing import Any
 
 from controller.coupling import Coupling
 from controller.lti import Array
-from design.certificate import assess, finite, guarantee_of
-from design.conditions import Requirement
+from design.certificate import assess
+from design.guarantee import guarantee_of
+from design.result import Requirement, finite
 from design.transparency import decibels, transparency
 from sim.accuracy import credible_part, force_error
 from sim.couplings import choose, limits_of

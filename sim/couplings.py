@@ -10,11 +10,12 @@ from typing import Any
 from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, MovingAverage, NoCoupling
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
-from design import certificate as store
-from design.certificate import Limits, Stored, assess, covered_limits, switching_guarantee, verify
-from design.conditions import Requirement
+from design.certificate import assess, verify
+from design.coverage import Limits, covered_limits
 from design.designs import KINDS, design_by_kind
-from design.result import PUBLISHED, DesignFailed
+from design.guarantee import switching_guarantee
+from design.result import PUBLISHED, DesignFailed, Requirement
+from design.stored import Stored, load
 from sim.scenario import InputError, Scenario
 
 NAMES = ("none", "published", *KINDS)
@@ -89,7 +90,7 @@ def limits_of(
 
 def read_coupling(path: str | Path) -> Stored:
     """A stored coupling. Raises InputError where there is none that can be read."""
-    stored = store.load(path)
+    stored = load(path)
     try:
         stored.built()
     except ValueError as error:

@@ -22,8 +22,8 @@ from controller.environment import GROUND, Network, Spring, Wall
 from controller.loop import Loop
 from controller.lti import Array
 from controller.process import Process, StepBuffer, limited
-from design.certificate import walls_of
-from design.conditions import BETA, encoder_friction, limiter, limiter_lag, this_environment
+from design.conditions import encoder_friction, this_environment
+from design.multipliers import BETA, limiter, limiter_lag, walls_of
 from models.device import RigidDevice
 from models.human import Human, Link
 from models.scene import Crowd, variants

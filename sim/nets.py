@@ -22,7 +22,7 @@ from controller.delay import LOST, Ticks, ages
 from controller.loop import DelayRange
 from controller.lti import Array, Lti
 from controller.process import Limiter, Net, Process, contact, limited
-from design.conditions import Requirement
+from design.result import Requirement
 from sim.run import Simulation
 from sim.scenario import Scenario
 from sim.switching import with_delays

@@ -14,9 +14,9 @@ from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel
 from controller.delay import LOST, Jitter, Ticks, ages
 from controller.lti import Array
 from controller.timing import Timing
-from design.certificate import ANY, CAVEATS, MAKING, assess, certificate_part, encoder_part, finite
-from design.conditions import Requirement
-from design.result import OLDER_NAMES, PRINTED_TAU_DB, PUBLISHED, listed
+from design.certificate import assess
+from design.guarantee import ANY, CAVEATS, MAKING, encoder_part
+from design.result import OLDER_NAMES, PRINTED_TAU_DB, PUBLISHED, Requirement, certificate_part, finite, listed
 from design.transparency import Transparency, decibels
 from models.human import Human, Person
 from sim.adversary import Worst

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from controller.lti import Array, Lti
 from controller.process import Limiter, Process, State, StepBuffer
 from controller.timing import Timing
-from design.certificate import finite
+from design.result import finite
 from models.scene import Scene, Variants
 from sim.engines import Engine, HeldPlant, MujocoBatchEngine, hold, profiler_off, quiet_warnings
 from sim.run import Simulation, beginnings, make_engine, run_blocks

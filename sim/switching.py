@@ -27,8 +27,10 @@ from controller.delay import LOST, Jitter, Ticks, realising
 from controller.loop import DelayRange, force_map
 from controller.lti import Array, Lti
 from controller.process import Process, StepBuffer
-from design.certificate import switching_guarantee, switching_part, switching_requirement
-from design.conditions import Requirement
+from design.certificate import switching_requirement
+from design.coverage import switching_part
+from design.guarantee import switching_guarantee
+from design.result import Requirement
 from models.scene import Scene, Variants
 from sim.couplings import Chosen
 from sim.engines import Engine, ExactBatchEngine, ExactTimedEngine, HeldPlant, MujocoBatchEngine, hold

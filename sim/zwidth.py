@@ -36,16 +36,11 @@ from controller.loop import Loop, force_map
 from controller.lti import Array, Complex, Lti, Sampled, SingularLoop, as_like
 from controller.process import Limiter, Process, contact, limited
 from design.audit import check_loop, edge
-from design.certificate import CONDITIONS, any_environment_of, covered_limits
-from design.conditions import (
-    Requirement,
-    any_environment_ratios,
-    refusal,
-    this_environment,
-    this_environment_ratios,
-)
+from design.certificate import CONDITIONS, any_environment_of
+from design.conditions import any_environment_ratios, this_environment, this_environment_ratios
+from design.coverage import covered_limits
 from design.lmi import least_phi
-from design.result import DesignFailed
+from design.result import DesignFailed, Requirement, refusal
 from models.device import Device
 from models.human import Population
 from sim.limit_cycles import UNLIMITED, Cells, HeldDevices, Plan, Points, Progress, simulate_cells

@@ -7,9 +7,11 @@ import re
 from dataclasses import dataclass
 
 from controller.coupling import Coupling
-from design.certificate import Limits, assess, guarantee_of
-from design.conditions import Requirement
+from design.certificate import assess
+from design.coverage import Limits
 from design.designs import KINDS
+from design.guarantee import guarantee_of
+from design.result import Requirement
 from sim.couplings import Chosen, choose, limits_of
 from sim.run import Simulation, assemble
 from sim.scenario import LONGEST_DELAY, InputError, Scenario

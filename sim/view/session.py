@@ -22,8 +22,7 @@ import numpy as np
 
 from controller.lti import Array, SingularLoop
 from controller.process import StepBuffer
-from design.certificate import certificate_part, finite
-from design.result import DesignFailed
+from design.result import DesignFailed, certificate_part, finite
 from models.scene import Plant, Scene, plant
 from sim.engines import ExactEngine, HeldPlant, hold
 from sim.run import outside_forces, run_block

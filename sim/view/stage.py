@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from controller.lti import Array
-from design.conditions import Requirement
+from design.result import Requirement
 from models.scene import APART, DRAWN, STEP, Scene
 from sim.view.events import GIVEN, KEYS, Couple, PreparedLoop, words
 from sim.view.session import HISTORY, Frame, Grip

@@ -8,9 +8,10 @@ import pytest
 from design import fixed_order as ccl
 from design import optimal, spring_damper
 from design.audit import report
-from design.certificate import Stored, assess, prove, verify
+from design.certificate import assess, prove, verify
 from design.optimal import LADDER, Options
 from design.result import CASE_I
+from design.stored import Stored
 from design.transparency import decibels
 from sim.scenario import load
 

@@ -9,7 +9,8 @@ from worlds import PAIR, SOFT
 
 from cli.check import main
 from cli.options import execute
-from design.certificate import Stored, prove, save
+from design.certificate import prove
+from design.stored import Stored, save
 
 
 def leave(monkeypatch, *argv: str) -> int:

@@ -11,7 +11,8 @@ import pytest
 
 from cli.run import main
 from controller.coupling import SpringDamper
-from design.certificate import Stored, prove, save
+from design.certificate import prove
+from design.stored import Stored, save
 from sim import run as loop
 from sim.scenario import InputError, load
 from sim.trace import Trace

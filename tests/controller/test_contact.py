@@ -17,8 +17,10 @@ from controller.loop import force_map
 from controller.lti import SingularLoop
 from controller.process import Complementarity, Process, StepBuffer, contact
 from design.audit import report, requirement
-from design.certificate import FROZEN, NotProved, assess, prove
+from design.certificate import assess, prove
 from design.conditions import this_environment
+from design.guarantee import FROZEN
+from design.result import NotProved
 from models.device import CompliantDevice
 from models.human import Population
 from models.scene import variants

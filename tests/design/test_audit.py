@@ -14,10 +14,10 @@ from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, RIGID_WALL, Box, Network, Spring
 from controller.loop import Loop
 from controller.lti import Lti
-from design import certificate as store
+from design import certificate, stored
+from design.api import certify
 from design.audit import MOST_EXTRA_SAMPLES, edge, remedies, report, requirement, stiffest, tolerance
-from design.certificate import ANY, CAVEATS, guarantee_of
-from design.designs import certify
+from design.guarantee import ANY, CAVEATS, guarantee_of
 from design.result import CASE_I
 
 CONDITIONS = ("this-environment", "any-environment")
@@ -78,12 +78,11 @@ def test_a_coupling_before_a_rigid_wall_is_proved_and_stored_like_any_other(thet
     assert needs["this-environment"].proof == ("rational" if proved else "sampled")
     assert guarantee_of(needs, loop) == ((ANY if theta == 0 else "a rigid wall only") if proved else None)
     if proved:
-        store.save(
-            store.Stored.of(loop, coupling, store.prove(loop, coupling, "this-environment")), tmp_path / "wall.json"
-        )
-        again = store.load(tmp_path / "wall.json")
+        made = certificate.prove(loop, coupling, "this-environment")
+        stored.save(stored.Stored.of(loop, coupling, made), tmp_path / "wall.json")
+        again = stored.load(tmp_path / "wall.json")
         assert again.loop == loop
-        assert store.verify(again).proved
+        assert certificate.verify(again).proved
 
 
 def test_what_a_rigid_wall_cannot_have():
@@ -271,10 +270,10 @@ def test_a_preset_names_its_source(run):
 def files(tmp_path):
     """A spring-damper for the default scenario, the same as a state space, and a file that is none."""
     loop = Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
-    store.save(store.Stored.of(loop, SAFE), tmp_path / "gains.json")
-    store.save(store.Stored(loop, Compliance(SAFE.compliance(T)).form()), tmp_path / "space.json")
+    stored.save(stored.Stored.of(loop, SAFE), tmp_path / "gains.json")
+    stored.save(stored.Stored(loop, Compliance(SAFE.compliance(T)).form()), tmp_path / "space.json")
     unstable = Compliance(Lti(1.1 * np.eye(2), np.eye(2), np.eye(2), np.eye(2), T))
-    store.save(store.Stored.of(loop, unstable), tmp_path / "unstable.json")
+    stored.save(stored.Stored.of(loop, unstable), tmp_path / "unstable.json")
     (tmp_path / "broken.json").write_text("{")
 
 

@@ -19,9 +19,11 @@ from controller.coupling import SpringDamper as StoredSpringDamper
 from controller.environment import FIGURE_4, Box, Network, Spring, UncertainSpring, environment, inside, members
 from controller.loop import Loop, force_map
 from design import optimal
-from design.certificate import NotProved, Stored, digest, load, prove, sealed, verify
+from design.certificate import check_set, prove, verify
+from design.coverage import set_part
 from design.optimal import Options
-from design.ranges import check_set, set_part
+from design.result import NotProved
+from design.stored import Stored, digest, load, sealed
 from sim.scenario import SCENARIOS, InputError, parse
 
 T, THETA = 1.2e-3, (1, 2)

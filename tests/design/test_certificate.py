@@ -15,22 +15,12 @@ from controller.loop import Loop
 from controller.lti import Lti, rational
 from design import certificate as design_certificate
 from design import spring_damper
-from design.certificate import (
-    NotProved,
-    Stored,
-    Verdict,
-    digest,
-    load,
-    prove,
-    required_damping,
-    save,
-    sealed,
-    verify,
-)
-from design.conditions import from_ratio, this_environment
+from design.certificate import Verdict, prove, required_damping, verify
+from design.conditions import this_environment
 from design.files import InputError
 from design.frequency import frequencies, on_circle, rounding
-from design.result import PUBLISHED
+from design.result import PUBLISHED, NotProved, from_ratio
+from design.stored import Stored, digest, load, save, sealed
 
 DEFAULT = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
 change = msgspec.structs.replace

@@ -18,8 +18,9 @@ from controller.environment import FIGURE_4, GROUND, Network, Spring, environmen
 from controller.loop import Loop, force_map
 from controller.lti import Lti
 from controller.process import limited
-from design.conditions import any_environment, limiter_lag, this_environment
+from design.conditions import any_environment, this_environment
 from design.lmi import Infeasible, Shaping, least_multiplier
+from design.multipliers import limiter_lag
 from design.result import CASE_I, CASE_II, PRINTED_TAU_DB
 from design.spring_damper import step
 from models.device import RigidDevice

@@ -19,17 +19,17 @@ from controller.environment import FIGURE_4, Box, Network, Spring, UncertainSpri
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, rational
 from design import certificate
-from design.certificate import NotProved, Stored, condition_block, digest, prove, sealed, verify
+from design.certificate import condition_block, prove, verify
 from design.conditions import (
-    JitterProof,
     any_environment_demand,
     delayed_coupling_block,
     delayed_environment_block,
-    from_ratio,
-    switching_block,
     this_environment_demand,
 )
 from design.exact import find_storage, prove_positive_real
+from design.multipliers import JitterProof, switching_block
+from design.result import NotProved, from_ratio
+from design.stored import Stored, digest, sealed
 
 CLOSE = 1e-6  # relative, on either side of a limit
 change = msgspec.structs.replace

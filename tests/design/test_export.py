@@ -18,8 +18,9 @@ from controller.environment import FIGURE_4, GROUND, Network, Spring, environmen
 from controller.loop import Loop, force_map
 from controller.lti import Lti
 from controller.process import Process, StepBuffer
-from design.certificate import Stored, prove, prove_limiter, save
+from design.certificate import prove, prove_limiter
 from design.export import process_block, sequential, trial
+from design.stored import Stored, save
 from sim.scenario import InputError
 
 SPRINGS = SpringDamper((300.0, 200.0), (0.0, 0.0))  # no state at all

@@ -12,11 +12,13 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.loop import DelayRange, Loop, force_map
 from controller.lti import Lti, Sampled
-from design.certificate import prove_switching, storage, switching_part, switching_requirement
-from design.conditions import half_widths, jitter_proof, switching_block, this_environment
+from design.certificate import prove_switching, storage, switching_requirement
+from design.conditions import this_environment
+from design.coverage import switching_part
 from design.exact import Matrix
 from design.frequency import hermitian
 from design.lmi import solve
+from design.multipliers import half_widths, jitter_proof, switching_block
 from sim.scenario import InputError
 
 

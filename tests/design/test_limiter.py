@@ -13,24 +13,13 @@ from controller.environment import FIGURE_4, GROUND, Box, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled, taps
 from controller.process import Limiter, Process, StepBuffer, limited
-from design.certificate import (
-    Certificate,
-    LimiterCertificate,
-    NotProved,
-    Stored,
-    lag,
-    limiter_requirement,
-    load,
-    prove,
-    prove_limiter,
-    save,
-    sealed,
-    verify,
-)
-from design.conditions import any_environment, least_multiple, limiter, limiter_demand, limiter_lag, this_environment
+from design.certificate import lag, prove, prove_limiter, verify
+from design.conditions import any_environment, least_multiple, this_environment
 from design.frequency import hermitian, on_circle
-from design.result import CASE_I
+from design.multipliers import limiter, limiter_demand, limiter_lag, limiter_requirement
+from design.result import CASE_I, NotProved
 from design.spring_damper import design
+from design.stored import Certificate, LimiterCertificate, Stored, load, save, sealed
 from design.transparency import transparency
 from sim.scenario import InputError
 

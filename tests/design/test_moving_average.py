@@ -6,8 +6,9 @@ import pytest
 from controller.coupling import MovingAverage, SpringDamper
 from controller.lti import Lti, taps
 from design import certify, design_coupling, transparency_of
-from design.certificate import Stored, load, prove, save, verify
+from design.certificate import prove, verify
 from design.conditions import any_environment
+from design.stored import Stored, load, save
 from design.transparency import decibels
 from sim import load as scenario_of
 from sim import simulate

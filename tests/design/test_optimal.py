@@ -17,14 +17,15 @@ from controller.coupling import ForceFilter, NoCoupling, basis
 from controller.environment import Network, Spring
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled
+from design.api import design_coupling
 from design.barrier import Block, Program, centre
 from design.bound import bound
-from design.certificate import Stored, save, verify
-from design.certificate import load as load_file
+from design.certificate import verify
 from design.conditions import this_environment
-from design.designs import design_coupling
 from design.frequency import hermitian, on_circle
 from design.optimal import Case, Options, Span, box_around, design, robustness, span_of, vertices
+from design.stored import Stored, save
+from design.stored import load as load_file
 from design.transparency import transparency
 from sim.scenario import load
 

@@ -10,9 +10,11 @@ from scipy.linalg import expm
 from controller.coupling import SpringDamper
 from controller.environment import FIGURE_4, Network, Spring
 from controller.loop import DelayRange, Loop
-from design.certificate import Stored, assess, digest, prove, required_damping, swept, verify
+from design.certificate import assess, prove, required_damping, verify
 from design.conditions import any_environment, any_environment_demand, even_damping, this_environment_demand
+from design.multipliers import swept
 from design.spring_damper import design
+from design.stored import Stored, digest
 
 T, LONG = 1e-3, 1.6e-3
 LOOP = Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)

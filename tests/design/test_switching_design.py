@@ -8,11 +8,11 @@ import pytest
 from cli.design import main
 from controller.coupling import SpringDamper
 from controller.delay import Jitter
-from design.certificate import load as load_stored
-from design.conditions import jitter_proof
-from design.designs import design_coupling
+from design.api import design_coupling
+from design.multipliers import jitter_proof
 from design.result import DesignFailed
 from design.spring_damper import design
+from design.stored import load as load_stored
 from models.scene import Crowd, variants
 from sim.run import assemble
 from sim.scenario import InputError, load

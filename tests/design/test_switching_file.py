@@ -21,23 +21,14 @@ from controller.loop import DelayRange, Loop, force_map
 from controller.lti import Sampled
 from design import certify
 from design import exact as positive_real
-from design.certificate import (
-    Certificate,
-    NotProved,
-    Stored,
-    condition_block,
-    digest,
-    load,
-    prove,
-    refuted,
-    save,
-    sealed,
-    verify,
-)
-from design.conditions import jitter_proof, switching_block, this_environment
+from design.certificate import condition_block, prove, refuted, verify
+from design.conditions import this_environment
 from design.exact import Matrix
 from design.files import InputError
 from design.frequency import hermitian
+from design.multipliers import jitter_proof, switching_block
+from design.result import NotProved
+from design.stored import Certificate, Stored, digest, load, save, sealed
 from hw.control import certified_couplings
 from sim.scenario import load as scenario_of
 

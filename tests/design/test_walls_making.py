@@ -12,20 +12,13 @@ from controller.environment import GROUND, Network, Spring, Wall, frozen_states
 from controller.loop import Loop
 from controller.lti import Lti
 from controller.process import contact
-from design.certificate import (
-    MAKING,
-    NotProved,
-    Stored,
-    assess,
-    guarantee_of,
-    making_covered,
-    prove,
-    sealed,
-    verify,
-    walls_of,
-)
-from design.conditions import any_environment, this_environment, walls_demand, walls_proof
+from design.certificate import assess, prove, verify
+from design.conditions import any_environment, this_environment
 from design.exact import find_storage
+from design.guarantee import MAKING, guarantee_of, making_covered
+from design.multipliers import walls_demand, walls_of, walls_proof
+from design.result import NotProved
+from design.stored import Stored, sealed
 
 change = msgspec.structs.replace
 

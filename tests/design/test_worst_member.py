@@ -13,11 +13,13 @@ from cli.design import _store
 from controller.coupling import ForceFilter, InternalModel
 from controller.environment import FIGURE_4, Box, Member, Network, Region, Spring, UncertainSpring, members, regions
 from design import optimal
-from design.certificate import Stored, load, prove, save, verify
-from design.designs import certify
+from design.api import certify
+from design.certificate import check_set, prove, verify
+from design.coverage import set_part, set_rows
+from design.environments import search
 from design.optimal import Options
-from design.ranges import check_set, search, set_part, set_rows
 from design.result import Design
+from design.stored import Stored, load, save
 from sim import scenario
 from sim.scenario import SCENARIOS
 

@@ -93,7 +93,7 @@ def test_what_one_overlong_tick_may_cost():
 
 def test_the_report_names_the_latency():
     (made,) = certified_couplings(LAB.replace(latency=((3e-5, 2.3e-4),) * 2), "I", None, None, 0, spare=0)
-    part = made.part()
+    part = made.part((12.0, 12.0))
     assert part["latency_s"] == [[3e-5, 2.3e-4]] * 2
     assert part["link_delay"] == 0
     assert part["coupling"] == coupling_part(made.chosen.kind, made.chosen.coupling, LAB.T)

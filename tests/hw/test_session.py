@@ -11,8 +11,9 @@ from rich.console import Console
 from cli import bridge
 from cli import replay as replay_command
 from cli import trace as trace_command
-from design.certificate import Stored, assess
-from design.certificate import save as save_coupling
+from design.certificate import assess
+from design.stored import Stored
+from design.stored import save as save_coupling
 from hw.control import CertifiedCoupling, LinearController, certified_coupling, certified_couplings, fill, link_delay
 from hw.emulator import Emulator, FaultInjection
 from hw.faults import CASES, Case, at, lively, person, rehearse_case

@@ -12,7 +12,7 @@ from cli.run import main
 from cli.validate import main as validate
 from controller.delay import Jitter, ages, realising
 from controller.process import StepBuffer
-from design import certificate as store
+from design import stored
 from models.scene import Crowd, plant, variants
 from sim.crowds import draw
 from sim.engines import ExactBatchEngine, ExactEngine, HeldPlant
@@ -144,7 +144,7 @@ def test_both_engines_meet_the_same_delays(tmp_path):
 
 
 def test_the_adversarial_pattern_shows_growth(tmp_path):
-    store.save(store.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
+    stored.save(stored.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
     options = ["--coupling", str(tmp_path / "stiff.json"), "--jitter", "1,2", "--pattern", "adversarial"]
     report = run(tmp_path, *options, "--duration", "1", "--engine", "exact")
     assert report["stability"]["verdict"] == "unstable"
@@ -212,7 +212,7 @@ def validated(tmp_path, *options):
 
 def test_random_humans_under_the_worst_switching(tmp_path):
     """The constants' design fails for most humans, the jitter-proof one for none; 0 and 1 are what is claimed."""
-    store.save(store.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
+    stored.save(stored.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
     code, stiff = validated(tmp_path, "--pattern", "adversarial", "--coupling", str(tmp_path / "stiff.json"))
     assert stiff["unstable"]["exact"] >= 10
     assert not stiff["covered"]

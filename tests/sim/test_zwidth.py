@@ -1,4 +1,4 @@
-"""The K-B map: its figures against closed forms and design.margin, its verdicts against loops one by one."""
+"""The K-B map: its figures against closed forms and design.conditions, its verdicts against loops one by one."""
 
 import csv
 import json

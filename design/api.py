@@ -1,0 +1,128 @@
+"""`from design import design_coupling, certify, ..`: what python -m design does, for scripts. SI units."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Literal, TypedDict, Unpack
+
+from controller.coupling import Coupling
+from controller.loop import Loop
+from design.certificate import assess, check_set, switching_requirement
+from design.designs import KINDS, NO_LONGER, OPTIONS, RETIRED, design_by_kind
+from design.guarantee import guarantee_of
+from design.result import Condition, Design, Requirement, bare, known, of_kind, one_of
+from design.stored import Stored
+from design.transparency import BAND_HZ, Transparency, transparency
+
+Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]
+
+
+LOOP = 'a Loop, as scenario.loop("I") gives it'
+
+
+class Options(TypedDict, total=False):
+    """What else can be asked of a kind, see design.designs.OPTIONS; functions, filter and margin have no effect."""
+
+    order: int  # ccl: states per channel
+    method: str  # ccl: complementarity, inner or fixed-poles
+    diagonal: bool  # ccl: no gain across channels
+    switching: tuple[Sequence[int], Sequence[int]]  # spring-damper, optimal: (lo, hi) [samples] of delays that vary
+    limiter: (
+        bool  # spring-damper and optimal for this-environment: covered also while forces are limited (usual) or not
+    )
+    objective: Literal["rms", "sup"]  # optimal: of the mismatch relative to the environment
+    band_hz: tuple[float, float]  # optimal, spring-damper for this environment: where the mismatch counts
+    high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: kept low, not limited
+    seconds: float  # optimal: no further rung of the ladder is begun later than this
+    functions: int
+    filter: str
+    margin: float
+
+
+def design_coupling(
+    loop: Loop, kind: Kind = "spring-damper", condition: Condition | None = None, **options: Unpack[Options]
+) -> Design:
+    """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
+
+    `kind` is "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal"; `condition` is
+    "any-environment" or "this-environment", None for what the commands design: a spring-damper for this environment,
+    also while forces are limited; for any environment before walls, ranges or delays that vary. `options` are those of
+    the kind, see Options; switching is not taken from loop.jitter.
+
+    Returns a Design: `coupling` (for a spring-damper with K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the damping
+    that it needs, from a sweep of the coupling alone), `figure` and `objective` (what was minimised, and its value).
+
+    Raises TypeError for an argument of another type or an option that the kind does not have, ValueError for a kind,
+    condition or loop that makes no sense, DesignFailed where no such coupling exists.
+    """
+    of_kind("loop", loop, Loop, LOOP)
+    one_of("kind", kind, KINDS)
+    known(options, OPTIONS[kind], f"kind {kind!r}")
+    asked: dict[str, Any] = dict(options)
+    if kind == "optimal" and (retired := [name for name in RETIRED if asked.pop(name, None) is not None]):
+        warnings.warn(NO_LONGER.format(", ".join(retired)), DeprecationWarning, stacklevel=2)
+    return design_by_kind(loop, kind, condition, **asked)
+
+
+def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[str]]:
+    """What both conditions, "any-environment" and "this-environment", ask of a coupling in its loop.
+
+    With ranges around the loop's environment this-environment is about the environment and every vertex: the figure is
+    that of the one that asks the most, proved only if all are. Between the vertices nothing is proved, but searched: a
+    violation found there (design.environments) is the figure then, and not certified. With a range of delays,
+    loop.jitter, there is a third, "jitter-proof": what any switching within the range asks.
+
+    Each Requirement has `required` and `available` (m,) [N s/m], `certified` (required < available), the frequency [Hz]
+    where it binds, and `proof`: "rational" where exact arithmetic confirms it, "sampled" where a refined sweep says so.
+    A condition that no damping satisfies has infinite `required` and a `reason`.
+
+    Raises TypeError for an argument of another type, ValueError where coupling and loop do not fit each other,
+    SingularLoop where their algebraic loop has no solution.
+    """
+    of_kind("loop", loop, Loop, LOOP)
+    phi = coupling.phi if isinstance(coupling, Design) else None
+    alone = _fitting(loop, coupling)
+    requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, phi))
+    if whole := check_set(loop, alone, samples=0):
+        _, worst = whole.worst if whole.proved else whole.worst_found
+        requirements["this-environment"] = replace(worst, proof="rational" if whole.proved else "sampled")
+    if loop.jitter:
+        requirements["jitter-proof"] = switching_requirement(loop, alone).requirement
+    return requirements
+
+
+def guarantee(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str | None:
+    """For which environments `certify(loop, coupling)` says that a coupling is safe, in words; None where for none.
+
+    "any passive environment", "a set" (the loop's environment and its box), "this environment", or each contact state
+    of an environment with walls. Raises TypeError for an argument of another type, ValueError for other requirements.
+    """
+    of_kind("loop", loop, Loop, LOOP)
+    of_kind("requirements", requirements, Mapping, "what certify returned")
+    if "this-environment" not in requirements:
+        raise ValueError(f"requirements has {', '.join(requirements) or 'nothing'}, expected what certify returned")
+    held = requirements["this-environment"]
+    whole_set = loop.box is not None and held.certified and held.proof == "rational"
+    return guarantee_of(requirements, loop, whole_set)
+
+
+def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[float, float] = BAND_HZ) -> Transparency:
+    """How close what the devices feel comes to the environment: figures of the mismatch (8), M = F - Lambda E.
+
+    `mismatch_db` is its largest share of the environment over `band_hz`, `rms_mismatch_db` the mean one: 0 dB
+    is as wrong as feeling nothing. `dc_ratio` is the share of the static stiffness that is felt. In the loop's own
+    environment; of one with walls, touching them all.
+
+    Raises TypeError and ValueError as `certify` does.
+    """
+    of_kind("loop", loop, Loop, LOOP)
+    return transparency(loop.F(_fitting(loop, coupling)), loop.E(), loop.lam, band_hz)
+
+
+def _fitting(loop: Loop, coupling: Coupling | Design) -> Coupling:
+    """The coupling alone. Raises ValueError where it is one of another number of channels."""
+    alone = bare(coupling)
+    Stored.of(loop, alone)
+    return alone

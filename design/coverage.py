@@ -1,0 +1,240 @@
+"""What is covered beyond one linear environment, as figures of a report: ranges, delays that switch, limited forces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from controller.coupling import Coupling
+from controller.delay import delay
+from controller.environment import Member, environment
+from controller.loop import DelayRange, Loop, force_map
+from controller.lti import Lti
+from design.certificate import SetCheck, prove_limiter
+from design.conditions import this_environment
+from design.environments import SEARCH, Searched, worst
+from design.multipliers import JitterProof, limiter_refusal, limiter_requirement
+from design.result import NotProved, Requirement, certificate_part, finite
+from design.stored import LimiterCertificate
+from design.transparency import decibels, transparency
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Whether a guarantee holds while forces are at their limits, and the limiter that it is about."""
+
+    rho: tuple[float, ...] | None  # (m,) [N/m] of the limiter; None: no guarantee, so the tick clips
+    reason: str  # why it holds, or why it does not
+    requirement: Requirement | None = None  # by the condition `limiter`, where it was asked
+    c: tuple[tuple[float, ...], ...] = ()  # its multiplier
+    certificate: LimiterCertificate | None = None  # its proof
+
+    def words(self, force_limit: Sequence[float]) -> str:
+        """In one line, for forces limited to so many N."""
+        amounts = [f"{f:.4g}" for f in force_limit]
+        limit = f"{', '.join(amounts if len(set(amounts)) > 1 else amounts[:1])} N"
+        if self.rho is None:
+            return f"clipped at {limit}: a guarantee holds while forces stay below ({self.reason})"
+        if not self.proved:
+            return f"certified, also while forces are limited to {limit} ({self.reason})"
+        return f"proved, also while forces are limited to {limit}"
+
+    @property
+    def proved(self) -> bool:
+        """In exact arithmetic."""
+        return self.rho is not None and (self.requirement is None or self.requirement.proof == "rational")
+
+    def part(self, force_limit: Sequence[float]) -> dict[str, Any]:
+        """As plain data."""
+        return {
+            "rho": None if self.rho is None else list(self.rho),
+            "force_limit": [finite(f) for f in force_limit],
+            "reason": self.reason,
+            "words": self.words(force_limit),
+            "certificate": self.requirement and certificate_part(self.requirement),
+            "c": self.c,
+        }
+
+
+def covered_limits(loop: Loop, coupling: Coupling, requirements: Mapping[str, Requirement]) -> Limits:
+    """The limiter that a coupling may have: of no lag under any-environment, else that of its own condition."""
+    if loop.jitter:
+        return Limits(None, str(limiter_refusal(loop)))
+    if requirements["any-environment"].certified and not any(loop.psi):
+        return Limits((0.0,) * loop.channels, "any-environment covers limited forces")
+    if not requirements["this-environment"].certified:
+        return Limits(None, "no guarantee that it could extend")
+    found = limiter_requirement(loop, coupling)
+    requirement = found.requirement
+    if not requirement.certified:
+        needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
+        return Limits(None, requirement.reason or needs, requirement, found.c)
+    try:
+        proved = prove_limiter(loop, coupling, c=found.c)
+    except NotProved as refused:
+        return Limits(found.rho, f"swept, not proved: {refused}", requirement, found.c)
+    return Limits(
+        found.rho,
+        "by a proof of its own, for this environment",
+        replace(requirement, proof="rational"),
+        found.c,
+        proved,
+    )
+
+
+# ----------------------------------------------------------------------------------------------------
+# What a report says of delays that vary: the jitter-proof requirement beside that of the playout buffer.
+
+
+NOT_COVERED = (
+    "Covered: any ages of the forces within the range, at every tick and on every channel. Not covered: jitter on the "
+    "measured positions, periods longer than T_max, or forces older than the range, which lost packets make."
+)
+
+
+def switching_part(found: JitterProof, G: Lti, span: DelayRange, T_max: float | None = None) -> dict[str, Any]:
+    """The requirement with its multiplier, and what a playout buffer to the constant delay hi would need.
+
+    G is the force map without Theta.
+    """
+    buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available, T_max)
+    return certificate_part(found.requirement) | {
+        "lo": list(span.lo),
+        "hi": list(span.hi),
+        "alpha": [finite(a) for a in found.alpha],
+        "playout": {
+            "theta": list(span.hi),
+            "required_damping": [finite(d) for d in buffered.required],
+            "certified": buffered.certified,
+        },
+        "not_covered": NOT_COVERED,
+    }
+
+
+# ----------------------------------------------------------------------------------------------------
+# What a guarantee for a set of environments costs: the robust coupling beside the one made for the nominal one.
+
+
+@dataclass(frozen=True)
+class Cost:
+    """One coupling over the members of a set, in which it runs on the current environment."""
+
+    name: str
+    ratio: tuple[float, float]  # required over available damping: in the nominal environment, and the most
+    violated: int  # members at which the this-environment condition fails
+    rms_db: tuple[float, float]  # mismatch: in the nominal environment, and at its worst vertex
+    sup_db: tuple[float, float]
+    worst: str  # the vertex with the largest rms mismatch
+
+
+def cost(name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -> Cost:
+    """Required damping and mismatch at every member; those that no device feels have no mismatch."""
+    ratios, figures = [], {}
+    for member in members:
+        E = environment(member.network, loop.T)
+        F = force_map(E, coupling, loop.theta, loop.psi)
+        ratios.append(this_environment(F, loop.delta, loop.T_max, loop.latency).ratio)
+        if E.D.any():
+            figures[member.name] = transparency(F, E, loop.lam)
+    nominal = figures[members[0].name]
+    worst = max(figures, key=lambda member: figures[member].rms_mismatch)
+    return Cost(
+        name,
+        (ratios[0], max(ratios)),
+        sum(ratio >= 1 for ratio in ratios),
+        (decibels(nominal.rms_mismatch), decibels(figures[worst].rms_mismatch)),
+        (decibels(nominal.relative_mismatch), decibels(max(f.relative_mismatch for f in figures.values()))),
+        worst,
+    )
+
+
+def price(loop: Loop, couplings: Mapping[str, Coupling]) -> tuple[Cost, ...]:
+    """The cost of each coupling over the box of the loop."""
+    members = loop.members()
+    return tuple(cost(name, loop, coupling, members) for name, coupling in couplings.items())
+
+
+def cost_part(row: Cost) -> dict[str, Any]:
+    """The row as plain data; null for a mismatch of zero, or where no damping is enough."""
+    pairs = {"required_over_available": row.ratio, "rms_mismatch_db": row.rms_db, "relative_mismatch_db": row.sup_db}
+    figures = {name: dict(zip(("nominal", "worst"), map(finite, pair), strict=True)) for name, pair in pairs.items()}
+    return {"coupling": row.name, "violated": row.violated, **figures, "worst": row.worst}
+
+
+WHAT_IS_PROVED = (
+    f"proved at the vertices; between them searched, not proved ({SEARCH}); every environment is frozen: nothing is "
+    "proved of one that changes while it is touched"
+)
+
+
+def set_part(check: SetCheck) -> dict[str, Any]:
+    """The check as plain data; SI units, null where no damping is enough."""
+    member, requirement = check.worst
+    part: dict[str, Any] = {
+        "vertices": len(check.members) - 1,
+        "vertices_certified": sum(r.certified for r in check.at_members[1:]),
+        "required_damping": [finite(d) for d in requirement.required],
+        "available_damping": list(requirement.available),
+        "worst": member.name,
+        "proof": "rational" if check.certificate else "sampled",
+        "certified": check.proved,
+        "search": search_part(check.searched),
+        "inside": _inside_part(check),
+        "what": WHAT_IS_PROVED,
+    }
+    return part | ({"reason": check.reason} if check.reason else {})
+
+
+def search_part(searched: Searched) -> dict[str, Any]:
+    """What the search between the vertices has found: evidence, no proof."""
+    worst = searched.worst[0]
+    return {
+        "how": SEARCH,
+        "environments": searched.tried,
+        "worst_ratio": finite(worst.ratio),
+        "worst": worst.member.name,
+        "violated": not worst.ratio < 1,
+    }
+
+
+def search_words(part: dict[str, Any]) -> str:
+    """What was found between the vertices, in a line."""
+    found = "[red]violated[/]" if part["violated"] else "no violation found"
+    ratio = "no damping is enough" if part["worst_ratio"] is None else f"worst ratio {part['worst_ratio']:.4f}"
+    return f"searched, not proved: {found}, {ratio} in {part['environments']} points, at {part['worst']}"
+
+
+def _inside_part(check: SetCheck) -> dict[str, Any]:
+    """What was found in the environments drawn from inside: evidence, no proof."""
+    if not check.samples:
+        return {"samples": 0, "certified": 0, "seed": check.seed, "worst_ratio": None, "worst": None}
+    i = worst(check.at_samples)
+    return {
+        "samples": len(check.samples),
+        "certified": sum(r.certified for r in check.at_samples),
+        "seed": check.seed,
+        "worst_ratio": finite(check.at_samples[i].ratio),
+        "worst": check.samples[i].name,
+    }
+
+
+def set_rows(part: dict[str, Any]) -> list[tuple[str, str]]:
+    """The part of a report as rows of a table."""
+    ratios = [d / a for d, a in zip(part["required_damping"], part["available_damping"], strict=True) if d is not None]
+    most = f"{max(ratios):.4f} of the damping" if ratios else "no damping is enough"
+    exact = part["proof"] == "rational"
+    proof = "[green]proved exactly[/] at all" if exact else f"[red]not proved[/]: {part['reason']}"
+    found, count = part["inside"], part["vertices"]
+    rows = [
+        ("set, vertices", f"{part['vertices_certified']} of {count} certified, {proof}"),
+        ("set, worst vertex", f"{most}, at {part['worst']}"),
+        ("set, between", search_words(part["search"])),
+    ]
+    if found["samples"]:
+        ratio = "no damping is enough" if found["worst_ratio"] is None else f"at most {found['worst_ratio']:.4f}"
+        inside = f"{found['certified']} of {found['samples']} random samples certified, {ratio} of the damping"
+        rows.append(("set, inside", inside))
+    if exact and not part["certified"]:
+        rows.append(("set", f"[red]not guaranteed[/]: {part['reason']}"))
+    return rows

@@ -1,0 +1,161 @@
+"""What a coupling asks in each environment of a set, and the one of a box that asks the most: a search, no proof."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from controller.coupling import Coupling
+from controller.environment import Member, Region, regions
+from controller.loop import Loop
+from controller.lti import Array, SingularLoop
+from design.conditions import this_environment
+from design.result import Requirement, refusal
+
+
+def in_each(loop: Loop, coupling: Coupling, members: Sequence[Member]) -> list[Requirement]:
+    """The this-environment condition of this coupling around each of the members, every one frozen."""
+    return [_required(loop, coupling, member) for member in members]
+
+
+def worst(requirements: Sequence[Requirement]) -> int:
+    """Which of them asks the most."""
+    return max(range(len(requirements)), key=lambda i: requirements[i].ratio)
+
+
+def _required(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
+    try:
+        F = loop.at(member.network).F(coupling)
+    except SingularLoop as error:
+        return refusal("this-environment", loop.delta, str(error))
+    return this_environment(F, loop.delta, loop.T_max, loop.latency)
+
+
+# ----------------------------------------------------------------------------------------------------
+# The environment of a box in which a coupling needs the most damping: a search, the same every time, and no proof.
+#
+# Between the vertices the need is no convex function of stiffness and mass, and what asks the most often lies on an
+# edge or a face, where points drawn evenly from the box never fall: the resonance moves from one vertex to the next.
+# So every way in which the contacts may be there or absent is searched along all its edges, on its faces and inside,
+# and from the worst points that were found a compass search goes on within the ranges until its steps are small.
+
+
+Ratio = Callable[[Member], float]  # required over available damping
+
+
+Progress = Callable[[int, int], None]  # points tried, of about how many
+
+
+ON_EDGES, ALONG = 240, (3, 9)  # points on the edges of a region, and on each of them: least, most
+
+
+DRAWN, SEED = 48, 0xFACE  # points on faces and inside of each region
+
+
+STARTS, APART, SAME = 4, 0.2, 0.05  # of the compass search in a region; least distance of starts, and of tops
+
+
+FIRST, LAST = 1 / 16, 1 / 128  # its steps, in widths of the ranges
+
+
+SEARCH = "along all edges, on faces and inside, then uphill from the worst points"
+
+
+@dataclass(frozen=True)
+class Found:
+    """An environment of the box, and the share of the damping that is needed there."""
+
+    member: Member
+    ratio: float
+
+
+@dataclass(frozen=True)
+class Searched:
+    """The worst environments, each the top of its neighbourhood, the worst of all first; and how many were tried."""
+
+    worst: tuple[Found, ...]
+    tried: int
+
+
+def search(regions: Sequence[Region], ratio: Ratio, progress: Progress = lambda done, total: None) -> Searched:
+    """Where the coupling behind `ratio` needs the most in the box that consists of these regions."""
+    points = [list(_points(region)) for region in regions]
+    refinements = [min(STARTS, len(some)) * 8 * region.low.size for region, some in zip(regions, points, strict=True)]
+    tried, total = 0, sum(map(len, points)) + sum(refinements)
+    tops: list[Found] = []
+
+    for region, some in zip(regions, points, strict=True):
+        known: dict[bytes, float] = {}
+
+        def need(point: Array, region: Region = region, known: dict[bytes, float] = known) -> float:
+            nonlocal tried
+            if point.tobytes() not in known:
+                tried += 1
+                progress(min(tried, total), total)
+                known[point.tobytes()] = ratio(_member(region, point))
+            return known[point.tobytes()]
+
+        starts = _apart(some, [need(point) for point in some], APART)[:STARTS]
+        climbed = [_climbed(need, *start) for start in starts]
+        distinct = _apart([point for point, _ in climbed], [value for _, value in climbed], SAME)
+        tops += [Found(_member(region, point), value) for point, value in distinct]
+    progress(total, total)
+    return Searched(tuple(sorted(tops, key=lambda found: -found.ratio)), tried)
+
+
+def _member(region: Region, point: Array) -> Member:
+    """The environment at a point of the unit cube that stands for the region."""
+    return region.at("point", region.low + point * (region.high - region.low))
+
+
+def _points(region: Region) -> Iterator[Array]:
+    """Of the unit cube: its vertices, points along every edge, and points on faces and inside."""
+    n = region.low.size
+    yield from (np.array(corner, dtype=float) for corner in product((0.0, 1.0), repeat=n))
+    if n == 0:
+        return
+    least, most = ALONG
+    count = int(np.clip(ON_EDGES // (n * 2 ** (n - 1)), least, most))
+    for i in range(n):
+        for others in product((0.0, 1.0), repeat=n - 1):
+            for x in np.arange(1, count + 1) / (count + 1):
+                yield np.insert(np.array(others), i, x)
+    if n == 1:
+        return
+    rng = np.random.default_rng(SEED)
+    for _ in range(DRAWN):  # every number in between, or at one of its ends, as often as not
+        between, end, coin = rng.random(n), rng.integers(0, 2, n), rng.random(n) < 0.5
+        yield np.where(coin, between, end)
+
+
+def _apart(points: Sequence[Array], values: Sequence[float], distance: float) -> list[tuple[Array, float]]:
+    """The points by falling value, without those that are close to a worse one."""
+    chosen: list[tuple[Array, float]] = []
+    for i in np.argsort(-np.array(values), kind="stable"):
+        if all(np.abs(points[i] - other).max(initial=0.0) >= distance for other, _ in chosen):
+            chosen.append((points[i], values[i]))
+    return chosen
+
+
+def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tuple[Array, float]:
+    """Uphill along the axes of the unit cube, with steps that are halved where none leads up; the ends are exact."""
+    step = FIRST
+    while point.size and step >= LAST and np.isfinite(value):
+        moves = [np.clip(point + sign * step * axis, 0, 1) for axis in np.eye(point.size) for sign in (1, -1)]
+        values = [need(move) if (move != point).any() else -np.inf for move in moves]
+        best = int(np.argmax(values))
+        if values[best] > value:
+            point, value = moves[best], values[best]
+        else:
+            step /= 2
+    return point, value
+
+
+def search_box(loop: Loop, coupling: Coupling, progress: Progress = lambda done, total: None) -> Searched:
+    """The worst environments of the loop's box that the search of design.environments finds."""
+    assert loop.box
+    parts = regions(loop.network, loop.box)
+    return search(parts, lambda member: in_each(loop, coupling, [member])[0].ratio, progress)

@@ -1,0 +1,99 @@
+"""For which environments a coupling is guaranteed, by its requirements, and what no guarantee covers. In words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from controller.coupling import Coupling, ForceFilter, InternalModel
+from controller.loop import DelayRange, Loop
+from design.conditions import encoder_friction
+from design.result import Requirement, finite
+
+# ----------------------------------------------------------------------------------------------------
+# What may be said of a coupling: required against available damping, for which environments, and what is left out.
+
+
+ANY, SET, HERE = "any passive environment", "a set", "this environment"
+
+
+FROZEN = "each frozen contact state of this environment (contact that makes and breaks is not covered)"
+
+
+MAKING = "this environment, with walls up to their stiffness that make and break contact"
+
+
+#: What no certificate covers.
+CAVEATS = (
+    "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted) "
+    "or leave through the limiter that a report names, "
+    "not for walls with dampers that make and break contact (except under any-environment without delay in the "
+    "environment), periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb "
+    "friction pays for, velocity filters or friction compensation."
+)
+
+
+def switching_guarantee(span: DelayRange) -> str:
+    """Which delays of the forces a coupling is certified for that bears switching, in the environment of its loop."""
+    return f"delays switching within {span}"
+
+
+def guarantee_of(requirements: Mapping[str, Requirement], loop: Loop, whole_set: bool = False) -> str | None:
+    """For which environments a coupling is certified, by its requirements; None for none.
+
+    The multiplier that any-environment takes for psi >= 1 is of one environment. `whole_set`: this-environment is
+    proved at every vertex of the loop's box, and a search has found no violation between them.
+    """
+    if requirements["any-environment"].certified and not any(loop.psi):
+        return ANY
+    if whole_set:
+        return SET
+    if not any(requirement.certified for requirement in requirements.values()):
+        return None
+    if loop.environment.walls:
+        return MAKING if making_covered(loop) else FROZEN
+    return loop.environment.here
+
+
+def encoder_part(
+    loop: Loop, coupling: Coupling, steps: Sequence[float], friction: Sequence[float]
+) -> dict[str, Any] | None:
+    """Whether declared Coulomb friction (m,) [N] pays for encoder steps (m,) [m]; None where encoders are ideal."""
+    if not any(steps):
+        return None
+    widths = ", ".join(f"{1e6 * q:.4g}" for q in steps)
+    part: dict[str, Any] = {"encoder_step": list(steps), "friction": list(friction)}
+    if loop.environment.walls:
+        words = f"encoder steps of {widths} um: with walls nothing is proved of them"
+        return part | {"friction_needed": None, "covered": False, "words": words}
+    needed = encoder_friction(loop.F(coupling), steps)
+    covered = bool((needed <= np.asarray(friction)).all())
+    has = ", ".join(f"{f:.4g}" for f in friction)
+    enough = (
+        f"friction of {', '.join(f'{f:.4g}' for f in needed)} N is enough for {widths} um, the devices declare {has} N"
+    )
+    words = f"encoder steps {'are covered' if covered else 'are not covered'}: {enough}"
+    return part | {"friction_needed": [finite(f) for f in needed], "covered": covered, "words": words}
+
+
+# ----------------------------------------------------------------------------------------------------
+# A coupling in every environment of a set: what the this-environment condition asks at each vertex of a box.
+
+
+def making_covered(loop: Loop) -> bool:
+    """Whether this-environment covers walls that make and break contact: those without dampers."""
+    walls = loop.environment.walls
+    return bool(walls) and not loop.box and not any(wall.damping for wall in walls)
+
+
+#: Why any-environment says nothing of forces that latch between ticks.
+LATE = "a latency of a fraction of a sample is derived for this environment only: count it as a whole sample of theta"
+
+
+def no_compliance(coupling: Coupling) -> str:
+    """Why Theorem 4 has nothing to say of a coupling that is no V of its own."""
+    if isinstance(coupling, InternalModel | ForceFilter):
+        return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
+    return "without a coupling there is nothing that Theorem 4 could use"

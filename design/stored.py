@@ -1,0 +1,170 @@
+"""The file in which a coupling is kept: the loop it was made for, its coefficients and its certificate, as JSON.
+
+Numbers are plain decimals, rationals are strings "p/q". Reading is strict: an unknown or ill-typed field is an error
+that names it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+
+from controller.coupling import Coupling, Form, Strict, require_channels
+from controller.loop import Loop
+from design.files import InputError, read, write
+from design.result import OLDER_NAMES, Condition
+
+# ----------------------------------------------------------------------------------------------------
+# The file in which a coupling is kept: the loop it was made for, its coefficients and its certificate, as JSON.
+#
+# Numbers are plain decimals, rationals are strings "p/q". Reading is strict: an unknown or ill-typed field is an
+# error that names it.
+
+
+Rows = tuple[tuple[float, ...], ...]
+
+
+Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=1000)]
+
+
+_Part = TypeVar("_Part", bound=msgspec.Struct)
+
+
+class SwitchingProof(Strict, frozen=True):
+    """What proves that the delays may switch within the loop's range (design.multipliers)."""
+
+    required: tuple[float, ...]  # (m,) [N s/m] with this multiplier, from a refined sweep
+    margin: float  # available / required
+    alpha: tuple[float, ...]  # (m,) multiplier [N/m], 0 where the delay does not vary
+    P: tuple[tuple[Rational, ...], ...]  # rationals "p/q"
+
+
+class LimiterCertificate(Strict, frozen=True):
+    """What proves this-environment also while forces are limited, by the limiter of controller.process."""
+
+    beta: float  # rho = beta delta/T, to six digits
+    rho: tuple[float, ...]  # (m,) lag of the limiter [N/m]; the tick must use these
+    c: tuple[tuple[float, ...], ...]  # (m, lags) multiplier
+    required: tuple[float, ...]  # (m,) [N s/m] with this multiplier, from a refined sweep
+    margin: float  # available / required
+    P: tuple[tuple[Rational, ...], ...]  # rationals "p/q"
+
+
+class Certificate(Strict, frozen=True):
+    """What is claimed of a coupling in its loop, and what proves it."""
+
+    condition: Condition
+    required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep
+    available: tuple[float, ...]  # (m,) [N s/m], the damping for which it is proved
+    margin: float  # available / required
+    guarantee: Literal["any passive environment", "a set", "this environment"] = msgspec.field(name="promise")
+    proof: Literal["sampled", "kyp", "rational"]
+    matrices: dict[str, tuple[tuple[Rational, ...], ...]]  # rationals "p/q"
+    scenario: str  # digest of the loop and the coupling
+    versions: dict[str, str]
+    seal: str = ""  # digest of all other fields
+    switching: SwitchingProof | msgspec.UnsetType = msgspec.UNSET  # of a loop with jitter; left out of other files
+    limiter: LimiterCertificate | msgspec.UnsetType = msgspec.UNSET  # where it was proved; left out of other files
+
+
+class Stored(Strict, frozen=True):
+    """A coupling with its loop and, once it is proved, its certificate."""
+
+    loop: Loop
+    coupling: Form
+    certificate: Certificate | None = None
+    version: Literal[1, 2] = 2  # 2: force filters
+
+    def __post_init__(self) -> None:
+        require_channels(self.coupling, self.loop.channels)
+
+    @classmethod
+    def of(cls, loop: Loop, coupling: Coupling, certificate: Certificate | None = None) -> Stored:
+        """What a file keeps of a coupling in its loop."""
+        return cls(loop, coupling.form(), certificate)
+
+    def built(self) -> Coupling:
+        """The coupling."""
+        return self.coupling.build(self.loop.T)
+
+
+def digest(*parts: msgspec.Struct) -> str:
+    """sha256 over the canonical JSON (sorted keys, shortest decimals, 7 as 7.0 where it is a float) of the parts."""
+    return _sha256([_read_back(part) for part in parts])
+
+
+def _read_back(part: _Part) -> _Part:
+    return msgspec.json.decode(msgspec.json.encode(part), type=type(part))
+
+
+def _sha256(parts: list[Any]) -> str:
+    return hashlib.sha256(msgspec.json.encode(parts, order="deterministic")).hexdigest()
+
+
+def sealed(certificate: Certificate) -> Certificate:
+    """The certificate with the digest of all its other fields, its condition by the name of the first files."""
+    older = {name: before for before, name in OLDER_NAMES.items()}
+    plain = _read_back(msgspec.structs.replace(certificate, seal=""))
+    first: Any = older[certificate.condition]
+    return msgspec.structs.replace(certificate, seal=_sha256([msgspec.structs.replace(plain, condition=first)]))
+
+
+def load(path: str | Path) -> Stored:
+    """Read a stored coupling. Raises InputError, one line that names the field or the file."""
+    content = read(path)
+    if not content.strip():
+        raise InputError(f"{path}: is empty, expected a coupling as python -m design stores it")
+    try:
+        stored = msgspec.json.decode(_renamed(content), type=Stored)
+        json.loads(content, object_pairs_hook=_once)
+        return stored
+    except _Twice as error:
+        raise InputError(f"{path}: names {str(error)!r} twice in one object") from None
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}: is no stored coupling: {' '.join(str(error).split())}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: {_place(content, str(error))}{' '.join(str(error).split())}") from None
+
+
+def _renamed(content: bytes) -> bytes:
+    """The content with the condition by its name of today; as it is where it has that, or is no certificate."""
+    try:
+        whole = msgspec.json.decode(content)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return content
+    match whole:
+        case {"certificate": {"condition": str(name)} as claim} if name in OLDER_NAMES:
+            return msgspec.json.encode(whole | {"certificate": claim | {"condition": OLDER_NAMES[name]}})
+    return content
+
+
+class _Twice(Exception):
+    """A name that an object of a file gives two values."""
+
+
+def _once(pairs: list[tuple[str, Any]]) -> None:
+    """Of the last value JSON readers speak, of the first one a person who reads the file."""
+    names: set[str] = set()
+    for name, _ in pairs:
+        if name in names:
+            raise _Twice(name)
+        names.add(name)
+
+
+def _place(content: bytes, message: str) -> str:
+    """Number and beginning of the line that a message points to as "(byte N)", or nothing."""
+    found = re.search(r"\(byte (\d+)\)", message)
+    if not found:
+        return ""
+    above = content[: int(found[1])].count(b"\n")
+    return f"line {above + 1}, {content.splitlines()[above].decode(errors='replace').strip()[:40]!r}: "
+
+
+def save(stored: Stored, path: str | Path) -> None:
+    """Write through a temporary file beside `path`, so that a reader never sees half of it. Raises InputError."""
+    write(Path(path), msgspec.json.format(msgspec.json.encode(stored), indent=1) + b"\n")
