@@ -12,7 +12,7 @@ from sim.accuracy import SETTINGS, Row, mark_front, measure, reference
 from sim.couplings import NAMES, choose, limits_of
 from sim.engines import EXPONENTIAL
 from sim.run import Simulation, assemble
-from sim.scenario import InputError, require_linear
+from sim.scenario import InputError, require_even_ticks, require_linear
 from sim.stepping import NEUTRAL, default_substeps, step_radius
 
 MOST_STEPS = 3_000_000  # of a row: a minute or two
@@ -29,6 +29,7 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     scenario = options.scenario_from(args)
     require_linear(scenario, "sim.accuracy")
+    require_even_ticks(scenario, "sim.accuracy")
     if args.duration is not None:
         scenario = scenario.replace(duration=args.duration)
     out = options.out_folder(args, "accuracy")

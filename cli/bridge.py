@@ -42,7 +42,7 @@ from cli.session_cli import (
 )
 from design.certificate import CONDITIONS
 from design.files import write_json
-from design.guarantees import CAVEATS
+from design.guarantees import CAVEATS, LATE
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages
@@ -66,6 +66,8 @@ def main(argv: list[str]) -> int:
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
     at_once = args.latch == "arrival" or host_clocked(args)  # a host that is the clock writes a force when it has it
+    if at_once and args.condition == "any-environment":
+        raise InputError(f"--latch arrival with --condition {args.condition}: {LATE}")
     if args.energy_budget and at_once:
         raise InputError("--energy-budget with --latch arrival: the budget counts forces that latch at ticks; give one")
     if args.energy_budget and not args.energy_budget[0]:

@@ -30,7 +30,7 @@ from design.transparency import transparency
 from sim import report
 from sim.baselines import PAIRS, SECONDS, SLOW, Rival, rivals
 from sim.couplings import NAMES, Chosen, choose
-from sim.scenario import InputError, Scenario
+from sim.scenario import InputError, Scenario, require_even_ticks
 
 MOST = 6  # curves that can be told apart in one panel
 
@@ -314,6 +314,7 @@ def _rung(row: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
+    require_even_ticks(scenario, "--baselines")
     if scenario.box or scenario.switches:
         raise InputError("--baselines compares in one environment with constant delays: leave out [box] and jitter")
     if any(device.friction for device in scenario.device):

@@ -282,7 +282,8 @@ def _switching_figures(loop: Loop, design: Design) -> dict[str, Any] | None:
     """What any switching asks of the designed coupling, from the coupling alone."""
     if loop.jitter is None:
         return None
-    return switching_part(switching_requirement(loop, design.coupling), loop.sent(design.coupling), loop.jitter)
+    found, sent = switching_requirement(loop, design.coupling), loop.sent(design.coupling)
+    return switching_part(found, sent, loop.jitter, loop.T_max)
 
 
 def _robustness_loss(args: argparse.Namespace, loop: Loop, design: Design) -> list[dict[str, Any]]:

@@ -21,6 +21,7 @@ from sim import report
 from sim.accuracy import ForceError, credible_part, force_error, position_error
 from sim.alternatives import Alternative, alternatives
 from sim.couplings import NAMES, Chosen, choose, limits_of
+from sim.engine_choice import EngineChoice, compare_engines, cross_check, pick
 from sim.engines import INTEGRATORS, default_integrator
 from sim.nets import BASELINES, Classic, EnergyNet, idle, netted
 from sim.run import ENGINES, Simulation, assemble, beginnings, make_engine, run
@@ -87,6 +88,12 @@ def _parser() -> options.Parser:
     steps = "MuJoCo steps per period (default: what the plant asks)"
     parser.add_argument("--substeps", type=options.whole(1, MOST), metavar="N", help=steps)
     parser.add_argument("--duration", type=options.number(), metavar="SECONDS", help="default: the scenario's")
+    asked = (
+        "relative rms of the positions: compare engines and steps on this scene, run with the cheapest that keeps it"
+    )
+    parser.add_argument("--error", type=options.number(), metavar="E", help=asked)
+    check = "run RK4 beside the exponential engine, with which it shares no matrix"
+    parser.add_argument("--cross-check", action="store_true", help=check)
     options.add_human_option(parser)
     options.add_band_option(parser)
     options.add_limiter_option(parser)
@@ -139,6 +146,7 @@ class _Run:
     period: Period | None  # of the worst switching found, where the delays switch
     integrator: str | None  # None for the exact engine, and so are the substeps
     substeps: int | None
+    choices: tuple[EngineChoice, ...]  # what --error compared, the cheapest first
     warnings: list[str]
     trace: Trace
     exact: Trace | None  # None where friction makes the loop another one than the linear
@@ -159,7 +167,11 @@ def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tupl
         raise InputError("--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco")
     if scenario.switches:
         simulation, period = switching(simulation, chosen.coupling, args.seed, scenario.samples)
+    choices = _compared(args, simulation)
     integrator, substeps, warnings = _steps(args, simulation)
+    if choices:
+        kept = pick(choices, args.error)
+        integrator, substeps = kept.integrator, kept.substeps
     engine, ran = make_engine(simulation, args.engine, integrator, substeps), simulation
     if args.coupling in BASELINES:
         ran = netted(simulation, chosen.coupling, Classic(args.coupling))
@@ -172,7 +184,7 @@ def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tupl
     exact = trace
     if args.engine != "exact":
         exact = None if simulation.friction else run(ran, "exact", ticks=trace.t.size)
-    return _Run(simulation, ran, period, integrator, substeps, warnings, trace, exact, wall)
+    return _Run(simulation, ran, period, integrator, substeps, choices, warnings, trace, exact, wall)
 
 
 def _budgeted(simulation: Simulation, chosen: Chosen, start: float, cap: float) -> Simulation:
@@ -206,6 +218,16 @@ def _steps(args: argparse.Namespace, simulation: Simulation) -> tuple[str | None
         raise
     except ValueError as error:
         raise InputError(f"--integrator {integrator}: {error}") from None
+
+
+def _compared(args: argparse.Namespace, simulation: Simulation) -> tuple[EngineChoice, ...]:
+    """Every engine and step on this scene, where an error is asked for. Raises InputError."""
+    if args.error is None:
+        return ()
+    if args.engine == "exact" or args.integrator or args.substeps:
+        raise InputError("--error chooses integrator and substeps of MuJoCo: give no --engine exact, --integrator, ..")
+    with render.progress("comparing engines"):
+        return compare_engines(simulation, args.error)
 
 
 def _alternatives(args: argparse.Namespace, scenario: Scenario, run: _Run) -> list[Alternative]:
@@ -279,6 +301,8 @@ def _settings(args: argparse.Namespace, run: _Run, lam: tuple[int, ...]) -> dict
         "T_s": scenario.T,
         "timing": report.timing_part(run.simulation.timing, scenario),
         "seed": args.seed,
+        "engines": [choice.part() for choice in run.choices] or None,
+        "cross_check": cross_check(run.ran, run.trace, run.integrator, run.substeps) if args.cross_check else None,
         "interrupted": run.trace.interrupted,
         "scenario_digest": scenario.digest,
         "encoder_step_m": process.encoder_step.tolist(),
@@ -338,6 +362,8 @@ def _tables(scenario: Scenario, outcome: dict[str, Any], others: list[Alternativ
     title = f"{scenario.title(outcome['case'])}: coupling {outcome['coupling']['kind']}"
     rows = [render.channel_row(scenario.environment.contacts), *_rows(outcome)]
     shown = [render.facts(title, rows, ("", ""))]
+    if outcome["run"]["engines"]:
+        shown.append(_speed_against_error(outcome["run"]))
     if others:
         shown.append(_beside(others, outcome))
     if rows := outcome["reproducibility"]:
@@ -345,6 +371,19 @@ def _tables(scenario: Scenario, outcome: dict[str, Any], others: list[Alternativ
         cells = [[row[column] for column in columns] for row in rows]
         shown.append(render.grid("beside the paper", ("", *columns[1:]), cells, range(4)))
     return shown
+
+
+def _speed_against_error(run: dict[str, Any]) -> Any:
+    """Every engine and step on this scene; the one that ran is marked."""
+    cells = []
+    for row in run["engines"]:
+        mark = " *" if (row["integrator"], row["substeps"]) == (run["integrator"], run["substeps"]) else ""
+        error = render.optional(row["position_relative_rms"], "{:.1e}")
+        right = "right" if row["verdict_correct"] else "[red]WRONG[/]"
+        speed = f"{run['duration_s'] / row['cpu_s']:.0f}"
+        cells.append((f"{row['integrator']} x {row['substeps']}{mark}", error, right, f"{row['cpu_s']:.3f}", speed))
+    heads = ("engine x steps", "position error", "verdict", "CPU s", "x real time")
+    return render.grid("speed against error on this scene (*: the cheapest that keeps --error, this run)", heads, cells)
 
 
 def _beside(others: list[Alternative], outcome: dict[str, Any]) -> Any:
@@ -402,7 +441,15 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("limited ticks", f"{stability['clipped_ticks']} of {run['samples']}"),
         ("speed", speed),
         ("position error", position),
+        ("cross-check", run["cross_check"] and _crossed(run["cross_check"])),
     ]
+
+
+def _crossed(part: dict[str, Any]) -> str:
+    apart = render.optional(part["position_relative_rms"], "{:.1e} relative rms apart")
+    growth = f"its loop grows {part['growth_rate_difference_per_s']:+.1e} 1/s otherwise"
+    verdict = "[green]same verdict[/]" if part["agrees"] else "[red]ANOTHER VERDICT[/]"
+    return f"{part['integrator']} x {part['substeps']}: {apart}, {growth}: {verdict}"
 
 
 def _net_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:

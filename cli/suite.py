@@ -34,6 +34,7 @@ from sim.couplings import choose
 from sim.guarantees import challenges
 from sim.hard import cases, measure
 from sim.scenario import InputError, load
+from sim.uneven import HANDS, uneven_ticks
 
 INTRODUCTION = """\
 Several force-feedback devices share one simulated object; the loop of hands, devices, delays and computer must not
@@ -110,6 +111,12 @@ def faults(seed: int) -> Iterator[Row]:
     """Faults of a link, a device, a controller or a person, in virtual time."""
     for outcome in rehearse_faults():
         yield asdict(outcome) | {"holds": outcome.holds}
+
+
+def uneven(seed: int) -> Iterator[Row]:
+    """Periods that vary and forces that latch late, drawn and chosen by an enemy."""
+    for row in uneven_ticks(seed):
+        yield asdict(row) | {"holds": row.holds}
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -268,6 +275,26 @@ def fault_table(report: dict[str, Any]) -> list[Part]:
     return [Part("", columns, tuple(rows), f"{good} of {len(rows)} faults end as they must")]
 
 
+def uneven_table(report: dict[str, Any]) -> list[Part]:
+    """Of uneven ticks."""
+    rows = tuple(
+        (
+            row["loop"],
+            f"{row['ticks']}, {'drawn' if row['drawn'] else 'the worst'}",
+            f"{row['required']:.4g} N s/m",
+            f"{row['energy']:.6g}",
+            "never" if row["balance"] >= 0 else f"to {row['balance']:.1e} of what it sums",
+            f"{row['grow']} of {HANDS}",
+        )
+        for row in report["rows"]
+    )
+    good, found = sum(row["holds"] for row in report["rows"]), sum(row["grow"] > 0 for row in report["rows"])
+    below = f"hands grow in {found} of them" if found else "no hand was found that grows"
+    gist = f"no hand gains energy in {good} of {len(rows)} runs at 1.02 times the requirement; at half of it {below}"
+    columns = ("loop", "ticks", "needs", "most energy, of the start's", "balance below 0", "grow with half")
+    return [Part("", columns, rows, gist)]
+
+
 def _by_whom(row: Row) -> str:
     if not row["found"]:
         return "no human"
@@ -332,6 +359,7 @@ CHECKS = (
     Check("map", "Which springs and dampers may a device render against a wall?", _MAP, gain_map),
     Check("accuracy", "Is MuJoCo right, and at what cost?", "sim.accuracy --duration 6", accuracy),
     Check("hard", "Numerically hard loops", hard_loops, hard),
+    Check("uneven", "Do uneven periods and late forces keep the guarantee?", uneven, uneven_table),
     Check("guarantees", "Do limits, budgets, walls and friction hold at what they ask?", edges, guarantees),
     Check("faults", "Does every fault of a link end as it must?", faults, fault_table),
 )

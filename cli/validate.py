@@ -19,9 +19,10 @@ from models.human import Human
 from sim import report
 from sim.adversary import Worst, search
 from sim.couplings import NAMES, Chosen, choose, limits_of
-from sim.crowds import ENGINES, MIXED, Findings, Validation, validate, validate_on_cluster
+from sim.crowds import ENGINES, MIXED, Findings, Validation
 from sim.run import assemble
 from sim.scenario import InputError, Scenario, require_linear, save_humans
+from sim.shards import Table, validate, validate_on_cluster
 from sim.switching import certified_part
 
 ENVIRONMENTS = ("nominal", "ranges", "box")  # the last is the older name of the second
@@ -29,7 +30,7 @@ LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
 
 def main(argv: list[str]) -> int:
-    """Meet random humans. 0: the claims hold, 1: not, 130: interrupted."""
+    """Meet random humans. 0: the claims hold, 1: not, 3: workers were lost, 130: interrupted."""
     args = _parser().parse_args(argv)
     scenario, out = _scenario(args), options.out_folder(args, "validate")
     chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter)
@@ -44,7 +45,7 @@ def main(argv: list[str]) -> int:
 
     limits = limits_of(scenario, chosen.coupling, requirements, args.limiter)
     question = _question(args, scenario, chosen, environments, limits.rho)
-    findings, wall = _findings(args, question)
+    findings, wall = _findings(args, question, Table(question, out, args.resume))
     outcome = {
         "case": args.case,
         "scenario": scenario.name,
@@ -64,7 +65,7 @@ def main(argv: list[str]) -> int:
         met = report.timing_part(scenario.timing(args.seed, max(1, question.ticks)), scenario) or {}
         _add(outcome, "timing", report.varying_delays_part(findings, met | {"covered": certified}))
     worst = None
-    if args.adversary and not findings.interrupted:
+    if args.adversary and not (findings.interrupted or findings.lost):
         attacked, ratio = scenario, requirements["this-environment"].ratio
         if environments and whole:
             member, requirement = whole.worst_found
@@ -77,6 +78,8 @@ def main(argv: list[str]) -> int:
     render.publish(args, outcome, [render.facts(title, _rows(outcome), ("", ""))], _lines(outcome), out, files)
     if outcome["interrupted"]:
         return options.INTERRUPTED
+    if outcome["unfinished"]:
+        return options.UNFINISHED
     return options.DONE if outcome["holds"] else options.DOES_NOT_HOLD
 
 
@@ -100,6 +103,8 @@ def _parser() -> options.Parser:
     shards = "local processes (default 1); the result is the same"
     parser.add_argument("--shards", type=options.whole(1, 256), default=1, metavar="K", help=shards)
     parser.add_argument("--dask", metavar="HOST:PORT", help="work on an existing Dask cluster; the result is the same")
+    again = "go on with what a run of the same words left unfinished in the folder"
+    parser.add_argument("--resume", action="store_true", help=again)
     parser.add_argument("--adversary", action="store_true", help="also search for the worst passive human")
     generations = "of the adversary's search (default 150)"
     parser.add_argument("--generations", type=options.whole(1, 10_000), metavar="N", help=generations)
@@ -148,14 +153,14 @@ def _question(
     return Validation(scenario, chosen.coupling, args.seed, *work, environments=environments, lag=lag)
 
 
-def _findings(args: argparse.Namespace, question: Validation) -> tuple[Findings, float]:
+def _findings(args: argparse.Namespace, question: Validation, table: Table) -> tuple[Findings, float]:
     """What the humans did, and the seconds that it took."""
     begin = time.perf_counter()
     with render.progress("validating") as move:
         if args.dask is not None:
-            findings = validate_on_cluster(question, args.dask, move)
+            findings = validate_on_cluster(question, args.dask, move, table)
         else:
-            findings = validate(question, args.shards, move)
+            findings = validate(question, args.shards, move, table)
     return findings, time.perf_counter() - begin
 
 
@@ -219,7 +224,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
     timing = outcome.get("timing")
     mujoco = "" if bad["mujoco"] is None else f", {bad['mujoco']} MuJoCo"
     verdict = {True: "[green]yes[/]", False: "[red]no[/]"}.get(outcome["holds"]) or str(outcome["reason"])
-    kept = f"{outcome['humans']} humans that were finished are kept; running batches and searches are not"
+    kept = f"{outcome['humans']} humans that were finished are kept, --resume does the others; searches are not kept"
     return [
         ("humans", f"{outcome['humans']} (links {outcome['links']}, seed {outcome['seed']})"),
         ("environments", _met(outcome["environments"])),
@@ -241,6 +246,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("certified", "yes" if outcome["certified"] else "no"),
         ("holds", verdict),
         ("interrupted", kept if outcome["interrupted"] else None),
+        ("unfinished", f"{outcome['unfinished']}; {kept}" if outcome["unfinished"] else None),
         ("time", f"{outcome['wall_s']:.1f} s, {outcome['simulated_s_per_s']:.0f} simulated seconds per second"),
     ]
 

@@ -28,7 +28,7 @@ from design.result import certificate_part, finite
 from sim import report
 from sim.couplings import NAMES, Chosen, choose
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
-from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks
+from sim.scenario import InputError, Scenario, require_constant_delay
 from sim.stability import MARGINAL
 from sim.trace import SUSTAINED, slowest_seen
 from sim.zwidth import (
@@ -330,16 +330,17 @@ def main(argv: list[str]) -> int:
     args.press = (3.0 if of_coupling else 0.0) if args.press is None else args.press
     scenario = options.scenario_from(args)
     require_constant_delay(scenario, "sim.zwidth")
-    require_even_ticks(scenario, "sim.zwidth")
-    if scenario.T_max is not None:
-        raise InputError("T_max: a map is of even periods; scale --delta by T/T_max instead")
+    if scenario.period is not None:
+        raise InputError("period: a map simulates even periods; give T_max alone, which its certificates are for")
     _check_case(args)
     chosen = _chosen(args, scenario)
     sweep: Sweep = _environment_sweep(scenario, chosen) if chosen else _coupling_sweep(args, scenario)
     marks = _marks(args)
     grid, plan, out = _grid(args, sweep, marks), _plan(args, sweep), options.out_folder(args, "zwidth")
 
-    crowd = HeldDevices.drawn(sweep.devices, sweep.population, sweep.loop.T, args.seed, args.humans)
+    crowd = HeldDevices.drawn(
+        sweep.devices, sweep.population, sweep.loop.T, args.seed, args.humans, latency=sweep.loop.latency
+    )
     with render.progress("certificates") as move:
         drawn = draw_map(sweep, grid, crowd, plan, lambda stage, k, of: move(k, of, stage))
     outcome = summary(sweep, drawn, plan, {"humans": args.humans, "seed": args.seed})
@@ -465,8 +466,8 @@ def _coupling_sweep(args: argparse.Namespace, scenario: Scenario) -> CouplingSwe
 
 
 def _nominal(loop: Loop) -> Loop:
-    """With the environment itself, constant delays and even periods: what a map is about."""
-    return msgspec.structs.replace(loop, box=None, jitter=None, T_max=None, latency=None)
+    """With the environment itself and constant delays: what a map is about."""
+    return msgspec.structs.replace(loop, box=None, jitter=None)
 
 
 def _marks(args: argparse.Namespace) -> tuple[Range, ...]:

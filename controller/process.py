@@ -630,6 +630,13 @@ class StepBuffer:
         if self.net is not None:
             self.net.apply(self.first + k, self.force[k])
 
+    def ticking(self) -> Callable[[int], object]:
+        """`tick` by the shortest way that does it here."""
+        if self._quantised or self._line is not None or self.net is not None:
+            return self.tick
+        transition, seen, after = self._transition, self._input, self._output
+        return lambda k: transition(seen[k], after[k])
+
     def seen(self, k: int) -> Array:
         """[z; x] of row k with x as the encoders give it, (order + m, nsim); the plant's own positions stay."""
         row = self._input[k]

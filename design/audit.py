@@ -11,7 +11,6 @@ from typing import Any, cast, get_args
 
 import msgspec
 import numpy as np
-from scipy.optimize import brentq
 
 from controller.coupling import (
     Compliance,
@@ -195,6 +194,8 @@ def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int 
 
 def edge(ratio: Ratio, inside: float, outside: float) -> float:
     """The argument nearest `outside` at which the ratio is still below 1, to a relative EDGE."""
+    from scipy.optimize import brentq  # slow to load, and seldom needed
+
     if ratio(outside) < 1:
         return outside
 

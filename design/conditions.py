@@ -475,7 +475,14 @@ def _delayed_scale(response: Complex, delta: Array, phi: Array) -> Array:
 Responses = Callable[[Complex], Sampled]  # z (n, k) or (1, k) -> responses there, a row for each system
 
 
-def this_environment_ratios(at: Responses, poles: Complex, delta: Sequence[float], delay: int) -> Array:
+def this_environment_ratios(
+    at: Responses,
+    poles: Complex,
+    delta: Sequence[float],
+    delay: int,
+    T_max: float | None = None,
+    latency: Latency | None = None,
+) -> Array:
     """Required over available damping, (n,), of n loops; inf where no damping is enough.
 
     `at` gives the responses of their force maps, `poles` (n, p) are these maps' own, and `delay` [samples] is the
@@ -486,7 +493,7 @@ def this_environment_ratios(at: Responses, poles: Complex, delta: Sequence[float
     sound = (np.abs(poles).max(axis=1, initial=0.0) < 1) & (skew <= STATIC) & (least >= -STATIC)
 
     def needed(w: Array) -> Array:
-        return _least_scales(this_environment_demand(at(on_circle(w)), delta))
+        return _least_scales(this_environment_demand(at(on_circle(w)), delta, T_max, latency))
 
     return np.where(sound, np.maximum(suprema(needed, *frequencies_of_many(poles, delay)), 0.0), np.inf)
 

@@ -12,7 +12,6 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linprog, minimize, minimize_scalar
 
 from controller.coupling import Coupling
 from controller.delay import delay
@@ -216,6 +215,8 @@ def walls_proof(
 
 def _best_g(needed: Callable[[Array], float], walls: int) -> Array:
     """g (walls,) with about the least `needed`: one for all of them, then one by one, each by a search in log g."""
+    from scipy.optimize import minimize_scalar  # slow to load, and seldom needed
+
     g = np.ones(walls)
     turns = [np.ones(walls, dtype=bool), *(np.eye(walls, dtype=bool) if walls > 1 else ())]
 
@@ -378,6 +379,7 @@ class _Search:
 
     def _bound(self, a: Array) -> tuple[Array, float]:
         """(a, value): the least maximum over a of the bounds n + p.a + q.(1/a), convex in log a."""
+        from scipy.optimize import minimize  # slow to load, and seldom needed
 
         def below(x: Array) -> Array:
             return x[0] - self._n - self._p @ np.exp(x[1:]) - self._q @ np.exp(-x[1:])
@@ -505,6 +507,8 @@ class _LimiterSearch:
 
     def least(self) -> tuple[tuple[tuple[float, ...], ...], float, float, float]:
         """(c, s(c), where it binds, a lower bound on s over all c that have something to spare)."""
+        from scipy.optimize import linprog  # slow to load, and seldom needed
+
         m, lags = self._shape
         c, bound = np.zeros(m * lags), -np.inf
         best: tuple[Array, float, float] = (c, np.inf, 0.0)

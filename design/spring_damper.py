@@ -8,11 +8,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import cvxpy as cp
 import numpy as np
-from scipy.optimize import OptimizeResult, minimize
 
 from controller.coupling import MovingAverage, SpringDamper
 from controller.delay import delay
@@ -35,6 +34,9 @@ from design.multipliers import (
 from design.multipliers import limiter as limiter_proof
 from design.result import Design, DesignFailed, Infeasible, Requirement
 from design.transparency import BAND_HZ, transparency
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
 
 # ----------------------------------------------------------------------------------------------------
 # The exact convex set of spring-damper gains that satisfy Theorem 4, channel by channel.
@@ -212,6 +214,10 @@ STUCK = 1e-3  # a search that leaves the sampled condition violated by this has 
 MOST_ROUNDS_FROZEN_ENVIRONMENT = 8
 
 
+Responses = tuple[Complex, Complex, Complex]  # (z-1)/(Tz), Psi E and Theta at some frequencies
+_DIFFERENCE = 1e-7
+
+
 class SampledLoop:
     """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta), shape (2N,)."""
 
@@ -227,6 +233,7 @@ class SampledLoop:
         self.target = delay(loop.lam, loop.T).at(on_circle(self.band)) @ E
         self.delta = even_damping(loop.delta, loop.T, loop.T_max)
         self.root = np.sqrt(loop.T / self.delta)
+        self._known: dict[int, tuple[Responses, Array, tuple[Complex, Array, Complex, Complex]]] = {}
 
     def coupling(self, x: Array) -> SpringDamper:
         log_k, b = np.split(x, 2)
@@ -240,18 +247,31 @@ class SampledLoop:
         self.conditions = np.append(self.conditions, w)
         self.loop_at_conditions = self._responses(self.conditions)
 
-    def _responses(self, w: Array) -> tuple[Complex, Complex, Complex]:
+    def _responses(self, w: Array) -> Responses:
         """(z-1)/(Tz), Psi E and Theta at exp(jw)."""
         loop, z = self.loop, on_circle(w)
         delayed = delay(loop.psi, loop.T).at(z) @ self.E.at(z)
         return (z - 1) / (loop.T * z), delayed, delay(loop.theta, loop.T).at(z)
 
-    def force(self, x: Array, responses: tuple[Complex, Complex, Complex]) -> Complex:
+    def force(self, x: Array, responses: Responses) -> Complex:
         """F = Theta G (G + Psi E)^-1 Psi E with G = V^-1, (k, N, N)."""
-        D, E, theta = responses
-        log_k, b = np.split(x, 2)
-        G = (np.exp(log_k) + D[:, None] * (b * self.delta))[:, :, None] * np.eye(self.loop.channels)
-        return theta @ G @ np.linalg.solve(G + E, E)
+        by, b, _, right = self._solved(x, responses)
+        g = by[0] + by[1] * b
+        return np.diagonal(responses[2], axis1=1, axis2=2)[:, :, None] * g[:, :, None] * right
+
+    def _solved(self, x: Array, responses: Responses) -> tuple[Complex, Array, Complex, Complex]:
+        """(dG by log K and by B/delta, (2, k, N); B/delta; S = (G + Psi E)^-1; S Psi E) at x; the last is remembered.
+
+        An unknown of channel i moves F by (Theta Psi E S)[:, i] (S Psi E)[i, :] times dG.
+        """
+        (D, E, _), N = responses, self.loop.channels
+        known = self._known.get(D.size)
+        if known is None or known[0] is not responses or not np.array_equal(known[1], x):
+            log_k, b = np.split(x, 2)
+            by = np.stack([np.broadcast_to(np.exp(log_k), (D.size, N)), D[:, None] * self.delta])
+            S = np.linalg.inv((by[0] + by[1] * b)[:, :, None] * np.eye(N) + E)
+            known = self._known[D.size] = (responses, x.copy(), (by, b, S, S @ E))
+        return known[2]
 
     def square_mismatch(self, x: Array) -> float:
         """Logarithm of the mean over log frequency of ||M||_F^2 / ||E||_F^2."""
@@ -260,16 +280,43 @@ class SampledLoop:
         log_w = np.log(self.band)
         return float(np.log(np.trapezoid(ratio, log_w) / (log_w[-1] - log_w[0])))
 
+    def square_mismatch_slope(self, x: Array) -> Array:
+        """Its gradient by x; the unknowns behind the gains do not move it."""
+        gains, (_, E, theta) = x[: 2 * self.loop.channels], self.loop_in_band
+        by, _, S, right = self._solved(gains, self.loop_in_band)
+        M, log_w = self.force(x, self.loop_in_band) - self.target, np.log(self.band)
+        back = right @ M.conj().swapaxes(1, 2) @ theta @ E
+        moved = 2 * (np.einsum("kij,kji->ki", back, S) * by).real
+        total = np.trapezoid((np.abs(M) ** 2).sum(axis=(1, 2)) / self.size2, log_w)
+        slope = np.trapezoid(moved / self.size2[:, None], log_w, axis=1).ravel() / total
+        return np.concatenate([slope, np.zeros(x.size - slope.size)])
+
     def room(self, x: Array) -> Array:
         """1 - SAMPLED_RESERVE less the damping ratio that each sampled frequency asks for; (k,), or (k + 1,).
 
         Delay in the environment can make the loop unstable where the sampled condition still holds, so there the
         distance of its poles from the circle is the last entry.
         """
-        ratio = self.force(x, self.loop_at_conditions) / (on_circle(self.conditions) - 1)[:, None, None]
-        need = -hermitian(self.root[:, None] * ratio * self.root)
-        room = 1 - SAMPLED_RESERVE - np.linalg.eigvalsh(need)[:, -1]
+        room = 1 - SAMPLED_RESERVE - np.linalg.eigvalsh(self._needed(x))[:, -1]
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
+
+    def room_slope(self, x: Array) -> Array:
+        """The gradient of `room`, (k, 2N) or (k + 1, 2N); poles are differenced."""
+        _, E, theta = self.loop_at_conditions
+        by, _, S, right = self._solved(x, self.loop_at_conditions)
+        v = np.linalg.eigh(self._needed(x))[1][:, :, -1:] * self.root[:, None]
+        into = (v.conj().swapaxes(1, 2) @ theta @ E @ S)[:, 0]
+        turned = into * (right @ v)[:, :, 0] / (on_circle(self.conditions) - 1)[:, None]
+        slope = np.concatenate([*(turned * by).real], axis=1)
+        if not any(self.loop.psi):
+            return slope
+        at, steps = self.stability(x), _DIFFERENCE * np.eye(x.size)
+        return np.vstack([slope, [(self.stability(x + step) - at) / _DIFFERENCE for step in steps]])
+
+    def _needed(self, x: Array) -> Complex:
+        """Whose largest eigenvalue is the damping ratio that each sampled frequency asks for."""
+        ratio = self.force(x, self.loop_at_conditions) / (on_circle(self.conditions) - 1)[:, None, None]
+        return -hermitian(self.root[:, None] * ratio * self.root)
 
     def stability(self, x: Array) -> float:
         """By how much more than CLOSEST_POLE the poles keep away from the circle."""
@@ -282,10 +329,13 @@ class SampledLoop:
     def minimised(self, x: Array, more: list[tuple[float, float]]) -> OptimizeResult:
         """The local optimum from x; `more` bounds the unknowns behind the gains."""
         N = self.loop.channels
+        from scipy.optimize import minimize  # slow to load
+
         bounds = [(np.log(SOFTEST), np.log(STIFFEST))] * N + [(0.0, 20.0)] * N + more
-        condition = {"type": "ineq", "fun": self.room}
+        condition = {"type": "ineq", "fun": self.room, "jac": None if more else self.room_slope}  # None: differenced
         options = {"maxiter": 100, "ftol": 1e-7}
-        return minimize(self.square_mismatch, x, method="SLSQP", bounds=bounds, constraints=condition, options=options)
+        problem = {"bounds": bounds, "constraints": condition, "options": options}
+        return minimize(self.square_mismatch, x, jac=self.square_mismatch_slope, method="SLSQP", **problem)
 
 
 Optimum = Callable[[SpringDamper], tuple[SpringDamper | None, int]]  # start -> (gains or None, searches)
@@ -364,7 +414,7 @@ class SwitchingLoop(SampledLoop):
         a = np.clip(np.where(np.isfinite(a), a, FIRST), *MULTIPLIERS)
         return np.concatenate([super().point(coupling), np.log(a)])
 
-    def force(self, x: Array, responses: tuple[Complex, Complex, Complex]) -> Complex:
+    def force(self, x: Array, responses: Responses) -> Complex:
         return super().force(self._gains(x), responses)
 
     def room(self, x: Array) -> Array:
@@ -434,7 +484,7 @@ class LimiterLoop(SampledLoop):
         loop = self.loop
         return limiter_proof(loop.sent(coupling), loop.theta, loop.delta, self.rho, c, T_max=loop.T_max)
 
-    def force(self, x: Array, responses: tuple[Complex, Complex, Complex]) -> Complex:
+    def force(self, x: Array, responses: Responses) -> Complex:
         return super().force(self._gains(x), responses)
 
     def room(self, x: Array) -> Array:

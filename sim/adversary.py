@@ -15,10 +15,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.optimize import OptimizeResult, differential_evolution
 
 from controller.coupling import Coupling
 from controller.environment import environment
@@ -30,6 +29,9 @@ from models.scene import Crowd, variants
 from sim.run import Progress
 from sim.scenario import Scenario
 from sim.stability import ClosedLoop, dominant_mode, exact_loops
+
+if TYPE_CHECKING:
+    from scipy.optimize import OptimizeResult
 
 _MASS, _STIFFNESS = (1e-3, 3.0), (0.1, 1e5)  # [kg], [N/m]
 DESTABILISED = 1e-6  # [1/s] growth from which a human counts as destabilising: rounding gives up to 1e-9
@@ -75,6 +77,8 @@ def search(
 
     `progress` is called after every generation.
     """
+    from scipy.optimize import differential_evolution  # slow to load, and seldom needed
+
     m, done = scenario.channels, 0
     passes = [p for p in _PASSES if m > 1 or not p.held]
 

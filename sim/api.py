@@ -14,6 +14,7 @@ from sim.engines import INTEGRATORS
 from sim.nets import EnergyNet, Plugged, netted
 from sim.run import ENGINES, Progress, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, require_linear
+from sim.shards import validate as validate_all
 from sim.stability import stability_part
 from sim.stepping import MOST, settle
 from sim.switching import switching
@@ -125,7 +126,7 @@ def validate(
     links = getattr(scenario.population, "links", 1)  # of a user's own population there are none
     lag = limits_of(scenario, alone, limiter=limiter).rho
     question = crowds.Validation(scenario, alone, seed, humans, links, engine, duration, lag=lag)
-    return crowds.validate(question, shards, progress)
+    return validate_all(question, shards, progress)
 
 
 def _bare(coupling: Coupling | Design | None) -> Coupling:

@@ -2,23 +2,18 @@
 
 Human i depends on the seed and i alone, whoever draws it and with whom. Batches are always the same ones, so that the
 merged result of shards and of a cluster is that of a single run, bit for bit (a cluster's workers need this package
-and the same versions of NumPy, SciPy and MuJoCo). MuJoCo decides by the map of its Runge-Kutta integrator, which shares
-nothing with the exact engine but the model; its traces take the exponential one, at a fifth of the cost.
+and the same versions of NumPy, SciPy and MuJoCo): see sim.shards. MuJoCo decides by the map of its Runge-Kutta
+integrator, which shares nothing with the exact engine but the model; its traces take the exponential one, at a fifth
+of the cost.
 """
 
 from __future__ import annotations
 
-import asyncio
-import logging
+import hashlib
 import math
-import multiprocessing
-import signal
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,8 +26,8 @@ from controller.timing import Timing
 from models.human import Population
 from models.scene import Crowd, HumanSets, Variants, variants
 from sim.engines import EXPONENTIAL, ExactBatchEngine, MujocoBatchEngine, hold
-from sim.run import Progress, Simulation, assemble
-from sim.scenario import InputError, Scenario
+from sim.run import Simulation, assemble
+from sim.scenario import Scenario
 from sim.stability import (
     ClosedLoop,
     ImpulseTest,
@@ -45,15 +40,9 @@ from sim.stability import (
 )
 from sim.switching import Switched, switched_crowd
 
-if TYPE_CHECKING:
-    from distributed import Client
-    from distributed import Future as DaskFuture
-
 ENGINES = ("exact", "mujoco", "both")
 MIXED = 0  # as a number of links: half the humans are simple, half are networks of two links
 BATCH = 125  # humans that are decided together
-
-_PATIENCE = 3.0  # [s] for a scheduler to answer, and again for its first worker
 
 
 # ---- random passive humans, each from its own seed
@@ -144,6 +133,21 @@ class Validation:
         """What the humans of this index meet, None for the scenario's own environment: each in turn."""
         return self.environments[index % len(self.environments)] if self.environments else None
 
+    @property
+    def digest(self) -> str:
+        """Of all that the findings depend on."""
+        how = (
+            self.coupling.form(),
+            self.seed,
+            self.humans,
+            self.links,
+            self.engine,
+            self.ticks,
+            self.environments,
+            self.lag,
+        )
+        return hashlib.sha256(f"{self.scenario.digest} {how!r}".encode()).hexdigest()[:16]
+
     def crowds(self, indices: Iterable[int]) -> Iterator[tuple[NDArray[np.intp], Crowd | HumanSets]]:
         """The humans of these indices, held together as the scenario's persons hold its devices.
 
@@ -182,6 +186,7 @@ class Findings:
     switching_mujoco: Array  # (n,) [1/s] the same on MuJoCo's trace; nan also where that was clipped
     simulated: float  # [s] in all traces
     interrupted: bool = False
+    lost: str = ""  # why batches are missing that nobody interrupted
 
     @property
     def disagreements(self) -> NDArray[np.bool_]:
@@ -190,14 +195,15 @@ class Findings:
         return disagree(self.exact, self.mujoco) | disagree(self.exact, self.trace) | switching
 
 
-def _merge(parts: Sequence[Findings], interrupted: bool = False) -> Findings:
-    """The findings of several batches as one, whatever their order."""
-    arrays = [f.name for f in fields(Findings) if f.name not in ("simulated", "interrupted")]
-    order = np.argsort(np.concatenate([p.index for p in parts]) if parts else np.zeros(0), kind="stable")
-    joined: dict[str, Any] = {
-        name: np.concatenate([getattr(p, name) for p in parts])[order] if parts else order for name in arrays
-    }
-    return Findings(**joined, simulated=math.fsum(p.simulated for p in parts), interrupted=interrupted)
+#: what Findings have one entry of for every set of humans
+COLUMNS = tuple(f.name for f in fields(Findings) if f.name not in ("simulated", "interrupted", "lost"))
+
+
+def _merge(parts: Sequence[Findings]) -> Findings:
+    """The findings of the groups of a batch as one."""
+    order = np.argsort(np.concatenate([p.index for p in parts]), kind="stable")
+    joined: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts])[order] for name in COLUMNS}
+    return Findings(**joined, simulated=math.fsum(p.simulated for p in parts))
 
 
 # ---- one batch
@@ -287,135 +293,3 @@ def _tests(
     timing = Timing(np.array([T]), np.array([late])) if late else None
     engine = MujocoBatchEngine(held_by.scene, T, EXPONENTIAL, 1, n, threads, held_by.fields, timing)
     return exact, impulse_test(process, engine, *settings, ticked)
-
-
-# ---- all batches: here, in processes, on a cluster
-
-
-def validate(validation: Validation, shards: int = 1, progress: Progress = lambda done, total: None) -> Findings:
-    """Examine every batch; from the keyboard it stops with the batches that are done."""
-    return _here(validation, progress) if shards == 1 else _in_processes(validation, shards, progress)
-
-
-def _here(validation: Validation, progress: Progress) -> Findings:
-    batches, parts = validation.batches(), []
-    ticks = max(1, validation.ticks)
-    done = 0
-
-    def ticked(count: int) -> None:
-        nonlocal done
-        done += count
-        progress(done, ticks * len(batches))
-
-    try:
-        for n, batch in enumerate(batches, start=1):
-            parts.append(examine(validation, batch, ticked))
-            done = n * ticks
-            progress(done, ticks * len(batches))
-    except KeyboardInterrupt:
-        return _merge(parts, interrupted=True)
-    return _merge(parts)
-
-
-def _in_processes(validation: Validation, shards: int, progress: Progress) -> Findings:
-    parts: list[Findings] = []
-    batches, alone = validation.batches(), replace(validation, threads=1)
-    # a forked child would inherit locks of MuJoCo's threads and of the progress bar
-    context = multiprocessing.get_context("spawn")
-    strangers = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(shards, mp_context=context, initializer=_ignore_interrupts)
-    futures: list[Future[Findings]] = []
-    try:
-        futures += [pool.submit(examine, alone, batch) for batch in batches]
-        for future in as_completed(futures):
-            parts.append(future.result())
-            progress(len(parts), len(batches))
-    except KeyboardInterrupt:
-        finished = [f.result() for f in futures if f.done() and not f.cancelled() and not f.exception()]
-        for worker in set(multiprocessing.active_children()) - strangers:
-            worker.terminate()  # a batch takes half a minute, and keeps nothing before its end
-        return _merge(finished, interrupted=True)
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-    return _merge(parts)
-
-
-def _ignore_interrupts() -> None:
-    """Ctrl-C reaches every process of a terminal; only the one that merges may act on it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def validate_on_cluster(
-    validation: Validation, address: str, progress: Progress = lambda done, total: None, patience: float = _PATIENCE
-) -> Findings:
-    """Examine every batch on the Dask cluster whose scheduler is at `address`; Ctrl-C keeps the batches that are done.
-
-    A lost worker's batches are done again by another. Raises InputError where there is no cluster, no worker, or no
-    package on the workers. Dask is an optional extra, imported only here.
-    """
-    parts: list[Findings] = []
-    batches, alone = validation.batches(), replace(validation, threads=1)
-    with _client(address, patience) as client:
-        from distributed import as_completed
-
-        tasks = client.map(_examine_alone, [alone] * len(batches), batches, pure=False)
-        try:
-            for task in as_completed(tasks, loop=client.loop):
-                parts.append(_result(task, address))
-                progress(len(parts), len(batches))
-        except KeyboardInterrupt:
-            client.cancel(tasks)
-            return _merge(parts, interrupted=True)
-    return _merge(parts)
-
-
-_one_at_a_time = threading.Lock()  # MuJoCo's clock and warning handler are global to a process
-
-
-def _examine_alone(validation: Validation, indices: Sequence[int]) -> Findings:
-    """`examine`, one at a time in every worker process, however many threads that has."""
-    with _one_at_a_time:
-        return examine(validation, indices)
-
-
-def _result(task: DaskFuture, address: str) -> Findings:
-    from distributed import KilledWorker
-
-    try:
-        return task.result()
-    except ImportError as error:
-        raise InputError(f"--dask {address}: the workers cannot import this package: {error}") from None
-    except KilledWorker as error:
-        raise InputError(f"--dask {address}: a batch killed every worker that tried it: {error}") from None
-    except CancelledError:
-        raise InputError(f"--dask {address}: the cluster was lost before all batches were done") from None
-
-
-@contextmanager
-def _client(address: str, patience: float) -> Iterator[Client]:
-    """A client of the cluster, checked to be there. Raises InputError."""
-    try:
-        from distributed import Client
-        from distributed.comm.core import connect
-        from distributed.core import coerce_to_address
-        from distributed.security import Security
-    except ImportError:
-        raise InputError("--dask needs Dask: pip install 'distributed>=2024.8'") from None
-    for name in ("distributed", "distributed.client"):  # what goes wrong is said once, in our words
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-
-    async def reach() -> None:
-        comm = await connect(coerce_to_address(address), timeout=patience, **Security().get_connection_args("client"))
-        await comm.close()
-
-    try:
-        asyncio.run(reach())  # a Client that finds nobody complains once more when it is collected
-        client = Client(address, timeout=patience, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(f"--dask {address}: no cluster there: {error}; expected HOST:PORT of a scheduler") from None
-    with client:
-        try:
-            client.wait_for_workers(1, timeout=patience)
-        except TimeoutError:
-            raise InputError(f"--dask {address}: that cluster has no workers") from None
-        yield client

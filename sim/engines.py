@@ -440,11 +440,11 @@ class MujocoBatchEngine:
         self._ctrl = self.batch.bind("ctrl").T
         self._sight = np.zeros((len(self._state) + model.nv, nsim))  # [q; v; qacc]
         self._seen, self._qacc_seen = self._sight[: len(self._state)], self._sight[len(self._state) :]
-        self.advance: Callable[[int], None] = self._by_steps
+        self._way = MujocoBatchEngine._by_steps  # not bound: a cycle would keep the batch's memory for long
         if integrator == EXPONENTIAL:
             moves = _rosenbrock(_rates(scene, fields), T / substeps)
             self._move: _Product = _each_by_its_own(moves) if fields else moves[0].dot
-            self._qacc, self.advance = self.batch.bind("qacc").T, self._by_exponentials
+            self._qacc, self._way = self.batch.bind("qacc").T, MujocoBatchEngine._by_exponentials
         self._start_ticks: Callable[[StepBuffer], None] = lambda buffer: None
         if timing:
             rates = _rates(scene, fields)
@@ -454,7 +454,7 @@ class MujocoBatchEngine:
             )
             by = self._exponentials_for if integrator == EXPONENTIAL else partial(self._steps_for, T)
             self._timed = _TimedTicks(timing, by, self._ctrl)
-            self.advance, self._start_ticks = self._by_ticks, self._timed.start
+            self._way, self._start_ticks = MujocoBatchEngine._by_ticks, self._timed.start
 
     def start(self, buffer: StepBuffer) -> None:
         self._state[...] = self._seen[...] = buffer.s[0][: len(self._seen)]
@@ -478,6 +478,9 @@ class MujocoBatchEngine:
             self._qacc_seen[...] = self._qacc
             move(self._sight, self._next)
             self._seen[...] = self._state[...] = self._next
+
+    def advance(self, k: int, /) -> None:
+        self._way(self, k)
 
     def _by_steps(self, k: int, /) -> None:
         self._ctrl[...] = self._inputs[k]

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from controller.lti import Array, Lti
 from controller.process import Contact, Process, StepBuffer
+from controller.timing import Timing
+from design.conditions import Latency
 from models.device import Device
 from models.human import Population
 from models.scene import Crowd, Scene, variants
@@ -46,6 +48,7 @@ class HeldDevices:
     T: float  # [s]
     #: (index of each human, who, plant, positions of motors and handles in its state)
     groups: tuple[tuple[Cells, Crowd, HeldPlant, tuple[int, ...]], ...]
+    late: tuple[float, ...] | None = None  # (m,) [s] when forces latch after the tick; None where at it
 
     @classmethod
     def drawn(
@@ -56,15 +59,20 @@ class HeldDevices:
         seed: int,
         humans: int,
         links: int | None = None,
+        latency: Latency | None = None,
     ) -> HeldDevices:
-        """Random humans with the devices; of so many links each, by default as their population says."""
+        """Random humans with the devices; of so many links each, by default as their population says.
+
+        With a latency (m,) [s] forces latch at its later end.
+        """
+        late = None if latency is None else tuple(most for _, most in latency)
         groups = []
         for index, crowd in crowds(
             population, len(devices), seed, range(humans), population.links if links is None else links
         ):
             held_by = variants(devices, crowd)
-            groups.append((index, crowd, hold(held_by.plants(), T), _motors_and_handles(held_by.scene)))
-        return cls(devices, T, tuple(groups))
+            groups.append((index, crowd, hold(held_by.plants(), T, late), _motors_and_handles(held_by.scene)))
+        return cls(devices, T, tuple(groups), late)
 
     def __len__(self) -> int:
         return sum(index.size for index, *_ in self.groups)
@@ -235,7 +243,7 @@ def simulate_cells(
                 seen += count
                 progress(first * ticks + min(seen, ticks) * min(size, cells.size - first), cells.size * ticks)
 
-            parts.append(_points(some, growth, trials, plan.effects.on(held.devices), plan, press, ticked))
+            parts.append(_points(some, growth, trials, held, plan, press, ticked))
     except KeyboardInterrupt:
         return Points.joined(parts), True
     return Points.joined(parts), False
@@ -269,7 +277,7 @@ def _points(
     cells: Cells,
     growth: Array,
     trials: list[_Trial],
-    devices: Sequence[Device],
+    held: HeldDevices,
     plan: Plan,
     press: Array,
     ticked: Callable[[int], None],
@@ -279,7 +287,7 @@ def _points(
     links = np.array([trial.links.shape[1] for trial in trials])
     for count in np.unique(links):
         which = np.flatnonzero(links == count)
-        found = _simulate([trials[i] for i in which], devices, press, plan, ticked)
+        found = _simulate([trials[i] for i in which], held, press, plan, ticked)
         lasting[which], amplitude[which], frequency[which] = found.sustained, found.amplitude, found.frequency_hz
     shape = (cells.size, -1)
     shown = np.where(lasting, amplitude + 1e9, amplitude).reshape(shape).argmax(axis=1)[:, None]
@@ -288,14 +296,15 @@ def _points(
 
 
 def _simulate(
-    trials: Sequence[_Trial], devices: Sequence[Device], press: Array, plan: Plan, ticked: Callable[[int], None]
+    trials: Sequence[_Trial], held: HeldDevices, press: Array, plan: Plan, ticked: Callable[[int], None]
 ) -> Oscillation:
     """All trials at once; their humans must have the same number of links. `press` (m,) [N]."""
     T = trials[0].process.F.T
-    held_by = variants(devices, Crowd(np.stack([trial.links for trial in trials])))
+    held_by = variants(plan.effects.on(held.devices), Crowd(np.stack([trial.links for trial in trials])))
     scene, ticks = held_by.scene, round(plan.duration / T)
     substeps = pace(held_by.plants().A).substeps(T)
-    n, processes = 2 * scene.model.nv, [trial.process for trial in trials]
+    timing = Timing(np.array([T]), np.array([held.late])) if held.late else None
+    n, processes = 2 * scene.model.nv + len(held.late or ()), [trial.process for trial in trials]
     buffer = _ManyProcesses(processes, min(_BLOCK, ticks), n, scene.outside)
     starts = np.stack([trial.start for trial in trials], axis=1)
     buffer.s[0] = starts[:n]
@@ -303,7 +312,7 @@ def _simulate(
         buffer.z[0] = starts[n:]
     seen, kept, done = list(_motors_and_handles(scene)), [], 0
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
-        engine = MujocoBatchEngine(scene, T, substeps=substeps, nsim=len(trials), fields=held_by.fields)
+        engine = MujocoBatchEngine(scene, T, substeps=substeps, nsim=len(trials), fields=held_by.fields, timing=timing)
         engine.start(buffer)
         while done < ticks:
             count = min(buffer.ticks, ticks - done)

@@ -78,6 +78,8 @@ def netted(simulation: Simulation, coupling: Coupling, wanted: Wanted, ticks: in
     that it has. Raises ValueError for numbers that no budget can have.
     """
     scenario, process = simulation.scenario, simulation.process
+    if scenario.latency:
+        raise ValueError("latency: a net counts forces that latch at ticks; count a whole sample of theta")
     delays, spans = process.delays, DelayRange(scenario.theta, scenario.theta)
     if delays is None:
         samples = scenario.samples if ticks is None else ticks
@@ -106,7 +108,8 @@ def _budget(wanted: EnergyNet, scenario: Scenario, process: Process, spans: Dela
     hold, delta = HELD if lost else 0, scenario.delta
     given: dict[str, Any] = {"eps": EPS, "start": wanted.start, "cap": wanted.cap, "nsim": nsim, "hold": hold}
     given["encoder_step"] = process.encoder_step
-    budget = EnergyBudget(delta, scenario.T, spans.lo, spans.hi, **given)
+    longest = scenario.longest_period or scenario.T  # the most that a held force can lose grows with the period
+    budget = EnergyBudget(delta, longest, spans.lo, spans.hi, **given)
     late = ages(process.delays) if lost else None
     return _Budgeted(budget, wanted, process.force_limit, late, np.array(spans.hi) + hold)
 

@@ -297,6 +297,7 @@ def validation_part(question: Validation, findings: Findings, certified: bool, w
         "certified": certified,
         "holds": disagreements == 0 and not (certified and wrong),
         "interrupted": findings.interrupted,
+        "unfinished": findings.lost or None,
         "wall_s": wall,
         "simulated_s_per_s": findings.simulated / wall,
     }
@@ -304,7 +305,7 @@ def validation_part(question: Validation, findings: Findings, certified: bool, w
         part["energy_audit"] = _energy(question, findings)
         part["holds"] = part["holds"] and part["energy_audit"]["holds"]
     if not findings.index.size:
-        part |= {"holds": None, "reason": "interrupted before the first batch of humans was done"}
+        part |= {"holds": None, "reason": "no batch of humans was done"}
     return part
 
 

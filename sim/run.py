@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -44,6 +45,7 @@ Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the ha
 Look = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
 Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 
+_COPIES = 5  # of a trace, at most, from the run to its report
 _BLOCK = 1024  # ticks between two looks at the clock, the keyboard and the numbers
 
 
@@ -128,6 +130,7 @@ def run(
     outside = outside or partial(outside_forces, scenario, simulation.scene, timing=simulation.timing)
     ticks = scenario.samples if ticks is None else ticks
     start = np.zeros((simulation.plant.A.shape[0], 1)) if start is None else start
+    _require_memory(process.F.order + len(start) + simulation.scene.outside + process.channels, ticks, scenario.T)
     blocks: list[tuple[Array, ...]] = []
     net: Net | None = None
     diverged = interrupted = False
@@ -165,6 +168,19 @@ def run(
     )
 
 
+def _require_memory(width: int, ticks: int, T: float) -> None:
+    """Raises InputError where the trace of a run, its report and the exact run beside it do not fit into memory."""
+    try:
+        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        free = 1024 * int(lines["MemAvailable"].split()[0])
+    except (OSError, KeyError, ValueError):
+        return  # this system does not say
+    each = _COPIES * 8 * width
+    if ticks * each > free:
+        needs = f"a trace of {ticks * T:g} s takes {ticks * each / 2**30:.3g} GiB, {free / 2**30:.3g} GiB are free"
+        raise InputError(f"duration: {needs}: allowed are {free / each * T:.3g} s; sim.validate keeps no traces")
+
+
 def run_blocks(
     process: Process, engine: Engine, outside: Outside, ticks: int, start: Array, look: Look, block: int = 32
 ) -> None:
@@ -188,7 +204,7 @@ def run_blocks(
 
 def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
     """Close the loop for the first `ticks` rows of the buffer."""
-    tick, advance = buffer.tick, engine.advance
+    tick, advance = buffer.ticking(), engine.advance
     for k in range(ticks):
         tick(k)  # sample x, compute f and z+
         advance(k)  # limit f, hold -f on the actuators for T, move the plant

@@ -30,6 +30,7 @@ SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
 LONGEST_DELAY = 1000  # [samples]; every one is a state
+MOST_DELAYS = 1000  # of all channels together: the eigenvalues of so many states take ten seconds, of 2000 a minute
 LONGEST_NAME = 200  # characters, that a table and a picture can show
 _TIMING_STREAM = 6  # keeps these draws apart from those of the humans with the same seed
 _Delays = tuple[int, ...]
@@ -82,6 +83,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"{name} has {len(value)} entries, but {contacts}")
             for i, n in enumerate(value if name in ("theta", "psi", "lam") and value else ()):
                 require(f"{name}[{i}]", n, 0, LONGEST_DELAY, "samples")
+        if (total := sum((*self.theta, *self.psi))) > MOST_DELAYS:
+            many = f"theta and psi are {total} samples in all, allowed are {MOST_DELAYS}"
+            raise ValueError(f"{many}: each is a state of the loop, and the work grows with the cube of their number")
         for i, lam in enumerate(self.lam or ()):
             if lam > self.theta[i] + self.psi[i]:
                 total = self.theta[i] + self.psi[i]

@@ -4,13 +4,12 @@ On a smooth scene the exponential integrator is exact with one step. Of MuJoCo's
 the eigenvalues of the continuous plant: the fastest weakly damped mode, which must be resolved (mode h <= 0.2), and
 the strongest damping, which must be followed (rate h < 1). What the rule picks is then checked: the loop that the
 engine simulates must have the exact loop's verdict, else the number is doubled. Where an error is asked for, runs
-decide: against the exact loop's, or against one of twice the steps where the scene has no exact loop.
+decide: see sim.engine_choice.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,14 +18,13 @@ from controller.lti import Array
 from controller.process import StepBuffer
 from models.scene import plant
 from sim.engines import EXPONENTIAL, LEAST, HeldPlant, default_integrator, quiet_warnings
-from sim.run import Simulation, make_engine, run
+from sim.run import Simulation, make_engine
 from sim.scenario import InputError
 from sim.stability import close, disagree, dominant_mode, exact_growth
 
 _RESOLVED, _FOLLOWED = 0.2, 1.0  # what a step may advance the fastest mode [rad] and the strongest damping
 MOST = 10_000  # substeps
 _MODE_LOST = "it damps fast modes away"
-_MOST_COMPARED = 256  # substeps, in the search for those that keep an error
 NEUTRAL = 1e-6  # a passive plant's free motion has eigenvalues at 1, which rounding splits by about 1e-8
 #: basis states and inputs are this long: the plant is linear, and no actuator limit is so small
 _UNIT = 1e-6
@@ -117,75 +115,6 @@ def check_substeps(simulation: Simulation, integrator: str, substeps: int) -> li
         growth = f"{simulated:+.3g} 1/s, the exact loop {exact:+.3g} 1/s"
         remarks.append(f"{integrator} x {substeps} gives a WRONG VERDICT: its loop grows by {growth}.")
     return remarks
-
-
-@dataclass(frozen=True)
-class EngineChoice:
-    """What keeps an error that was asked for, and what it costs."""
-
-    integrator: str
-    substeps: int
-    error: float  # relative rms of the encoders' positions over the run, at most
-    cpu_s: float  # of that run
-
-
-def cheapest(simulation: Simulation, error: float, ticks: int | None = None) -> EngineChoice:
-    """The cheapest of exponential and RK4 that keeps the relative rms error of the positions below `error`.
-
-    `ticks` of the scenario are run for it (default: all). A smooth scene is compared with the exact loop. Where
-    something rubs there is none: n steps are compared with 2 n, and since the method is of first order at least there,
-    what n steps miss is at most twice the difference; one exponential step is tried too. Raises InputError where
-    neither keeps it.
-    """
-    if not error > 0:
-        raise InputError(f"--error is {error:g}, expected a positive relative error")
-    ticks = simulation.scenario.samples if ticks is None else ticks
-    if default_integrator(simulation.scene) == EXPONENTIAL:
-        (exact, _), (own, cost) = (
-            _timed(simulation, ticks, "exact"),
-            _timed(simulation, ticks, "mujoco", EXPONENTIAL, 1),
-        )
-        found = EngineChoice(EXPONENTIAL, 1, _apart(own, exact), cost)
-        if found.error > error:
-            raise InputError(
-                f"--error {error:g}: the engine that is exact here is within {found.error:.1g}, by rounding"
-            )
-        return found
-    substeps, best = 1, math.inf
-    own, cost = _timed(simulation, ticks, "mujoco", "RK4", substeps)
-    while 2 * substeps <= _MOST_COMPARED:
-        finer, more = _timed(simulation, ticks, "mujoco", "RK4", 2 * substeps)
-        best = min(best, missed := 2 * _apart(own, finer))
-        if missed <= error:
-            rough, least = _timed(simulation, ticks, "mujoco", EXPONENTIAL, 1)  # a quarter of the force evaluations
-            apart = _apart(rough, finer) + missed
-            return (
-                EngineChoice(EXPONENTIAL, 1, apart, least)
-                if apart <= error
-                else EngineChoice("RK4", substeps, missed, cost)
-            )
-        own, cost, substeps = finer, more, 2 * substeps
-    raise InputError(f"--error {error:g}: RK4 comes within {best:.1g} with up to {_MOST_COMPARED // 2} substeps")
-
-
-def _timed(
-    simulation: Simulation, ticks: int, engine: str, integrator: str | None = None, substeps: int | None = None
-) -> tuple[Array, float]:
-    """Positions (N, m) of a run from rest, with its CPU seconds."""
-    stepped = make_engine(simulation, engine, integrator, substeps)
-    begin = time.process_time()
-    trace = run(simulation, stepped, ticks=ticks)
-    if trace.interrupted:  # a part of a run is no measurement
-        raise KeyboardInterrupt
-    return trace.s[:, : simulation.process.channels], time.process_time() - begin
-
-
-def _apart(own: Array, truth: Array) -> float:
-    """Relative rms difference; infinite where one of them ended before its time."""
-    if own.shape != truth.shape:
-        return math.inf
-    scale = float(np.mean(truth**2))
-    return math.sqrt(float(np.mean((own - truth) ** 2)) / scale) if scale else 0.0
 
 
 def step_radius(simulation: Simulation, integrator: str, substeps: int) -> float:

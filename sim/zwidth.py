@@ -37,8 +37,9 @@ from controller.lti import Array, Complex, Lti, Sampled, SingularLoop, as_like
 from controller.process import Limiter, Process, contact, limited
 from design.audit import check_loop, edge
 from design.certificate import CONDITIONS, any_environment_of
-from design.conditions import any_environment_ratios, this_environment, this_environment_ratios
+from design.conditions import any_environment_ratios, even_damping, this_environment, this_environment_ratios
 from design.coverage import covered_limits
+from design.guarantees import LATE
 from design.lmi import least_phi
 from design.result import DesignFailed, Requirement, refusal
 from models.device import Device
@@ -73,7 +74,7 @@ class _Sweep:
             return as_like(G, theta) @ G
 
         longest = max(n + p for n, p in zip(self.loop.theta, self.loop.psi, strict=True))
-        return this_environment_ratios(at, F.poles(), self.loop.delta, longest)
+        return this_environment_ratios(at, F.poles(), self.loop.delta, longest, self.loop.T_max, self.loop.latency)
 
     def _limits(self, devices: Sequence[Device]) -> tuple[Array, Array]:
         """Force limits [N] and encoder steps [m], (m,) each."""
@@ -121,6 +122,8 @@ class CouplingSweep(_Sweep):
     @cached_property
     def multiplier(self) -> tuple[Array | None, str | None]:
         """Phi of Theorem 4 [N s/m], (m,), which only delay in the environment needs; or why there is none."""
+        if self.loop.latency:
+            return None, LATE
         if any(self.loop.psi) and self.loop.environment.walls:
             return None, "with delay in the environment its multiplier is of a linear one: no walls"
         try:
@@ -176,7 +179,8 @@ class CouplingSweep(_Sweep):
         if reason:
             return np.full(K.size, np.inf)
         one, none = self._couplings(K, B, 1), [None] * self.loop.channels
-        channels = set(zip(self.loop.theta, self.loop.delta, none if phi is None else phi.tolist(), strict=True))
+        damping = even_damping(self.loop.delta, self.loop.T, self.loop.T_max).tolist()
+        channels = set(zip(self.loop.theta, damping, none if phi is None else phi.tolist(), strict=True))
         each = [
             any_environment_ratios(lambda z: one.sampled(z, self.loop.T), K.size, [n], [d], None if p is None else [p])
             for n, d, p in channels
@@ -188,7 +192,7 @@ class CouplingSweep(_Sweep):
         loop = self.loop
         coupling = SpringDamper([K] * loop.channels, [B] * loop.channels, self.cutoff)
         if condition == "this-environment":
-            states = [this_environment(state.F(coupling), loop.delta) for state in self._states]
+            states = [this_environment(s.F(coupling), loop.delta, loop.T_max, loop.latency) for s in self._states]
             return max(states, key=lambda requirement: requirement.ratio)
         phi, reason = self.multiplier
         return refusal("any-environment", loop.delta, reason) if reason else any_environment_of(loop, coupling, phi)
@@ -279,7 +283,7 @@ class EnvironmentSweep(_Sweep):
             return self._any_environment
         try:
             F = self._force_map(self._matrices(np.array([K]), np.array([B])), self._facing(condition))[0]
-            return this_environment(F, self.loop.delta)
+            return this_environment(F, self.loop.delta, self.loop.T_max, self.loop.latency)
         except SingularLoop as error:
             return refusal("this-environment", self.loop.delta, str(error))
 
@@ -288,6 +292,8 @@ class EnvironmentSweep(_Sweep):
         """any-environment's requirement, which no spring of the environment changes."""
         if any(self.loop.psi):
             return refusal("any-environment", self.loop.delta, "not asked")
+        if self.loop.latency:
+            return refusal("any-environment", self.loop.delta, LATE)
         return any_environment_of(self.loop, self.coupling)
 
     def _facing(self, condition: str) -> Coupling:

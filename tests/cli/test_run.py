@@ -251,3 +251,21 @@ def test_a_trace_that_is_none(tmp_path, content, message):
         path.write_bytes(content)
     with pytest.raises(InputError, match=message):
         Trace.load_npz(path)
+
+
+def test_an_error_that_is_asked_for_chooses_the_engine_and_a_cross_check_stands_beside(tmp_path, capsys):
+    file = tmp_path / "r.json"
+    options = ["--case", "I", "--duration", "0.4", "--no-plot", "--no-alternatives", "--out", str(tmp_path)]
+    assert main([*options, "--error", "1e-9", "--cross-check", "--json", str(file)]) == 0
+    done = json.loads(file.read_text())["run"]
+    assert (done["integrator"], done["substeps"]) == ("exponential", 1)
+    errors = {(row["integrator"], row["substeps"]): row["position_relative_rms"] for row in done["engines"]}
+    assert errors["exponential", 1] < 1e-11
+    assert errors["RK4", 8] < errors["RK4", 4] < errors["Euler", 4]
+    assert [row["cpu_s"] for row in done["engines"]] == sorted(row["cpu_s"] for row in done["engines"])
+    check = done["cross_check"]
+    assert (check["integrator"], check["substeps"], check["agrees"]) == ("RK4", 4, True)
+    assert 0 < check["position_relative_rms"] < 1e-6
+    assert "RK4 x 4" in capsys.readouterr().out
+    with pytest.raises(InputError, match="--error chooses integrator and substeps"):
+        main([*options, "--error", "1e-9", "--engine", "exact"])

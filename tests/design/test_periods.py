@@ -1,5 +1,6 @@
 """A period that varies: what it costs in every condition, and loops of drawn periods simulated exactly."""
 
+import json
 from fractions import Fraction
 
 import msgspec
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from cli.design import main as cli_design
 from controller.coupling import SpringDamper
 from controller.environment import FIGURE_4, Network, Spring
 from controller.loop import DelayRange, Loop
@@ -20,6 +22,21 @@ T, LONG = 1e-3, 1.6e-3
 LOOP = Loop(T, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
 STIFF, SOFT = SpringDamper([7806, 3137], [0.105, 1.68]), SpringDamper([500, 350], [0.2, 0.3])
 change = msgspec.structs.replace
+
+
+def test_a_report_on_switching_delays_is_for_the_longest_period(tmp_path):
+    """Also of the buffer that makes the delay the largest one."""
+    needs = []
+    for more in ([], ["--T-max", "1.8e-3"]):
+        file, soft = tmp_path / "r.json", ["--condition", "this-environment"]
+        cli_design(["--jitter", "1,2", *soft, *more, "--json", str(file), "--out", str(tmp_path / "c.json")])
+        report = json.loads(file.read_text())
+        stored = msgspec.json.decode((tmp_path / "c.json").read_bytes(), type=Stored)
+        loop = stored.loop.switching(None)
+        buffered = required_damping(change(loop, theta=(2, 2)), stored.coupling.build(loop.T), "this-environment")
+        needs.append((report["jitter_proof"]["playout"]["required_damping"], list(buffered.required)))
+    for shown, swept_alone in needs:
+        assert shown == pytest.approx(swept_alone, rel=1e-6)
 
 
 @pytest.mark.parametrize("condition", ["this-environment", "any-environment"])

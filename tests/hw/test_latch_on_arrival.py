@@ -1,11 +1,14 @@
 """A device that latches a force as soon as it comes: what moves it, what is measured, and what is certified for it."""
 
+import json
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
+from cli.bridge import main as bridge
+from cli.replay import main as replay
 from hw.control import certified_couplings, overlong_tick, timed
 from hw.emulator import Emulator
 from hw.limits import Fault
@@ -17,6 +20,7 @@ from models.scene import plant
 from sim import load
 from sim.report import coupling_part
 from sim.run import outside_forces
+from sim.scenario import InputError
 
 LAB = load("omega-pair").replace(theta=(0, 0))
 TAU = 130  # [us] of an emulated link
@@ -98,3 +102,34 @@ def test_the_report_names_the_latency():
     assert part["link_delay"] == 0
     assert part["coupling"] == coupling_part(made.chosen.kind, made.chosen.coupling, LAB.T)
     assert made.name == "spring-damper for theta = [0, 0] and 30 to 230 us"
+
+
+def test_a_session_is_certified_and_replayed_bit_for_bit(tmp_path, capsys):
+    file = tmp_path / "r.json"
+    options = ["--rehearse", "--theta", "0", "--latch", "arrival", "--duration", "0.3", "--no-plot"]
+    assert bridge([*options, "--out", str(tmp_path), "--json", str(file)]) == 0
+    report = json.loads(file.read_text())
+    assert report["theta"] == [0, 0]
+    assert report["latency_s"][0] == pytest.approx([30e-6, 230e-6])
+    assert report["promise"] == "this environment"
+    assert report["link"]["age_us"]["p50"] == pytest.approx(TAU)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "forces act 30 to 230 us after their tick" in said
+    assert "one longer tick may give a hand at most 1.46 mJ for every ms" in said
+    assert replay([str(tmp_path / "trace.npz")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (
+            ["--condition", "any-environment"],
+            "--latch arrival with --condition any-environment: a latency",
+        ),
+        (["--energy-budget", "0.01"], "--energy-budget with --latch arrival"),
+        (["--latency", "1e-4"], "latency: hw.bridge takes the ticks that it has"),
+    ],
+)
+def test_what_does_not_go_together(more, said):
+    with pytest.raises(InputError, match=said):
+        bridge(["--rehearse", "--latch", "arrival", *more])

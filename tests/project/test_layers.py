@@ -23,7 +23,7 @@ HOMES = {
     # the view only shows what runs without it: shapes and arrows, the window, pictures without a window
     "mujoco": {"models/scene.py", "sim/engines.py", "sim/view/"},
     "cvxpy": {"design/lmi.py", "design/fixed_order.py", "design/spring_damper.py"},
-    "distributed": {"sim/crowds.py"},
+    "distributed": {"sim/shards.py"},
     "serial": {"hw/transport.py", "hw/port.py"},
     "matplotlib": {"sim/plots.py"},
     "PIL": {"sim/view/"},

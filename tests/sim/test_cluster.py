@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +16,12 @@ import pytest
 distributed = pytest.importorskip("distributed", reason="Dask is not installed (extra `dask`)")
 
 from design.result import CASE_I  # noqa: E402
-from sim.crowds import BATCH, MIXED, Findings, Validation, validate, validate_on_cluster  # noqa: E402
+from sim.crowds import BATCH, MIXED, Findings, Validation  # noqa: E402
 from sim.scenario import (  # noqa: E402
     InputError,
     load,
 )
+from sim.shards import Table, validate, validate_on_cluster  # noqa: E402
 
 ROOT = Path(__file__).parents[2]
 QUESTION = Validation(load(), CASE_I, 0, 4 * BATCH, MIXED, "both", 0.25)  # 0.25 s: just enough for growth rates
@@ -117,3 +118,20 @@ def test_a_cluster_without_workers_says_so(cluster, monkeypatch):
 def test_wrong_addresses(address, message):
     with pytest.raises(InputError, match=f"--dask {address}: {message}"):
         validate_on_cluster(QUESTION, address, patience=0.5)
+
+
+def test_a_lost_scheduler_leaves_what_is_done(cluster, tmp_path):
+    """The rest is done by the same question without a cluster, which ends with the single run's result."""
+    cluster.add_worker("alone")
+    question, table = replace(QUESTION, humans=12 * BATCH), Table(replace(QUESTION, humans=12 * BATCH), tmp_path)
+
+    def kill(done: int, total: int) -> None:
+        if done == 2:
+            cluster.scheduler.kill()
+
+    found = validate_on_cluster(question, cluster.address, kill, table, patience=60)
+    assert "the cluster was lost before all batches were done" in found.lost
+    assert 2 * BATCH <= found.index.size < 12 * BATCH
+    whole = validate(question, table=Table(question, tmp_path, resume=True))
+    assert whole.index.size == 12 * BATCH
+    assert not whole.lost

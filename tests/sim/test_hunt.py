@@ -32,6 +32,15 @@ def test_every_frozen_state_of_a_draw_is_certified_and_any_environment_is_not(ca
         assert not any_environment_per_channel(channels, s.theta, s.delta).certified
 
 
+@pytest.mark.parametrize("index", range(6))
+def test_what_is_proved_of_walls_without_dampers_holds_in_the_hunt(index):
+    """At the requirement of walls that make and break contact nothing goes on bouncing: the condition's own test."""
+    case = draw(1, index, dampers=False)
+    if case is not None:
+        assert not any(wall.damping for wall in case.scenario.environment.walls)
+        assert not attack(case, index, seed=1, hands=30, seconds=0.5).counterexample
+
+
 def test_too_little_damping_is_found_out(cases):
     """With a third of the damping that the frozen states require, the same search finds hands that go on for ever."""
     thirds = ((i, replace(c, scenario=c.scenario.replace(delta=(c.scenario.delta[0] / 3,)))) for i, c in cases.items())

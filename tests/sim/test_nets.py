@@ -158,3 +158,21 @@ def test_baselines_are_compared_in_one_table_and_one_picture(tmp_path, capsys, m
     assert rows["energy budget"]["fastest_m_s"] < rows["none, clipped"]["fastest_m_s"]
     assert (tmp_path / "out/baselines.png").is_file()
     assert "baseline po-pc" in capsys.readouterr().out
+
+
+def test_no_hand_is_given_more_than_the_budget_in_uneven_periods():
+    """It reserves for the longest tick; the loop without a coupling, which grows, takes what it is given."""
+    scenario = stiffer(load().replace(duration=4.0, period={"min": 0.4e-3, "max": 1.6e-3}), 20)
+    simulation = assemble(scenario, NoCoupling())
+    for start in (0.0, 0.01):
+        trace = run(netted(simulation, NoCoupling(), EnergyNet(start)), "exact")
+        dx, ticks = np.diff(trace.s[:, :2], axis=0), simulation.timing.period[: len(trace.t) - 1]
+        lost = (dx**2 * np.array(scenario.delta)).sum(axis=1) / ticks
+        taken = np.cumsum(-(trace.f[:-1] * dx).sum(axis=1) - lost)
+        assert taken.max() <= start + 1e-9
+        assert trace.net.part()["limited_ticks"] > 10
+
+
+def test_a_net_counts_forces_that_latch_at_ticks():
+    with pytest.raises(ValueError, match="a net counts forces that latch at ticks"):
+        netted(assemble(SHORT.replace(latency=((0.0, 1e-4),) * 2), NoCoupling()), NoCoupling(), EnergyNet(0.0))

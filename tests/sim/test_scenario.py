@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
+from controller.coupling import NoCoupling
 from controller.environment import FIGURE_4
+from sim.run import assemble, run
 from sim.scenario import SCENARIOS, InputError, built_in, load, parse
 
 TEXT = (SCENARIOS / "omega-pair.toml").read_text()
@@ -197,3 +199,13 @@ def test_a_device_that_is_not_known_well_enough(device, message):
     with pytest.raises(InputError) as caught:
         parse(FALCON.format(device=device))
     assert message in str(caught.value)
+
+
+def test_delays_that_make_too_many_states_are_refused_with_their_number():
+    with pytest.raises(ValueError, match=r"theta and psi are 1998 samples in all, allowed are 1000: each is a state"):
+        load().replace(theta=(999, 999))
+
+
+def test_a_trace_that_does_not_fit_into_memory_is_refused_before_the_run():
+    with pytest.raises(InputError, match=r"a trace of 1e\+06 s takes .* GiB, .* GiB are free: allowed are .* s"):
+        run(assemble(load().replace(duration=1e6), NoCoupling()))

@@ -13,7 +13,7 @@ from controller.delay import Jitter
 from controller.timing import Periods, Timing
 from design.files import InputError
 from models.scene import plant
-from sim import load
+from sim import load, uneven
 from sim.run import assemble, make_engine, run
 from sim.stability import close, dominant_mode
 
@@ -156,3 +156,24 @@ def test_periods_vary_beside_delays():
     scenario = PAIR.replace(period=DRAWN, jitter=Jitter((1, 2), (2, 3)), theta=(1, 2))
     simulation = assemble(scenario, SOFT)
     assert len(run(simulation, "exact").t) == scenario.samples
+
+
+def test_at_the_requirement_no_hand_gains_energy_and_below_it_some_grow(monkeypatch):
+    """The suite's check, in short; with less damping than the condition asks it must find what is wrong."""
+    rows = list(uneven.uneven_ticks(0, 3, 1200))
+    assert [(row.ticks, row.drawn) for row in rows[:3]] == [("periods", True), ("periods", False), ("latency", True)]
+    assert all(row.holds for row in rows)
+    assert sum(row.grow > 0 for row in rows) >= 4
+    monkeypatch.setattr(uneven, "ENOUGH", 0.5)
+    assert not all(row.holds for row in uneven.uneven_ticks(0, 2, 600))
+
+
+def test_the_positions_at_the_latch_are_those_of_the_engine():
+    """What the energy balance counts as the way before a latch."""
+    A = np.array([[[0, 1], [-400.0, -2.0]]])
+    P = uneven.Plant(A, np.array([[[0.0], [-5.0]]]), np.eye(1, 2))
+    seen = uneven._at_the_latch(P, (3e-4,))
+    xi = np.array([0.1, -0.2, 3.0])  # [x; v; held force]
+    whole = np.zeros((3, 3))
+    whole[:2, :2], whole[:2, 2] = A[0], [0.0, -5.0]
+    assert seen[0, 0] @ xi == pytest.approx((expm(whole * 3e-4) @ xi)[0], rel=1e-12)

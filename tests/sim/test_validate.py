@@ -20,13 +20,14 @@ from models.device import RigidDevice
 from models.human import Person
 from models.scene import Crowd, build, plant, variants
 from sim import crowds as examine_module
-from sim import crowds as shards
 from sim import report as verdict_report
+from sim import shards
 from sim.couplings import choose
-from sim.crowds import BATCH, MIXED, Findings, Validation, crowds, draw, validate
+from sim.crowds import BATCH, MIXED, Findings, Validation, crowds, draw
 from sim.engines import ExactBatchEngine, ExactEngine, hold
 from sim.run import assemble, run
 from sim.scenario import InputError, load
+from sim.shards import validate
 from sim.stability import close, disagree, dominant_mode, exact_loops, impulse_forces, mujoco_loops, unstable
 
 SCENARIO = load()

@@ -510,3 +510,32 @@ def test_bad_input_is_one_line(options, message, tmp_path, capsys, monkeypatch):
     assert leaving.value.code == BAD_INPUT
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_a_map_is_of_late_forces_and_of_the_longest_period(tmp_path):
+    """1000 N/m before a rigid wall needs 0.7749 N s/m at 0.13 ms of 1.2 ms, 1.8 as a whole sample; 0.9 up to 1.8."""
+    file = tmp_path / "r.json"
+    wall = [
+        "--rigid",
+        "--T",
+        "1.2e-3",
+        "--delta",
+        "2",
+        "--mark",
+        "1000,0",
+        "--grid",
+        "6",
+        "--humans",
+        "20",
+        "--no-plot",
+    ]
+    needs = {}
+    for name, options in {
+        "late": ["--theta", "0", "--latency", "130e-6:130e-6", "--points", "2"],
+        "whole": ["--theta", "1", "--points", "0"],
+        "long": ["--theta", "0", "--T-max", "1.8e-3", "--points", "0"],
+    }.items():
+        assert zwidth.main([*wall, *options, "--out", str(tmp_path), "--json", str(file)]) == 0
+        (mark,) = json.loads(file.read_text())["marks"]
+        needs[name] = mark["this-environment"]["required_damping"][0]
+    assert needs == pytest.approx({"late": 0.774878, "whole": 1.8, "long": 0.9}, abs=2e-6)

@@ -1,0 +1,154 @@
+"""Uneven ticks against the condition: random loops, lossless hands, periods and latencies drawn or chosen by an enemy.
+
+Each loop has one or two light devices in front of a random network behind a random spring-damper, and devices of a
+given share of the damping that this-environment requires for periods up to T_max, or for forces that latch late. 40
+pairs of lossless hands start from random speeds, everything else at rest. At every tick the period and the latencies
+are drawn, or they are those that leave hands and devices most mechanical energy. With 1.02 times the requirement that
+energy may never exceed the energy at the start, and sum f'dx + dx'D dx/T never be negative, at any tick; with half of
+it some hand of some loop should grow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from controller.coupling import SpringDamper
+from controller.environment import GROUND, Network, Spring
+from controller.loop import Loop
+from controller.lti import Array, SingularLoop
+from design.certificate import this_environment_of
+from models.scene import Plant
+from sim.engines import hold
+from sim.stability import close
+
+T, LONG = 1e-3, 1.6e-3  # [s]
+HANDS, TICKS = 40, 4000
+ENOUGH, SHORT = 1.02, 0.5  # times the required damping
+GROWN = 100.0  # times the energy at the start
+
+
+@dataclass(frozen=True)
+class UnevenTicks:
+    """What became of one loop under one kind of uneven ticks."""
+
+    loop: str
+    ticks: str
+    drawn: bool  # else the worst tick for the hands is chosen
+    required: float  # [N s/m] of the first device
+    energy: float  # largest mechanical energy over that at the start, with ENOUGH
+    balance: float  # least sum f'dx + dissipation over the sum of its magnitudes, with ENOUGH
+    grow: int  # hands that grow, with SHORT
+
+    @property
+    def holds(self) -> bool:
+        return self.energy <= 1 + 1e-9 and self.balance >= -1e-9
+
+
+def uneven_ticks(seed: int, loops: int = 8, ticks: int = TICKS) -> Iterator[UnevenTicks]:
+    """Random loops under periods up to T_max, latencies, and both."""
+    for index in range(loops):
+        rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
+        kind = ("periods", "latency", "both")[index % 3]
+        loop, coupling = _draw(rng, kind)
+        required = np.array(this_environment_of(loop, coupling).required)
+        m = loop.channels
+        hands = 10 ** rng.uniform(-3, 0, (HANDS, m)), 10 ** rng.uniform(0, 4, (HANDS, m))
+        for drawn in (True, False):
+            runs = [_run(loop, coupling, share * required, hands, drawn, ticks, rng) for share in (ENOUGH, SHORT)]
+            name = f"{index}: {m} channel{'s'[: m - 1]}, theta = {list(loop.theta)}"
+            (energy, _, balance), (_, end, _) = runs
+            grown = int((end > GROWN).sum())
+            yield UnevenTicks(name, kind, drawn, float(required[0]), float(energy.max()), float(balance.min()), grown)
+
+
+def _draw(rng: np.random.Generator, kind: str) -> tuple[Loop, SpringDamper]:
+    """A random loop that has a required damping, and its coupling."""
+    while True:
+        m = int(rng.integers(1, 3))
+        names = tuple(f"contact {i + 1}" for i in range(m))
+        springs = [Spring((name, "mass"), 10 ** rng.uniform(2, 4), 10 ** rng.uniform(-2, 0)) for name in names]
+        springs.append(Spring(("mass", GROUND), 10 ** rng.uniform(1, 3), 10 ** rng.uniform(-2, 0)))
+        network = Network(names, tuple(springs), {"mass": 10 ** rng.uniform(-2, 0)})
+        theta = tuple(rng.integers(0, 3, m).tolist())
+        coupling = SpringDamper(10 ** rng.uniform(2.5, 4, m), 10 ** rng.uniform(-2, 0.5, m))
+        latest = rng.uniform(0.1, 0.4) * T
+        latency = ((rng.uniform(0, latest), latest),) * m if kind != "periods" else None
+        longest = LONG if kind != "latency" else None
+        loop = Loop(T, theta, (0,) * m, theta, (1.0,) * m, network, T_max=longest, latency=latency)
+        try:
+            if 0.01 < this_environment_of(loop, coupling).ratio < 20:
+                return loop, coupling
+        except SingularLoop:
+            continue
+
+
+def _run(
+    loop: Loop,
+    coupling: SpringDamper,
+    damping: Array,
+    hands: tuple[Array, Array],
+    drawn: bool,
+    ticks: int,
+    rng: np.random.Generator,
+) -> tuple[Array, Array, Array]:
+    """Of each pair of hands (masses and stiffnesses, device included): largest and last energy, least balance."""
+    mass, stiff = hands
+    n, m = mass.shape
+    A, B = np.zeros((n, 2 * m, 2 * m)), np.zeros((n, 2 * m, m))
+    i = np.arange(m)
+    A[:, i, m + i], A[:, m + i, i], A[:, m + i, m + i], B[:, m + i, i] = 1, -stiff / mass, -damping / mass, -1 / mass
+    plants, F, longest = Plant(A, B, np.eye(m, 2 * m)), loop.F(coupling), loop.T_max or loop.T
+    spans = loop.latency or ((0.0, 0.0),) * m
+    periods = np.linspace(0.3 * LONG, LONG, 3) if loop.T_max else (T,)
+    kinds = [(period, late) for period in periods for late in product(*(dict.fromkeys(span) for span in spans))]
+    steps = np.stack([close(hold(plants, period, late), F).A for period, late in kinds])  # (kinds, n, order, order)
+    seen = np.stack([_at_the_latch(plants, late) for _, late in kinds])  # (kinds, n, m, 3 m): x at the latch
+    output = np.hstack([F.D @ np.eye(m, 2 * m), np.zeros((m, m)), F.C])
+    xi = np.zeros((n, steps.shape[-1]))
+    xi[:, m : 2 * m] = rng.standard_normal((n, m))
+    weight = np.concatenate([stiff, mass], axis=1)
+    before = (weight * xi[:, : 2 * m] ** 2).sum(axis=1)
+    largest, log, balance, size, least = np.ones(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    first = damping / np.array([most or np.inf for _, most in spans])
+    last = damping / (longest - np.array([soonest for soonest, _ in spans]))
+    everyone, which = np.arange(n), np.zeros(n, dtype=int)
+    for k in range(ticks):
+        if drawn:
+            which[:] = rng.integers(len(kinds))
+            after = np.einsum("nij,nj->ni", steps[which[0]], xi)
+        else:
+            each = np.einsum("knij,nj->kni", steps, xi)
+            which = (weight * each[:, :, : 2 * m] ** 2).sum(axis=2).argmax(axis=0)
+            after = each[which, everyone]
+        x, held, force = xi[:, :m], xi[:, 2 * m : 3 * m], xi @ output.T
+        middle = np.einsum("nij,nj->ni", seen[which, everyone], xi[:, : 3 * m])
+        a, b = middle - x, after[:, :m] - middle
+        work, spent = (held * a + force * b).sum(axis=1), (first * a**2 + last * b**2).sum(axis=1)
+        balance, size = balance + work + spent, size + np.abs(work) + spent
+        least = np.minimum(least, balance / np.maximum(size, 1e-300))
+        xi = after
+        if k % 16 == 15:
+            energy = (weight * xi[:, : 2 * m] ** 2).sum(axis=1)
+            scale = np.sqrt(np.maximum(energy, 1e-290))
+            xi, balance, size = xi / scale[:, None], balance / scale**2, size / scale**2
+            log += np.log(np.maximum(energy, 1e-290) / (before if k == 15 else 1.0))
+            largest = np.maximum(largest, np.exp(np.minimum(log, 700)))
+    return largest, np.exp(np.minimum(log, 700)), least
+
+
+def _at_the_latch(plants: Plant, late: tuple[float, ...]) -> Array:
+    """[s; held forces] to each device's position at its own latch, (n, m, 3 m)."""
+    n, m = len(plants.A), len(late)
+    rows = np.zeros((n, m, 3 * m))
+    for i, tau in enumerate(late):
+        if tau == 0:
+            rows[:, i, i] = 1
+            continue
+        # forces that latch before have no part in this device's position: the channels are separate plants
+        held = hold(plants, tau)
+        rows[:, i, : 2 * m], rows[:, i, 2 * m :] = held.A[:, i], held.B[:, i]
+    return rows

@@ -1,0 +1,92 @@
+"""What devices, delays, hands and seconds cost, beside what comes out: CPU seconds of one core.
+
+PYTHONPATH=. python tests/benchmarks/scale.py [devices|delays|hands|duration ..]
+"""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+from controller.coupling import SpringDamper
+from design import certify, design_coupling
+from design.result import CASE_I
+from sim.crowds import MIXED, Validation
+from sim.run import assemble, run
+from sim.scenario import Scenario, load, parse
+from sim.shards import validate
+from sim.stability import exact_growth
+
+
+def star(n: int) -> Scenario:
+    """So many unlike devices around one hub on a soft spring, with delays of 0, 1 and 2 samples in turn."""
+    springs = [f'{{ between = ["c{i}", "hub"], stiffness = {300 + 20 * (i % 9)}, damping = 0.2 }}' for i in range(n)]
+    device = '[[device]]\nkind = "rigid"\nmass = {}\ndamping = {}\n'
+    text = [
+        f'name = "star"\nT = 1e-3\nduration = 2.0\ntheta = {[i % 3 for i in range(n)]}\npsi = {[0] * n}\n',
+        *(device.format(0.1 + 0.01 * (i % 7), 0.8 + 0.05 * (i % 5)) for i in range(n)),
+        "[[human]]\nlinks = [{ mass = 0.3, damping = 3.0, stiffness = 200.0 }]\n" * n,
+        "[environment]\ncontacts = [" + ", ".join(f'"c{i}"' for i in range(n)) + "]\nmasses = { hub = 0.8 }\n",
+        "springs = [" + ", ".join(springs) + ', { between = ["hub", "ground"], stiffness = 50.0, damping = 0.1 }]\n',
+        "[tap]\nchannel = 1\nforce = 1.0\nstart = 0.1\nduration = 0.01\n",
+    ]
+    return parse("".join(text))
+
+
+def cpu(call: Callable[[], Any]) -> tuple[Any, float]:
+    begin = time.process_time()
+    done = call()
+    return done, time.process_time() - begin
+
+
+def devices() -> None:
+    """The run is of 2 s; the audit is both conditions with their exact proofs."""
+    for n in (2, 4, 8, 16, 32):
+        scenario = star(n)
+        loop = scenario.loop("I")
+        design, designed = cpu(
+            lambda loop=loop: design_coupling(loop, "spring-damper", "this-environment", limiter=False)
+        )
+        needs, audited = cpu(lambda loop=loop, design=design: certify(loop, design.coupling))
+        simulation = assemble(scenario, design.coupling)
+        trace, ran = cpu(lambda simulation=simulation: run(simulation))
+        ratio = needs["this-environment"].ratio
+        print(f"| {n} devices | {ran:.2f} | {audited:.2f} | {designed:.2f} | needs {ratio:.4f}, {trace.t.size} ticks |")
+
+
+def delays() -> None:
+    """The run is of 2 s; the growth rate is that of the eigenvalues."""
+    for theta in (2, 20, 100, 200, 400):
+        scenario = load().replace(theta=(theta, theta), duration=2.0)
+        coupling = SpringDamper([1000 / theta] * 2, [0.1, 0.1])
+        simulation, built = cpu(lambda scenario=scenario, coupling=coupling: assemble(scenario, coupling))
+        _, ran = cpu(lambda simulation=simulation: run(simulation))
+        growth, solved = cpu(lambda simulation=simulation: exact_growth(simulation))
+        print(f"| {theta} samples of delay | {built + ran:.2f} | eigenvalues {solved:.2f} | growth {growth:+.4f} 1/s |")
+
+
+def hands() -> None:
+    """Verdicts by both engines, without traces and with 2 s of them."""
+    for count in (1000, 10_000):
+        for duration in (0.0, 2.0) if count == 1000 else (0.0,):
+            question = Validation(load(), CASE_I, 0, count, MIXED, "both", duration)
+            found, used = cpu(lambda question=question: validate(question))
+            print(f"| {count} hands, {duration:g} s | {used:.2f} | {int(found.disagreements.sum())} disagreements |")
+
+
+def duration() -> None:
+    """The memory is the most that the process has had so far."""
+    for seconds in (15, 150, 600):
+        simulation = assemble(load().replace(duration=seconds), CASE_I)
+        _, used = cpu(lambda simulation=simulation: run(simulation))
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print(f"| {seconds} s | {used:.2f} | {peak:.0f} MiB |")
+
+
+if __name__ == "__main__":
+    known = {f.__name__: f for f in (devices, delays, hands, duration)}
+    for name in sys.argv[1:] or known:
+        known[name]()

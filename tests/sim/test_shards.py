@@ -1,0 +1,123 @@
+"""Nothing is lost when a process dies: killed workers, killed parents, and runs that go on where they were left."""
+
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cli.validate import main
+from design.result import CASE_I
+from sim import shards
+from sim.crowds import BATCH, MIXED, Findings, Validation
+from sim.scenario import InputError, load
+from sim.shards import Table, validate
+
+ROOT = Path(__file__).parents[2]
+QUESTION = Validation(load(), CASE_I, 0, 3 * BATCH + 10, MIXED, "exact", 0.0)
+OPTIONS = ["--humans", str(3 * BATCH), "--engine", "exact", "--duration", "0", "--no-plot"]
+
+
+def same(one: Findings, other: Findings) -> None:
+    for field in fields(Findings):
+        np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name), err_msg=field.name)
+
+
+def kill_when_there(times: int, strangers) -> threading.Thread:
+    """Kill one new child process after another, so many of them, soon after each has started."""
+
+    def work() -> None:
+        left = times
+        while left:
+            for child in set(multiprocessing.active_children()) - strangers:
+                if child.pid:
+                    os.kill(child.pid, signal.SIGKILL)
+                    child.join()
+                    left -= 1
+                    break
+            time.sleep(0.05)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    return thread
+
+
+def test_a_killed_worker_changes_nothing():
+    killer = kill_when_there(1, set(multiprocessing.active_children()))
+    found = validate(QUESTION, shards=2)
+    killer.join()
+    same(found, validate(QUESTION))
+
+
+def test_workers_that_die_again_and_again_leave_what_is_done(tmp_path, monkeypatch):
+    """Then the command goes on where it was, and ends with what it would have found at once."""
+    whole = validate(QUESTION)
+    table = Table(QUESTION, tmp_path)
+    table.put(1, shards.examine(QUESTION, QUESTION.batches()[1]))
+    monkeypatch.setattr(shards, "_as_worker", die)
+    found = validate(QUESTION, 2, table=table)
+    assert found.lost == "worker processes died 3 times in a row"
+    np.testing.assert_array_equal(found.index, np.arange(BATCH, 2 * BATCH))
+    monkeypatch.undo()
+    again, examined = Table(QUESTION, tmp_path, resume=True), []
+    real = shards.examine
+    monkeypatch.setattr(shards, "examine", lambda *words: examined.append(words[1]) or real(*words))
+    same(validate(QUESTION, table=again), whole)
+    assert QUESTION.batches()[1] not in examined
+    assert not list(tmp_path.iterdir())
+
+
+def die() -> None:
+    os._exit(1)
+
+
+def test_the_command_says_what_is_missing(tmp_path, monkeypatch, capsys):
+    real, calls = shards.examine, []
+
+    def fails(*words):
+        calls.append(words)
+        if len(calls) > 1:
+            raise MemoryError
+        return real(*words)
+
+    monkeypatch.setattr(shards, "examine", fails)
+    assert main([*OPTIONS, "--out", str(tmp_path)]) == 3
+    assert f"memory ran out; {BATCH} humans that were finished are kept" in " ".join(capsys.readouterr().out.split())
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["humans"], report["unfinished"], report["interrupted"]) == (BATCH, "memory ran out", False)
+    monkeypatch.undo()
+    assert main([*OPTIONS, "--out", str(tmp_path), "--resume"]) == 0
+    assert json.loads((tmp_path / "report.json").read_text())["humans"] == 3 * BATCH
+    with pytest.raises(InputError, match=r"--resume: .* holds nothing unfinished of these humans and this loop"):
+        main([*OPTIONS, "--out", str(tmp_path), "--resume"])
+
+
+def children(pid: int) -> list[int]:
+    """Of a process, from the kernel's own list."""
+    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="the kernel lists no children here")
+@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_with_the_process_that_started_them(tmp_path, end):
+    command = [sys.executable, "-m", "sim.validate", "--humans", "100000", "--shards", "2", "--out", str(tmp_path)]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while len(workers := children(process.pid)) < 3:  # the third keeps count of shared resources
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    time.sleep(2)
+    process.send_signal(end)
+    process.wait()
+    while any(Path(f"/proc/{worker}").exists() for worker in workers):
+        assert time.monotonic() < deadline, "a worker outlives its parent"
+        time.sleep(0.1)
