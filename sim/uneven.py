@@ -128,13 +128,14 @@ def _run(
         middle = np.einsum("nij,nj->ni", seen[which, everyone], xi[:, : 3 * m])
         a, b = middle - x, after[:, :m] - middle
         work, spent = (held * a + force * b).sum(axis=1), (first * a**2 + last * b**2).sum(axis=1)
-        balance, size = balance + work + spent, size + np.abs(work) + spent
+        unit = np.exp(np.minimum(log, 600)) if k > 15 else 1 / before  # of the energy at the start
+        balance, size = balance + unit * (work + spent), size + unit * (np.abs(work) + spent)
         least = np.minimum(least, balance / np.maximum(size, 1e-300))
         xi = after
         if k % 16 == 15:
             energy = (weight * xi[:, : 2 * m] ** 2).sum(axis=1)
             scale = np.sqrt(np.maximum(energy, 1e-290))
-            xi, balance, size = xi / scale[:, None], balance / scale**2, size / scale**2
+            xi = xi / scale[:, None]
             log += np.log(np.maximum(energy, 1e-290) / (before if k == 15 else 1.0))
             largest = np.maximum(largest, np.exp(np.minimum(log, 700)))
     return largest, np.exp(np.minimum(log, 700)), least

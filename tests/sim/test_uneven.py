@@ -160,7 +160,7 @@ def test_periods_vary_beside_delays():
 
 def test_at_the_requirement_no_hand_gains_energy_and_below_it_some_grow(monkeypatch):
     """The suite's check, in short; with less damping than the condition asks it must find what is wrong."""
-    rows = list(uneven.uneven_ticks(0, 3, 1200))
+    rows = list(uneven.uneven_ticks(0, 3))
     assert [(row.ticks, row.drawn) for row in rows[:3]] == [("periods", True), ("periods", False), ("latency", True)]
     assert all(row.holds for row in rows)
     assert sum(row.grow > 0 for row in rows) >= 4
