@@ -3,7 +3,7 @@
 # make check  lint, and the tests of what your change touches, under a minute
 # make lint   ruff and pyright, without a finding: to be run, with make test, before anything is committed
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
-# make validate  every check that a verdict rests on: a report in out/validate/report.md, under five minutes
+# make validate  every check that a verdict rests on: a report in out/validate/report.md, about ten minutes
 # make oldest  the tests of models, blocks and files with the oldest packages that pyproject.toml allows, in .venv-oldest
 # make figures  the pictures that README and docs show, and the output in their blocks
 PYTHON ?= python3

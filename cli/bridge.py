@@ -42,7 +42,7 @@ from cli.session_cli import (
 )
 from design.certificate import CONDITIONS
 from design.files import write_json
-from design.guarantee import CAVEATS, LATE
+from design.guarantees import CAVEATS, LATE
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages

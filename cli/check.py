@@ -13,7 +13,7 @@ from cli import options, render
 from design.certificate import Verdict, lag, verify, violated_between
 from design.coverage import search_part, search_words
 from design.environments import Searched, search_box
-from design.guarantee import HERE, SET, switching_guarantee
+from design.guarantees import HERE, SET, switching_guarantee
 from design.result import listed
 from design.stored import Stored, SwitchingProof
 from sim.couplings import read_coupling

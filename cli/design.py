@@ -18,7 +18,7 @@ from design.certificate import SAMPLES, SetCheck, assess, check_set, lag, prove,
 from design.coverage import Limits, cost_part, covered_limits, price, set_part, set_rows, switching_part
 from design.designs import KINDS, NO_LONGER, design_by_kind, usual_condition
 from design.files import out_file
-from design.guarantee import ANY, HERE, guarantee_of, switching_guarantee
+from design.guarantees import ANY, HERE, guarantee_of, switching_guarantee
 from design.optimal import OBJECTIVES, Optimal, Options, box_around, robustness, spread
 from design.result import METHODS, Design, DesignFailed, NotProved, finite, listed
 from design.spring_damper import STIFFEST

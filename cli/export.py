@@ -28,7 +28,7 @@ from design.export import (
     trial,
 )
 from design.files import out_file, write
-from design.guarantee import HERE, SET, switching_guarantee
+from design.guarantees import HERE, SET, switching_guarantee
 from design.result import listed
 from design.stored import Stored
 from sim.couplings import read_coupling

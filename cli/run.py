@@ -14,7 +14,7 @@ from controller.loop import Loop
 from design.certificate import SetCheck, assess, check_set
 from design.coverage import set_part, set_rows
 from design.files import write
-from design.guarantee import guarantee_of
+from design.guarantees import guarantee_of
 from design.result import listed
 from design.transparency import BAND_HZ, transparency
 from sim import report

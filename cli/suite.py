@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import platform
+import resource
 import shlex
+import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stdout
@@ -18,6 +22,7 @@ from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from importlib.metadata import version
 from io import StringIO
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +33,21 @@ from controller.coupling import NoCoupling
 from controller.lti import SingularLoop
 from design.files import folder, write, write_json
 from design.result import DesignFailed, finite
-from hw.faults import rehearse_faults
+from hw.control import certified_couplings
+from hw.emulator import Emulator
+from hw.faults import person, rehearse_faults
+from hw.limits import Stage
+from hw.monitor import LinkSettings
+from hw.rehearsal import Rehearsal
+from hw.session import session_for
 from sim.adversary import Attempt, attempts
 from sim.couplings import choose
+from sim.crowds import Validation
 from sim.guarantees import challenges
 from sim.hard import cases, measure
 from sim.scenario import InputError, load
+from sim.shards import validate
+from sim.stability import unstable
 from sim.uneven import HANDS, uneven_ticks
 
 INTRODUCTION = """\
@@ -111,6 +125,86 @@ def faults(seed: int) -> Iterator[Row]:
     """Faults of a link, a device, a controller or a person, in virtual time."""
     for outcome in rehearse_faults():
         yield asdict(outcome) | {"holds": outcome.holds}
+
+
+Mark = Callable[[float], None]  # is told what share of the work is done
+
+
+def long_session(mark: Mark, seconds: float = 3600.0) -> tuple[bool, str]:
+    """A session of the default loop in virtual time, armed for `seconds`; whether it ended as planned, and how."""
+    scenario = load()
+    made = certified_couplings(scenario, "I", None, None, 1, spare=0)
+    session, emulator = session_for(scenario, LinkSettings()), Emulator(scenario)
+    actions = [(seconds, person("stop"))]
+    rehearsal = Rehearsal(session, emulator, lambda ages: made, actions=actions, keep=False)
+    rehearsal.run(0.1 * seconds)
+    mark(0.1)
+    rehearsal.run_to_the_end(seconds + 5.0)
+    ends = session.stage == Stage.FINISHED and not np.any(emulator.applied)
+    return ends, f"{session.stage} ({session.cause}) after {session.counters.states} ticks"
+
+
+def many_hands(mark: Mark, count: int = 100_000) -> tuple[bool, str]:
+    """Random hands on the default loop with its usual coupling, by eigenvalues; whether all are stable."""
+    scenario = load()
+    question = Validation(scenario, choose(scenario, "I", "spring-damper").coupling, 0, count, 1, "exact", 0.0)
+    found = validate(question, progress=lambda done, total: mark(done / total))
+    bad = int(unstable(found.exact).sum())
+    return bad == 0 and found.index.size == count, f"{bad} of {found.index.size} unstable"
+
+
+Work = Callable[[Mark], tuple[bool, str]]
+
+#: what is done, and by how much its peak of memory may rise after a tenth of it [MiB]: a session keeps nothing of a
+#: tick, a crowd 128 bytes of a hand, twice while its batches are joined
+_LONG: tuple[tuple[str, Work, float], ...] = (
+    ("an hour of a session", long_session, 8.0),
+    ("100,000 hands", many_hands, 32.0),
+)
+
+
+def endurance(seed: int) -> Iterator[Row]:
+    """Whether memory stays flat over an hour of a session and 100,000 hands, each in a process of its own."""
+    context = multiprocessing.get_context("spawn")  # a fork would begin with the memory of all checks before
+    for what, work, allowed in _LONG:
+        here, there = context.Pipe(duplex=False)
+        worker = context.Process(target=_alone, args=(work, allowed, there), daemon=True)
+        worker.start()
+        there.close()
+        try:
+            yield {"what": what, **here.recv()}
+        except EOFError:
+            yield {"what": what, "result": "broke off", "tenth_mib": None, "end_mib": None, "holds": False}
+        finally:
+            worker.terminate()
+            worker.join()
+
+
+def _alone(work: Work, allowed: float, there: Connection) -> None:
+    """Of the process that does it: only the one that waits acts on Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    there.send(endure(work, allowed))
+
+
+def endure(work: Work, allowed: float) -> Row:
+    """Do it, and look at this process's peak of memory after a tenth and at the end [MiB]."""
+    peaks: list[float] = []
+
+    def mark(share: float) -> None:
+        if share >= 0.1 and not peaks:
+            peaks.append(_peak())
+
+    good, result = work(mark)
+    tenth, end = peaks[0], _peak()
+    flat = end - tenth <= allowed
+    return {"result": result, "tenth_mib": tenth, "end_mib": end, "allowed_mib": allowed, "holds": good and flat}
+
+
+def _peak() -> float:
+    """Most memory that this process had [MiB]. Linux's getrusage counts that of the parent before exec, too."""
+    if (status := Path("/proc/self/status")).exists():
+        return float(status.read_text().partition("VmHWM:")[2].split()[0]) / 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def uneven(seed: int) -> Iterator[Row]:
@@ -275,6 +369,17 @@ def fault_table(report: dict[str, Any]) -> list[Part]:
     return [Part("", columns, tuple(rows), f"{good} of {len(rows)} faults end as they must")]
 
 
+def memory_table(report: dict[str, Any]) -> list[Part]:
+    """Of work that goes on for long."""
+    rows = [
+        (row["what"], row["result"], *(render.optional(row[n], "{:.0f} MiB") for n in ("tenth_mib", "end_mib")))
+        for row in report["rows"]
+    ]
+    good = sum(row["holds"] for row in report["rows"])
+    columns = ("work", "result", "peak after a tenth", "peak at the end")
+    return [Part("", columns, tuple(rows), f"{good} of {len(rows)} end as they must, with flat memory")]
+
+
 def uneven_table(report: dict[str, Any]) -> list[Part]:
     """Of uneven ticks."""
     rows = tuple(
@@ -362,6 +467,7 @@ CHECKS = (
     Check("uneven", "Do uneven periods and late forces keep the guarantee?", uneven, uneven_table),
     Check("guarantees", "Do limits, budgets, walls and friction hold at what they ask?", edges, guarantees),
     Check("faults", "Does every fault of a link end as it must?", faults, fault_table),
+    Check("endurance", "Does memory stay flat over an hour and 100,000 hands?", endurance, memory_table),
 )
 
 
@@ -471,7 +577,8 @@ def main(argv: list[str]) -> int:
 def _parser() -> options.Parser:
     parser = options.Parser(
         "sim.suite",
-        "Run every check that a verdict rests on and write one report.",
+        "Run every check that a verdict rests on and write one report: about ten minutes on two cores, half of them for"
+        " endurance (an hour of a session in virtual time, 100,000 hands).",
         "python -m sim.suite --only I,hard --humans 200",
     )
     names = ",".join(check.name for check in CHECKS)

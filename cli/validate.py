@@ -14,7 +14,7 @@ from controller.environment import Member
 from design.certificate import SetCheck, assess, check_set
 from design.conditions import this_environment
 from design.coverage import set_part
-from design.guarantee import ANY, guarantee_of
+from design.guarantees import ANY, guarantee_of
 from models.human import Human, Population
 from sim import report
 from sim.adversary import Worst, search, search_population

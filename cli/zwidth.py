@@ -23,7 +23,7 @@ from controller.lti import Array
 from design.certificate import CONDITIONS, assess, check_set
 from design.coverage import set_part
 from design.files import write
-from design.guarantee import CAVEATS, guarantee_of
+from design.guarantees import CAVEATS, guarantee_of
 from design.result import certificate_part, finite
 from sim import report
 from sim.couplings import NAMES, Chosen, choose

@@ -11,7 +11,7 @@ from controller.coupling import Coupling
 from controller.loop import Loop
 from design.certificate import assess, check_set, switching_requirement
 from design.designs import KINDS, NO_LONGER, OPTIONS, RETIRED, design_by_kind, usual_condition
-from design.guarantee import guarantee_of
+from design.guarantees import guarantee_of
 from design.result import Condition, Design, Requirement, bare, known, of_kind, one_of
 from design.stored import Stored
 from design.transparency import BAND_HZ, Transparency, decibels, transparency

@@ -26,7 +26,7 @@ from controller.loop import DelayRange, Loop
 from design.certificate import SetCheck, any_environment_of, switching_requirement, this_environment_of
 from design.conditions import any_environment
 from design.coverage import set_part, switching_part
-from design.guarantee import ANY, CAVEATS, LATE, guarantee_of
+from design.guarantees import ANY, CAVEATS, LATE, guarantee_of
 from design.result import Condition, Requirement, certificate_part, listed, refusal
 
 # ----------------------------------------------------------------------------------------------------

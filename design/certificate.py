@@ -35,7 +35,7 @@ from design.conditions import (
 from design.environments import Progress, Searched, in_each, search_box, worst
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
 from design.frequency import frequencies, on_circle, rounding
-from design.guarantee import LATE, making_covered, no_compliance, switching_guarantee
+from design.guarantees import LATE, making_covered, no_compliance, switching_guarantee
 from design.multipliers import (
     BETA,
     WALL_MULTIPLIER,

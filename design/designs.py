@@ -12,7 +12,7 @@ import msgspec
 
 from controller.loop import Loop
 from design.conditions import this_environment
-from design.guarantee import LATE
+from design.guarantees import LATE
 from design.result import Design, DesignFailed
 
 #: name -> the conditions that it can be made for, its own first

@@ -25,7 +25,7 @@ from controller.lti import Array, Lti
 from controller.process import Limiter, limited
 from design.certificate import assess
 from design.coverage import Limits as ForceLimits
-from design.guarantee import guarantee_of
+from design.guarantees import guarantee_of
 from design.result import DesignFailed, Requirement, certificate_part
 from hw.limits import Fault, Gain, Heat, Limits, Units, check_jolt, check_jump, check_range, check_speed, shape
 from hw.monitor import Ages, ClockMonitor, CommandMonitor, Counters, EncoderMonitor, EncoderTest, LinkSettings

@@ -15,7 +15,7 @@ import numpy as np
 
 from controller.coupling import Coupling
 from controller.lti import Array
-from design.guarantee import guarantee_of
+from design.guarantees import guarantee_of
 from design.result import COUPLING, Design, Requirement, bare, number, of_kind, whole
 from hw.control import CertifiedCoupling, Program, certified_coupling, certified_couplings, timed
 from hw.emulator import Emulator, FaultInjection, Line

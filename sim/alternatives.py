@@ -15,7 +15,7 @@ from typing import Any
 from controller.coupling import Coupling
 from controller.lti import Array
 from design.certificate import assess
-from design.guarantee import guarantee_of
+from design.guarantees import guarantee_of
 from design.result import Requirement, finite
 from design.transparency import decibels, transparency
 from sim.accuracy import credible_part, force_error

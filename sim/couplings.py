@@ -13,7 +13,7 @@ from controller.lti import Array
 from design.certificate import assess, verify
 from design.coverage import Limits, covered_limits
 from design.designs import KINDS, design_by_kind
-from design.guarantee import switching_guarantee
+from design.guarantees import switching_guarantee
 from design.result import PUBLISHED, DesignFailed, Requirement
 from design.stored import Stored, load
 from sim.scenario import InputError, Scenario

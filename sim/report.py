@@ -15,7 +15,7 @@ from controller.delay import LOST, Jitter, Ticks, ages
 from controller.lti import Array
 from controller.timing import Timing
 from design.certificate import assess
-from design.guarantee import ANY, CAVEATS, MAKING, encoder_part
+from design.guarantees import ANY, CAVEATS, MAKING, encoder_part
 from design.result import OLDER_NAMES, PRINTED_TAU_DB, PUBLISHED, Requirement, certificate_part, finite, listed
 from design.transparency import Transparency, decibels
 from models.human import Human, Person

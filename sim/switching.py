@@ -29,7 +29,7 @@ from controller.lti import Array, Lti
 from controller.process import Process, StepBuffer
 from design.certificate import switching_requirement
 from design.coverage import switching_part
-from design.guarantee import switching_guarantee
+from design.guarantees import switching_guarantee
 from design.result import Requirement
 from models.scene import Scene, Variants
 from sim.couplings import Chosen

@@ -39,7 +39,7 @@ from design.audit import check_loop, edge
 from design.certificate import CONDITIONS, any_environment_of
 from design.conditions import any_environment_ratios, even_damping, this_environment, this_environment_ratios
 from design.coverage import covered_limits
-from design.guarantee import LATE
+from design.guarantees import LATE
 from design.lmi import least_phi
 from design.result import DesignFailed, Requirement, refusal
 from models.device import Device

@@ -10,7 +10,7 @@ from controller.coupling import Coupling
 from design.certificate import assess
 from design.coverage import Limits
 from design.designs import KINDS
-from design.guarantee import guarantee_of
+from design.guarantees import guarantee_of
 from design.result import Requirement
 from sim.couplings import Chosen, choose, limits_of
 from sim.run import Simulation, assemble

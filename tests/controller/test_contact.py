@@ -19,7 +19,7 @@ from controller.process import Complementarity, Process, StepBuffer, contact
 from design.audit import report, requirement
 from design.certificate import assess, prove
 from design.conditions import this_environment
-from design.guarantee import FROZEN
+from design.guarantees import FROZEN
 from design.result import NotProved
 from models.device import CompliantDevice
 from models.human import Population

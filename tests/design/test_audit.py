@@ -17,7 +17,7 @@ from controller.lti import Lti
 from design import certificate, stored
 from design.api import certify
 from design.audit import MOST_EXTRA_SAMPLES, edge, remedies, report, requirement, stiffest, tolerance
-from design.guarantee import ANY, CAVEATS, guarantee_of
+from design.guarantees import ANY, CAVEATS, guarantee_of
 from design.result import CASE_I
 
 CONDITIONS = ("this-environment", "any-environment")

@@ -14,7 +14,7 @@ from design.api import design_coupling, transparency_of
 from design.certificate import assess, prove, required_damping, verify
 from design.conditions import latency_demand, least_scale, this_environment, this_environment_demand
 from design.frequency import frequencies, hermitian, on_circle
-from design.guarantee import LATE
+from design.guarantees import LATE
 from design.result import NotProved
 from design.stored import Stored
 

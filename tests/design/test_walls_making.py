@@ -15,7 +15,7 @@ from controller.process import contact
 from design.certificate import assess, prove, verify
 from design.conditions import any_environment, this_environment
 from design.exact import find_storage
-from design.guarantee import MAKING, guarantee_of, making_covered
+from design.guarantees import MAKING, guarantee_of, making_covered
 from design.multipliers import walls_demand, walls_of, walls_proof
 from design.result import NotProved
 from design.stored import Stored, sealed

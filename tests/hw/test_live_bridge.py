@@ -18,6 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from cli import bridge, identify, replay
@@ -28,6 +29,7 @@ from controller.delay import Jitter
 from hw.control import certified_coupling, certified_couplings
 from hw.limits import ENDED, Limits, Stage
 from hw.monitor import LinkSettings
+from hw.recording import IncidentLog
 from hw.session import Session
 from hw.transport import Live, SerialPort
 from sim.scenario import InputError
@@ -107,6 +109,37 @@ def test_the_command_drives_the_emulator(tmp_path, capsys, monkeypatch):
         pytest.fail(f"never armed, at last {stage}: {report['session']['cause']}")
     assert report["certificate"]["certified"]
     assert replay.main(["out/bridge-I/trace.npz"]) == 0
+
+
+def test_an_interrupt_while_forces_act_is_130_after_a_ramp(tmp_path, capsys, monkeypatch):
+    """The whole command: the gain comes down to zero in 100 ms, and the exit code tells of the interrupt."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    look = IncidentLog.glance
+
+    def glance(incidents, session):
+        look(incidents, session)
+        if session.stage == Stage.ARMED and session.gain == 1.0 and not sent:
+            sent.append(session.stage)
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(IncidentLog, "glance", glance)
+    for pace in PACES:
+        sent = []
+        options = ["--emulate", "--case", "I", "--duration", "20", "--measure", "60", "--pace", str(pace)]
+        code = bridge.main([*options, "--no-plot", "--json", "-"])
+        report = json.loads(capsys.readouterr().out)
+        if sent and report["session"]["stage"] == "finished":  # else the machine was too busy
+            break
+    else:
+        pytest.fail(f"never armed and interrupted, at last {report['session']}")
+    assert code == 130
+    assert report["session"]["cause"] == "SIGINT"
+    gain = np.load("out/bridge-I/trace.npz")["link_gain"]
+    falling = gain[int(np.flatnonzero(gain == 1.0)[-1]) :]
+    assert falling.size * 1.2e-3 == pytest.approx(0.1, abs=0.01)  # s
+    assert (np.diff(falling) < 0).all()
+    assert falling[-1] < 0.02
 
 
 @pytest.mark.parametrize(

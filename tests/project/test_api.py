@@ -208,7 +208,7 @@ LOOP = SHORT.loop("I")
         ),
         (lambda: design_coupling(LOOP, order=3), "order is no option of kind 'spring-damper', allowed are switching"),
         (lambda: design_coupling(LOOP, "optimal", high_gain="x"), "high_gain is 'x' (str), expected a number"),
-        (lambda: design_coupling(LOOP, "ccl", order=1.5), "order is 1.5 (float), allowed are whole numbers, 1 or more"),
+        (lambda: design_coupling(LOOP, "ccl", order=1.5), "order is 1.5 (float), allowed are whole numbers, 1 to 10"),
         (lambda: certify(SHORT, SOFT), "loop is a Scenario, expected a Loop"),
         (lambda: certify(LOOP, None), "coupling is None, expected a coupling (controller.coupling), or a Design"),
         (lambda: certify(LOOP, SpringDamper), "expected a coupling (controller.coupling), or a Design"),

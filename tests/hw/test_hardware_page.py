@@ -1,0 +1,93 @@
+"""What docs/hardware.md promises in numbers, asked of the session, the bridge's options and the line it opens."""
+
+import gc
+import re
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from cli import bridge
+from hw.control import certified_couplings
+from hw.faults import CASES, lively, rehearse_case
+from hw.monitor import LinkSettings
+from hw.transport import SerialPort, _no_collections
+from sim.scenario import load
+
+PAGE = (Path(__file__).parents[2] / "docs" / "hardware.md").read_text(encoding="utf-8")
+TABLE = re.search(r"^\| fault \| ends in .*\n\|[-|]+\n((?:\|.*\n)+)", PAGE, flags=re.MULTILINE)[1]
+ROWS = [[cell.strip() for cell in line.strip("|").split("|")] for line in TABLE.splitlines()]
+#: rows of the page that are not called after their case
+CALLED = {
+    "no FORCE arrives; cable pulled": ("no FORCE arrives", "cable pulled"),
+    "encoder jumps by 5 mm": ("jump of 5 mm, encoder 1",),
+    "encoder 1, encoder 2 dies": ("encoder dies", "encoder 2 dies"),
+    "a handle at 1.5 m/s": ("1.5 m/s, handle 1",),
+    "e-stop at the device, at the host": ("e-stop at the device", "e-stop at the host"),
+    "10 % of answers late": ("answers get late",),
+}
+IN_WORDS = ("no FORCE arrives; cable pulled", "10 % of answers late")  # causes that the page tells in its own words
+
+
+@pytest.fixture(scope="module")
+def made():
+    scenario = lively(load())
+    return scenario, certified_couplings(scenario, "I", None, None, 1, spare=1)
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0])
+def test_the_table_of_faults_shows_what_the_rehearsal_gives(row, made):
+    fault, ends, cause, zero = row
+    shown = [re.search(r"[\d.]+", part)[0] for part in zero.split(";")]
+    names = CALLED.get(fault, (fault,))
+    outcomes = [rehearse_case(next(c for c in CASES if c.name == name), *made)[1] for name in names]
+    times = [f"{outcome.zero_force_ms:.1f}" for outcome in outcomes]
+    assert times == (shown if len(shown) == len(times) else shown * len(times))
+    for outcome in outcomes:
+        assert outcome.stage in ends
+    if fault not in IN_WORDS:
+        assert cause in outcomes[0].cause
+
+
+def test_the_table_of_faults_is_there():
+    assert len(ROWS) == 10
+
+
+def test_the_defaults_of_the_delay_are_those_of_the_page():
+    words = "It times 800 answers and takes the 99th percentile and 0.1 ms more"
+    assert words in PAGE
+    args = bridge._parser().parse_args([])
+    assert (float(args.quantile), float(args.guard)) == (0.99, 1e-4)
+    assert int(args.measure) == LinkSettings().measure == 800
+
+
+def test_the_garbage_collector_is_frozen_and_off_while_the_bridge_runs():
+    before, frozen = gc.isenabled(), gc.get_freeze_count()
+    with _no_collections():
+        assert not gc.isenabled()
+        assert gc.get_freeze_count() > frozen + 1000
+    assert gc.isenabled() == before
+    assert gc.get_freeze_count() <= frozen
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_serial_port_asks_its_driver_for_low_latency(known, monkeypatch):
+    """A driver that does not know it is no error."""
+    asked = []
+
+    class Serial:
+        def __init__(self, path, baud, **options):
+            self.path = path
+
+        def set_low_latency_mode(self, on):
+            asked.append((self.path, on))
+            if not known:
+                raise ValueError("not supported")
+
+        def fileno(self):
+            return 7
+
+    monkeypatch.setitem(sys.modules, "serial", SimpleNamespace(Serial=Serial, SerialException=OSError))
+    assert SerialPort("/dev/ttyUSB0", 921_600).fileno() == 7
+    assert asked == [("/dev/ttyUSB0", True)]
