@@ -15,9 +15,9 @@ from sim.run import Simulation, assemble
 from sim.scenario import InputError, require_even_ticks, require_linear
 from sim.stepping import NEUTRAL, default_substeps, step_radius
 
-MOST_STEPS = 3_000_000  # of a row: a minute or two
-HEADS = ("setting", "position", "growth", "verdict", "cycle N", "Hz", "real")
-LEGEND = (
+_MOST_STEPS = 3_000_000  # of a row: a minute or two
+_HEADS = ("setting", "position", "growth", "verdict", "cycle N", "Hz", "real")
+_LEGEND = (
     "position: relative rms error; growth: error [1/s], the larger of the loop with and without the coupling",
     "cycle: standard deviation [N] and frequency of the limit cycle without coupling, once it is sustained",
     "real: simulated seconds per second; * nothing of the same kind is both faster and nearer",
@@ -39,8 +39,8 @@ def main(argv: list[str]) -> int:
     coupled, uncoupled = assemble(scenario, chosen.coupling, lag), assemble(scenario, NoCoupling())
     default = max(default_substeps(loop, "RK4") for loop in (coupled, uncoupled))
 
-    if scenario.samples * default > MOST_STEPS:
-        longest = MOST_STEPS // default * scenario.T
+    if scenario.samples * default > _MOST_STEPS:
+        longest = _MOST_STEPS // default * scenario.T
         raise InputError(f"--duration: RK4 needs {default} steps a tick here; allowed are up to {longest:.3g} s")
     rows, skipped, interrupted = _rows(coupled, uncoupled, default)
     mark_front(rows)
@@ -55,8 +55,8 @@ def main(argv: list[str]) -> int:
         "interrupted": interrupted,
     }
     title = f"speed against error · {scenario.title(args.case)}, {chosen.kind}"
-    table = render.grid(title, HEADS, map(_cells, rows))
-    lines = [*(f"not measured: {reason}" for reason in skipped), *LEGEND]
+    table = render.grid(title, _HEADS, map(_cells, rows))
+    lines = [*(f"not measured: {reason}" for reason in skipped), *_LEGEND]
     render.publish(args, outcome, [table], lines, out, _picture(args, rows, out))
     if interrupted:
         return options.INTERRUPTED

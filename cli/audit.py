@@ -25,7 +25,7 @@ from sim.couplings import check_stored, fitted, read_coupling
 from sim.report import encoder_steps
 from sim.scenario import InputError, Scenario
 
-EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
+_EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
   python -m design.audit --rigid --K 5000 --B 0 --T 1e-3 --theta 0 --delta 1.37
   python -m design.audit --case I --K 879,552 --B 0.39,0.52 --jitter 1,2
   python -m design.audit --device falcon --delta 0.5
@@ -70,7 +70,7 @@ def main(argv: list[str]) -> int:
 
 def _parser() -> options.Parser:
     what = "Say whether a coupling is safe for every passive human, and how far."
-    parser = options.Parser("design.audit", what, EXAMPLE)
+    parser = options.Parser("design.audit", what, _EXAMPLE)
     coupling = parser.add_argument_group("the coupling")
     stiffness = options.several(float, 1e-3, 1e9, "N/m")  # far from overflow, and so is the damping
     coupling.add_argument("--K", type=stiffness, metavar="K,K,..", help="stiffness per channel [N/m]; one is for all")
@@ -111,19 +111,19 @@ def _with_device(args: argparse.Namespace) -> argparse.Namespace:
         found["source"] = f"K and B: {device.stiffness.source}; T: the 1 kHz that haptic loops customarily run at"
         largest = {"K": (device.stiffness.value,), "B": (device.framework_damping.value,)}
         given = {key: value for key, value in vars(args).items() if value is not None and value is not False}
-        found |= {key: value for key, value in (largest | FRAMEWORK_LOOP).items() if key not in given}
+        found |= {key: value for key, value in (largest | _FRAMEWORK_LOOP).items() if key not in given}
     return argparse.Namespace(**(vars(args) | found))
 
 
-FRAMEWORK_LOOP: dict[str, Any] = {"T": 1e-3, "theta": (0,), "rigid": True}
+_FRAMEWORK_LOOP: dict[str, Any] = {"T": 1e-3, "theta": (0,), "rigid": True}
 
-UNITS = {"damping": 1.0, "mass": 1e3, "force_limit": 1.0, "encoder_step": 1e6, "friction": 1.0, "stiffness": 1.0}
+_UNITS = {"damping": 1.0, "mass": 1e3, "force_limit": 1.0, "encoder_step": 1e6, "friction": 1.0, "stiffness": 1.0}
 
 
 def _device_part(device: Listed) -> dict[str, Any]:
     """What is known of a device, each number with its source; null is what nobody publishes."""
     part: dict[str, Any] = {"title": device.title}
-    for name in (*UNITS, "framework_damping"):
+    for name in (*_UNITS, "framework_damping"):
         fact = getattr(device, name)
         if name == "damping" and fact:
             part[name] = {"least": fact[0].value, "most": fact[1].value, "source": fact[0].source}
@@ -143,10 +143,10 @@ def _list_devices(args: argparse.Namespace) -> int:
         if fact is None:
             return "unknown"
         value = fact["least"] if field == "damping" else fact["value"]
-        return f"{value * UNITS[field]:g}[{numbered[fact['source']]}]"
+        return f"{value * _UNITS[field]:g}[{numbered[fact['source']]}]"
 
     heads = ("device", "N s/m", "g", "N", "um", "N", "N/m")
-    rows = [(name, *(cell(part, field) for field in UNITS)) for name, part in parts.items()]
+    rows = [(name, *(cell(part, field) for field in _UNITS)) for name, part in parts.items()]
     title = "damping, mass, force, encoder step, Coulomb friction, and the stiffness that CHAI3D allows"
     lines = [f"[{i}] {source}" for source, i in numbered.items()]
     lines.append("What is unknown is given beside `device` in a scenario, or with --delta: hw.identify measures it.")
@@ -209,7 +209,7 @@ def _notes(args: argparse.Namespace, scenario: Scenario, switching: DelayRange |
 def _tables(outcome: dict[str, Any]) -> list[Table]:
     parts = [outcome[condition] for condition in render.ORDER]
     table = Table("", *render.ORDER, title=_verdict(outcome), title_justify="left")
-    for name, cell in ROWS.items():
+    for name, cell in _ROWS.items():
         table.add_row(name, *(cell(part) for part in parts))
     if not outcome["set"]:
         return [table]
@@ -249,7 +249,7 @@ def _stiffest(K: Sequence[float | None]) -> str:
 
 
 #: name of a row -> what stands in it, given the part of a condition
-ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
+_ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "needs damping": _needs,
     "margin": lambda part: render.optional(part["margin"], "{:.5g}"),
     "binds at": lambda part: render.optional(part["binding_frequency_hz"], "{:.5g} Hz"),

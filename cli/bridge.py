@@ -52,7 +52,7 @@ from sim.couplings import NAMES
 from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 from sim.trace import format_growth
 
-LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
+_LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
 
 
 def main(argv: list[str]) -> int:
@@ -62,7 +62,7 @@ def main(argv: list[str]) -> int:
     require_linear(scenario, "hw.bridge")
     require_constant_delay(scenario, "hw.bridge")
     require_even_ticks(scenario, "hw.bridge")
-    seconds = number(args, "duration", 0.1, LONGEST, scenario.duration)
+    seconds = number(args, "duration", 0.1, _LONGEST, scenario.duration)
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
     at_once = args.latch == "arrival" or host_clocked(args)  # a host that is the clock writes a force when it has it

@@ -32,7 +32,7 @@ from sim.baselines import PAIRS, SECONDS, SLOW, Rival, rivals
 from sim.couplings import NAMES, Chosen, choose
 from sim.scenario import InputError, Scenario, require_even_ticks
 
-MOST = 6  # curves that can be told apart in one panel
+_MOST = 6  # curves that can be told apart in one panel
 
 
 def main(argv: list[str]) -> int:
@@ -85,7 +85,7 @@ def _beside(text: str) -> tuple[str, ...]:
 
 
 #: options -> the modes that take them
-MODES = {
+_MODES = {
     "coupling": ("",),
     "condition": ("",),
     "no_plot": ("", "--over", "--baselines"),
@@ -104,7 +104,7 @@ def _check_mode(args: argparse.Namespace, parser: options.Parser) -> None:
         raise InputError(f"--ladder shows both cases: leave out --case {args.case}")
     if mode and args.case == "none":
         raise InputError("--case none has no coupling to design: give I or II")
-    for name, modes in MODES.items():
+    for name, modes in _MODES.items():
         if mode not in modes and getattr(args, name) != parser.get_default(name):
             takes = (
                 f"for --over, not for {mode}"
@@ -141,8 +141,8 @@ def _names(args: argparse.Namespace) -> list[str]:
         raise InputError(f"--coupling is {args.coupling!r}, expected names separated by commas")
     if len(set(names)) < len(names):
         raise InputError(f"--coupling is {args.coupling!r}: a name stands there twice")
-    if len(names) > MOST:
-        raise InputError(f"--coupling has {len(names)} entries, allowed are 1 to {MOST}")
+    if len(names) > _MOST:
+        raise InputError(f"--coupling has {len(names)} entries, allowed are 1 to {_MOST}")
     return names
 
 

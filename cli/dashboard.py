@@ -18,12 +18,12 @@ from rich.table import Table
 from cli.render import Screen
 from hw.session import Session
 
-WIDTH = 72  # columns
-BAR = 30  # characters of a bar
-COUNTED = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale")
+_WIDTH = 72  # columns
+_BAR = 30  # characters of a bar
+_COUNTED = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale")
 
 
-def snapshot(session: Session) -> dict[str, Any]:
+def _snapshot(session: Session) -> dict[str, Any]:
     """What the view shows, as plain data."""
     drive = session.drive
     return {
@@ -35,18 +35,18 @@ def snapshot(session: Session) -> dict[str, Any]:
         "gain": session.gain,
         "theta": session.config.theta if session.config else None,
         "margin_us": session.link.least_margin,
-        "counters": {name: getattr(session.counters, name) for name in COUNTED}
+        "counters": {name: getattr(session.counters, name) for name in _COUNTED}
         | {"host_errors": session.decoder.rejected},
     }
 
 
-def view(data: dict[str, Any], width: int = WIDTH) -> Table:
+def view(data: dict[str, Any], width: int = _WIDTH) -> Table:
     """One snapshot as a table, in a terminal of `width` columns."""
-    table = Table(title=f"{data['stage']}: {data['cause']}", width=min(width, WIDTH), show_header=False)
-    table.add_column("what", width=16 if width >= WIDTH else 7)
+    table = Table(title=f"{data['stage']}: {data['cause']}", width=min(width, _WIDTH), show_header=False)
+    table.add_column("what", width=16 if width >= _WIDTH else 7)
     table.add_column("now")
     for i, (x, f, cap) in enumerate(zip(data["x_mm"], data["f"], data["cap"], strict=False), start=1):
-        table.add_row(f"axis {i}", f"{x:+8.3f} mm  {f:+7.3f} N  {_bar(f / cap) if width >= WIDTH else ''}")
+        table.add_row(f"axis {i}", f"{x:+8.3f} mm  {f:+7.3f} N  {_bar(f / cap) if width >= _WIDTH else ''}")
     margin = "-" if data["margin_us"] is None else f"at least {data['margin_us']} us in the last ticks"
     table.add_row("margin", f"{margin}; theta = {data['theta']}, gain {data['gain']:.2f}")
     table.add_row("counted", ", ".join(f"{name} {n}" for name, n in data["counters"].items()))
@@ -56,7 +56,7 @@ def view(data: dict[str, Any], width: int = WIDTH) -> Table:
 
 def _bar(part: float) -> str:
     """A force between its limits: the bar grows from the middle."""
-    half = BAR // 2
+    half = _BAR // 2
     n = round(min(1.0, abs(part)) * half)
     return ("█" * n).rjust(half) + "│" + " " * half if part < 0 else " " * half + "│" + ("█" * n).ljust(half)
 
@@ -75,7 +75,7 @@ class Dashboard:
     def __call__(self, session: Session) -> None:
         """Show the session as it is now; a view that does not keep up misses a picture."""
         with suppress(OSError):
-            os.write(self._pipe, (json.dumps(snapshot(session)) + "\n").encode())
+            os.write(self._pipe, (json.dumps(_snapshot(session)) + "\n").encode())
 
     def close(self) -> None:
         """Leave the last picture on the screen."""

@@ -159,7 +159,7 @@ def _number_or_none(text: str) -> float | str:
 
 
 #: options of a design -> the couplings that take them
-OPTIONS = {
+_OPTIONS = {
     "limiter": ("spring-damper", "optimal"),
     "order": ("ccl",),
     "method": ("ccl",),
@@ -210,13 +210,13 @@ def _for_switching(args: argparse.Namespace) -> bool:
 
 def _asked(args: argparse.Namespace, loop: Loop) -> dict[str, Any]:
     """The arguments of the design's own function. Raises InputError for options of another coupling."""
-    given = {name: getattr(args, name) for name in OPTIONS}
+    given = {name: getattr(args, name) for name in _OPTIONS}
     given = {name: value for name, value in given.items() if value is not None and value is not False}
     if args.coupling == "spring-damper" and args.limiter is not None:
         given["limiter"] = args.limiter
     for name in given:
-        if args.coupling not in OPTIONS[name]:
-            allowed = " or ".join(OPTIONS[name])
+        if args.coupling not in _OPTIONS[name]:
+            allowed = " or ".join(_OPTIONS[name])
             shown = name.removesuffix("_hz").replace("_", "-")
             raise InputError(f"--{shown} is for --coupling {allowed}, not {args.coupling}")
     if args.coupling == "optimal":
@@ -245,15 +245,15 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
 # What was designed: its figures, its file.
 
 
-MOST_FOR_A_BOUND = 2  # devices: for more the bound takes minutes
+_MOST_FOR_A_BOUND = 2  # devices: for more the bound takes minutes
 
 
 def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[str, Any]:
     """What an optimal coupling is reported with: how it was found, and how it stands to what is possible."""
     price = None if loop.box else spread(loop, Options(**optimal_options(args)[0]))
     limit: dict[str, Any] = {"rms_mismatch_db": None}
-    if loop.channels > MOST_FOR_A_BOUND:
-        limit["reason"] = f"worked out for up to {MOST_FOR_A_BOUND} devices"
+    if loop.channels > _MOST_FOR_A_BOUND:
+        limit["reason"] = f"worked out for up to {_MOST_FOR_A_BOUND} devices"
     elif best.objective == 0:
         limit["reason"] = "the mismatch is zero: there is nothing to bound"
     else:
@@ -377,7 +377,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("guarantee", outcome["promise"] or "none"),
         ("guarantee, forces", outcome["limiter"]["words"]),
         ("guarantee, delays", switching["promise"] if switching.get("proof") else None),
-        ("designed for", f"{OBJECTIVE_WORDS[outcome['objective_name']]}: {outcome['objective']:.5g}"),
+        ("designed for", f"{_OBJECTIVE_WORDS[outcome['objective_name']]}: {outcome['objective']:.5g}"),
         ("transparency error", render.transparency_error(transparent)),
         *_robustness_rows(outcome["robustness"]),
         *_best_rows(outcome),
@@ -388,7 +388,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
 
 
 #: what a design minimised or maximised -> in words
-OBJECTIVE_WORDS = {
+_OBJECTIVE_WORDS = {
     "loop-norm": "the least norm of W1 L W2, (23) of the paper",
     "rms": "the least rms transparency error, a ratio",
     "sup": "the least largest transparency error, a ratio",

@@ -34,7 +34,7 @@ from design.stored import Stored
 from sim.couplings import read_coupling
 from sim.scenario import InputError
 
-SUFFIX = {"c": ".c", "json": ".json", "npz": ".npz", "control": ".py"}
+_SUFFIX = {"c": ".c", "json": ".json", "npz": ".npz", "control": ".py"}
 
 
 def main(argv: list[str]) -> int:
@@ -76,7 +76,7 @@ def _parser() -> options.Parser:
         "python -m design.export coupling.json --process --format c",
     )
     parser.add_argument("coupling", metavar="FILE.json", help="the stored coupling, which names its loop")
-    parser.add_argument("--format", choices=tuple(SUFFIX), default="c", help="(default c)")
+    parser.add_argument("--format", choices=tuple(_SUFFIX), default="c", help="(default c)")
     parser.add_argument("--process", action="store_true", help="coupling, environment and delays as one block (6)")
     link = "leave out Theta, where the link to the devices is that delay"
     parser.add_argument("--without-theta", action="store_true", help=link)
@@ -133,7 +133,7 @@ def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
 
 
 def _destination(args: argparse.Namespace, block: Block) -> Path:
-    return out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}{SUFFIX[args.format]}")
+    return out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}{_SUFFIX[args.format]}")
 
 
 def _content(kind: str, block: Block, test: Trial, file: str) -> Any:

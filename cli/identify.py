@@ -39,7 +39,7 @@ from hw.session import Session, session_for
 from models.device import RigidDevice
 from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
-LIMITS = (
+_LIMITS = (
     "The bound is a statement about this record: the least viscous friction of all laws that fit it, less its scatter "
     "between parts of the record (95 %) and a part for what is left unexplained. It does not see friction that changes "
     "with temperature or wear, nor that of a handle behind its transmission apart from the motor's. A hand that rests "
@@ -115,7 +115,7 @@ def _identified(
     estimates = capped(estimates, scenario, session)
     report["axes"] = [asdict(e) for e in estimates]
     report["bounded"] = bool(estimates) and all(e.delta > 0 for e in estimates) and not warnings
-    report["limits"] = LIMITS
+    report["limits"] = _LIMITS
     return report, estimates
 
 
@@ -170,5 +170,5 @@ def _print(report: dict[str, Any], console: Console) -> None:
         console.print(f"nothing was identified: {report['reason']}")
     for warning in report["warnings"]:
         console.print(f"[yellow]{warning}[/]")
-    console.print(f"[dim]·[/] {LIMITS}")
+    console.print(f"[dim]·[/] {_LIMITS}")
     console.print("files: " + ", ".join(report["files"]), soft_wrap=True)

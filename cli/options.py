@@ -35,8 +35,8 @@ from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load, l
 
 DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 
-Number = TypeVar("Number", int, float)
-OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # of the types below
+_Number = TypeVar("_Number", int, float)
+_OWN_WORDS = re.compile(r"argument ([\w-]+): ((?:is|has) .*)", re.DOTALL)  # of the types below
 
 
 class Parser(argparse.ArgumentParser):
@@ -60,7 +60,7 @@ class Parser(argparse.ArgumentParser):
         return found, rest
 
     def error(self, message: str) -> NoReturn:
-        own = OWN_WORDS.fullmatch(message)
+        own = _OWN_WORDS.fullmatch(message)
         raise InputError(f"{own[1]} {own[2]}" if own else f"{message} (--help lists the options)")
 
 
@@ -79,11 +79,11 @@ def whole(least: float = -math.inf, most: float = math.inf) -> Callable[[str], i
 
 
 def several(
-    kind: Callable[[str], Number], least: float = -math.inf, most: float = math.inf, unit: str = ""
-) -> Callable[[str], tuple[Number, ...]]:
+    kind: Callable[[str], _Number], least: float = -math.inf, most: float = math.inf, unit: str = ""
+) -> Callable[[str], tuple[_Number, ...]]:
     """Numbers within these limits, separated by commas; `per_channel` makes them one for each channel."""
 
-    def read(text: str) -> tuple[Number, ...]:
+    def read(text: str) -> tuple[_Number, ...]:
         try:
             values = tuple(kind(part) for part in text.split(","))
         except ValueError:
@@ -103,7 +103,7 @@ def pair(text: str) -> tuple[float, float]:
     return first, second
 
 
-def band_of(text: str) -> tuple[float, float]:
+def _band_of(text: str) -> tuple[float, float]:
     """Two rising frequencies [Hz]."""
     low, high = pair(text)
     if not 0 < low < high < math.inf:
@@ -132,7 +132,7 @@ def delay_ranges(text: str) -> tuple[tuple[int, int], ...]:
         raise argparse.ArgumentTypeError(f"is {text!r}, expected {expected}") from None
 
 
-def latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
+def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
     """'130e-6' as 0 to 0.13 ms, '100e-6:130e-6' as a range of its own; one for all, or one per channel [s]."""
     try:
         parts = [[float(word) for word in part.split(":")] for part in text.split(",")]
@@ -151,8 +151,8 @@ def condition(text: str) -> str:
     return name
 
 
-def _one(kind: Callable[[str], Number], least: float, most: float, unit: str) -> Callable[[str], Number]:
-    def read(text: str) -> Number:
+def _one(kind: Callable[[str], _Number], least: float, most: float, unit: str) -> Callable[[str], _Number]:
+    def read(text: str) -> _Number:
         try:
             value = kind(text)
         except ValueError:
@@ -163,7 +163,7 @@ def _one(kind: Callable[[str], Number], least: float, most: float, unit: str) ->
     return read
 
 
-def _within(value: Number, least: float, most: float, unit: str) -> Number:
+def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
     if least <= value <= most:  # False for nan
         return value
     shown, low, high = (str(n) if isinstance(n, int) else f"{n:g}" for n in (value, least, most))
@@ -171,7 +171,7 @@ def _within(value: Number, least: float, most: float, unit: str) -> Number:
     raise argparse.ArgumentTypeError(f"is {shown}, allowed are {span}{unit and f' {unit}'}")
 
 
-def per_channel(option: str, values: tuple[Number, ...], channels: int) -> tuple[Number, ...]:
+def per_channel(option: str, values: tuple[_Number, ...], channels: int) -> tuple[_Number, ...]:
     """One value for each channel; a single one serves all. Raises InputError."""
     values = values * channels if len(values) == 1 else values
     if len(values) != channels:
@@ -190,7 +190,7 @@ def ranges_per_channel(
     return lo, hi
 
 
-def numbers(option: str, text: str, kind: Callable[[str], Number], count: int) -> tuple[Number, ...]:
+def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) -> tuple[_Number, ...]:
     """Numbers that stand within a longer text, a single one for all. Raises InputError with `option` in front."""
     try:
         if count == 1 and "," not in text:
@@ -219,7 +219,7 @@ def add_loop_options(parser: argparse.ArgumentParser) -> None:
     longest = "longest period [s], where it varies from tick to tick: certificates then are for any up to it"
     loop.add_argument("--T-max", type=number(), metavar="SECONDS", help=longest)
     late = "how late after a tick forces latch [s], less than T: at most S, or LO:HI; one is for all"
-    loop.add_argument("--latency", type=latency_ranges, metavar="S", help=late)
+    loop.add_argument("--latency", type=_latency_ranges, metavar="S", help=late)
 
 
 def scenario_from(args: argparse.Namespace) -> Scenario:
@@ -239,7 +239,7 @@ def scenario_from(args: argparse.Namespace) -> Scenario:
 def add_band_option(parser: argparse._ActionsContainer) -> None:
     """--band."""
     band = "frequencies over which the transparency error counts [Hz] (default 0.5,80)"
-    parser.add_argument("--band", dest="band_hz", type=band_of, metavar="LOW,HIGH", help=band)
+    parser.add_argument("--band", dest="band_hz", type=_band_of, metavar="LOW,HIGH", help=band)
 
 
 def add_human_option(parser: argparse.ArgumentParser, more: str = "") -> None:
@@ -367,7 +367,7 @@ def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 # Delays that vary.
 
 
-DRAWN = ("constant", "random", "bursty", "adversarial")
+_DRAWN = ("constant", "random", "bursty", "adversarial")
 
 
 def add_varying_delay_options(parser: argparse.ArgumentParser) -> None:
@@ -377,7 +377,7 @@ def add_varying_delay_options(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--period", metavar="MIN,MAX|FILE", help=periods)
     span = "range of the forces' delays [samples]; or LO-HI,LO-HI,.. per channel"
     group.add_argument("--jitter", type=delay_ranges, metavar="LO,HI", help=span)
-    pattern = f"{', '.join(DRAWN)} (default random), or a file of recorded delays, a row per tick"
+    pattern = f"{', '.join(_DRAWN)} (default random), or a file of recorded delays, a row per tick"
     group.add_argument("--pattern", metavar="NAME|FILE", help=pattern)
     loss = "probability that a force is lost and the last one held"
     group.add_argument("--loss", type=number(), metavar="P", help=loss)
@@ -435,7 +435,7 @@ def _periods(text: str) -> Periods:
 
 
 def _pattern(name: str, channels: int) -> dict[str, Any]:
-    if name in DRAWN:
+    if name in _DRAWN:
         return {"pattern": name, "recorded": ()}
     rows = _recorded(name, channels)
     arrived = [[n for n in column if n != LOST] or [0] for column in zip(*rows, strict=True)]
@@ -445,7 +445,7 @@ def _pattern(name: str, channels: int) -> dict[str, Any]:
 
 def _recorded(name: str, channels: int) -> tuple[tuple[int, ...], ...]:
     """Rows of delays, separated by commas or blanks; one column serves all channels; # begins a comment."""
-    text = read_text(name, f"--pattern {name}", f"; give a file or one of: {', '.join(DRAWN)}")
+    text = read_text(name, f"--pattern {name}", f"; give a file or one of: {', '.join(_DRAWN)}")
     rows = []
     for line_number, line in enumerate(text.splitlines(), start=1):
         words = line.split("#")[0].replace(",", " ").split()

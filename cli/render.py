@@ -29,11 +29,11 @@ from design.result import DesignFailed, listed
 # The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
 
 
-CUT = "…"  # what stands in a table for the end of a word that did not fit
-WIDEST = 400  # characters
-STEP = 2
-SHORT_NAME = 24  # characters of a row's name that are never broken
-OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # what opens no tag of our reports: a unit, a name
+_CUT = "…"  # what stands in a table for the end of a word that did not fit
+_WIDEST = 400  # characters
+_STEP = 2
+_SHORT_NAME = 24  # characters of a row's name that are never broken
+_OTHER_BRACKET = re.compile(r"\[(?!(?:red|green|yellow|dim|/)\])")  # what opens no tag of our reports: a unit, a name
 
 
 class Screen(Console):
@@ -53,7 +53,7 @@ class Screen(Console):
         how, text = how | {"emoji": False}, printable(text)
         if how.get("markup") is not False:
             try:
-                return super().render_str(OTHER_BRACKET.sub(r"\\[", text), **how)
+                return super().render_str(_OTHER_BRACKET.sub(r"\\[", text), **how)
             except MarkupError:  # one of our own tags, closed too often
                 how |= {"markup": False}
         return super().render_str(text, **how)
@@ -65,11 +65,11 @@ class Screen(Console):
 
     def _needed(self, table: Table) -> int:
         least = 4 * len(table.columns) + 1  # frames and padding, and one character for each column
-        for width in range(max(self.width, least), WIDEST, STEP):
+        for width in range(max(self.width, least), _WIDEST, _STEP):
             lines = self.render_lines(table, self.options.update(width=width), pad=False)
-            if not any(CUT in part.text for line in lines for part in line):
+            if not any(_CUT in part.text for line in lines for part in line):
                 return width
-        return WIDEST
+        return _WIDEST
 
 
 def console(args: argparse.Namespace) -> Screen:
@@ -77,7 +77,7 @@ def console(args: argparse.Namespace) -> Screen:
     return Screen(stderr=args.json == "-", highlight=False)
 
 
-Heard = Callable[[str, int, int], None]  # (what, steps done, of how many)
+_Heard = Callable[[str, int, int], None]  # (what, steps done, of how many)
 
 
 class Move(Protocol):
@@ -100,7 +100,7 @@ def progress(description: str) -> Iterator[Move]:
 
 
 @contextmanager
-def designing(loop: Loop | None = None, kind: str | None = None, condition: str | None = None) -> Iterator[Heard]:
+def designing(loop: Loop | None = None, kind: str | None = None, condition: str | None = None) -> Iterator[_Heard]:
     """The bar of a design: yields what `choose` and `design_by_kind` take as `progress`.
 
     Where the design of this `kind` (by default the spring-damper) fails for a `loop`, the error names what can be had.
@@ -157,11 +157,11 @@ def plain(report: Any) -> dict[str, Any]:
 # Tables.
 
 
-Rows = Iterable[tuple[str, str | None]]
-Form = str | Callable[[Any], str]
+_Rows = Iterable[tuple[str, str | None]]
+_Form = str | Callable[[Any], str]
 
 
-def facts(title: str, rows: Rows, heads: Sequence[str] = (), left: bool = False) -> Table:
+def facts(title: str, rows: _Rows, heads: Sequence[str] = (), left: bool = False) -> Table:
     """A table of names and texts; a text of None is left out."""
     table = Table(*heads, title=title, title_justify="left" if left else "center", show_header=bool(heads))
     for name, text in rows:
@@ -173,7 +173,7 @@ def facts(title: str, rows: Rows, heads: Sequence[str] = (), left: bool = False)
 def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: Sequence[int] = (0,)) -> Table:
     """A table of figures, to the right but for the columns `left`."""
     table, rows = Table(title=title), list(rows)
-    short = all(len(row[0]) <= SHORT_NAME for row in rows)
+    short = all(len(row[0]) <= _SHORT_NAME for row in rows)
     for i, head in enumerate(heads):
         how: Any = {"no_wrap": short, "overflow": "ellipsis" if short else "fold"} if i == 0 else {}
         table.add_column(head, justify="left" if i in left else "right", **how)
@@ -182,12 +182,12 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
     return table
 
 
-def figure(name: str, form: Form = "{}", default: Any = MISSING) -> Any:
+def figure(name: str, form: _Form = "{}", default: Any = MISSING) -> Any:
     """A field of a report that its table shows under this name, in this format."""
     return field(default=default, metadata={"name": name, "form": form})
 
 
-def rows_of(report: Any) -> Rows:
+def rows_of(report: Any) -> _Rows:
     """The figures of a dataclass as rows; those that are None are left out."""
     for one in _figures(report):
         value = getattr(report, one.name)
@@ -198,7 +198,7 @@ def _figures(report: Any) -> list[Any]:
     return [one for one in fields(report) if "form" in one.metadata]
 
 
-def _formed(value: Any, form: Form) -> str:
+def _formed(value: Any, form: _Form) -> str:
     return form(value) if callable(form) else form.format(value)
 
 
@@ -222,7 +222,7 @@ def needs(part: Mapping[str, Any], digits: int = 6) -> str:
     return f"{required} of {available} N s/m"
 
 
-def certificate_rows(certificates: Mapping[str, dict[str, Any]], digits: int = 6, proof: bool = True) -> Rows:
+def certificate_rows(certificates: Mapping[str, dict[str, Any]], digits: int = 6, proof: bool = True) -> _Rows:
     """What each condition needs, and whether that is proved exactly, where no other row says it."""
     for name, part in certificates.items():
         if name in ORDER:
@@ -265,7 +265,7 @@ def timing_row(part: Mapping[str, Any] | None) -> tuple[str, str | None]:
     return "ticks", "; ".join(words)
 
 
-def delay_rows(part: Mapping[str, Any]) -> Rows:
+def delay_rows(part: Mapping[str, Any]) -> _Rows:
     """Delays that vary, of a run or of a validation."""
     spans = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))
     played = ", played out at the largest" if part["playout"] else ""

@@ -27,9 +27,9 @@ from hw.session import Operator, Session
 from hw.transport import Live, SerialPort, Wire, preflight
 from sim.scenario import InputError, Scenario
 
-USUAL_BAUD = 921_600
-SPARE = 600.0  # [s] beside the run, after which an orphan of --emulate would end by itself
-PASSED_ON = ("case", "scenario", "theta", "psi", "lam", "delta", "T")
+_USUAL_BAUD = 921_600
+_SPARE = 600.0  # [s] beside the run, after which an orphan of --emulate would end by itself
+_PASSED_ON = ("case", "scenario", "theta", "psi", "lam", "delta", "T")
 
 
 def add_link_options(parser: argparse.ArgumentParser) -> None:
@@ -127,7 +127,7 @@ def _baud(args: argparse.Namespace) -> int | None:
     """
     if args.baud is None:
         pseudo = not args.port or host_clocked(args) or os.path.realpath(args.port).startswith("/dev/pts/")
-        return None if pseudo else USUAL_BAUD
+        return None if pseudo else _USUAL_BAUD
     if args.baud == "none":
         return None
     (baud,) = numbers("--baud", args.baud, int, 1)
@@ -165,7 +165,7 @@ def measured_link(args: argparse.Namespace, ages: Ages, T: float) -> int:
 
 
 @dataclass(frozen=True)
-class Held:
+class _Held:
     """What came to pass beside the session: signals, and bytes that the port would not take at once."""
 
     signals: Sequence[int] = ()
@@ -181,7 +181,7 @@ def hold_session(
     out: Path,
     nobody: bool = False,
     coulomb: float = 0.0,
-) -> Held:
+) -> _Held:
     """From opening the port, or starting an emulator, to the end of the session.
 
     An emulated device has `nobody` at its handles where that is asked for, and dry friction `coulomb` [N].
@@ -230,7 +230,7 @@ def hold_session(
             deadman,
         )
         live.run()
-    return Held(live.signals, live.dropped)
+    return _Held(live.signals, live.dropped)
 
 
 def _rehearsed(
@@ -242,7 +242,7 @@ def _rehearsed(
     incidents: IncidentLog,
     nobody: bool,
     coulomb: float,
-) -> Held:
+) -> _Held:
     """The session in virtual time; whoever would be there arms once, and holds the deadman."""
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
     try:
@@ -253,15 +253,15 @@ def _rehearsed(
     operator = Operator(True, seconds)
     Rehearsal(
         session, emulator, plan, faults, seed, operator=operator, keep=False, glance=incidents.glance
-    ).run_to_the_end(seconds + SPARE)
-    return Held()
+    ).run_to_the_end(seconds + _SPARE)
+    return _Held()
 
 
 def _emulator_options(args: argparse.Namespace, seed: int, seconds: float) -> list[str]:
     """The same loop, the faults of --fault, and an end."""
-    options = [f"--{name}={getattr(args, name)}" for name in PASSED_ON if getattr(args, name) is not None]
+    options = [f"--{name}={getattr(args, name)}" for name in _PASSED_ON if getattr(args, name) is not None]
     options += [f"--fault={fault}" for fault in args.fault]
-    return [*options, f"--seed={seed}", f"--pace={args.pace}", f"--duration={seconds + SPARE:g}"]
+    return [*options, f"--seed={seed}", f"--pace={args.pace}", f"--duration={seconds + _SPARE:g}"]
 
 
 def _view(stack: ExitStack) -> Callable[[Session], None]:

@@ -50,7 +50,7 @@ from sim.shards import validate
 from sim.stability import unstable
 from sim.uneven import HANDS, uneven_ticks
 
-INTRODUCTION = """\
+_INTRODUCTION = """\
 Several force-feedback devices share one simulated object; the loop of hands, devices, delays and computer must not
 start to oscillate by itself, whoever holds the devices. A *coupling* is the filter between devices and object that
 ensures this; it is *certified* when the devices have more damping than a proved condition requires. This report puts
@@ -67,10 +67,10 @@ never negative. An uncertified loop may be unstable; it holds as long as the eng
 # Checks of our own: what they measure, row by row.
 
 
-Row = dict[str, Any]
+_Row = dict[str, Any]
 
 
-def hard_loops(seed: int) -> Iterator[Row]:
+def hard_loops(seed: int) -> Iterator[_Row]:
     """Numerically hard loops, each with a setting that fails and the one that holds."""
     for case in cases():
         yield asdict(measure(case))
@@ -83,7 +83,7 @@ def shortages(couplings: Sequence[str], short: Sequence[float], generations: int
     the condition is tight; with the damping that is required it must never succeed.
     """
 
-    def rows(seed: int) -> Iterator[Row]:
+    def rows(seed: int) -> Iterator[_Row]:
         scenario = load().replace(**changes)
         for name in couplings:
             coupling = NoCoupling() if name == "none" else choose(scenario, "I", name).coupling
@@ -95,7 +95,7 @@ def shortages(couplings: Sequence[str], short: Sequence[float], generations: int
     return rows
 
 
-def _shortage(attempt: Attempt) -> Row:
+def _shortage(attempt: Attempt) -> _Row:
     worst = attempt.worst
     return {
         "loop": attempt.name,
@@ -109,28 +109,28 @@ def _shortage(attempt: Attempt) -> Row:
     }
 
 
-def rates(rows: Sequence[Row]) -> list[Row]:
+def rates(rows: Sequence[_Row]) -> list[_Row]:
     """Share of the loops that the adversary destabilises, by shortage."""
     parts = {short: [row["found"] for row in rows if row["short"] == short] for short in {r["short"] for r in rows}}
     return [{"short": s, "attempts": len(found), "rate": sum(found) / len(found)} for s, found in sorted(parts.items())]
 
 
-def edges(seed: int) -> Iterator[Row]:
+def edges(seed: int) -> Iterator[_Row]:
     """Guarantees beyond the linear loop, at 1.02 times what they ask for and at far too little."""
     for row in challenges(seed):
         yield asdict(row)
 
 
-def faults(seed: int) -> Iterator[Row]:
+def faults(seed: int) -> Iterator[_Row]:
     """Faults of a link, a device, a controller or a person, in virtual time."""
     for outcome in rehearse_faults():
         yield asdict(outcome) | {"holds": outcome.holds}
 
 
-Mark = Callable[[float], None]  # is told what share of the work is done
+_Mark = Callable[[float], None]  # is told what share of the work is done
 
 
-def long_session(mark: Mark, seconds: float = 3600.0) -> tuple[bool, str]:
+def long_session(mark: _Mark, seconds: float = 3600.0) -> tuple[bool, str]:
     """A session of the default loop in virtual time, armed for `seconds`; whether it ended as planned, and how."""
     scenario = load()
     made = certified_couplings(scenario, "I", None, None, 1, spare=0)
@@ -144,7 +144,7 @@ def long_session(mark: Mark, seconds: float = 3600.0) -> tuple[bool, str]:
     return ends, f"{session.stage} ({session.cause}) after {session.counters.states} ticks"
 
 
-def many_hands(mark: Mark, count: int = 100_000) -> tuple[bool, str]:
+def many_hands(mark: _Mark, count: int = 100_000) -> tuple[bool, str]:
     """Random hands on the default loop with its usual coupling, by eigenvalues; whether all are stable."""
     scenario = load()
     question = Validation(scenario, choose(scenario, "I", "spring-damper").coupling, 0, count, 1, "exact", 0.0)
@@ -153,17 +153,17 @@ def many_hands(mark: Mark, count: int = 100_000) -> tuple[bool, str]:
     return bad == 0 and found.index.size == count, f"{bad} of {found.index.size} unstable"
 
 
-Work = Callable[[Mark], tuple[bool, str]]
+_Work = Callable[[_Mark], tuple[bool, str]]
 
 #: what is done, and by how much its peak of memory may rise after a tenth of it [MiB]: a session keeps nothing of a
 #: tick, a crowd 128 bytes of a hand, twice while its batches are joined
-_LONG: tuple[tuple[str, Work, float], ...] = (
+_LONG: tuple[tuple[str, _Work, float], ...] = (
     ("an hour of a session", long_session, 8.0),
     ("100,000 hands", many_hands, 32.0),
 )
 
 
-def endurance(seed: int) -> Iterator[Row]:
+def endurance(seed: int) -> Iterator[_Row]:
     """Whether memory stays flat over an hour of a session and 100,000 hands, each in a process of its own."""
     context = multiprocessing.get_context("spawn")  # a fork would begin with the memory of all checks before
     for what, work, allowed in _LONG:
@@ -180,13 +180,13 @@ def endurance(seed: int) -> Iterator[Row]:
             worker.join()
 
 
-def _alone(work: Work, allowed: float, there: Connection) -> None:
+def _alone(work: _Work, allowed: float, there: Connection) -> None:
     """Of the process that does it: only the one that waits acts on Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     there.send(endure(work, allowed))
 
 
-def endure(work: Work, allowed: float) -> Row:
+def endure(work: _Work, allowed: float) -> _Row:
     """Do it, and look at this process's peak of memory after a tenth and at the end [MiB]."""
     peaks: list[float] = []
 
@@ -207,7 +207,7 @@ def _peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
-def uneven(seed: int) -> Iterator[Row]:
+def uneven(seed: int) -> Iterator[_Row]:
     """Periods that vary and forces that latch late, drawn and chosen by an enemy."""
     for row in uneven_ticks(seed):
         yield asdict(row) | {"holds": row.holds}
@@ -218,7 +218,7 @@ def uneven(seed: int) -> Iterator[Row]:
 
 
 @dataclass(frozen=True)
-class Part:
+class _Part:
     """A table of a check; `answer` is its gist, shown in the table of verdicts."""
 
     title: str
@@ -227,7 +227,7 @@ class Part:
     answer: str = ""
 
 
-def verdicts(report: dict[str, Any]) -> list[Part]:
+def verdicts(report: dict[str, Any]) -> list[_Part]:
     """Of sim.validate."""
     bad, worst, energy = report["unstable"], report["worst"], report.get("energy_audit")
     humans, adversary, traces = report["humans"], report.get("adversary"), report["traces"]
@@ -257,10 +257,10 @@ def verdicts(report: dict[str, Any]) -> list[Part]:
     if adversary:
         gist += f", adversary {'succeeds' if adversary['found'] else 'fails'}"
     gist += f", {report['disagreements']} disagreements"
-    return [Part("", ("figure", "value"), tuple(rows), gist)]
+    return [_Part("", ("figure", "value"), tuple(rows), gist)]
 
 
-def tightness(report: dict[str, Any]) -> list[Part]:
+def tightness(report: dict[str, Any]) -> list[_Part]:
     """Of loops that lack damping."""
     found = rates(report["rows"])
     rows = tuple((f"{r['short']:.1%}", str(r["attempts"]), f"{r['rate']:.0%}") for r in found)
@@ -273,12 +273,12 @@ def tightness(report: dict[str, Any]) -> list[Part]:
         for r in report["rows"]
     )
     return [
-        Part("Success rate of the adversary", ("damping missing", "loops", "destabilised"), rows, gist),
-        Part("Each loop", ("loop", "damping missing", "destabilised by", "growth [1/s], first found"), single),
+        _Part("Success rate of the adversary", ("damping missing", "loops", "destabilised"), rows, gist),
+        _Part("Each loop", ("loop", "damping missing", "destabilised by", "growth [1/s], first found"), single),
     ]
 
 
-def accuracy(report: dict[str, Any]) -> list[Part]:
+def accuracy(report: dict[str, Any]) -> list[_Part]:
     """Of sim.accuracy."""
     default = report["default_substeps"]
     rows = []
@@ -292,10 +292,10 @@ def accuracy(report: dict[str, Any]) -> list[Part]:
     ours = next((r for r in report["rows"] if (r["integrator"], r["substeps"]) == ("RK4", default)), None)
     gist = f"default RK4 x {default}: growth off by {ours['growth_rate_error']:+.0e} 1/s" if ours else ""
     columns = ("setting", "position error, relative rms", "growth error [1/s]", "verdict", "times real time")
-    return [Part("", columns, tuple(rows), gist)]
+    return [_Part("", columns, tuple(rows), gist)]
 
 
-def gain_map(report: dict[str, Any]) -> list[Part]:
+def _gain_map(report: dict[str, Any]) -> list[_Part]:
     """Of sim.zwidth."""
     cells = len(report["grid"]["K"]) * len(report["grid"]["B"])
     population, simulation = report["population"], report["simulation"]
@@ -313,10 +313,10 @@ def gain_map(report: dict[str, Any]) -> list[Part]:
     edge = max(report["error"][name]["edge_relative_in_K"] for name in render.ORDER)
     rows.append(("edge of the map, error in K", f"{edge:.0e}"))
     contradicted = sum(report[name]["contradicted_cells"] for name in render.ORDER)
-    return [Part("", ("figure", "value"), tuple(rows), f"{contradicted} certified cells that a hand destabilises")]
+    return [_Part("", ("figure", "value"), tuple(rows), f"{contradicted} certified cells that a hand destabilises")]
 
 
-def hard(report: dict[str, Any]) -> list[Part]:
+def hard(report: dict[str, Any]) -> list[_Part]:
     """Of hard loops."""
     rows = tuple(
         (
@@ -330,10 +330,10 @@ def hard(report: dict[str, Any]) -> list[Part]:
     )
     good = sum(row["holds"] for row in report["rows"])
     columns = ("loop", "exact growth [1/s]", "fails", "holds", "growth error [1/s]")
-    return [Part("", columns, rows, f"{good} of {len(rows)} verdicts right under the substep rule")]
+    return [_Part("", columns, rows, f"{good} of {len(rows)} verdicts right under the substep rule")]
 
 
-def _failing(row: Row) -> str:
+def _failing(row: _Row) -> str:
     """The setting that fails, how and by how much."""
     if not row["fails"]:
         return "none tried"
@@ -341,7 +341,7 @@ def _failing(row: Row) -> str:
     return f"{' x '.join(map(str, row['fails']))}: {row['fault'] or '-'}{off}"
 
 
-def guarantees(report: dict[str, Any]) -> list[Part]:
+def guarantees(report: dict[str, Any]) -> list[_Part]:
     """Of guarantees at their edge: a row for each and each share of what it asks."""
     rows, taken = [], []
     for name, factor in dict.fromkeys((row["guarantee"], row["factor"]) for row in report["rows"]):
@@ -355,10 +355,10 @@ def guarantees(report: dict[str, Any]) -> list[Part]:
         if factor >= 1:
             taken.append(took + grew)
     columns = ("guarantee", "times what it asks", "motions that took energy", "hands that grew", "limited", "least J")
-    return [Part("", columns, tuple(rows), f"{sum(taken)} violations at 1.02 times what {len(taken)} guarantees ask")]
+    return [_Part("", columns, tuple(rows), f"{sum(taken)} violations at 1.02 times what {len(taken)} guarantees ask")]
 
 
-def fault_table(report: dict[str, Any]) -> list[Part]:
+def _fault_table(report: dict[str, Any]) -> list[_Part]:
     """Of faults."""
     rows = []
     for row in report["rows"]:
@@ -366,10 +366,10 @@ def fault_table(report: dict[str, Any]) -> list[Part]:
         rows.append((row["fault"], row["stage"], "; ".join(row["wrong"]) or row["cause"], zero, allowed))
     good = sum(row["holds"] for row in report["rows"])
     columns = ("fault", "ends in", "cause", "zero force after", "allowed")
-    return [Part("", columns, tuple(rows), f"{good} of {len(rows)} faults end as they must")]
+    return [_Part("", columns, tuple(rows), f"{good} of {len(rows)} faults end as they must")]
 
 
-def memory_table(report: dict[str, Any]) -> list[Part]:
+def memory_table(report: dict[str, Any]) -> list[_Part]:
     """Of work that goes on for long."""
     rows = [
         (row["what"], row["result"], *(render.optional(row[n], "{:.0f} MiB") for n in ("tenth_mib", "end_mib")))
@@ -377,10 +377,10 @@ def memory_table(report: dict[str, Any]) -> list[Part]:
     ]
     good = sum(row["holds"] for row in report["rows"])
     columns = ("work", "result", "peak after a tenth", "peak at the end")
-    return [Part("", columns, tuple(rows), f"{good} of {len(rows)} end as they must, with flat memory")]
+    return [_Part("", columns, tuple(rows), f"{good} of {len(rows)} end as they must, with flat memory")]
 
 
-def uneven_table(report: dict[str, Any]) -> list[Part]:
+def _uneven_table(report: dict[str, Any]) -> list[_Part]:
     """Of uneven ticks."""
     rows = tuple(
         (
@@ -397,10 +397,10 @@ def uneven_table(report: dict[str, Any]) -> list[Part]:
     below = f"hands grow in {found} of them" if found else "no hand was found that grows"
     gist = f"no hand gains energy in {good} of {len(rows)} runs at 1.02 times the requirement; at half of it {below}"
     columns = ("loop", "ticks", "needs", "most energy, of the start's", "balance below 0", "grow with half")
-    return [Part("", columns, rows, gist)]
+    return [_Part("", columns, rows, gist)]
 
 
-def _by_whom(row: Row) -> str:
+def _by_whom(row: _Row) -> str:
     if not row["found"]:
         return "no human"
     return "one person" if row["held_together"] else "one hand each"
@@ -431,8 +431,8 @@ class Check:
 
     name: str  # of its folder, too
     asks: str
-    answer: str | Callable[[int], Iterator[Row]]  # a command ({humans}, {seed} are filled in), or rows by the seed
-    figures: Callable[[dict[str, Any]], list[Part]]
+    answer: str | Callable[[int], Iterator[_Row]]  # a command ({humans}, {seed} are filled in), or rows by the seed
+    figures: Callable[[dict[str, Any]], list[_Part]]
     picture: str | None = None  # of rows: the function of sim.plots that draws them
 
     def command(self, humans: int, seed: int) -> str:
@@ -461,25 +461,25 @@ CHECKS = (
     _meets("three", "Three people, rigid devices, unequal delays", "--scenario three-rigid --case I"),
     Check("tightness", "How tight is the condition?", _SHORT, tightness, "plot_tightness"),
     Check("delayed", "How tight is it with long delays?", _DELAYED, tightness, "plot_tightness"),
-    Check("map", "Which springs and dampers may a device render against a wall?", _MAP, gain_map),
+    Check("map", "Which springs and dampers may a device render against a wall?", _MAP, _gain_map),
     Check("accuracy", "Is MuJoCo right, and at what cost?", "sim.accuracy --duration 6", accuracy),
     Check("hard", "Numerically hard loops", hard_loops, hard),
-    Check("uneven", "Do uneven periods and late forces keep the guarantee?", uneven, uneven_table),
+    Check("uneven", "Do uneven periods and late forces keep the guarantee?", uneven, _uneven_table),
     Check("guarantees", "Do limits, budgets, walls and friction hold at what they ask?", edges, guarantees),
-    Check("faults", "Does every fault of a link end as it must?", faults, fault_table),
+    Check("faults", "Does every fault of a link end as it must?", faults, _fault_table),
     Check("endurance", "Does memory stay flat over an hour and 100,000 hands?", endurance, memory_table),
 )
 
 
 @dataclass(frozen=True)
-class Answer:
+class _Answer:
     """What a check found. Its files are in the folder of its name."""
 
     check: Check
     command: str
     code: int | None  # the command's exit code; None where it broke off with `trouble`
     wall_s: float
-    parts: tuple[Part, ...] = ()
+    parts: tuple[_Part, ...] = ()
     pictures: tuple[str, ...] = ()  # paths from the report's folder
     trouble: str | None = None
     report: dict[str, Any] = field(default_factory=dict)
@@ -489,7 +489,7 @@ class Answer:
         return self.code == options.DONE
 
 
-def ask(check: Check, out: Path, humans: int, seed: int) -> Answer:
+def ask(check: Check, out: Path, humans: int, seed: int) -> _Answer:
     """Run one check with its files in `out`/name; bad input and impossible designs are its trouble."""
     command, place = check.command(humans, seed), folder(out / check.name)
     begin, trouble, code = time.perf_counter(), None, None
@@ -504,7 +504,7 @@ def ask(check: Check, out: Path, humans: int, seed: int) -> Answer:
     report = json.loads(written.read_text()) if written.exists() else {}
     parts = tuple(check.figures(report)) if report else ()
     pictures = tuple(path.relative_to(out).as_posix() for path in sorted(place.glob("*.png")))
-    return Answer(check, f"python -m {command}", code, wall, parts, pictures, trouble, report)
+    return _Answer(check, f"python -m {command}", code, wall, parts, pictures, trouble, report)
 
 
 def _called(command: str, place: Path) -> int:
@@ -543,7 +543,7 @@ def main(argv: list[str]) -> int:
     args = _parser().parse_args(argv)
     options.check_json(args)
     checks, out, screen = _chosen(args), folder(Path(args.out or "out/validate")), render.console(args)
-    answers: list[Answer] = []
+    answers: list[_Answer] = []
     begin, interrupted = time.perf_counter(), False
     for number, check in enumerate(checks, start=1):
         screen.print(f"[dim]{number}/{len(checks)}[/] {check.asks} ...", end="\n" if screen.is_terminal else " ")
@@ -565,10 +565,10 @@ def main(argv: list[str]) -> int:
         "wall_s": time.perf_counter() - begin,
         "machine": machine(),
     }
-    screen.print(headline(outcome))
+    screen.print(_headline(outcome))
     if len(checks) == 1 and answers:
         _show(answers[0], screen)
-    render.publish(args, outcome, (), (), out, [write(out / "report.md", markdown(outcome))])
+    render.publish(args, outcome, (), (), out, [write(out / "report.md", _markdown(outcome))])
     if interrupted:
         return options.INTERRUPTED
     return options.DONE if outcome["holds"] else options.DOES_NOT_HOLD
@@ -602,19 +602,19 @@ def _chosen(args: argparse.Namespace) -> list[Check]:
     return [check for check in CHECKS if args.only is None or check.name in args.only]
 
 
-def _verdict(answer: Answer) -> str:
+def _verdict(answer: _Answer) -> str:
     if answer.code == options.INTERRUPTED:
         return "[yellow]interrupted[/]"
     return "[green]holds[/]" if answer.holds else f"[red]{answer.trouble or 'does not hold'}[/]"
 
 
-def _show(answer: Answer, screen: render.Screen) -> None:
+def _show(answer: _Answer, screen: render.Screen) -> None:
     """The figures of a check that was asked for alone."""
     for part in answer.parts:
         screen.print(render.grid(part.title, part.columns, part.rows, left=range(len(part.columns))))
 
 
-def _part(answer: Answer) -> Row:
+def _part(answer: _Answer) -> _Row:
     return {
         "name": answer.check.name,
         "asks": answer.check.asks,
@@ -633,7 +633,7 @@ def _part(answer: Answer) -> Row:
 # The report for a stranger.
 
 
-def headline(outcome: dict[str, Any]) -> str:
+def _headline(outcome: dict[str, Any]) -> str:
     """One sentence."""
     checks = outcome["checks"]
     good = sum(check["holds"] for check in checks)
@@ -646,11 +646,11 @@ def headline(outcome: dict[str, Any]) -> str:
     return text + (" Interrupted." if outcome["interrupted"] else "")
 
 
-def markdown(outcome: dict[str, Any]) -> str:
+def _markdown(outcome: dict[str, Any]) -> str:
     """The whole report."""
     machine = outcome["machine"]
-    lines = ["# Validation report", "", f"**{headline(outcome)}** {outcome['wall_s']:.0f} s, seed {outcome['seed']}."]
-    lines += ["", "## Verdicts", "", *_verdict_table(outcome), "", INTRODUCTION]
+    lines = ["# Validation report", "", f"**{_headline(outcome)}** {outcome['wall_s']:.0f} s, seed {outcome['seed']}."]
+    lines += ["", "## Verdicts", "", *_verdict_table(outcome), "", _INTRODUCTION]
     for check in outcome["checks"]:
         lines += _section(check)
     lines += ["## Where this was run", "", ", ".join(f"{name} {value}" for name, value in machine.items()) + ".", ""]

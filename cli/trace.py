@@ -9,7 +9,7 @@ from design.files import check_file
 from sim.scenario import InputError
 from sim.trace import Trace, format_growth, growths
 
-ZOOM_HZ = 10.0  # the picture shows six periods of it where nothing oscillates
+_ZOOM_HZ = 10.0  # the picture shows six periods of it where nothing oscillates
 
 
 def main(argv: list[str]) -> int:
@@ -31,7 +31,7 @@ def main(argv: list[str]) -> int:
     if args.plot:
         from sim.plots import plot_run
 
-        strongest = next((one.frequency_hz for one in found if one.frequency_hz), ZOOM_HZ)
+        strongest = next((one.frequency_hz for one in found if one.frequency_hz), _ZOOM_HZ)
         plot_run(result, Path(args.plot), args.trace, strongest)
     T = float(result.t[-1]) / max(1, result.t.size - 1)
     lines = [f"growth, {format_growth(part, T)}" for part in outcome["growth"]]

@@ -25,8 +25,8 @@ from sim.scenario import InputError, Scenario, require_linear, save_humans
 from sim.shards import Table, validate, validate_on_cluster
 from sim.switching import certified_part
 
-ENVIRONMENTS = ("nominal", "ranges", "box")  # the last is the older name of the second
-LINKS = {"1": 1, "2": 2, "mixed": MIXED}
+_ENVIRONMENTS = ("nominal", "ranges", "box")  # the last is the older name of the second
+_LINKS = {"1": 1, "2": 2, "mixed": MIXED}
 
 
 def main(argv: list[str]) -> int:
@@ -100,7 +100,7 @@ def _parser() -> options.Parser:
     options.add_limiter_option(parser)
     humans, count = "random humans per device (default 1000)", options.whole(1, 1_000_000)
     parser.add_argument("--humans", type=count, default=1000, metavar="N", help=humans)
-    parser.add_argument("--links", choices=tuple(LINKS), help="of each human (default: the scenario's population)")
+    parser.add_argument("--links", choices=tuple(_LINKS), help="of each human (default: the scenario's population)")
     parser.add_argument("--engine", choices=ENGINES, default="both", help="default both")
     seconds = "of the traces (default 2; 0 for none)"
     parser.add_argument("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)
@@ -113,7 +113,9 @@ def _parser() -> options.Parser:
     generations = "of the adversary's search (default 150)"
     parser.add_argument("--generations", type=options.whole(1, 10_000), metavar="N", help=generations)
     met = "nominal (default), or ranges: in turn all vertices of the scenario's ranges and as many others inside"
-    parser.add_argument("--environments", choices=ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met)
+    parser.add_argument(
+        "--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met
+    )
     options.add_output_options(parser, picture=True)
     return parser
 
@@ -152,7 +154,7 @@ def _question(
     environments: tuple[Member, ...],
     lag: tuple[float, ...] | None,
 ) -> Validation:
-    links = LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)  # a user's own has none
+    links = _LINKS[args.links] if args.links else getattr(scenario.population, "links", 1)  # a user's own has none
     work = args.humans, links, args.engine, args.duration
     return Validation(scenario, chosen.coupling, args.seed, *work, environments=environments, lag=lag)
 

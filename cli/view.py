@@ -17,11 +17,11 @@ from sim.view.film import Picture, check_film, painter, save_film
 from sim.view.session import LONGEST_LAG, Session, session_report
 from sim.view.stage import Stage, keys_help
 
-EXAMPLE = "python -m sim.view --video out.gif --script '0:none 1:theta+1 6:designed'"
-SCRIPT = "0:none 1:theta+1 6:designed"  # of a video: an oscillation starts and dies
-AFTER = 3.0  # [s] that a video goes on after the last event of its script
-LONGEST = 3600  # [s]
-DRAWN = ("auto", "gl", "flat")
+_EXAMPLE = "python -m sim.view --video out.gif --script '0:none 1:theta+1 6:designed'"
+_SCRIPT = "0:none 1:theta+1 6:designed"  # of a video: an oscillation starts and dies
+_AFTER = 3.0  # [s] that a video goes on after the last event of its script
+_LONGEST = 3600  # [s]
+_DRAWN = ("auto", "gl", "flat")
 
 
 def main(argv: list[str]) -> int:
@@ -53,14 +53,14 @@ def main(argv: list[str]) -> int:
 
 def _parser() -> options.Parser:
     keys = ", ".join(f"{name} {word}" for name, word in keys_help(given=True))
-    parser = options.Parser("sim.view", f"Feel the loop in a window, or film it.\n\nKeys: {keys}.", EXAMPLE)
+    parser = options.Parser("sim.view", f"Feel the loop in a window, or film it.\n\nKeys: {keys}.", _EXAMPLE)
     options.add_loop_options(parser)
     what = f"to begin with: {', '.join(_names())} or FILE.json; designed is spring-damper"
     parser.add_argument("--coupling", metavar="NAME|FILE", help=what)
     options.add_condition_option(parser, "of a design")
     options.add_limiter_option(parser)
-    parser.add_argument("--script", metavar="EVENTS", help=f"what happens when [s] (default of a video: '{SCRIPT}')")
-    seconds, until = options.number(1e-3, LONGEST, "s"), "a window until it is closed, a video until after its script"
+    parser.add_argument("--script", metavar="EVENTS", help=f"what happens when [s] (default of a video: '{_SCRIPT}')")
+    seconds, until = options.number(1e-3, _LONGEST, "s"), "a window until it is closed, a video until after its script"
     parser.add_argument("--duration", type=seconds, metavar="SECONDS", help=f"default: {until}")
     options.add_json_option(parser)
     film = parser.add_argument_group("without a display")
@@ -68,7 +68,7 @@ def _parser() -> options.Parser:
     rate = "pictures per second (default 10); for a .gif what divides 100"
     film.add_argument("--fps", type=options.whole(1, 100), default=10, metavar="N", help=rate)
     drawn = "by OpenGL, or flat without it (default: by what works)"
-    film.add_argument("--draw", choices=DRAWN, default="auto", help=drawn)
+    film.add_argument("--draw", choices=_DRAWN, default="auto", help=drawn)
     return parser
 
 
@@ -82,7 +82,7 @@ def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:
     """The first coupling, as the user calls it, and what follows. Raises InputError."""
     label = _label(args)
     told = args.video and args.coupling is None and args.case != "none"
-    text = args.script if args.script is not None else SCRIPT if told else None
+    text = args.script if args.script is not None else _SCRIPT if told else None
     script = () if text is None else parse_script(text, channels)
     if script and script[0][0] == 0 and isinstance(script[0][1], Couple):
         return script[0][1].name, script[1:]  # nothing else need be designed first
@@ -112,7 +112,7 @@ def _names() -> list[str]:
 
 def _film(args: argparse.Namespace, session: Session) -> dict[str, Any]:
     """The session against a clock of its own: the same film every time. Interrupted, it is as long as it got."""
-    seconds = args.duration or (session.script_ends + AFTER)
+    seconds = args.duration or (session.script_ends + _AFTER)
     count, interrupted = round(seconds * args.fps) + 1, False
     assembly = session.prepared.assembly
     artist, drawn, remarks = painter(args.draw, assembly.scene, assembly.process.force_limit)

@@ -167,10 +167,10 @@ def _share(count: int, cells: int) -> str:
 # A Z-width map as JSON and CSV.
 
 
-NOT_REACHED = "not reached before the interruption"
+_NOT_REACHED = "not reached before the interruption"
 
 
-def summary(sweep: Sweep, drawn: Map, plan: Plan, population: dict[str, Any]) -> dict[str, Any]:
+def _summary(sweep: Sweep, drawn: Map, plan: Plan, population: dict[str, Any]) -> dict[str, Any]:
     """The whole map. Rows are stiffnesses; null is infinite, or not reached before an interruption."""
     known, loop = np.isfinite(drawn.growth), sweep.loop
     unsafe = known & (drawn.growth > MARGINAL)
@@ -199,7 +199,7 @@ def summary(sweep: Sweep, drawn: Map, plan: Plan, population: dict[str, Any]) ->
         "unstable_humans_at_least": _rows(drawn, drawn.unstable),
         "stable_cells": int((known & ~unsafe).sum()),
         "decided_cells": int(known.sum()),
-    } | ({"reason": f"null: {NOT_REACHED}"} if np.isnan(drawn.growth).any() else {})
+    } | ({"reason": f"null: {_NOT_REACHED}"} if np.isnan(drawn.growth).any() else {})
     part["simulation"] = _simulation(sweep, drawn, plan)
     contradicted = sum(part[name]["contradicted_cells"] for name in CONDITIONS)
     disagree = 0 if part["simulation"]["nonlinear"] else part["simulation"]["differ_from_linear"]
@@ -216,7 +216,7 @@ def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
         return sweep.refusals[name]
     ratio, (K, B) = drawn.ratio[name], drawn.grid.flat
     unreached, infinite = np.isnan(ratio), np.flatnonzero(np.isposinf(ratio))
-    parts = [f"null at {unreached.sum()} cells: {NOT_REACHED}"] if unreached.any() else []
+    parts = [f"null at {unreached.sum()} cells: {_NOT_REACHED}"] if unreached.any() else []
     if infinite.size:
         first = infinite[0]
         why = sweep.requirement(name, float(K[first]), float(B[first])).reason or "the figure grows without end"
@@ -261,7 +261,7 @@ def _simulation(sweep: Sweep, drawn: Map, plan: Plan) -> dict[str, Any]:
     }
 
 
-def add_errors(outcome: dict[str, Any], found: dict[str, MapError | None]) -> None:
+def _add_errors(outcome: dict[str, Any], found: dict[str, MapError | None]) -> None:
     """How far the map is from design.conditions."""
     outcome["error"] = {
         name: error
@@ -270,7 +270,7 @@ def add_errors(outcome: dict[str, Any], found: dict[str, MapError | None]) -> No
     }
 
 
-def add_marks(outcome: dict[str, Any], marks: Sequence[Mark]) -> None:
+def _add_marks(outcome: dict[str, Any], marks: Sequence[Mark]) -> None:
     """What is asked about single couplings; the whole holds only if this-environment certifies them all."""
     outcome["marks"] = [
         {
@@ -287,7 +287,7 @@ def add_marks(outcome: dict[str, Any], marks: Sequence[Mark]) -> None:
     outcome["holds"] = outcome["holds"] and certified
 
 
-def save_csv(drawn: Map, path: Path) -> Path:
+def _save_csv(drawn: Map, path: Path) -> Path:
     """One line per cell, SI units in the header; empty where nothing is known."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -316,10 +316,10 @@ def _rows(drawn: Map, values: Array) -> list[list[float | None]]:
     return [[finite(value) for value in row] for row in values.reshape(drawn.grid.shape).tolist()]
 
 
-EXAMPLE = """python -m sim.zwidth --theta 1 --grid 30
+_EXAMPLE = """python -m sim.zwidth --theta 1 --grid 30
   python -m sim.zwidth --rigid --T 1e-3 --theta 0 --mark 5000,0
   python -m sim.zwidth --rigid --theta 1 --quantisation 1e-5 --saturation --friction 0.2 --wall"""
-FINEST = 1e-5  # [m] least default threshold: what a desk device's encoders resolve
+_FINEST = 1e-5  # [m] least default threshold: what a desk device's encoders resolve
 
 
 def main(argv: list[str]) -> int:
@@ -343,12 +343,12 @@ def main(argv: list[str]) -> int:
     )
     with render.progress("certificates") as move:
         drawn = draw_map(sweep, grid, crowd, plan, lambda stage, k, of: move(k, of, stage))
-    outcome = summary(sweep, drawn, plan, {"humans": args.humans, "seed": args.seed})
+    outcome = _summary(sweep, drawn, plan, {"humans": args.humans, "seed": args.seed})
     outcome |= {"scenario": None if args.rigid else scenario.name, "scenario_digest": scenario.digest}
     outcome |= _coupling(args, scenario, chosen) if chosen else {"axes": "coupling", "coupling": None}
     if not drawn.interrupted:
-        add_errors(outcome, {name: map_error(sweep, drawn, name) for name in drawn.ratio})
-        add_marks(outcome, [evaluate_point(sweep, crowd, *mark, grid.K) for mark in marks])
+        _add_errors(outcome, {name: map_error(sweep, drawn, name) for name in drawn.ratio})
+        _add_marks(outcome, [evaluate_point(sweep, crowd, *mark, grid.K) for mark in marks])
     files, lines = _save(args, drawn, outcome, out), [_mark_line(m, args.humans) for m in outcome.get("marks", ())]
     render.publish(args, outcome, [_table(outcome)], [*lines, *_remarks(outcome)], out, files)
     if drawn.interrupted:
@@ -358,7 +358,7 @@ def main(argv: list[str]) -> int:
 
 def _parser() -> options.Parser:
     what = "Draw the Z-width map: which spring-dampers are safe, for whom, by which test."
-    parser = options.Parser("sim.zwidth", what, EXAMPLE)
+    parser = options.Parser("sim.zwidth", what, _EXAMPLE)
     options.add_loop_options(parser)
     options.add_rigid_option(parser)
     of_map = parser.add_argument_group("the map (K and B are the same on all channels)")
@@ -486,7 +486,7 @@ def _grid(args: argparse.Namespace, sweep: Sweep, marks: tuple[Range, ...]) -> G
 def _plan(args: argparse.Namespace, sweep: Sweep) -> Plan:
     effects = Effects(args.quantisation, args.friction, args.saturation)
     coarsest = max(device.encoder_step for device in effects.on(sweep.devices))
-    threshold = max(2 * coarsest, FINEST) if args.threshold is None else args.threshold
+    threshold = max(2 * coarsest, _FINEST) if args.threshold is None else args.threshold
     shortest = max(1.5, 1024 * sweep.loop.T)
     if not shortest <= args.duration <= 1e4:
         raise InputError(f"--duration is {args.duration:g}, allowed are {shortest:g} to 10000 s")
@@ -495,7 +495,7 @@ def _plan(args: argparse.Namespace, sweep: Sweep) -> Plan:
 
 def _save(args: argparse.Namespace, drawn: Map, outcome: dict[str, Any], out: Path) -> list[Path]:
     """The table and the picture."""
-    files = [save_csv(drawn, out / "map.csv")]
+    files = [_save_csv(drawn, out / "map.csv")]
     if not args.no_plot:
         from sim.plots import plot_zwidth
 

@@ -43,9 +43,9 @@ from numpy.typing import ArrayLike, NDArray
 from controller.lti import Array, Lti
 
 EPS = 0.05  # the share of the damping that a budget leaves alone, if nobody says otherwise
-UNTOLD = 4096  # ticks that wait for the device's word; older ones stay booked as their largest loss
-HUGE = 1e12  # [N], from which a force is no number any more
-SHAVE = 1 - 1e-12  # of a scaled force, so that rounding takes nothing from the reserve
+_UNTOLD = 4096  # ticks that wait for the device's word; older ones stay booked as their largest loss
+_HUGE = 1e12  # [N], from which a force is no number any more
+_SHAVE = 1 - 1e-12  # of a scaled force, so that rounding takes nothing from the reserve
 
 
 class _Net:
@@ -170,7 +170,7 @@ class EnergyBudget(_Net):
         if acted is not None:
             self._settle(tick, acted, dx, most)
             return
-        self._untold.pop(tick - UNTOLD, None)
+        self._untold.pop(tick - _UNTOLD, None)
         self._untold[tick] = dx.copy(), most
 
     def _settle(self, tick: int, acted: Array, dx: Array, most: Array) -> None:
@@ -207,7 +207,7 @@ class EnergyBudget(_Net):
             order = np.argsort(_root(*parts), axis=0)
             square, linear, now = (np.take_along_axis(part, order, axis=0).cumsum(axis=0) for part in parts)
             most = _root(square, linear, room[short] + now).min(axis=0)
-            scale[short] = np.minimum(most, 1.0) * SHAVE
+            scale[short] = np.minimum(most, 1.0) * _SHAVE
         return scale
 
 
@@ -259,7 +259,7 @@ class Shell(_Net):
         root = np.sqrt(b**2 + 4 * c * W)
         gains = b > 0  # either form of the upper root, free of cancellation; where b > 0, so is c
         upper = np.divide(np.where(gains, b + root, 2 * W), np.where(gains, 2 * c, root - b), out=0 * W, where=root > 0)
-        scale[short] = np.minimum(upper, 1.0) * SHAVE
+        scale[short] = np.minimum(upper, 1.0) * _SHAVE
         return scale
 
 
@@ -339,5 +339,5 @@ def _root(square: Array, linear: Array, most: Array) -> Array:
 def _finite(wanted: ArrayLike) -> tuple[Array, NDArray[np.bool_]]:
     """The force with zero where it is no finite number, and in which simulations that was so."""
     wanted = np.asarray(wanted, dtype=float)
-    good = np.abs(wanted) < HUGE
+    good = np.abs(wanted) < _HUGE
     return np.where(good, wanted, 0.0), np.asarray(~good.all(axis=0))

@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from controller.lti import Array, Block, Complex, Lti, Number, ReadOnly, Sampled, frozen, numbers, taps
 
-LARGEST_COEFFICIENT = 1e12  # of a stored coupling, SI units
-MOST_TERMS = 2000  # of a moving average; every one is a state
-LARGEST_WEIGHT = 1e9  # of a force filter: beyond it arithmetic would overflow before the filter could be judged
-Rows = tuple[tuple[float, ...], ...]
+_LARGEST_COEFFICIENT = 1e12  # of a stored coupling, SI units
+_MOST_TERMS = 2000  # of a moving average; every one is a state
+_LARGEST_WEIGHT = 1e9  # of a force filter: beyond it arithmetic would overflow before the filter could be judged
+_Rows = tuple[tuple[float, ...], ...]
 
 
 class Coupling(Protocol):
@@ -50,8 +50,8 @@ class NoCoupling:
     def compliance(self, T: Number) -> None:
         return None
 
-    def form(self) -> NoForm:
-        return NoForm()
+    def form(self) -> _NoForm:
+        return _NoForm()
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +79,12 @@ class SpringDamper(ReadOnly):
             )
         if not self.K.shape[-1]:
             raise ValueError("K has no channels, expected one stiffness per device")
-        if not ((self.K > 0) & (self.K <= LARGEST_COEFFICIENT)).all():
-            raise ValueError(f"K is {self.K.tolist()}, expected positive stiffnesses up to {LARGEST_COEFFICIENT:g} N/m")
-        if not ((self.B >= 0) & (self.B <= LARGEST_COEFFICIENT)).all():
-            raise ValueError(f"B is {self.B.tolist()}, expected dampings >= 0 up to {LARGEST_COEFFICIENT:g} N s/m")
+        if not ((self.K > 0) & (self.K <= _LARGEST_COEFFICIENT)).all():
+            raise ValueError(
+                f"K is {self.K.tolist()}, expected positive stiffnesses up to {_LARGEST_COEFFICIENT:g} N/m"
+            )
+        if not ((self.B >= 0) & (self.B <= _LARGEST_COEFFICIENT)).all():
+            raise ValueError(f"B is {self.B.tolist()}, expected dampings >= 0 up to {_LARGEST_COEFFICIENT:g} N s/m")
         if self.cutoff is not None and not 0 < self.cutoff < np.inf:
             raise ValueError(f"cutoff is {self.cutoff}, expected a positive frequency in Hz")
 
@@ -154,14 +156,14 @@ class MovingAverage(ReadOnly):
         for name in ("weight", "constant"):
             values = frozen(getattr(self, name), 1, name)
             object.__setattr__(self, name, values)
-            if not ((values >= 0).all() and (values <= LARGEST_COEFFICIENT).all()):
-                raise ValueError(f"{name} is {values.tolist()}, allowed are 0 to {LARGEST_COEFFICIENT:g} m/N")
+            if not ((values >= 0).all() and (values <= _LARGEST_COEFFICIENT).all()):
+                raise ValueError(f"{name} is {values.tolist()}, allowed are 0 to {_LARGEST_COEFFICIENT:g} m/N")
         object.__setattr__(self, "terms", tuple(int(n) for n in self.terms))
         if not len(self.weight) == len(self.constant) == len(self.terms):
             sizes = f"{len(self.weight)}, {len(self.terms)} and {len(self.constant)}"
             raise ValueError(f"weight, terms and constant have {sizes} entries; give one of each per device")
-        if not all(1 <= n <= MOST_TERMS for n in self.terms):
-            raise ValueError(f"terms are {list(self.terms)}, allowed are 1 to {MOST_TERMS}")
+        if not all(1 <= n <= _MOST_TERMS for n in self.terms):
+            raise ValueError(f"terms are {list(self.terms)}, allowed are 1 to {_MOST_TERMS}")
 
     @property
     def stiffness(self) -> Array:
@@ -180,8 +182,8 @@ class MovingAverage(ReadOnly):
     def around(self, environment: Block, further: int = 0) -> Block:
         return Compliance(self.compliance(environment.T)).around(environment, further)
 
-    def form(self) -> MovingAverageForm:
-        return MovingAverageForm(tuple(self.weight.tolist()), self.terms, tuple(self.constant.tolist()))
+    def form(self) -> _MovingAverageForm:
+        return _MovingAverageForm(tuple(self.weight.tolist()), self.terms, tuple(self.constant.tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,9 +296,9 @@ class ForceFilter(ReadOnly):
         if functions != expected or columns not in (rows, rows + 1) or not rows:
             shapes = f"({expected}, channels, channels) or ({expected}, channels, channels + 1)"
             raise ValueError(f"R has shape {self.R.shape}, expected {shapes}")
-        if not (np.isfinite(self.R).all() and np.abs(self.R).max() <= LARGEST_WEIGHT):
+        if not (np.isfinite(self.R).all() and np.abs(self.R).max() <= _LARGEST_WEIGHT):
             raise ValueError(
-                f"R has an entry of {np.abs(self.R).max():g}, allowed are numbers up to {LARGEST_WEIGHT:g}"
+                f"R has an entry of {np.abs(self.R).max():g}, allowed are numbers up to {_LARGEST_WEIGHT:g}"
             )
         static = self._static()
         if (static - static[0, 0] * np.eye(rows, dtype=object)).any() or static[0, 0] < 0:
@@ -337,9 +339,9 @@ class ForceFilter(ReadOnly):
             raise ValueError(f"the coupling is {m} x {m}, the environment has {environment.inputs} contacts")
         return self.filter(environment.T) @ environment
 
-    def form(self) -> ForceFilterForm:
+    def form(self) -> _ForceFilterForm:
         poles, pairs = tuple(self.poles.tolist()), tuple((b1, b2) for b1, b2 in self.pairs.tolist())
-        return ForceFilterForm(poles, pairs, tuple(_rows(R) for R in self.R))
+        return _ForceFilterForm(poles, pairs, tuple(_rows(R) for R in self.R))
 
 
 NO_PAIRS = np.zeros((0, 2))
@@ -437,7 +439,7 @@ class Strict(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Immutable, and refuses fields that it does not know."""
 
 
-class NoForm(Strict, frozen=True, tag_field="kind", tag="none"):
+class _NoForm(Strict, frozen=True, tag_field="kind", tag="none"):
     """V = 0."""
 
     @property
@@ -466,7 +468,7 @@ class SpringDamperForm(Strict, frozen=True, tag_field="kind", tag="spring-damper
         return SpringDamper(self.K, self.B)
 
 
-class MovingAverageForm(Strict, frozen=True, tag_field="kind", tag="moving-average"):
+class _MovingAverageForm(Strict, frozen=True, tag_field="kind", tag="moving-average"):
     """A weighted sum of the last forces and a plain spring per channel."""
 
     weight: tuple[float, ...]  # (m,) [m/N]
@@ -487,10 +489,10 @@ class MovingAverageForm(Strict, frozen=True, tag_field="kind", tag="moving-avera
 class ComplianceForm(Strict, frozen=True, tag_field="kind", tag="compliance"):
     """A general V(z), as the rows of its state-space matrices."""
 
-    A: Rows
-    B: Rows
-    C: Rows
-    D: Rows
+    A: _Rows
+    B: _Rows
+    C: _Rows
+    D: _Rows
 
     def __post_init__(self) -> None:
         self.build(1.0)
@@ -510,7 +512,7 @@ class InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-mod
     """The parameter Q(z) of the pair with the environment: poles of its basis, and a coefficient per function."""
 
     poles: tuple[float, ...]  # (n,)
-    Q: tuple[Rows, ...]  # (n + 1, m, m) [m/N]
+    Q: tuple[_Rows, ...]  # (n + 1, m, m) [m/N]
 
     def __post_init__(self) -> None:
         if any(len(rows) != len(self.Q[0]) or any(len(row) != len(rows) for row in rows) for rows in self.Q):
@@ -527,12 +529,12 @@ class InternalModelForm(Strict, frozen=True, tag_field="kind", tag="internal-mod
         return InternalModel(self.poles, self.Q)
 
 
-class ForceFilterForm(Strict, frozen=True, tag_field="kind", tag="force-filter"):
+class _ForceFilterForm(Strict, frozen=True, tag_field="kind", tag="force-filter"):
     """The filter R(z) of the environment's forces: poles of its basis, and a coefficient per function."""
 
     poles: tuple[float, ...]  # (n,)
     pairs: tuple[tuple[float, float], ...]  # (p, 2)
-    R: tuple[Rows, ...]  # (1 + n + 2 p, m, m or m + 1)
+    R: tuple[_Rows, ...]  # (1 + n + 2 p, m, m or m + 1)
 
     def __post_init__(self) -> None:
         if any([len(row) for row in rows] != [len(self.R[0][0])] * len(self.R[0]) for rows in self.R):
@@ -547,7 +549,7 @@ class ForceFilterForm(Strict, frozen=True, tag_field="kind", tag="force-filter")
         return ForceFilter(self.poles, self.pairs, self.R)
 
 
-Form = NoForm | SpringDamperForm | MovingAverageForm | ComplianceForm | InternalModelForm | ForceFilterForm
+Form = _NoForm | SpringDamperForm | _MovingAverageForm | ComplianceForm | InternalModelForm | _ForceFilterForm
 
 
 def require_channels(form: Form, m: int) -> None:
@@ -558,19 +560,19 @@ def require_channels(form: Form, m: int) -> None:
         raise ValueError(f"{shape[0]} {size}, the environment has {m} contacts")
 
 
-def _require_sensible(name: str, rows: Rows) -> None:
+def _require_sensible(name: str, rows: _Rows) -> None:
     """Raise ValueError where a coefficient is so large that arithmetic would overflow before it could be judged."""
     for value in (value for row in rows for value in row):
-        if not abs(value) <= LARGEST_COEFFICIENT:
-            raise ValueError(f"{name} has an entry {value:g}, allowed are up to {LARGEST_COEFFICIENT:g}")
+        if not abs(value) <= _LARGEST_COEFFICIENT:
+            raise ValueError(f"{name} has an entry {value:g}, allowed are up to {_LARGEST_COEFFICIENT:g}")
 
 
-def _table(name: str, rows: Rows, height: int, width: int) -> Array:
+def _table(name: str, rows: _Rows, height: int, width: int) -> Array:
     if len(rows) != height or any(len(row) != width for row in rows):
         raise ValueError(f"{name} has rows of {[len(row) for row in rows]} entries, expected {height} x {width}")
     _require_sensible(name, rows)
     return np.array(rows, dtype=float).reshape(height, width)
 
 
-def _rows(matrix: Array) -> Rows:
+def _rows(matrix: Array) -> _Rows:
     return tuple(map(tuple, matrix.tolist()))

@@ -119,9 +119,9 @@ class HeldLine:
         force[...] = self._held
 
 
-Pattern = Literal["constant", "random", "bursty", "adversarial", "recorded"]
+_Pattern = Literal["constant", "random", "bursty", "adversarial", "recorded"]
 
-LONGEST = 1000  # [samples]
+_LONGEST = 1000  # [samples]
 
 
 class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -129,7 +129,7 @@ class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     lo: tuple[int, ...]  # (m,) [samples]
     hi: tuple[int, ...]  # (m,) [samples]
-    pattern: Pattern = "random"
+    pattern: _Pattern = "random"
     loss: float = 0.0  # probability that a packet is lost, each by itself
     playout: bool = False  # the device applies every packet at age hi, so that what arrives is delayed constantly
     calm: float = 20.0  # bursty: mean length of a stretch at lo [packets]
@@ -140,9 +140,9 @@ class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if len(self.lo) != len(self.hi):
             raise ValueError(f"jitter.lo has {len(self.lo)} entries and jitter.hi {len(self.hi)}: one each per channel")
         for i, (lo, hi) in enumerate(zip(self.lo, self.hi, strict=True)):
-            if not 0 <= lo <= hi <= LONGEST:
+            if not 0 <= lo <= hi <= _LONGEST:
                 raise ValueError(
-                    f"jitter on channel {i + 1} is {lo} to {hi}, expected 0 <= lo <= hi <= {LONGEST} samples"
+                    f"jitter on channel {i + 1} is {lo} to {hi}, expected 0 <= lo <= hi <= {_LONGEST} samples"
                 )
         if not 0 <= self.loss <= 1:
             raise ValueError(f"jitter.loss is {self.loss:g}, allowed are probabilities 0 to 1")

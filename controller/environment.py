@@ -31,17 +31,17 @@ from controller.lti import Array, Complex, Lti, Number, Sampled, inverse, ration
 # that may be absent is there or not. An absent spring stays in its network with neither stiffness nor damping.
 
 
-Range = tuple[float, float]
+_Range = tuple[float, float]
 
-MOST_VERTICES = 64  # each is a world of the design and a proof
+_MOST_VERTICES = 64  # each is a world of the design and a proof
 
 
 class UncertainSpring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What may be of one spring; a range that is not given leaves the environment's own value."""
 
     between: tuple[str, str]
-    stiffness: Range | None = None  # [N/m]
-    damping: Range | None = None  # [N s/m]
+    stiffness: _Range | None = None  # [N/m]
+    damping: _Range | None = None  # [N s/m]
     absent: bool = False  # the spring may also be missing altogether: a contact lost, or not made yet
 
     def __post_init__(self) -> None:
@@ -53,7 +53,7 @@ class Box(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Ranges of a network's parameters, each independent of the others."""
 
     springs: tuple[UncertainSpring, ...] = ()
-    masses: dict[str, Range] = {}  # [kg], by node
+    masses: dict[str, _Range] = {}  # [kg], by node
 
     def __post_init__(self) -> None:
         for node, limits in self.masses.items():
@@ -72,7 +72,7 @@ class Member:
 class _State:
     """An uncertain thing that is there, or one that is absent: the ranges that it then has, and what it is in them."""
 
-    ranges: tuple[Range, ...]  # those of some width
+    ranges: tuple[_Range, ...]  # those of some width
     value: Callable[[Sequence[float]], Spring | float]
 
 
@@ -111,9 +111,9 @@ def members(network: Network, box: Box) -> tuple[Member, ...]:
     nominal = Member("the nominal environment", network)
     parts = _parts(network, box)
     count = prod(len(part.corners) for part in parts)
-    if count > MOST_VERTICES:
+    if count > _MOST_VERTICES:
         raise ValueError(
-            f"box has {count} vertices, allowed are {MOST_VERTICES}: leave out the ranges that matter least, "
+            f"box has {count} vertices, allowed are {_MOST_VERTICES}: leave out the ranges that matter least, "
             "each halves the number"
         )
     corners = (c for c in product(*(part.corners for part in parts)) if c != tuple(part.own for part in parts))
@@ -136,10 +136,10 @@ def inside(network: Network, box: Box, count: int, seed: int) -> tuple[Member, .
     return tuple(_member(f"sample {i}", network, parts, [p.draw(rng) for p in parts]) for i in range(1, count + 1))
 
 
-def shrunk(network: Network, box: Box, factor: float) -> Box:
+def _shrunk(network: Network, box: Box, factor: float) -> Box:
     """The box with every range drawn in towards the environment's own value; what may be absent still may."""
 
-    def closer(limits: Range, own: float) -> Range:
+    def closer(limits: _Range, own: float) -> _Range:
         return own + factor * (limits[0] - own), own + factor * (limits[1] - own)
 
     springs = []
@@ -203,7 +203,7 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
     return _Part(f"{a}-{b}", tuple(corners), own, draw, tuple(states))
 
 
-def _spring_state(between: tuple[str, str], stiffness: Range, damping: Range) -> _State:
+def _spring_state(between: tuple[str, str], stiffness: _Range, damping: _Range) -> _State:
     """A spring that is there; of its two ranges those without width are no coordinates."""
     free = [low < high for low, high in (stiffness, damping)]
 
@@ -215,7 +215,7 @@ def _spring_state(between: tuple[str, str], stiffness: Range, damping: Range) ->
     return _State(tuple(r for f, r in zip(free, (stiffness, damping), strict=True) if f), value)
 
 
-def _mass_part(network: Network, node: str, limits: Range) -> _Part:
+def _mass_part(network: Network, node: str, limits: _Range) -> _Part:
     if node not in network.nodes():
         raise ValueError(f"box.masses names {node!r}, which no spring reaches; nodes: {', '.join(network.nodes())}")
     own = network.masses.get(node, 0.0)
@@ -257,16 +257,16 @@ def _check_inside(field: str, uncertain: UncertainSpring, own: Spring) -> None:
             _require_inside(f"{field}: {name}", limits, getattr(own, name), unit)
 
 
-def _require_inside(field: str, limits: Range, own: float, unit: str) -> None:
+def _require_inside(field: str, limits: _Range, own: float, unit: str) -> None:
     if not limits[0] <= own <= limits[1]:
         raise ValueError(
             f"{field} is {limits[0]:g} to {limits[1]:g} {unit}, which leaves out the environment's own {own:g}"
         )
 
 
-def _check_range(field: str, limits: Range | None, unit: str) -> None:
-    if limits is not None and not 0 <= limits[0] <= limits[1] <= MOST[unit]:
-        expected = f"[least, most] in {unit}, 0 <= least <= most <= {MOST[unit]:g}"
+def _check_range(field: str, limits: _Range | None, unit: str) -> None:
+    if limits is not None and not 0 <= limits[0] <= limits[1] <= _MOST[unit]:
+        expected = f"[least, most] in {unit}, 0 <= least <= most <= {_MOST[unit]:g}"
         raise ValueError(f"{field} is {list(limits)}, expected {expected}")
 
 
@@ -274,13 +274,13 @@ GROUND = "ground"
 
 
 #: largest amounts, far from where arithmetic ends and beyond what anybody renders
-MOST = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
-MOST_NODES, MOST_PARTS = 200, 2000  # a mass is two states, and a proof has at most a few hundred
+_MOST = {"N/m": 1e12, "N s/m": 1e9, "kg": 1e6}
+_MOST_NODES, _MOST_PARTS = 200, 2000  # a mass is two states, and a proof has at most a few hundred
 
 
 def _check_amount(what: str, value: float, unit: str) -> None:
-    if not 0 <= value <= MOST[unit]:
-        raise ValueError(f"{what} is {value}, allowed are 0 to {MOST[unit]:g} {unit} (a passive network)")
+    if not 0 <= value <= _MOST[unit]:
+        raise ValueError(f"{what} is {value}, allowed are 0 to {_MOST[unit]:g} {unit} (a passive network)")
 
 
 class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -397,7 +397,7 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         if len(set(self.contacts)) < len(self.contacts) or GROUND in self.contacts:
             raise ValueError(f"contacts must be different names other than {GROUND!r}, got {list(self.contacts)}")
         nodes = self.nodes()
-        for what, count, most in (("nodes", len(nodes), MOST_NODES), ("springs", len(self.springs), MOST_PARTS)):
+        for what, count, most in (("nodes", len(nodes), _MOST_NODES), ("springs", len(self.springs), _MOST_PARTS)):
             if count > most:
                 raise ValueError(f"the network has {count} {what}, allowed are {most}")
         for name, mass in self.masses.items():

@@ -115,7 +115,7 @@ class Lti(ReadOnly):
     @classmethod
     def diag(cls, *blocks: Lti) -> Self:
         """The blocks side by side, each with its own inputs and outputs."""
-        A, B, C, D = (block_diagonal([getattr(g, name) for g in blocks]) for name in "ABCD")
+        A, B, C, D = (_block_diagonal([getattr(g, name) for g in blocks]) for name in "ABCD")
         return cls(A, B, C, D, _common_period(*blocks))
 
     @classmethod
@@ -225,7 +225,7 @@ class Lti(ReadOnly):
         if not isinstance(other, Lti):
             return Lti(self.A, self.B, self.C, self.D + other, self.T)
         T = _common_period(self, other)
-        A = block_diagonal([self.A, other.A])
+        A = _block_diagonal([self.A, other.A])
         return Lti(A, _block([[self.B], [other.B]]), _block([[self.C, other.C]]), self.D + other.D, T)
 
     __radd__ = __add__
@@ -260,7 +260,7 @@ class Lti(ReadOnly):
         y_u = S @ self.D
         u_x = _block([[np.zeros((self.inputs, self.order), dtype=int), -other.C]]) - other.D @ y_x
         u_u = _eye(self.inputs, T) - other.D @ y_u
-        A = block_diagonal([self.A, other.A]) + _block([[self.B @ u_x], [other.B @ y_x]])
+        A = _block_diagonal([self.A, other.A]) + _block([[self.B @ u_x], [other.B @ y_x]])
         return Lti(A, _block([[self.B @ u_u], [other.B @ y_u]]), y_x, y_u, T)
 
     def inverse(self) -> Lti:
@@ -371,8 +371,8 @@ def vstack(*blocks: Any) -> Any:
     C, D = [[b.C] for b in blocks], _block([[b.D] for b in blocks])
     if all(b.A is first.A and b.B is first.B for b in blocks):
         return Lti(first.A, first.B, _block(C), D, T)
-    A, B = block_diagonal([b.A for b in blocks]), _block([[b.B] for b in blocks])
-    return Lti(A, B, block_diagonal([b.C for b in blocks]), D, T)
+    A, B = _block_diagonal([b.A for b in blocks]), _block([[b.B] for b in blocks])
+    return Lti(A, B, _block_diagonal([b.C for b in blocks]), D, T)
 
 
 def hstack(*blocks: Any) -> Any:
@@ -381,7 +381,7 @@ def hstack(*blocks: Any) -> Any:
     if isinstance(first, Sampled):
         return first._with(_block([[b.G for b in blocks]]))
     T = _common_period(*blocks)
-    A, B = block_diagonal([b.A for b in blocks]), block_diagonal([b.B for b in blocks])
+    A, B = _block_diagonal([b.A for b in blocks]), _block_diagonal([b.B for b in blocks])
     return Lti(A, B, _block([[b.C for b in blocks]]), _block([[b.D for b in blocks]]), T)
 
 
@@ -408,7 +408,7 @@ def taps(weights: Sequence[Any], T: Number) -> Lti:
     return Lti(np.eye(n, k=-1, dtype=int), first, row[1:].reshape(1, n), row[:1].reshape(1, 1), T)
 
 
-def block_diagonal(parts: Sequence[Array]) -> Array:
+def _block_diagonal(parts: Sequence[Array]) -> Array:
     """The parts along the diagonal, of any arithmetic and any stack."""
     zeros = [[np.zeros((p.shape[-2], q.shape[-1]), dtype=int) for q in parts] for p in parts]
     return _block([[p if i == j else zeros[i][j] for j in range(len(parts))] for i, p in enumerate(parts)])
@@ -471,10 +471,10 @@ def _solve(M: Array, right: Array) -> Array:
             return np.linalg.solve(M, right)
         except np.linalg.LinAlgError:
             raise SingularLoop(f"a {M.shape[-2]} x {M.shape[-1]} matrix is singular: a pole at z = 1") from None
-    return solve_exactly(M, right)
+    return _solve_exactly(M, right)
 
 
-def solve_exactly(M: Any, right: Any) -> Any:
+def _solve_exactly(M: Any, right: Any) -> Any:
     """X with M X = right over the Fractions, by sparse elimination. Raises SingularLoop.
 
     The models here are series of small blocks, triangular when read in the right order: the next pivot is in the row

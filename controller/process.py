@@ -191,8 +191,8 @@ class Complementarity(ReadOnly):
 #
 # together with the walls, whose forces are the same kind of unknown over the box (-inf, 0]: a box problem.
 
-LEAST_MINOR = 1e-12  # of a matrix whose diagonal is one: what is smaller counts as singular
-MOST_CANDIDATES = 27  # three channels, or two with a wall: beyond, the sets are not listed but pivoted through
+_LEAST_MINOR = 1e-12  # of a matrix whose diagonal is one: what is smaller counts as singular
+_MOST_CANDIDATES = 27  # three channels, or two with a wall: beyond, the sets are not listed but pivoted through
 GROUNDED = 1e-10  # of the largest diagonal entry: what makes a singular matrix regular for pivoting
 PIVOT_ROUNDING = 1e-12  # of the numbers that are subtracted
 
@@ -245,10 +245,10 @@ class BoxProblem(ReadOnly):
         for size in range(1, n + 1) if n <= 10 else (1,):
             for chosen in itertools.combinations(range(n), size):
                 minor = np.linalg.det(unit[np.ix_(chosen, chosen)])
-                if minor < -LEAST_MINOR:
+                if minor < -_LEAST_MINOR:
                     which = [i + 1 for i in chosen]
                     raise SingularLoop(f"limited forces {which} are not determined: {self.M.tolist()}")
-                regular &= bool(minor > LEAST_MINOR)
+                regular &= bool(minor > _LEAST_MINOR)
         return regular
 
     @cached_property
@@ -259,13 +259,13 @@ class BoxProblem(ReadOnly):
             [0.0, *[1.0] * bool(np.isfinite(b)), *[-1.0] * bool(np.isfinite(a))]
             for a, b in zip(self.lower, self.upper, strict=True)
         ]
-        if np.prod([len(kind) for kind in kinds]) > MOST_CANDIDATES:
+        if np.prod([len(kind) for kind in kinds]) > _MOST_CANDIDATES:
             return []
         scale, found = np.sqrt(np.maximum(np.abs(np.diag(self.M)), 1e-300)), []
         for signs in map(np.array, itertools.product(*kinds)):
             active = np.flatnonzero(signs)
             chosen = np.ix_(active, active)
-            if np.linalg.det((self.M / scale / scale[:, None])[chosen]) > LEAST_MINOR:
+            if np.linalg.det((self.M / scale / scale[:, None])[chosen]) > _LEAST_MINOR:
                 inverse = np.zeros((n, n))
                 inverse[chosen] = np.linalg.inv(self.M[chosen])
                 bounds = np.where(signs > 0, self.upper, np.where(signs < 0, self.lower, 0.0))
@@ -461,10 +461,10 @@ class Limiter(ReadOnly):
         """
         m, G = self.channels, self.sent
         free = Lti(G.A, G.B[:, :m], G.C[:m], G.D[:m, :m], G.T)
-        stiffness = np.stack([free.C @ resting(free, unit) for unit in np.eye(m)], axis=1) + free.D
+        stiffness = np.stack([free.C @ _resting(free, unit) for unit in np.eye(m)], axis=1) + free.D
         (e,), (f,) = (side.T for side in BoxProblem(stiffness, -self.limit, self.limit).solve(stiffness @ x[:, None]))
         lines = np.repeat(f, self.theta)
-        return np.concatenate([resting(free, x - e), e, lines, np.zeros(len(self.walls))])
+        return np.concatenate([_resting(free, x - e), e, lines, np.zeros(len(self.walls))])
 
     def depths(self, z: Array) -> Array:
         """h [m] at each tick but the last, (ticks - 1, w, ..), from the states at all of them, (ticks, order, ..)."""
@@ -491,7 +491,7 @@ def limited(
     return Limiter(sent, tuple(theta), np.asarray(limit), np.asarray(rho), network.walls)
 
 
-def resting(F: Lti, x: Array) -> Array:
+def _resting(F: Lti, x: Array) -> Array:
     """The state z = A z + B x in which F rests with the displacements x held.
 
     Where F drifts (an environment with a free mass, whose place no x decides), the shortest such z.
@@ -567,7 +567,7 @@ class Process(ReadOnly):
 
     def at_rest(self, x: Array) -> Array:
         """The state in which the process rests with the displacements x (m,) [m] held."""
-        return self.limiter.at_rest(x) if self.limiter else resting(self.F, x)
+        return self.limiter.at_rest(x) if self.limiter else _resting(self.F, x)
 
     def frozen(self) -> dict[State, Lti]:
         """The linear force maps that the process switches between, by the walls that touch: F alone without walls."""

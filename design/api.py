@@ -16,10 +16,10 @@ from design.result import Condition, Design, Requirement, bare, known, of_kind, 
 from design.stored import Stored
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
-Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]
+_Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]
 
 
-LOOP = 'a Loop, as scenario.loop("I") gives it'
+_LOOP = 'a Loop, as scenario.loop("I") gives it'
 
 
 class Options(TypedDict, total=False):
@@ -42,7 +42,7 @@ class Options(TypedDict, total=False):
 
 
 def design_coupling(
-    loop: Loop, kind: Kind = "spring-damper", condition: Condition | None = None, **options: Unpack[Options]
+    loop: Loop, kind: _Kind = "spring-damper", condition: Condition | None = None, **options: Unpack[Options]
 ) -> Design:
     """Design a coupling for a loop: `scenario.loop("I")`, which is all that a design knows of a scenario.
 
@@ -57,7 +57,7 @@ def design_coupling(
     Raises TypeError for an argument of another type or an option that the kind does not have, ValueError for a kind,
     condition or loop that makes no sense, DesignFailed where no such coupling exists.
     """
-    of_kind("loop", loop, Loop, LOOP)
+    of_kind("loop", loop, Loop, _LOOP)
     one_of("kind", kind, KINDS)
     known(options, OPTIONS[kind], f"kind {kind!r}")
     asked: dict[str, Any] = dict(options)
@@ -67,7 +67,7 @@ def design_coupling(
 
 
 #: kinds and conditions that are quick to try in the place of something else; of the optimal coupling the first rung
-_QUICK: tuple[tuple[Kind, Condition, Options], ...] = (
+_QUICK: tuple[tuple[_Kind, Condition, Options], ...] = (
     ("optimal", "this-environment", {"seconds": 0.0}),
     ("spring-damper", "this-environment", {}),
     ("spring-damper", "any-environment", {}),
@@ -110,7 +110,7 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[st
     Raises TypeError for an argument of another type, ValueError where coupling and loop do not fit each other,
     SingularLoop where their algebraic loop has no solution.
     """
-    of_kind("loop", loop, Loop, LOOP)
+    of_kind("loop", loop, Loop, _LOOP)
     phi = coupling.phi if isinstance(coupling, Design) else None
     alone = _fitting(loop, coupling)
     requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, phi))
@@ -128,7 +128,7 @@ def guarantee(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str |
     "any passive environment", "a set" (the loop's environment and its box), "this environment", or each contact state
     of an environment with walls. Raises TypeError for an argument of another type, ValueError for other requirements.
     """
-    of_kind("loop", loop, Loop, LOOP)
+    of_kind("loop", loop, Loop, _LOOP)
     of_kind("requirements", requirements, Mapping, "what certify returned")
     if "this-environment" not in requirements:
         raise ValueError(f"requirements has {', '.join(requirements) or 'nothing'}, expected what certify returned")
@@ -146,7 +146,7 @@ def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[floa
 
     Raises TypeError and ValueError as `certify` does.
     """
-    of_kind("loop", loop, Loop, LOOP)
+    of_kind("loop", loop, Loop, _LOOP)
     return transparency(loop.F(_fitting(loop, coupling)), loop.E(), loop.lam, band_hz)
 
 

@@ -80,17 +80,17 @@ def check_loop(loop: Loop) -> None:
 # returned is itself certified, and the other side of the edge is not.
 
 
-Ratio = Callable[[float], float]  # required over available damping, of a varied loop
+_Ratio = Callable[[float], float]  # required over available damping, of a varied loop
 
 #: Searches of the stiffest K and the largest T end here; each is far outside what any device is used with.
-STIFFEST, LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
-SOFTEST, STEP = 1.0, 3.0  # [N/m]; between two stiffnesses tried
-EDGE = 1e-7  # relative accuracy of an edge
-NOT_CERTIFIED = "not certified: there is nothing to lose"
+_STIFFEST, _LONGEST_PERIOD, MOST_EXTRA_SAMPLES = 1e6, 0.1, 16
+_SOFTEST, _STEP = 1.0, 3.0  # [N/m]; between two stiffnesses tried
+_EDGE = 1e-7  # relative accuracy of an edge
+_NOT_CERTIFIED = "not certified: there is nothing to lose"
 
 
 @dataclass(frozen=True)
-class Stiffest:
+class _Stiffest:
     """The largest certified stiffness of each channel beside its B [N/m]; None where the reason says why."""
 
     K: tuple[float | None, ...]
@@ -98,7 +98,7 @@ class Stiffest:
 
 
 @dataclass(frozen=True)
-class Tolerance:
+class _Tolerance:
     """What may be wrong, one thing at a time, before the certificate is lost; None where the reason says why."""
 
     least_delta: tuple[float, ...] | None  # [N s/m]: the required damping
@@ -107,11 +107,11 @@ class Tolerance:
     reason: str | None = None
 
 
-def stiffest(loop: Loop, coupling: Coupling, condition: Condition) -> Stiffest:
+def stiffest(loop: Loop, coupling: Coupling, condition: Condition) -> _Stiffest:
     """any-environment: channel by channel; this-environment: the largest common scale of all K."""
     unknown = (None,) * loop.channels
     if not isinstance(coupling, SpringDamper):
-        return Stiffest(unknown, "only a spring-damper has a K")
+        return _Stiffest(unknown, "only a spring-damper has a K")
     if condition == "any-environment":
         return _stiffest_for_any_environment(loop, coupling)
     K, B = coupling.K, coupling.B
@@ -120,23 +120,23 @@ def stiffest(loop: Loop, coupling: Coupling, condition: Condition) -> Stiffest:
     def ratio(scale: float) -> float:
         return requirement(loop, SpringDamper(scale * K, B), condition).ratio
 
-    scale = STIFFEST / K.max()
+    scale = _STIFFEST / K.max()
     if ratio(scale) < 1:
-        return Stiffest(unknown, f"certified up to the stiffest K tried, {STIFFEST:g} N/m")
-    while scale * K.max() > SOFTEST:
-        softer = scale / STEP
+        return _Stiffest(unknown, f"certified up to the stiffest K tried, {_STIFFEST:g} N/m")
+    while scale * K.max() > _SOFTEST:
+        softer = scale / _STEP
         if ratio(softer) < 1:
-            return Stiffest(tuple((edge(ratio, softer, scale) * K).tolist()))
+            return _Stiffest(tuple((edge(ratio, softer, scale) * K).tolist()))
         scale = softer
-    return Stiffest(unknown, "no scale of K is certified beside this B")
+    return _Stiffest(unknown, "no scale of K is certified beside this B")
 
 
-def _stiffest_for_any_environment(loop: Loop, coupling: SpringDamper) -> Stiffest:
+def _stiffest_for_any_environment(loop: Loop, coupling: SpringDamper) -> _Stiffest:
     """Between 0 and 2 (delta - B)/T, the bound where z^-n = -1; the set of gains is convex and contains K -> 0."""
     if any(loop.psi):
-        return Stiffest((None,) * loop.channels, "with psi >= 1 each K needs a multiplier of its own: not searched")
+        return _Stiffest((None,) * loop.channels, "with psi >= 1 each K needs a multiplier of its own: not searched")
     if loop.latency:
-        return Stiffest((None,) * loop.channels, LATE)
+        return _Stiffest((None,) * loop.channels, LATE)
     stiffest, reasons = [], []
     for B, theta, delta in zip(coupling.B.tolist(), loop.theta, loop.delta, strict=True):
         if delta <= B:
@@ -151,23 +151,23 @@ def _stiffest_for_any_environment(loop: Loop, coupling: SpringDamper) -> Stiffes
 
         bound = 2 * (delta - B) / loop.T
         stiffest.append(edge(ratio, 1e-9 * bound, bound))
-    return Stiffest(tuple(stiffest), "; ".join(reasons) or None)
+    return _Stiffest(tuple(stiffest), "; ".join(reasons) or None)
 
 
-def tolerance(loop: Loop, coupling: Coupling, needs: Requirement) -> Tolerance:
+def tolerance(loop: Loop, coupling: Coupling, needs: Requirement) -> _Tolerance:
     """How much error in delta, T and delay the certificate by `needs.condition` tolerates."""
     if not needs.certified:
-        return Tolerance(None, None, None, NOT_CERTIFIED)
+        return _Tolerance(None, None, None, _NOT_CERTIFIED)
     if needs.condition == "any-environment" and any(loop.psi):
         reason = "with psi >= 1 every T and delay needs a multiplier of its own: not searched"
-        return Tolerance(needs.required, None, None, reason)
+        return _Tolerance(needs.required, None, None, reason)
     largest = _largest_period(loop, coupling, needs.condition)
     extra = _extra_samples(loop, coupling, needs.condition)
     reasons = [
-        f"certified up to the largest T tried, {LONGEST_PERIOD:g} s" if largest is None else "",
+        f"certified up to the largest T tried, {_LONGEST_PERIOD:g} s" if largest is None else "",
         f"certified with {MOST_EXTRA_SAMPLES} samples more, the most that were tried" if extra is None else "",
     ]
-    return Tolerance(needs.required, largest, extra, "; ".join(filter(None, reasons)) or None)
+    return _Tolerance(needs.required, largest, extra, "; ".join(filter(None, reasons)) or None)
 
 
 def _largest_period(loop: Loop, coupling: Coupling, condition: Condition) -> float | None:
@@ -176,8 +176,8 @@ def _largest_period(loop: Loop, coupling: Coupling, condition: Condition) -> flo
         return _at_period(loop, coupling, condition, T).ratio
 
     inside, step = loop.T, 0.1
-    while inside < LONGEST_PERIOD:
-        outside = min(inside * (1 + step), LONGEST_PERIOD)
+    while inside < _LONGEST_PERIOD:
+        outside = min(inside * (1 + step), _LONGEST_PERIOD)
         if ratio(outside) >= 1:
             return edge(ratio, inside, outside)
         inside, step = outside, 2 * step
@@ -192,7 +192,7 @@ def _extra_samples(loop: Loop, coupling: Coupling, condition: Condition) -> int 
     return None
 
 
-def edge(ratio: Ratio, inside: float, outside: float) -> float:
+def edge(ratio: _Ratio, inside: float, outside: float) -> float:
     """The argument nearest `outside` at which the ratio is still below 1, to a relative EDGE."""
     from scipy.optimize import brentq  # slow to load, and seldom needed
 
@@ -202,8 +202,8 @@ def edge(ratio: Ratio, inside: float, outside: float) -> float:
     def above(x: float) -> float:
         return float(np.clip(math.log(max(ratio(x), 1e-9)), -3, 3))
 
-    root = cast(float, brentq(above, inside, outside, rtol=np.float64(EDGE), xtol=EDGE * inside))
-    for back in EDGE * 4.0 ** np.arange(12):
+    root = cast(float, brentq(above, inside, outside, rtol=np.float64(_EDGE), xtol=_EDGE * inside))
+    for back in _EDGE * 4.0 ** np.arange(12):
         x = root + back * (inside - root)
         if ratio(x) < 1:
             return float(x)
@@ -214,18 +214,18 @@ def edge(ratio: Ratio, inside: float, outside: float) -> float:
 # What would help a coupling that a condition does not certify, found by trying each change alone.
 
 
-FACTORS = (0.75, 0.5, 0.25, 0.1)  # of B and T that are tried
+_FACTORS = (0.75, 0.5, 0.25, 0.1)  # of B and T that are tried
 
 
 @dataclass(frozen=True, eq=False)
-class Remedy:
+class _Remedy:
     """One change, as mild as certifies; or, where none does, the one that lowers the required damping most."""
 
     change: str
     requirement: Requirement
 
 
-def remedies(loop: Loop, coupling: Coupling, needs: Requirement) -> list[Remedy]:
+def remedies(loop: Loop, coupling: Coupling, needs: Requirement) -> list[_Remedy]:
     """What certifies, or lowers the required damping by 10 % or more, each change alone; [] where it is certified."""
     condition = needs.condition
     if needs.certified or (condition == "any-environment" and any(loop.psi)):
@@ -248,33 +248,33 @@ def remedies(loop: Loop, coupling: Coupling, needs: Requirement) -> list[Remedy]
     return [r for r in found if r and (r.requirement.certified or r.requirement.ratio < least)]
 
 
-def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> Remedy | None:
+def _fewer_samples(loop: Loop, coupling: Coupling, condition: Condition, name: str) -> _Remedy | None:
     """One sample less at a time, on every channel that has one; the reference is none later than the loop."""
     steps, tried = getattr(loop, name), []
     for fewer in range(1, max(steps) + 1):
         less = tuple(max(n - fewer, 0) for n in steps)
         needs = _varied(loop, coupling, condition, lam=(0,) * loop.channels, **{name: less})
-        tried.append(Remedy(f"less delay: {name} = {listed(less, 5)}", needs))
+        tried.append(_Remedy(f"less delay: {name} = {listed(less, 5)}", needs))
         if tried[-1].requirement.certified:
             return tried[-1]
     return min(tried, key=lambda remedy: remedy.requirement.ratio, default=None)
 
 
-def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], str]) -> Remedy:
+def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], str]) -> _Remedy:
     """The largest factor that certifies, in steps of 0.001; where none does, the one that needs the least damping."""
 
     needs = cache(vary)
-    for larger, factor in pairwise((1.0, *FACTORS)):
+    for larger, factor in pairwise((1.0, *_FACTORS)):
         if needs(factor).certified:
             mildest = edge(lambda x: needs(x).ratio, factor, larger)
             printable = max(math.floor(1e3 * mildest - 1e-2) / 1e3, factor)  # certified as rounded for the report
             mildest = printable if needs(printable).certified else factor
-            return Remedy(describe(mildest), needs(mildest))
-    best = min(FACTORS, key=lambda x: needs(x).ratio)
-    return Remedy(describe(best), needs(best))
+            return _Remedy(describe(mildest), needs(mildest))
+    best = min(_FACTORS, key=lambda x: needs(x).ratio)
+    return _Remedy(describe(best), needs(best))
 
 
-KINDS = {
+_KINDS = {
     NoCoupling: "none",
     SpringDamper: "spring-damper",
     MovingAverage: "moving-average",
@@ -305,7 +305,7 @@ def report(
     gains = coupling if isinstance(coupling, SpringDamper) else None
     return {
         "coupling": {
-            "kind": KINDS[type(coupling)],
+            "kind": _KINDS[type(coupling)],
             "K": gains.K.tolist() if gains else None,
             "B": gains.B.tolist() if gains else None,
         },
@@ -344,11 +344,11 @@ def _switching_part(loop: Loop, coupling: Coupling, span: DelayRange) -> dict[st
     return switching_part(found, touching.sent(coupling), span, loop.T_max)
 
 
-def _stiffest_part(found: Stiffest) -> dict[str, Any]:
+def _stiffest_part(found: _Stiffest) -> dict[str, Any]:
     return {"K": list(found.K)} | _because(found.reason)
 
 
-def _sensitivity_part(loop: Loop, needs: Requirement, found: Tolerance) -> dict[str, Any]:
+def _sensitivity_part(loop: Loop, needs: Requirement, found: _Tolerance) -> dict[str, Any]:
     """Errors are relative: delta may be 1 - delta_error times and T 1 + T_error times what was given."""
     return {
         "least_delta": None if found.least_delta is None else list(found.least_delta),

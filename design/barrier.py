@@ -16,11 +16,11 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, qr, solve_triangula
 
 from controller.lti import Array, Complex
 
-CENTRED = 0.5  # Newton decrement squared at which a point counts as central: 0.05/t above the best value
-MOST_STEPS = 60
-KEPT = 0.3  # of an eigenvalue, at least, after a step
-LONGEST = 1e3  # times the Newton step
-RIDGE = 1e-9  # of its column: what a direction that neither objective nor inequalities see is charged
+_CENTRED = 0.5  # Newton decrement squared at which a point counts as central: 0.05/t above the best value
+_MOST_STEPS = 60
+_KEPT = 0.3  # of an eigenvalue, at least, after a step
+_LONGEST = 1e3  # times the Newton step
+_RIDGE = 1e-9  # of its column: what a direction that neither objective nor inequalities see is charged
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class Program:
         rows = [_directions(block, x)[0] for block in self.blocks]
         scale = np.linalg.norm(np.vstack([self.A, *rows]), axis=0)
         scale = np.where(scale > 0, scale, 1.0)
-        stacked = np.vstack([self.A, *rows, RIDGE * np.diag(scale)])
+        stacked = np.vstack([self.A, *rows, _RIDGE * np.diag(scale)])
         U = np.asarray(qr(stacked, mode="r")[0])[: x.size]
         A = solve_triangular(U, self.A.T, trans=1).T
         blocks = tuple(Block(block.constant, _changed(block.slope, U)) for block in self.blocks)
@@ -80,7 +80,7 @@ class Program:
 
 def centre(program: Program, x: Array, t: float) -> Array:
     """The minimiser of t (|A x - b|^2 + c'x) - sum log det S, from a strictly feasible x."""
-    for _ in range(MOST_STEPS):
+    for _ in range(_MOST_STEPS):
         parts = [_directions(block, x) for block in program.blocks]
         gradient = 2 * t * program.A.T @ (program.A @ x - program.b) + t * program.c
         hessian = 2 * t * program.A.T @ program.A
@@ -89,7 +89,7 @@ def centre(program: Program, x: Array, t: float) -> Array:
             hessian += rows.T @ rows
         step = _solved(hessian, -gradient)
         decrement = float(-gradient @ step)
-        if not decrement > CENTRED:
+        if not decrement > _CENTRED:
             break
         x = x + _length(program, step, x, t) * step
     return x
@@ -129,7 +129,7 @@ def _length(program: Program, step: Array, x: Array, t: float) -> float:
     def rises(s: float) -> bool:
         return linear + square * s > (along / (1 + s * along)).sum()
 
-    low, high = 0.0, (1 - KEPT) / -along.min() if along.min() < 0 else LONGEST
+    low, high = 0.0, (1 - _KEPT) / -along.min() if along.min() < 0 else _LONGEST
     if not rises(high):
         return high
     while high - low > 0.01 * high:

@@ -31,22 +31,22 @@ from design.barrier import Block, Program, centre, towards
 from design.frequency import frequencies, hermitian, on_circle
 from design.transparency import BAND_HZ, decibels
 
-Indices = NDArray[np.intp]  # of points of the transform
+_Indices = NDArray[np.intp]  # of points of the transform
 
-POINTS = 65536  # of the transform
-KNOTS = {1: 60, 2: 40, 3: 24}  # of h, by channels; fewer for more
-FEWEST = 16
-NEAR_END = (0.22, 0.5)  # of a step between knots: h falls to zero at the upper end of the band
-DEGREE = 3  # of the splines that h is made of
-GAP = 0.01  # of the bound, relatively, that the barrier leaves
-SWEEPS = 6
-QUADRATURE = 3e-6  # of the mean square: what the sums over transform and band may differ from their integrals
-LARGEST_CHARGE = 0.003  # of the bound, for what D lacks between the frequencies where it is imposed
-STEEPER = 4.0
+_POINTS = 65536  # of the transform
+_KNOTS = {1: 60, 2: 40, 3: 24}  # of h, by channels; fewer for more
+_FEWEST = 16
+_NEAR_END = (0.22, 0.5)  # of a step between knots: h falls to zero at the upper end of the band
+_DEGREE = 3  # of the splines that h is made of
+_GAP = 0.01  # of the bound, relatively, that the barrier leaves
+_SWEEPS = 6
+_QUADRATURE = 3e-6  # of the mean square: what the sums over transform and band may differ from their integrals
+_LARGEST_CHARGE = 0.003  # of the bound, for what D lacks between the frequencies where it is imposed
+_STEEPER = 4.0
 
 
 @dataclass(frozen=True)
-class Bound:
+class _Bound:
     """No linear coupling for this environment has less rms mismatch."""
 
     rms: float  # relative to the environment
@@ -57,12 +57,12 @@ class Bound:
         return decibels(self.rms)
 
 
-def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None) -> Bound:
+def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None) -> _Bound:
     """The least rms mismatch over the band that any coupling certified this-environment can have."""
     started = time.perf_counter()
-    dual = _Dual.of(loop, band_hz, knots or KNOTS.get(loop.channels, FEWEST))
+    dual = _Dual.of(loop, band_hz, knots or _KNOTS.get(loop.channels, _FEWEST))
     square = dual.best()
-    return Bound(float(np.sqrt(max(square - QUADRATURE, 0.0))), time.perf_counter() - started)
+    return _Bound(float(np.sqrt(max(square - _QUADRATURE, 0.0))), time.perf_counter() - started)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,17 +88,17 @@ class _Dual:
         knots = np.geomspace(low, high, count)
         width = knots[1] / knots[0]
         extra = [w * f for w in modes for f in (width**-0.5, 1.0, width**0.5) if low < w * f < high]
-        extra += [high * width**-f for f in NEAR_END]
+        extra += [high * width**-f for f in _NEAR_END]
         knots = np.union1d(knots, extra)
         knots = knots[np.concatenate([[True], np.diff(np.log(knots)) > 0.2 * np.log(width)])]
         x = np.log(knots)
-        spline = np.concatenate([[x[0]] * DEGREE, x, [x[-1]] * DEGREE])
-        inner = x.size + DEGREE - 3  # h is zero at both ends of the band, else H_+ would be unbounded there
+        spline = np.concatenate([[x[0]] * _DEGREE, x, [x[-1]] * _DEGREE])
+        inner = x.size + _DEGREE - 3  # h is zero at both ends of the band, else H_+ would be unbounded there
 
         def hats(w: Array) -> Array:
             """(inner, k): B-splines in log w."""
             x = np.clip(np.log(w), spline[0], spline[-1])
-            return BSpline.design_matrix(x, spline, DEGREE).toarray()[:, 1:-1].T
+            return BSpline.design_matrix(x, spline, _DEGREE).toarray()[:, 1:-1].T
 
         # objective, by Gauss's rule between the points of a grid that has the knots
         grid = np.union1d(knots, frequencies(E, low=low, high=high, points=200))
@@ -130,7 +130,7 @@ class _Dual:
         c[sizes[0] : sizes[0] + sizes[1]] = [1.0 if i == j else 0.0 for i, j in _triangle(m)]
 
         # the causal parts, by transforms
-        w = 2 * np.pi * np.arange(POINTS // 2 + 1) / POINTS
+        w = 2 * np.pi * np.arange(_POINTS // 2 + 1) / _POINTS
         inside = (w > low) & (w < high)
         real = np.zeros((inner, w.size))
         e = np.linalg.norm(E.at(on_circle(w[inside])), axis=(1, 2))
@@ -147,10 +147,10 @@ class _Dual:
     def inner(self) -> int:
         return len(self.parts) // 2
 
-    def block(self, points: Indices) -> Block:
+    def block(self, points: _Indices) -> Block:
         """D at some of the transform's points, scaled by root(delta) from both sides."""
         m, inner = self.m, self.inner
-        z = np.exp(2j * np.pi * points / POINTS)
+        z = np.exp(2j * np.pi * points / _POINTS)
         slope = np.zeros((points.size, self.c.size, m, m), dtype=complex)
         at = 0
         for i in range(m):
@@ -176,13 +176,13 @@ class _Dual:
 
     def lacking(self, x: Array) -> Array:
         """The least eigenvalue of D at every point, (POINTS/2 + 1,)."""
-        points = np.arange(POINTS // 2 + 1)
+        points = np.arange(_POINTS // 2 + 1)
         return np.concatenate([np.linalg.eigvalsh(self._at(x, some))[:, 0] for some in np.array_split(points, 16)])
 
-    def _at(self, x: Array, points: Indices) -> Complex:
+    def _at(self, x: Array, points: _Indices) -> Complex:
         """D itself, without its slopes."""
         m, inner = self.m, self.inner
-        z = np.exp(2j * np.pi * points / POINTS)
+        z = np.exp(2j * np.pi * points / _POINTS)
         D = np.zeros((points.size, m, m), dtype=complex)
         h = x[: 2 * inner * m * m].reshape(m, m, 2 * inner)
         D += 2 * np.einsum("ijh,hk->kij", h, self.parts[:, points]) * np.outer(self.root, self.root)
@@ -197,7 +197,7 @@ class _Dual:
 
     def best(self) -> float:
         """The bound on the mean square."""
-        last = POINTS // 2
+        last = _POINTS // 2
         # the lowest points first, then even in the logarithm and even
         points = np.unique(np.concatenate([[0], np.geomspace(1, last, 220).round(), np.linspace(1, last, 160).round()]))
         points = points.astype(int)
@@ -206,24 +206,24 @@ class _Dual:
         rest = float(self.b @ self.b - b @ b)  # what no h reaches
         start = x = self.start()
         t, found = None, 0.0
-        for sweep in range(SWEEPS):
+        for sweep in range(_SWEEPS):
             program = Program(A, b, self.c, (self.block(points),))
             x = towards(start, x, program)
             program, U = program.conditioned(x)
             y = U @ x
-            t = program.degree / max(program.value(y), 1e-12) if t is None else t / STEEPER
+            t = program.degree / max(program.value(y), 1e-12) if t is None else t / _STEEPER
             while True:
                 y = centre(program, y, t)
                 left = max(1 - rest - program.value(y), 1e-9)
-                if program.degree / t <= (GAP if sweep else 5 * GAP) * left:
+                if program.degree / t <= (_GAP if sweep else 5 * _GAP) * left:
                     break
-                t *= STEEPER
+                t *= _STEEPER
             x = solve_triangular(U, y)
             lacking = self.lacking(x)
             charge = self.m * max(0.0, -float(lacking.min()))
             value = 1 - rest - program.value(y) - charge
             found = max(found, value)
-            if sweep and charge <= LARGEST_CHARGE * max(value, 1e-9):
+            if sweep and charge <= _LARGEST_CHARGE * max(value, 1e-9):
                 break
             points = np.union1d(points, _worst(lacking))
         return found
@@ -268,14 +268,14 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[int, Array], ...]:
 
 def _causal(half: Complex) -> Complex:
     """(1/z - 1) H_+ + H_0 on the half circle, of functions H given there, (n, POINTS/2 + 1); H(conj z) = conj H(z)."""
-    coefficients = np.fft.irfft(half, n=POINTS)  # H_k of z^-k: H(w) = sum_k H_k e^{-jwk}
-    coefficients[:, POINTS // 2 :] = 0.0  # k < 0
+    coefficients = np.fft.irfft(half, n=_POINTS)  # H_k of z^-k: H(w) = sum_k H_k e^{-jwk}
+    coefficients[:, _POINTS // 2 :] = 0.0  # k < 0
     shifted = np.roll(coefficients, 1, axis=1) - coefficients
     shifted[:, 0] = 0.0  # -H_0 + H_0
-    return np.fft.rfft(shifted, n=POINTS)
+    return np.fft.rfft(shifted, n=_POINTS)
 
 
-def _worst(lacking: Array) -> Indices:
+def _worst(lacking: Array) -> _Indices:
     """The points of the deepest local minima below zero."""
     padded = np.concatenate([[np.inf], lacking, [np.inf]])
     local = np.flatnonzero((lacking <= padded[:-2]) & (lacking <= padded[2:]) & (lacking < 0))

@@ -63,7 +63,7 @@ from design.stored import Certificate, LimiterCertificate, Stored, SwitchingProo
 # Channels whose delay does not vary have no row and column of the second kind, and alpha = 0.
 
 
-CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
+_CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
 
 
 def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
@@ -104,9 +104,9 @@ def _refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof) -> str | Non
         return str(error)
     found = swept(loop, coupling, proof.alpha)
     required = found.requirement.required
-    if len(proof.required) != len(required) or not np.allclose(proof.required, required, rtol=CLAIM_TOLERANCE):
+    if len(proof.required) != len(required) or not np.allclose(proof.required, required, rtol=_CLAIM_TOLERANCE):
         return f"required is {list(proof.required)}, the sweep finds {list(required)}"
-    if not np.isclose(proof.margin, _margin(found.requirement), rtol=CLAIM_TOLERANCE):
+    if not np.isclose(proof.margin, _margin(found.requirement), rtol=_CLAIM_TOLERANCE):
         return f"margin is {proof.margin:.9g}, the sweep finds {_margin(found.requirement):.9g}"
     return refuted_rows("P", condition, proof.P)
 
@@ -153,13 +153,13 @@ def prove_limiter(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | 
         needed, have = (", ".join(f"{d:.6g}" for d in side) for side in (requirement.required, requirement.available))
         reason = requirement.reason or f"limiter: needs {needed} N s/m of damping, has {have}"
         raise NotProved(reason, requirement)
-    P, refused = find_storage(limiter_block(loop, coupling, found.rho, found.c))
+    P, refused = find_storage(_limiter_block(loop, coupling, found.rho, found.c))
     if P is None:
         raise NotProved(f"limiter: {refused}; the sweep asks {requirement.ratio:.9f} of the damping", requirement)
     return LimiterCertificate(beta, found.rho, found.c, requirement.required, _margin(found.requirement), rows_of(P))
 
 
-def limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: Lags) -> Lti:
+def _limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: Lags) -> Lti:
     """The exact block that must be strictly positive real. Raises NotProved."""
     try:
         G = loop.sent(coupling, exact=True)
@@ -186,11 +186,11 @@ def _refuted_limiter(loop: Loop, coupling: Coupling, certificate: Certificate) -
         return f"limiter: rho is {list(proof.rho)}, expected beta delta/T with beta = {proof.beta:g}, one row of c each"
     found = limiter_requirement(loop, coupling, proof.beta, proof.c)
     required = found.requirement.required
-    if len(proof.required) != len(required) or not np.allclose(proof.required, required, rtol=CLAIM_TOLERANCE):
+    if len(proof.required) != len(required) or not np.allclose(proof.required, required, rtol=_CLAIM_TOLERANCE):
         return f"limiter: required is {list(proof.required)}, the sweep finds {list(required)}"
-    if not np.isclose(proof.margin, _margin(found.requirement), rtol=CLAIM_TOLERANCE):
+    if not np.isclose(proof.margin, _margin(found.requirement), rtol=_CLAIM_TOLERANCE):
         return f"limiter: margin is {proof.margin:.9g}, the sweep finds {_margin(found.requirement):.9g}"
-    reason = refuted_rows("P", limiter_block(loop, coupling, proof.rho, proof.c), proof.P)
+    reason = refuted_rows("P", _limiter_block(loop, coupling, proof.rho, proof.c), proof.P)
     return reason and f"limiter: {reason}"
 
 
@@ -292,8 +292,8 @@ def prove(
 
 
 #: More delays, states or digits than these are not looked at: a proof would take minutes.
-MOST_BITS = 400  # of the denominator of a coefficient: a decimal of 120 places
-MOST_COST = 8  # environments of a set, each as many as LARGEST states are
+_MOST_BITS = 400  # of the denominator of a coefficient: a decimal of 120 places
+_MOST_COST = 8  # environments of a set, each as many as LARGEST states are
 
 
 def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:
@@ -301,7 +301,7 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
     late = sum(loop.delays.hi) + sum(loop.psi)
     _require_size(late)
     for value in _coefficients(msgspec.to_builtins((loop, coupling.form()))):
-        if rational(value).denominator.bit_length() > MOST_BITS:
+        if rational(value).denominator.bit_length() > _MOST_BITS:
             raise NotProved(f"the coefficient {value:g} has too many digits for exact arithmetic")
     try:
         states = loop.sent(coupling).order
@@ -310,7 +310,7 @@ def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> Non
     states += sum(loop.theta) if condition == "this-environment" else 0
     _require_size(states)
     members = len(loop.members()) if condition == "this-environment" else 1
-    if members * states**3 > MOST_COST * LARGEST**3:
+    if members * states**3 > _MOST_COST * LARGEST**3:
         raise NotProved(f"a proof in {members} environments over {states} states each takes long")
 
 
@@ -323,7 +323,7 @@ def _coefficients(value: Any) -> Iterator[float]:
             yield from _coefficients(part)
 
 
-MOST_LOST = 1e-4  # of the largest force, or of Delta_D/T: a twentieth of what the designs of least margin leave unused
+_MOST_LOST = 1e-4  # of the largest force, or of Delta_D/T: a twentieth of what the designs of least margin leave unused
 
 
 def _another_system(loop: Loop, coupling: Coupling) -> str | None:
@@ -340,10 +340,10 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
     response = running.at(z)
     lost = rounding(running, z) + float(np.abs(response - exact.floats().at(z)).max())
     scale = max(float(np.abs(response).max()), min(loop.delta) / loop.T)
-    if lost <= MOST_LOST * scale:
+    if lost <= _MOST_LOST * scale:
         return None
     return (
-        f"in floating point the forces may be off by {lost / scale:.1e} of themselves, allowed is {MOST_LOST:g}: "
+        f"in floating point the forces may be off by {lost / scale:.1e} of themselves, allowed is {_MOST_LOST:g}: "
         "what runs would not be what is proved"
     )
 
@@ -502,10 +502,10 @@ def _refuted_claims(loop: Loop, coupling: Coupling, certificate: Certificate) ->
     _require_limits(loop, coupling, certificate.condition)
     requirement = required_damping(loop, coupling, certificate.condition, _multiplier(loop, certificate))
     if len(certificate.required) != len(loop.delta) or not np.allclose(
-        certificate.required, requirement.required, rtol=CLAIM_TOLERANCE
+        certificate.required, requirement.required, rtol=_CLAIM_TOLERANCE
     ):
         return f"required is {list(certificate.required)}, the sweep finds {list(requirement.required)}"
-    if not np.isclose(certificate.margin, 1 / max(requirement.ratio, 1e-12), rtol=CLAIM_TOLERANCE):
+    if not np.isclose(certificate.margin, 1 / max(requirement.ratio, 1e-12), rtol=_CLAIM_TOLERANCE):
         return f"margin is {certificate.margin:.9g}, the sweep finds {1 / max(requirement.ratio, 1e-12):.9g}"
     if not requirement.certified:
         return f"the sweep asks {requirement.ratio:.6g} times the available damping, whatever the matrices prove"

@@ -38,7 +38,7 @@ from design.transparency import decibels, transparency
 # A coupling over frequency: singular values, the demand for damping, and what a hand perceives.
 
 
-LOWEST_HZ = 0.1
+_LOWEST_HZ = 0.1
 FEEL_HZ = (1.0, 10.0)  # where perceived stiffness and damping are quoted
 
 
@@ -96,7 +96,7 @@ def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Judged:
     return Judged(F, requirements, demands)
 
 
-def grid(loop: Loop, couplings: Sequence[Judged], low_hz: float = LOWEST_HZ) -> Array:
+def grid(loop: Loop, couplings: Sequence[Judged], low_hz: float = _LOWEST_HZ) -> Array:
     """Frequencies [Hz] up to Nyquist's, dense around every pole, with FEEL_HZ and where conditions bind."""
     per_hz = 2 * np.pi * loop.T
     systems = (loop.E(), *(judged.F for judged in couplings))
@@ -114,16 +114,16 @@ def curves(loop: Loop, judged: Judged, hz: Array) -> Curves:
     target = (delay(loop.lam, loop.T) @ E).at(z)
     F = judged.F.at(z)
     demands = {name: None if demand is None else demand(w) for name, demand in judged.demands.items()}
-    return Curves(singular_values(F), singular_values(F - target), perceived(F, hz), demands)
+    return Curves(_singular_values(F), _singular_values(F - target), perceived(F, hz), demands)
 
 
 def ideal(loop: Loop, hz: Array) -> tuple[Array, Perceived]:
     """Singular values of E (k, m) [N/m] and its effective impedance: what an undelayed loop without coupling gives."""
     E = loop.E().at(on_circle(2 * np.pi * hz * loop.T))
-    return singular_values(E), perceived(E, hz)
+    return _singular_values(E), perceived(E, hz)
 
 
-def singular_values(G: NDArray[np.complex128]) -> Array:
+def _singular_values(G: NDArray[np.complex128]) -> Array:
     """(k, m, m) -> (k, m), largest first."""
     return np.linalg.svd(G, compute_uv=False)
 
@@ -154,11 +154,11 @@ def _multiplier(loop: Loop, coupling: Coupling) -> Array | None:
 # found.
 
 
-Kept = Literal["samples", "seconds"]  # what stays of a delay when the period changes
+_Kept = Literal["samples", "seconds"]  # what stays of a delay when the period changes
 
 
 @dataclass(frozen=True)
-class Axis:
+class _Axis:
     """What is varied: its label, its unit, and the range around what there is, unless another is asked for."""
 
     label: str
@@ -170,10 +170,10 @@ class Axis:
 
 
 AXES = {
-    "damping": Axis("damping of the devices (the least)", "N s/m", 0.5, 1.4, 1e-3, 1e3),
-    "delay": Axis("transmission delay (the largest)", "samples", math.nan, math.nan, 0, 100),
-    "period": Axis("sampling period", "s", 0.5, 2.5, 1e-5, 0.1),
-    "order": Axis("rungs of the optimal coupling's basis", "rungs", 0.2, 1.0, 1, len(LADDER)),
+    "damping": _Axis("damping of the devices (the least)", "N s/m", 0.5, 1.4, 1e-3, 1e3),
+    "delay": _Axis("transmission delay (the largest)", "samples", math.nan, math.nan, 0, 100),
+    "period": _Axis("sampling period", "s", 0.5, 2.5, 1e-5, 0.1),
+    "order": _Axis("rungs of the optimal coupling's basis", "rungs", 0.2, 1.0, 1, len(LADDER)),
 }
 
 
@@ -187,7 +187,7 @@ class Setting:
 
 
 def settings(
-    axis: str, loop: Loop, wish: Options, points: int, span: tuple[float, float] | None = None, kept: Kept = "samples"
+    axis: str, loop: Loop, wish: Options, points: int, span: tuple[float, float] | None = None, kept: _Kept = "samples"
 ) -> list[Setting]:
     """The points of one axis, with what there is among them. Raises ValueError for a range that is none.
 
@@ -307,7 +307,7 @@ def remembered(designer: Designer, whole: bool) -> Designer:
     return recalled
 
 
-def _spread(base: float, axis: Axis, points: int, span: tuple[float, float] | None) -> Array:
+def _spread(base: float, axis: _Axis, points: int, span: tuple[float, float] | None) -> Array:
     """`points` values, even in their logarithm; the nearest to what there is becomes that, if it lies between."""
     low, high = span or (axis.low * base, axis.high * base)
     values = np.geomspace(low, high, points)
@@ -328,7 +328,7 @@ def _delayed(loop: Loop, more: int) -> Loop:
     return msgspec.structs.replace(loop, theta=theta, lam=_reference(loop, theta, loop.psi))
 
 
-def _sampled(loop: Loop, T: float, kept: Kept) -> Loop:
+def _sampled(loop: Loop, T: float, kept: _Kept) -> Loop:
     """Another period. In seconds a delay is never shortened: it becomes the next whole number of samples."""
     if kept == "samples":
         return msgspec.structs.replace(loop, T=T)
@@ -347,13 +347,13 @@ def _reference(loop: Loop, theta: tuple[int, ...], psi: tuple[int, ...]) -> tupl
 # Every design side by side: what it requires, how close it comes to the environment, and what proves it.
 
 
-PRINTED = {"I": "(27)", "II": "(28)"}  # the paper's equations for its gains
+_PRINTED = {"I": "(27)", "II": "(28)"}  # the paper's equations for its gains
 
-Progress = Callable[[int, int], None]  # (designs done, designs in all)
+_Progress = Callable[[int, int], None]  # (designs done, designs in all)
 
 
 @dataclass(frozen=True)
-class Entry:
+class _Entry:
     """A design to be made: its name in the table, and the arguments of design.designs.design_by_kind."""
 
     name: str
@@ -363,7 +363,7 @@ class Entry:
 
 
 @dataclass(frozen=True)
-class LadderRow:
+class _LadderRow:
     """One line of the table."""
 
     design: str
@@ -382,29 +382,29 @@ class LadderRow:
 
 
 SHORT = (
-    Entry("none", "none"),
-    Entry("published", "published"),
-    Entry("spring-damper, any-environment", "spring-damper", "any-environment"),
-    Entry("spring-damper, this-environment", "spring-damper"),
-    Entry("optimal", "optimal"),
-    Entry("bound for any linear coupling", "bound"),
+    _Entry("none", "none"),
+    _Entry("published", "published"),
+    _Entry("spring-damper, any-environment", "spring-damper", "any-environment"),
+    _Entry("spring-damper, this-environment", "spring-damper"),
+    _Entry("optimal", "optimal"),
+    _Entry("bound for any linear coupling", "bound"),
 )
-FULL = (
+_FULL = (
     *SHORT[:4],
-    Entry("ccl, one state per channel, any-environment", "ccl", "any-environment"),
-    Entry("optimal, one rung", "optimal", options={"ladder": LADDER[:1]}),
-    Entry("optimal, |F| <= 1.5 |E| above 100 Hz", "optimal", options={"high_gain": 1.5}),
-    Entry("optimal, sup", "optimal", options={"objective": "sup"}),
+    _Entry("ccl, one state per channel, any-environment", "ccl", "any-environment"),
+    _Entry("optimal, one rung", "optimal", options={"ladder": LADDER[:1]}),
+    _Entry("optimal, |F| <= 1.5 |E| above 100 Hz", "optimal", options={"high_gain": 1.5}),
+    _Entry("optimal, sup", "optimal", options={"objective": "sup"}),
     *SHORT[4:],
 )
-LADDERS = {"short": SHORT, "full": FULL}
+LADDERS = {"short": SHORT, "full": _FULL}
 
 
 def compare_designs(
-    loops: Mapping[str, Loop], entries: Sequence[Entry], progress: Progress
-) -> tuple[list[LadderRow], bool]:
+    loops: Mapping[str, Loop], entries: Sequence[_Entry], progress: _Progress
+) -> tuple[list[_LadderRow], bool]:
     """The rows of every case, and whether the keyboard ended it; what was done before is kept."""
-    rows: list[LadderRow] = []
+    rows: list[_LadderRow] = []
     total = len(loops) * len(entries)
     try:
         for case, loop in loops.items():
@@ -416,7 +416,7 @@ def compare_designs(
     return rows, False
 
 
-def ladder_row(case: str, loop: Loop, entry: Entry) -> LadderRow:
+def ladder_row(case: str, loop: Loop, entry: _Entry) -> _LadderRow:
     """One design with its proof; a request without a solution gives its reason."""
     begin = time.perf_counter()
     if entry.kind == "bound":
@@ -425,7 +425,7 @@ def ladder_row(case: str, loop: Loop, entry: Entry) -> LadderRow:
         coupling, design = _made(loop, case, entry)
     except DesignFailed as error:
         wall = time.perf_counter() - begin
-        return LadderRow(
+        return _LadderRow(
             _name(entry, case), case, None, False, entry.condition, None, None, None, wall, 0.0, str(error)
         )
     wall = time.perf_counter() - begin
@@ -443,24 +443,24 @@ def ladder_row(case: str, loop: Loop, entry: Entry) -> LadderRow:
     mismatch = finite(decibels(figures.relative_mismatch)), finite(decibels(figures.rms_mismatch))
     proof_s = time.perf_counter() - begin
     certified = requirement.certified
-    return LadderRow(
+    return _LadderRow(
         _name(entry, case), case, required, certified, entry.condition, *mismatch, proof, wall, proof_s, reason
     )
 
 
-def _bound_row(case: str, loop: Loop, entry: Entry) -> LadderRow:
+def _bound_row(case: str, loop: Loop, entry: _Entry) -> _LadderRow:
     """What no linear coupling can be better than: no design, and of the rms mismatch only."""
     found = bound(loop)
-    return LadderRow(
+    return _LadderRow(
         entry.name, case, None, False, entry.condition, None, finite(found.rms_db), None, found.seconds, 0.0
     )
 
 
-def _name(entry: Entry, case: str) -> str:
-    return f"{entry.name} {PRINTED[case]}" if entry.kind == "published" else entry.name
+def _name(entry: _Entry, case: str) -> str:
+    return f"{entry.name} {_PRINTED[case]}" if entry.kind == "published" else entry.name
 
 
-def _made(loop: Loop, case: str, entry: Entry) -> tuple[Coupling, Design | None]:
+def _made(loop: Loop, case: str, entry: _Entry) -> tuple[Coupling, Design | None]:
     if entry.kind == "none":
         return NoCoupling(), None
     if entry.kind == "published":
@@ -471,11 +471,11 @@ def _made(loop: Loop, case: str, entry: Entry) -> tuple[Coupling, Design | None]
     return design.coupling, design
 
 
-Sweeps = dict[str, dict[str, list[Limit]]]  # sweep -> design -> its points
-EXACT_DB = -60.0  # below it the difference to the environment is the solver's
+_Sweeps = dict[str, dict[str, list[Limit]]]  # sweep -> design -> its points
+_EXACT_DB = -60.0  # below it the difference to the environment is the solver's
 
 
-def gains(plan: dict[str, list[Setting]], curves: Sweeps, loop: Loop, wish: Options) -> list[str]:
+def gains(plan: dict[str, list[Setting]], curves: _Sweeps, loop: Loop, wish: Options) -> list[str]:
     """What there is to gain, in a line per sweep."""
     lines = []
     for name, rows in curves.items():
@@ -509,7 +509,7 @@ def _figure(limit: Limit, objective: str) -> float | None:
 
 def printed_decibels(value: float) -> str:
     """In case I a loop that needs no coupling reaches minus infinity, of which a solver finds some -60 to -120 dB."""
-    return f"below {EXACT_DB:g} dB" if value < EXACT_DB else f"{value:.2f} dB"
+    return f"below {_EXACT_DB:g} dB" if value < _EXACT_DB else f"{value:.2f} dB"
 
 
 if __name__ == "__main__":

@@ -145,9 +145,9 @@ def delayed_environment_block(delayed: Lti, phi: Sequence[Any]) -> tuple[Array, 
 
 
 #: Delta_V^-1 stays this much, relatively, below the limit of (14), which is strict.
-STRICT = Fraction(1, 10**9)
+_STRICT = Fraction(1, 10**9)
 #: Delta_V^-1 in units of 1/delta where Phi is 0 and (14) asks only Delta_V > 0.
-UNLIMITED = 10**6
+_UNLIMITED = 10**6
 
 
 def delayed_coupling_block(
@@ -165,7 +165,7 @@ def delayed_coupling_block(
         raise ValueError("the multiplier Phi is not between 0 and the device damping on every channel")
     H = V - np.diag(T / (2 * damping)) @ moving_sum(theta, T)
     H1, R = H.split_at_one()
-    excess = [(1 / p - 1 / d) * (1 - STRICT) if p else UNLIMITED / d for p, d in zip(phi, damping, strict=True)]
+    excess = [(1 / p - 1 / d) * (1 - _STRICT) if p else _UNLIMITED / d for p, d in zip(phi, damping, strict=True)]
     m = len(delta)
     right = np.vstack([np.zeros((m, m), dtype=object), np.diag(numbers(excess, T))])
     return H1, hstack(vstack(T * (H1 / 2 - R), 2 * H), Lti.constant(right, T))
@@ -239,10 +239,10 @@ def this_environment(
         return refused(f"the force map is singular in floating point: {error}")
     F1, end = F.dc(), F.at(-1.0)
     skew, least = _static_errors(F1, F.D, end)
-    slack = STATIC
+    slack = _STATIC
     if max(skew, -least) > slack:  # of a map that is nothing but rounding
         size = max(float(np.abs(part).max()) for part in (F1, F.D, end))
-        allowed = min(rounding(F, on_circle(frequencies(F))), STATIC * min(available) / F.T)
+        allowed = min(rounding(F, on_circle(frequencies(F))), _STATIC * min(available) / F.T)
         slack = max(slack, allowed / max(size, 1e-12))
     if skew > slack:
         return refused("the static stiffness F(1) is not symmetric: a slow closed path could extract energy")
@@ -252,9 +252,9 @@ def this_environment(
     return from_ratio("this-environment", max(ratio, 0.0), available, w / (2 * np.pi * F.T))
 
 
-W_ZERO = 1e-10  # [rad/sample] stands for F(1) of many, whose real part is even: sampled, a network may be 0/0 there
+_W_ZERO = 1e-10  # [rad/sample] stands for F(1) of many, whose real part is even: sampled, a network may be 0/0 there
 #: rounding that F(1) may miss of symmetry and of positive semidefiniteness
-STATIC = 1e-9
+_STATIC = 1e-9
 
 
 def _static_errors(F1: Array, *elsewhere: Array | Complex) -> tuple[Array, Array]:
@@ -340,7 +340,7 @@ def dampings(delta: Sequence[float], channels: int) -> tuple[float, ...]:
 # Coulomb friction of at least W_i at the encoder's coordinate dissipates that.
 
 
-SMALL_TAIL, CHUNK, MOST_CHUNKS = (
+_SMALL_TAIL, _CHUNK, _MOST_CHUNKS = (
     1e-9,
     256,
     20_000,
@@ -365,15 +365,15 @@ def l1_gain(F: Lti) -> Array:
     P = (P + P.T) / 2
     reach = np.sqrt(np.einsum("in,ni->i", F.C, np.linalg.solve(P, F.C.T)))
     powers = [F.C]
-    for _ in range(CHUNK - 1):
+    for _ in range(_CHUNK - 1):
         powers.append(powers[-1] @ A)
-    rows, ahead = np.stack(powers), np.linalg.matrix_power(A, CHUNK)
+    rows, ahead = np.stack(powers), np.linalg.matrix_power(A, _CHUNK)
     tail = np.full_like(total, np.inf)
-    for _ in range(MOST_CHUNKS):
+    for _ in range(_MOST_CHUNKS):
         total = total + np.abs(rows @ X).sum(axis=0)
         X = ahead @ X
         tail = np.outer(reach, np.sqrt(np.maximum(np.einsum("nj,nk,kj->j", X, P, X), 0.0))) / (1 - r)
-        if (tail <= SMALL_TAIL * total.max()).all():
+        if (tail <= _SMALL_TAIL * total.max()).all():
             break
     return total + tail
 
@@ -393,7 +393,7 @@ def encoder_friction(F: Lti, steps: Sequence[float]) -> Array:
 
 
 #: What a sweep may find uncovered, relatively to the damping: rounding.
-ROUNDING = 1e-6
+_ROUNDING = 1e-6
 
 
 def any_environment_delayed(
@@ -421,7 +421,7 @@ def any_environment_delayed(
     if np.abs(V1 - V1.T).max() > 1e-9 * max(float(np.abs(V1).max()), 1e-300):
         return refused("the static compliance V(1) is not symmetric")
     damping = even_damping(available, V.T, T_max)
-    if uncovered(environment, psi, np.diag(phi)) > ROUNDING * max(damping):
+    if uncovered(environment, psi, np.diag(phi)) > _ROUNDING * max(damping):
         return refused("E-hat + Phi is not passive for this multiplier")
     needed = delayed_demand(V, theta, damping, np.asarray(phi))
     ratio, w = supremum(needed, np.concatenate([[0.0], frequencies(V)]))
@@ -472,11 +472,11 @@ def _delayed_scale(response: Complex, delta: Array, phi: Array) -> Array:
 
 # Many couplings or environments at once: a row for each, as a map asks for them.
 
-Responses = Callable[[Complex], Sampled]  # z (n, k) or (1, k) -> responses there, a row for each system
+_Responses = Callable[[Complex], Sampled]  # z (n, k) or (1, k) -> responses there, a row for each system
 
 
 def this_environment_ratios(
-    at: Responses,
+    at: _Responses,
     poles: Complex,
     delta: Sequence[float],
     delay: int,
@@ -488,9 +488,9 @@ def this_environment_ratios(
     `at` gives the responses of their force maps, `poles` (n, p) are these maps' own, and `delay` [samples] is the
     longest way through the loop, which makes so many lobes.
     """
-    here, opposite = (np.full((len(poles), 1), w) for w in (W_ZERO, np.pi))
+    here, opposite = (np.full((len(poles), 1), w) for w in (_W_ZERO, np.pi))
     skew, least = _static_errors(at(on_circle(here)).G[:, 0].real, at(on_circle(opposite)).G[:, 0])
-    sound = (np.abs(poles).max(axis=1, initial=0.0) < 1) & (skew <= STATIC) & (least >= -STATIC)
+    sound = (np.abs(poles).max(axis=1, initial=0.0) < 1) & (skew <= _STATIC) & (least >= -_STATIC)
 
     def needed(w: Array) -> Array:
         return _least_scales(this_environment_demand(at(on_circle(w)), delta, T_max, latency))
@@ -499,7 +499,7 @@ def this_environment_ratios(
 
 
 def any_environment_ratios(
-    V: Responses, count: int, theta: Sequence[int], delta: Sequence[float], phi: Sequence[float] | None = None
+    V: _Responses, count: int, theta: Sequence[int], delta: Sequence[float], phi: Sequence[float] | None = None
 ) -> Array:
     """The same of any-environment for `count` couplings; phi (m,) [N s/m] is the multiplier that psi >= 1 needs."""
 

@@ -87,7 +87,7 @@ def covered_limits(loop: Loop, coupling: Coupling, requirements: Mapping[str, Re
 # What a report says of delays that vary: the jitter-proof requirement beside that of the playout buffer.
 
 
-NOT_COVERED = (
+_NOT_COVERED = (
     "Covered: any ages of the forces within the range, at every tick and on every channel. Not covered: jitter on the "
     "measured positions, periods longer than T_max, or forces older than the range, which lost packets make."
 )
@@ -108,7 +108,7 @@ def switching_part(found: JitterProof, G: Lti, span: DelayRange, T_max: float | 
             "required_damping": [finite(d) for d in buffered.required],
             "certified": buffered.certified,
         },
-        "not_covered": NOT_COVERED,
+        "not_covered": _NOT_COVERED,
     }
 
 
@@ -117,7 +117,7 @@ def switching_part(found: JitterProof, G: Lti, span: DelayRange, T_max: float | 
 
 
 @dataclass(frozen=True)
-class Cost:
+class _Cost:
     """One coupling over the members of a set, in which it runs on the current environment."""
 
     name: str
@@ -128,7 +128,7 @@ class Cost:
     worst: str  # the vertex with the largest rms mismatch
 
 
-def cost(name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -> Cost:
+def cost(name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -> _Cost:
     """Required damping and mismatch at every member; those that no device feels have no mismatch."""
     ratios, figures = [], {}
     for member in members:
@@ -139,7 +139,7 @@ def cost(name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -
             figures[member.name] = transparency(F, E, loop.lam)
     nominal = figures[members[0].name]
     worst = max(figures, key=lambda member: figures[member].rms_mismatch)
-    return Cost(
+    return _Cost(
         name,
         (ratios[0], max(ratios)),
         sum(ratio >= 1 for ratio in ratios),
@@ -149,20 +149,20 @@ def cost(name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -
     )
 
 
-def price(loop: Loop, couplings: Mapping[str, Coupling]) -> tuple[Cost, ...]:
+def price(loop: Loop, couplings: Mapping[str, Coupling]) -> tuple[_Cost, ...]:
     """The cost of each coupling over the box of the loop."""
     members = loop.members()
     return tuple(cost(name, loop, coupling, members) for name, coupling in couplings.items())
 
 
-def cost_part(row: Cost) -> dict[str, Any]:
+def cost_part(row: _Cost) -> dict[str, Any]:
     """The row as plain data; null for a mismatch of zero, or where no damping is enough."""
     pairs = {"required_over_available": row.ratio, "rms_mismatch_db": row.rms_db, "relative_mismatch_db": row.sup_db}
     figures = {name: dict(zip(("nominal", "worst"), map(finite, pair), strict=True)) for name, pair in pairs.items()}
     return {"coupling": row.name, "violated": row.violated, **figures, "worst": row.worst}
 
 
-WHAT_IS_PROVED = (
+_WHAT_IS_PROVED = (
     f"proved at the vertices; between them searched, not proved ({SEARCH}); every environment is frozen: nothing is "
     "proved of one that changes while it is touched"
 )
@@ -181,7 +181,7 @@ def set_part(check: SetCheck) -> dict[str, Any]:
         "certified": check.proved,
         "search": search_part(check.searched),
         "inside": _inside_part(check),
-        "what": WHAT_IS_PROVED,
+        "what": _WHAT_IS_PROVED,
     }
     return part | ({"reason": check.reason} if check.reason else {})
 

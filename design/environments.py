@@ -43,29 +43,29 @@ def _required(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
 # and from the worst points that were found a compass search goes on within the ranges until its steps are small.
 
 
-Ratio = Callable[[Member], float]  # required over available damping
+_Ratio = Callable[[Member], float]  # required over available damping
 
 
 Progress = Callable[[int, int], None]  # points tried, of about how many
 
 
-ON_EDGES, ALONG = 240, (3, 9)  # points on the edges of a region, and on each of them: least, most
+_ON_EDGES, _ALONG = 240, (3, 9)  # points on the edges of a region, and on each of them: least, most
 
 
-DRAWN, SEED = 48, 0xFACE  # points on faces and inside of each region
+_DRAWN, _SEED = 48, 0xFACE  # points on faces and inside of each region
 
 
-STARTS, APART, SAME = 4, 0.2, 0.05  # of the compass search in a region; least distance of starts, and of tops
+_STARTS, _APART, _SAME = 4, 0.2, 0.05  # of the compass search in a region; least distance of starts, and of tops
 
 
-FIRST, LAST = 1 / 16, 1 / 128  # its steps, in widths of the ranges
+_FIRST, _LAST = 1 / 16, 1 / 128  # its steps, in widths of the ranges
 
 
 SEARCH = "along all edges, on faces and inside, then uphill from the worst points"
 
 
 @dataclass(frozen=True)
-class Found:
+class _Found:
     """An environment of the box, and the share of the damping that is needed there."""
 
     member: Member
@@ -76,16 +76,16 @@ class Found:
 class Searched:
     """The worst environments, each the top of its neighbourhood, the worst of all first; and how many were tried."""
 
-    worst: tuple[Found, ...]
+    worst: tuple[_Found, ...]
     tried: int
 
 
-def search(regions: Sequence[Region], ratio: Ratio, progress: Progress = lambda done, total: None) -> Searched:
+def search(regions: Sequence[Region], ratio: _Ratio, progress: Progress = lambda done, total: None) -> Searched:
     """Where the coupling behind `ratio` needs the most in the box that consists of these regions."""
     points = [list(_points(region)) for region in regions]
-    refinements = [min(STARTS, len(some)) * 8 * region.low.size for region, some in zip(regions, points, strict=True)]
+    refinements = [min(_STARTS, len(some)) * 8 * region.low.size for region, some in zip(regions, points, strict=True)]
     tried, total = 0, sum(map(len, points)) + sum(refinements)
-    tops: list[Found] = []
+    tops: list[_Found] = []
 
     for region, some in zip(regions, points, strict=True):
         known: dict[bytes, float] = {}
@@ -98,10 +98,10 @@ def search(regions: Sequence[Region], ratio: Ratio, progress: Progress = lambda 
                 known[point.tobytes()] = ratio(_member(region, point))
             return known[point.tobytes()]
 
-        starts = _apart(some, [need(point) for point in some], APART)[:STARTS]
+        starts = _apart(some, [need(point) for point in some], _APART)[:_STARTS]
         climbed = [_climbed(need, *start) for start in starts]
-        distinct = _apart([point for point, _ in climbed], [value for _, value in climbed], SAME)
-        tops += [Found(_member(region, point), value) for point, value in distinct]
+        distinct = _apart([point for point, _ in climbed], [value for _, value in climbed], _SAME)
+        tops += [_Found(_member(region, point), value) for point, value in distinct]
     progress(total, total)
     return Searched(tuple(sorted(tops, key=lambda found: -found.ratio)), tried)
 
@@ -117,16 +117,16 @@ def _points(region: Region) -> Iterator[Array]:
     yield from (np.array(corner, dtype=float) for corner in product((0.0, 1.0), repeat=n))
     if n == 0:
         return
-    least, most = ALONG
-    count = int(np.clip(ON_EDGES // (n * 2 ** (n - 1)), least, most))
+    least, most = _ALONG
+    count = int(np.clip(_ON_EDGES // (n * 2 ** (n - 1)), least, most))
     for i in range(n):
         for others in product((0.0, 1.0), repeat=n - 1):
             for x in np.arange(1, count + 1) / (count + 1):
                 yield np.insert(np.array(others), i, x)
     if n == 1:
         return
-    rng = np.random.default_rng(SEED)
-    for _ in range(DRAWN):  # every number in between, or at one of its ends, as often as not
+    rng = np.random.default_rng(_SEED)
+    for _ in range(_DRAWN):  # every number in between, or at one of its ends, as often as not
         between, end, coin = rng.random(n), rng.integers(0, 2, n), rng.random(n) < 0.5
         yield np.where(coin, between, end)
 
@@ -142,8 +142,8 @@ def _apart(points: Sequence[Array], values: Sequence[float], distance: float) ->
 
 def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tuple[Array, float]:
     """Uphill along the axes of the unit cube, with steps that are halved where none leads up; the ends are exact."""
-    step = FIRST
-    while point.size and step >= LAST and np.isfinite(value):
+    step = _FIRST
+    while point.size and step >= _LAST and np.isfinite(value):
         moves = [np.clip(point + sign * step * axis, 0, 1) for axis in np.eye(point.size) for sign in (1, -1)]
         values = [need(move) if (move != point).any() else -np.inf for move in moves]
         best = int(np.argmax(values))

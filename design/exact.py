@@ -22,14 +22,14 @@ from design.frequency import frequencies, hermitian, on_circle, supremum
 # 12/10000 here, not the nearest binary fraction. Everything after that is exact.
 
 
-Integers = NDArray[np.object_]
+_Integers = NDArray[np.object_]
 
 
 @dataclass(frozen=True, eq=False)
 class Matrix:
     """`num / den` with integer entries and one positive denominator."""
 
-    num: Integers  # (p, m), Python integers
+    num: _Integers  # (p, m), Python integers
     den: int = 1
 
     @classmethod
@@ -114,7 +114,7 @@ def block_diag(*parts: Matrix) -> Matrix:
 
 
 @dataclass(frozen=True)
-class Definiteness:
+class _Definiteness:
     """What the exact elimination of a symmetric matrix found."""
 
     definite: bool
@@ -129,7 +129,7 @@ class Definiteness:
         return f"the leading minor of order {self.minor} is {sign}"
 
 
-def definiteness(S: Matrix) -> Definiteness:
+def definiteness(S: Matrix) -> _Definiteness:
     """Whether the symmetric matrix S is positive (semi)definite, by fraction-free LDL' (Bareiss).
 
     The pivots of the elimination are the leading minors themselves. A zero pivot leaves a semidefinite
@@ -143,15 +143,15 @@ def definiteness(S: Matrix) -> Definiteness:
     for k in range(work.shape[0]):
         pivot, column = work[k, k], work[k + 1 :, k].copy()
         if pivot < 0:
-            return Definiteness(False, False, k + 1, -1)
+            return _Definiteness(False, False, k + 1, -1)
         if pivot == 0:
             if (column != 0).any():
-                return Definiteness(False, False, k + 1, 0)
+                return _Definiteness(False, False, k + 1, 0)
             singular = singular or k + 1
             continue
         work[k + 1 :, k + 1 :] = (pivot * work[k + 1 :, k + 1 :] - np.outer(column, column)) // previous
         previous = pivot
-    return Definiteness(singular is None, True, singular, None if singular is None else 0)
+    return _Definiteness(singular is None, True, singular, None if singular is None else 0)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -164,8 +164,8 @@ def definiteness(S: Matrix) -> Definiteness:
 
 
 BITS = 192  # of the rounded matrix whose definiteness is tested
-FACTOR_BITS = 56  # of the entries of each factor of R, relative to the largest of their column
-PASSES = 4  # one is enough for a condition number below 1e14; each further one takes as much off what is left
+_FACTOR_BITS = 56  # of the entries of each factor of R, relative to the largest of their column
+_PASSES = 4  # one is enough for a condition number below 1e14; each further one takes as much off what is left
 GROWTH = 2.0**-40  # part of the identity that is added where rounding has made the factorisation fail
 
 Floats = NDArray[np.float64]
@@ -184,7 +184,7 @@ def strictly_positive(S: Matrix) -> bool:
     if any(S.num[i, i] <= 0 for i in range(n)):
         return False
     W = _rounded(S) - n * np.eye(n, dtype=object)
-    for _ in range(PASSES):
+    for _ in range(_PASSES):
         if _dominates(W):
             return True
         R = _whitening(_floats(W))
@@ -194,7 +194,7 @@ def strictly_positive(S: Matrix) -> bool:
     return _dominates(W)
 
 
-def _rounded(S: Matrix) -> Integers:
+def _rounded(S: Matrix) -> _Integers:
     """S with a diagonal near one, in units of 2^-BITS."""
     n = S.shape[0]
     half = [(int(S.num[i, i]).bit_length() - S.den.bit_length()) // 2 for i in range(n)]
@@ -207,18 +207,18 @@ def _rounded(S: Matrix) -> Integers:
     return rounded
 
 
-def _dominates(W: Integers) -> bool:
+def _dominates(W: _Integers) -> bool:
     """Whether every diagonal entry is larger than the sum of the absolute values of the others in its row."""
     return all(2 * W[i, i] > sum(abs(v) for v in row) for i, row in enumerate(W))
 
 
-def _floats(W: Integers) -> Floats:
+def _floats(W: _Integers) -> Floats:
     """W to double precision, times the power of two that brings its largest entry near one."""
     length = max((int(v).bit_length() for v in W.flat), default=0)
     return np.array([[int(v) / (1 << length) for v in row] for row in W], dtype=np.float64).reshape(W.shape)
 
 
-def _whitening(W: Floats) -> Integers | None:
+def _whitening(W: Floats) -> _Integers | None:
     """R in integers such that R'WR is nearly a multiple of the identity, or None where W is far from definite."""
     with np.errstate(all="ignore"):
         scale = 1 / np.sqrt(np.diag(W)) if (np.diag(W) > 0).all() else np.ones(W.shape[0])
@@ -231,7 +231,7 @@ def _whitening(W: Floats) -> Integers | None:
         except LinAlgError:
             continue
         inverse = scale[:, None] * solve_triangular(L, np.eye(W.shape[0]), lower=True).T
-        size = FACTOR_BITS - np.ceil(np.log2(np.abs(inverse).max()))
+        size = _FACTOR_BITS - np.ceil(np.log2(np.abs(inverse).max()))
         return np.vectorize(int, otypes=[object])(np.round(np.ldexp(inverse, int(size))))
     return None
 
@@ -246,12 +246,12 @@ def _whitening(W: Floats) -> Integers | None:
 
 
 LARGEST = 300  # states of a model that a proof is tried for: 0.1 s at 50, 0.5 s at 100, 3 s at 200
-MOST_BITS = 4000  # of the common denominator of a stored P, a power of two of some hundred bits when we made it
-STORED_BITS = 44  # of each entry of P, relative to its diagonal
-UNIT = 2.0**-53  # of double precision
+_MOST_BITS = 4000  # of the common denominator of a stored P, a power of two of some hundred bits when we made it
+_STORED_BITS = 44  # of each entry of P, relative to its diagonal
+_UNIT = 2.0**-53  # of double precision
 
 
-def kyp_matrix(G: Lti, P: Matrix) -> Matrix:
+def _kyp_matrix(G: Lti, P: Matrix) -> Matrix:
     """The matrix of (KYP), exactly, shape (n + m, n + m)."""
     A, B, C, D = (Matrix.of(getattr(G, name)) for name in "ABCD")
     PA, PB = P @ A, P @ B
@@ -276,15 +276,15 @@ def prove_positive_real(G: Lti, P: Matrix) -> str | None:
         return f"P has shape {P.shape}, the model has {n} states"
     if not P.equals(P.T):
         return "P is not symmetric"
-    if refuted_in_floating_point(G, P):
+    if _refuted_in_floating_point(G, P):
         return "the KYP matrix has a negative direction, beyond the error bound of floating point"
-    for name, matrix in (("P", P), ("the KYP matrix", kyp_matrix(G, P))):
+    for name, matrix in (("P", P), ("the KYP matrix", _kyp_matrix(G, P))):
         if not strictly_positive(matrix):
             return f"{name} is not positive definite, or by so little that it is not proved"
     return None
 
 
-def refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
+def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
     """Whether some direction makes the KYP matrix negative by more than every rounding error.
 
     The matrix is S - J'PJ with S = [[P, C'], [C, D + D']] and J = [A B], sums of products of three correctly
@@ -299,13 +299,13 @@ def refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
         M = direct.copy() - J.T @ p @ J
     if not np.isfinite(M).all():
         return False
-    k = (2 * G.order + 8) * UNIT
+    k = (2 * G.order + 8) * _UNIT
     error = k / (1 - k) * (np.abs(direct) + np.abs(J.T) @ np.abs(p) @ np.abs(J))
     scale = 1 / np.sqrt(np.maximum(np.abs(np.diag(M)), np.diag(error)) + np.finfo(float).tiny)
     _, basis = np.linalg.eigh(scale[:, None] * M * scale)
     x = scale * basis[:, 0]
     # x'Mx is itself computed with at most 2(n + m) + 2 roundings per term
-    k = 2 * (x.size + 1) * UNIT
+    k = 2 * (x.size + 1) * _UNIT
     bound = np.abs(x) @ error @ np.abs(x) + 2 * k * (np.abs(x) @ np.abs(M) @ np.abs(x))
     return bool(x @ M @ x < -2 * bound)
 
@@ -394,21 +394,21 @@ def _rounded_positive_real(P: Array) -> Matrix:
     """P to STORED_BITS binary digits, relative to its diagonal."""
     exponent = np.ceil(np.log2(np.abs(np.diag(P))) / 2)
     scale = np.exp2(-exponent)
-    integers = np.round((P + P.T) / 2 * scale[:, None] * scale * 2.0**STORED_BITS)
+    integers = np.round((P + P.T) / 2 * scale[:, None] * scale * 2.0**_STORED_BITS)
     n = P.shape[0]
     common = 2 * int(exponent.min())  # every exponent is at least half of this
     num = np.empty((n, n), dtype=object)
     for i in range(n):
         for j in range(n):
             num[i, j] = int(integers[i, j]) << (int(exponent[i] + exponent[j]) - common)
-    power = STORED_BITS - common
+    power = _STORED_BITS - common
     return Matrix(num, 1 << power).reduced() if power >= 0 else Matrix(num * (1 << -power))
 
 
-Rows = tuple[tuple[str, ...], ...]
+_Rows = tuple[tuple[str, ...], ...]
 
 
-def rows_of(M: Matrix) -> Rows:
+def rows_of(M: Matrix) -> _Rows:
     """Every entry in lowest terms."""
     return tuple(tuple(str(value) for value in row) for row in M.fractions())
 
@@ -426,8 +426,8 @@ def refuted_rows(name: str, block: Lti, rows: Sequence[Sequence[str]]) -> str | 
         common = 1
         for value in (value for row in rows for value in row):
             common = math.lcm(common, int(value.partition("/")[2] or 1))
-            if common.bit_length() > MOST_BITS:
-                return f"{name} has a common denominator of more than {MOST_BITS} bits: testing it would take minutes"
+            if common.bit_length() > _MOST_BITS:
+                return f"{name} has a common denominator of more than {_MOST_BITS} bits: testing it would take minutes"
         P = Matrix.of(rows, (n, n))
     except (ValueError, ZeroDivisionError) as error:
         return f"{name} has an entry that is not a rational number: {error}"

@@ -29,12 +29,12 @@ from design.stored import Stored
 # since all principal minors are positive. e then moves [y; z+] by its kick, and the forces that leave are set to f_e.
 
 
-TICKS = 64  # of a test vector: longer than the delays and the fast modes of a loop
-MOST_TURNS = 100_000  # of a tick's box problem; a handful are needed
+_TICKS = 64  # of a test vector: longer than the delays and the fast modes of a loop
+_MOST_TURNS = 100_000  # of a tick's box problem; a handful are needed
 
 
 @dataclass(frozen=True)
-class Signal:
+class _Signal:
     """One side of a block: m numbers of one kind."""
 
     letter: str
@@ -42,9 +42,9 @@ class Signal:
     size: float  # of a test vector's numbers, in that unit
 
 
-FORCE = Signal("f", "force [N]", 1.0)
-DISPLACEMENT = Signal("x", "displacement [m]", 1e-3)
-GIVEN_WAY = Signal("d", "displacement [m]", 1e-3)
+FORCE = _Signal("f", "force [N]", 1.0)
+_DISPLACEMENT = _Signal("x", "displacement [m]", 1e-3)
+_GIVEN_WAY = _Signal("d", "displacement [m]", 1e-3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +53,8 @@ class Block:
 
     name: str  # "coupling" | "process"
     system: Lti  # at least one state
-    input: Signal
-    output: Signal
+    input: _Signal
+    output: _Signal
     about: tuple[str, ...]  # what it is, one line each
     limiter: Limiter | None = None  # whose loop the system is while no force is limited
 
@@ -77,7 +77,7 @@ def coupling_block(stored: Stored) -> Block:
     if V is None:
         raise NothingToExport("this coupling is no V in feedback around the environment; the whole process can be had")
     about = ("d = V f: what the coupling gives way by. In its loop the environment sees u = x - d, and f = Psi E u.",)
-    return Block("coupling", with_a_state(V), FORCE, GIVEN_WAY, about)
+    return Block("coupling", _with_a_state(V), FORCE, _GIVEN_WAY, about)
 
 
 def process_block(stored: Stored, with_theta: bool = True, force_limit: Sequence[float] | None = None) -> Block:
@@ -97,7 +97,7 @@ def process_block(stored: Stored, with_theta: bool = True, force_limit: Sequence
         "f = F x: the whole discrete process; the devices get -f, held for T. Forces are not limited here.",
         _delays(loop, with_theta),
     )
-    return Block("process", with_a_state(F), DISPLACEMENT, FORCE, about)
+    return Block("process", _with_a_state(F), _DISPLACEMENT, FORCE, about)
 
 
 def _limited_block(stored: Stored, theta: Sequence[int], force_limit: Sequence[float], with_theta: bool) -> Block:
@@ -110,10 +110,10 @@ def _limited_block(stored: Stored, theta: Sequence[int], force_limit: Sequence[f
         f"{', '.join(f'{f:g}' for f in force_limit)} N: the contact slips instead, and the certificate holds there.",
         _delays(loop, with_theta),
     )
-    return Block("process", limiter.open, DISPLACEMENT, FORCE, about, limiter)
+    return Block("process", limiter.open, _DISPLACEMENT, FORCE, about, limiter)
 
 
-def with_a_state(system: Lti) -> Lti:
+def _with_a_state(system: Lti) -> Lti:
     """The same block, with a state that stays zero where it has none: C has no empty arrays."""
     if system.order:
         return system
@@ -124,7 +124,7 @@ def with_a_state(system: Lti) -> Lti:
 def trial(block: Block, seed: int = 0) -> Trial:
     """Normally distributed inputs, with a limiter such that a third of the ticks are limited, and the outputs."""
     rng = np.random.default_rng(seed)
-    inputs = block.input.size * rng.standard_normal((TICKS, block.system.inputs))
+    inputs = block.input.size * rng.standard_normal((_TICKS, block.system.inputs))
     if block.limiter:
         share = np.abs(sequential(block.system, inputs)) / block.limiter.limit
         inputs = inputs / np.quantile(share.max(axis=1), 2 / 3)
@@ -142,7 +142,7 @@ def sequential(system: Lti, inputs: Array, limiter: Limiter | None = None) -> Ar
         if limiter:
             free = sums[limiter.sent_rows]
             if (np.abs(free) > limiter.limit).any():
-                e, f = _boxed(box_matrix(limiter).tolist(), limiter.limit.tolist(), free.tolist())
+                e, f = _boxed(_box_matrix(limiter).tolist(), limiter.limit.tolist(), free.tolist())
                 for column, value in zip(limiter.kick.T, e, strict=True):
                     sums = sums + column * value
                 sums[limiter.sent_rows] = f
@@ -151,7 +151,7 @@ def sequential(system: Lti, inputs: Array, limiter: Limiter | None = None) -> Ar
     return np.array(outputs)
 
 
-def box_matrix(limiter: Limiter) -> Array:
+def _box_matrix(limiter: Limiter) -> Array:
     """M of the box problem, (m, m), regular also where nothing holds the environment."""
     M = limiter.problem.M
     return M if limiter.problem.regular else M + GROUNDED * np.diag(M).max() * np.eye(len(M))
@@ -159,7 +159,7 @@ def box_matrix(limiter: Limiter) -> Array:
 
 def _turns(m: int) -> int:
     """Switches of a limit after which the box problem is solved for sure."""
-    return min(3**m, MOST_TURNS)
+    return min(3**m, _MOST_TURNS)
 
 
 def _boxed(M: list[list[float]], limit: list[float], q: list[float]) -> tuple[list[float], list[float]]:
@@ -226,7 +226,7 @@ def _limiter_data(limiter: Limiter) -> dict[str, Any]:
     """What turns the linear tick into the limited one; rows are counted in [y; z+] from 0."""
     return {
         "limit": limiter.limit.tolist(),
-        "box_matrix": box_matrix(limiter).tolist(),
+        "box_matrix": _box_matrix(limiter).tolist(),
         "kick": limiter.kick.tolist(),
         "sent_rows": limiter.sent_rows.tolist(),
     }
@@ -329,7 +329,7 @@ def _rows(values: Array) -> str:
     return "\n".join(f"    {row}," for row in values.tolist())
 
 
-SOURCE_C = Template("""\
+_SOURCE_C = Template("""\
 /*
 $about
  *
@@ -428,12 +428,12 @@ int main(void)
 """)
 
 #: a coupling stands in a feedback loop that its user closes, so it can be asked before its input is known
-FREE_DECLARED = """
+_FREE_DECLARED = """
 /* $y = free + D $u: the free part, before this tick's $u is known, and D, for solving u = x - $y, $u = E(u). */
 void ${name}_free(const ${name}_state *state, double $y[${NAME}_CHANNELS]);
 extern const double ${name}_D[${NAME}_CHANNELS][${NAME}_CHANNELS];
 """
-FREE_DEFINED = """
+_FREE_DEFINED = """
 void ${name}_free(const ${name}_state *state, double $y[${NAME}_CHANNELS])
 {
     int i, j;
@@ -447,7 +447,7 @@ void ${name}_free(const ${name}_state *state, double $y[${NAME}_CHANNELS])
 
 
 #: the box problem, and what a tick does that asks for more than a limit
-LIMIT_DEFINED = """
+_LIMIT_DEFINED = """
 static double ${name}_size(double a)
 {
     return a < 0.0 ? -a : a;
@@ -505,7 +505,7 @@ static void ${name}_limit(const double q[${NAME}_CHANNELS], double e[${NAME}_CHA
     }
 }
 """
-LIMITED = """    {
+_LIMITED = """    {
         double q[${NAME}_CHANNELS], e[${NAME}_CHANNELS], f[${NAME}_CHANNELS];
         int more = 0;
         for (i = 0; i < ${NAME}_CHANNELS; i++) {
@@ -545,7 +545,7 @@ def c_source(block: Block, test: Trial, file: str) -> str:
         "m": system.inputs,
         "n": system.order,
         "T": repr(system.T),
-        "ticks": TICKS,
+        "ticks": _TICKS,
         "tables": "\n\n".join(
             _table(f"{'' if name == 'coupling' and letter == 'D' else 'static '}const double {name}_{letter}", matrix)
             for letter, matrix in (("A", system.A), ("B", system.B), ("C", system.C), ("D", system.D))
@@ -559,15 +559,15 @@ def c_source(block: Block, test: Trial, file: str) -> str:
     words["limit_defined"] = words["limited"] = ""
     if limiter := block.limiter:
         words |= {"turns": str(_turns(system.inputs)), "rounding": PIVOT_ROUNDING.hex()}
-        tables = (("LIMIT", limiter.limit[None]), ("M", box_matrix(limiter)), ("KICK", limiter.kick))
+        tables = (("LIMIT", limiter.limit[None]), ("M", _box_matrix(limiter)), ("KICK", limiter.kick))
         words["tables"] += "".join("\n\n" + _table(f"static const double {name}_{of}", rows) for of, rows in tables)
         rows = ", ".join(map(str, limiter.sent_rows))
         words["tables"] += f"\n\nstatic const int {name}_SENT[{system.inputs}] = {{{rows}}};"
-        words["limit_defined"] = Template(LIMIT_DEFINED).substitute(words)
-        words["limited"] = Template(LIMITED).substitute(words)
-    words["more_declared"] = Template(FREE_DECLARED).substitute(words) if loose else ""
-    words["more_defined"] = Template(FREE_DEFINED).substitute(words) if loose else ""
-    return SOURCE_C.substitute(words)
+        words["limit_defined"] = Template(_LIMIT_DEFINED).substitute(words)
+        words["limited"] = Template(_LIMITED).substitute(words)
+    words["more_declared"] = Template(_FREE_DECLARED).substitute(words) if loose else ""
+    words["more_defined"] = Template(_FREE_DEFINED).substitute(words) if loose else ""
+    return _SOURCE_C.substitute(words)
 
 
 def _comment_c(lines: Iterable[str]) -> Iterable[str]:

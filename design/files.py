@@ -28,15 +28,15 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-MOST_TEXT = 2_000_000  # bytes: scenarios, humans, recorded delays
-MOST_STORED = 50_000_000  # bytes: a proof over 200 states takes a tenth of it
-MOST_TRACE = 1_000_000_000  # bytes, packed: an hour of two channels takes a fifth of it
-MOST_UNPACKED = 4_000_000_000  # bytes
-MOST_WORDS = 1000  # characters of one message
+_MOST_TEXT = 2_000_000  # bytes: scenarios, humans, recorded delays
+_MOST_STORED = 50_000_000  # bytes: a proof over 200 states takes a tenth of it
+_MOST_TRACE = 1_000_000_000  # bytes, packed: an hour of two channels takes a fifth of it
+_MOST_UNPACKED = 4_000_000_000  # bytes
+_MOST_WORDS = 1000  # characters of one message
 
-DEEPEST_KEY = 20  # names joined by dots: tomllib takes time and memory that grow with their square
+_DEEPEST_KEY = 20  # names joined by dots: tomllib takes time and memory that grow with their square
 _KEY_PART = r"""(?:(?<![\w-])[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
-_DEEP_KEY = re.compile(rf"(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{DEEPEST_KEY}}}")
+_DEEP_KEY = re.compile(rf"(?:{_KEY_PART}[ \t]*+\.[ \t]*+){{{_DEEPEST_KEY}}}")
 
 
 class InputError(ValueError):
@@ -55,8 +55,8 @@ def printable(text: str) -> str:
 def one_line(text: object) -> str:
     """A message in one line of at most MOST_WORDS characters."""
     words = printable(" ".join(str(text).split()))
-    half = MOST_WORDS // 2 - 3
-    return words if len(words) <= MOST_WORDS else f"{words[:half]} [..] {words[-half:]}"
+    half = _MOST_WORDS // 2 - 3
+    return words if len(words) <= _MOST_WORDS else f"{words[:half]} [..] {words[-half:]}"
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -110,7 +110,7 @@ def _met(places: set[Any], known: dict[Any, str]) -> str | None:
 # Reading.
 
 
-def read(path: str | Path, named: str | None = None, most: int = MOST_STORED, hint: str = "") -> bytes:
+def read(path: str | Path, named: str | None = None, most: int = _MOST_STORED, hint: str = "") -> bytes:
     """The bytes of a regular file of at most `most` bytes, called `named` in messages. Raises InputError."""
     named, path = str(path) if named is None else named, Path(path)
     try:
@@ -138,7 +138,7 @@ def read(path: str | Path, named: str | None = None, most: int = MOST_STORED, hi
 def read_text(path: str | Path, named: str | None = None, hint: str = "") -> str:
     """The text of a file in UTF-8. Raises InputError."""
     try:
-        return read(path, named, MOST_TEXT, hint).decode()
+        return read(path, named, _MOST_TEXT, hint).decode()
     except UnicodeDecodeError:
         raise InputError(f"{path if named is None else named}: not a text file in UTF-8") from None
 
@@ -147,7 +147,7 @@ def toml(text: str, named: str) -> dict[str, Any]:
     """What TOML text says. Raises InputError."""
     if found := _DEEP_KEY.search(text):
         line = text.count("\n", 0, found.start()) + 1
-        raise InputError(f"{named}: line {line}: a key of more than {DEEPEST_KEY} names joined by dots")
+        raise InputError(f"{named}: line {line}: a key of more than {_DEEPEST_KEY} names joined by dots")
     try:
         return tomllib.loads(text)
     except RecursionError:
@@ -158,13 +158,13 @@ def toml(text: str, named: str) -> dict[str, Any]:
 
 def read_arrays(path: str | Path, expected: str) -> dict[str, NDArray[Any]]:
     """The arrays of an npz file, in which no object is unpickled. Raises InputError where it is none."""
-    content = read(path, most=MOST_TRACE)
+    content = read(path, most=_MOST_TRACE)
     try:
         with ZipFile(BytesIO(content)) as archive:
             entries = archive.infolist()
             size = sum(entry.file_size for entry in entries)  # zipfile unpacks no byte more
-            if size > MOST_UNPACKED:
-                raise ValueError(f"unpacks to {size / 1e9:.3g} GB, allowed are {MOST_UNPACKED / 1e9:g} GB")
+            if size > _MOST_UNPACKED:
+                raise ValueError(f"unpacks to {size / 1e9:.3g} GB, allowed are {_MOST_UNPACKED / 1e9:g} GB")
             return {entry.filename.removesuffix(".npy"): _array(archive, entry) for entry in entries}
     except MemoryError:
         raise

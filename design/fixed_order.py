@@ -54,8 +54,8 @@ from design.result import METHODS, Design, DesignFailed, Requirement, Row, of_ki
 
 
 #: Poles given to states beyond the first of a channel, which a spring-damper does not have.
-MOST_STATES = 10  # per channel: each adds a row and a column to every cone
-SPARE_POLE = 0.5
+_MOST_STATES = 10  # per channel: each adds a row and a column to every cone
+_SPARE_POLE = 0.5
 
 
 class FixedOrder:
@@ -107,7 +107,7 @@ class FixedOrder:
         k, b = gains.K * self.loop.T / self.usable, gains.B / self.usable
         pole = b / (k + b)
         A = np.kron(np.diag(pole), np.diag(np.eye(self.order)[0]))
-        spare = np.diag(np.r_[0.0, SPARE_POLE ** np.arange(1, self.order)]) + np.eye(self.order, k=1)
+        spare = np.diag(np.r_[0.0, _SPARE_POLE ** np.arange(1, self.order)]) + np.eye(self.order, k=1)
         A = A + np.kron(np.eye(pole.size), spare)
         # 1/(k + b - b/z) = 1/k - (z - 1) (pole/k) / (z - pole)
         B = np.kron(np.diag(pole / k), np.eye(self.order)[:, :1])
@@ -156,14 +156,14 @@ def _plant(shaping: Shaping) -> Lti:
 # Storage matrices of a given coupling: what makes the inequalities of a fixed-order design hold at a start.
 
 
-def passivity_storage(family: FixedOrder, p: Array) -> Array:
+def _passivity_storage(family: FixedOrder, p: Array) -> Array:
     """P > 0 of the remedied (2) for the coupling p, with the most room; the coupling must satisfy it strictly."""
     G = family.ports(p)
     m, paid = G.D2.shape[0], G.D1.shape[0]
     return _roomiest(lambda P: lemma1(G, P, np.eye(paid), np.zeros((m, m))), G.A.shape[0], "the storage of V-hat")
 
 
-def gain_storage(family: FixedOrder, p: Array, mu: float) -> Array:
+def _gain_storage(family: FixedOrder, p: Array, mu: float) -> Array:
     """U = X^-1 > 0 of Lemma 3, ||W1 L W2||_inf < mu, with the most room in coordinates of unit reachability."""
     A, B, C, D = family.weighted_loop(p)
     S = reachability_scaled(Lti(A, B, C, D, 1.0))
@@ -196,9 +196,9 @@ def _roomiest(inequality: Callable[[Array], Array], n: int, what: str) -> Array:
 
 
 #: Room above the start's norm for its first certificate, relatively.
-FIRST_ROOM = 0.05
+_FIRST_ROOM = 0.05
 #: Bounds on Q and U in coordinates where they were I: a state that little reaches leaves them free to degenerate.
-LEAST, MOST = 0.1, 1.99
+_LEAST, _MOST = 0.1, 1.99
 
 
 def descend(family: FixedOrder, p: Array, norm: float) -> Iterator[Array]:
@@ -206,8 +206,8 @@ def descend(family: FixedOrder, p: Array, norm: float) -> Iterator[Array]:
 
     Ends where a certificate is singular to rounding: the coupling then stands on the boundary.
     """
-    Q = np.linalg.inv(passivity_storage(family, p))
-    U = gain_storage(family, p, norm * (1 + FIRST_ROOM))
+    Q = np.linalg.inv(_passivity_storage(family, p))
+    U = _gain_storage(family, p, norm * (1 + _FIRST_ROOM))
     while min(np.linalg.eigvalsh(Q)[0], np.linalg.eigvalsh(U)[0]) > 0:
         p, Q, U = _step(family, p, Q, U, norm)
         yield p
@@ -226,7 +226,7 @@ def _step(family: FixedOrder, at: Array, Q0: Array, U0: Array, norm: float) -> t
 
     def passivity(v: Array) -> Array:
         p, Q, _, _ = split(v)
-        G = in_coordinates(family.ports(p), LQ)
+        G = _in_coordinates(family.ports(p), LQ)
         sigma = np.eye(G.C1.shape[0]) if G.C1.size else None
         return lemma2(G, Q, 2 * np.eye(nq) - Q, sigma, np.zeros_like(G.D2))
 
@@ -237,15 +237,15 @@ def _step(family: FixedOrder, at: Array, Q0: Array, U0: Array, norm: float) -> t
         return lemma3(A, B, C, D / norm, 2 * np.eye(nu) - U, U, t)
 
     storages = [affine(lambda v: split(v)[1], x), affine(lambda v: split(v)[2], x)]
-    least = [Z >> LEAST * np.eye(Z.shape[0]) for Z in storages]
-    most = [Z << MOST * np.eye(Z.shape[0]) for Z in storages]
+    least = [Z >> _LEAST * np.eye(Z.shape[0]) for Z in storages]
+    most = [Z << _MOST * np.eye(Z.shape[0]) for Z in storages]
     cuts: list[cp.Constraint] = [affine(passivity, x) >> 0, affine(gain, x) >> 0, *least, *most]
     solve(cp.Problem(cp.Minimize(x[-1]), cuts), "a step of the inner convex approximation")
     p, Q, U, _ = split(solved(x))
     return p, LQ @ Q @ LQ.T, LU @ U @ LU.T
 
 
-def in_coordinates(G: Ports, L: Array) -> Ports:
+def _in_coordinates(G: Ports, L: Array) -> Ports:
     """G with the states L^-1 x."""
     return Ports(np.linalg.solve(L, G.A @ L), np.linalg.solve(L, G.B), G.C2 @ L, G.D2, G.C1 @ L, G.D1)
 
@@ -259,19 +259,19 @@ def in_coordinates(G: Ports, L: Array) -> Ports:
 
 
 #: Linearised problems per value of mu, and the relative width at which bisection ends.
-PATIENCE = 20
-WIDTH = 5e-3
+_PATIENCE = 20
+_WIDTH = 5e-3
 
 
-def bisect(
+def _bisect(
     family: FixedOrder, p: Array, norm: float, holds: Callable[[Array, float], bool], budget: int
 ) -> tuple[Array, int]:
     """(the best coupling, SDPs spent). `holds(p, mu)` judges a coupling from itself alone; p holds for its norm."""
     relaxed = _Relaxed(family, p, norm)
     low, high, best, sdps = 0.5 * norm, norm, p, 0
-    while high - low > WIDTH * high and sdps < budget:
+    while high - low > _WIDTH * high and sdps < budget:
         mu = (low + high) / 2
-        found, spent = relaxed.search(mu, holds, min(PATIENCE, budget - sdps))
+        found, spent = relaxed.search(mu, holds, min(_PATIENCE, budget - sdps))
         sdps += spent
         if found is None:
             low = mu
@@ -285,8 +285,8 @@ class _Relaxed:
 
     def __init__(self, family: FixedOrder, p: Array, norm: float) -> None:
         self.family, self.at, self.norm = family, p, norm
-        self.LQ = np.linalg.cholesky(np.linalg.inv(passivity_storage(family, p)))
-        self.LU = np.linalg.cholesky(gain_storage(family, p, norm * (1 + FIRST_ROOM)))
+        self.LQ = np.linalg.cholesky(np.linalg.inv(_passivity_storage(family, p)))
+        self.LU = np.linalg.cholesky(_gain_storage(family, p, norm * (1 + _FIRST_ROOM)))
         self.sizes = (self.LQ.shape[0],) * 2 + (self.LU.shape[0],) * 2
         self.ends = np.cumsum([family.unknowns, *map(packed, self.sizes)])[:-1]
 
@@ -319,7 +319,7 @@ class _Relaxed:
     def _constraints(self, x: cp.Variable, mu: float) -> list[cp.Constraint]:
         def passivity(v: Array) -> Array:
             p, (Q, Y, _, _) = self.split(v)
-            G = in_coordinates(self.family.ports(p), self.LQ)
+            G = _in_coordinates(self.family.ports(p), self.LQ)
             sigma = np.eye(G.C1.shape[0]) if G.C1.size else None
             return lemma2(G, Q, Y, sigma, np.zeros_like(G.D2))
 
@@ -344,8 +344,8 @@ class _Relaxed:
 
 
 #: Relative gap between the norm on a refined sweep and the bound at the sampled frequencies.
-GAP = 1e-5
-MOST_CUTS = 20
+_GAP = 1e-5
+_MOST_CUTS = 20
 
 
 class FixedPoles:
@@ -362,11 +362,11 @@ class FixedPoles:
         while True:
             V, bound = self._solve(poles)
             norm, peak = self.shaping.norm(V)
-            if norm <= bound * (1 + GAP):
+            if norm <= bound * (1 + _GAP):
                 return V, norm
             self.frequencies.append(peak)
             cuts += 1
-            if cuts == MOST_CUTS:
+            if cuts == _MOST_CUTS:
                 return V, norm
 
     def search(self, start: Sequence[float], holds: Callable[[Lti], bool], evaluations: int = 60) -> tuple[Lti, float]:
@@ -443,9 +443,9 @@ class FixedPoles:
 
 
 #: The start is designed for this much less damping, so that it is strictly feasible.
-START_ROOM = 1e-3
+_START_ROOM = 1e-3
 #: Descent ends when a step improves the norm by less than this, relatively.
-SETTLED = 1e-4
+_SETTLED = 1e-4
 
 
 def design(
@@ -460,7 +460,7 @@ def design(
 
     Raises Infeasible if Theorem 4 admits no spring-damper to start from, DesignFailed if no result is certified.
     """
-    whole("order", order, 1, MOST_STATES)
+    whole("order", order, 1, _MOST_STATES)
     of_kind("diagonal", diagonal, bool, "True or False")
     one_of("method", method, METHODS)
     if method == "fixed-poles" and (order, diagonal) != (1, True):
@@ -520,7 +520,7 @@ class _Search:
         return V
 
     def _structured(self) -> SpringDamper:
-        reserved = msgspec.structs.replace(self.loop, delta=tuple((1 - START_ROOM) * d for d in self.loop.delta))
+        reserved = msgspec.structs.replace(self.loop, delta=tuple((1 - _START_ROOM) * d for d in self.loop.delta))
         found = spring_damper.design(reserved)
         self.sdps += found.sdps
         assert isinstance(found.coupling, SpringDamper)
@@ -538,13 +538,13 @@ class _Search:
                 break
             self.sdps += 1
             before, norm, p = norm, self.shaping.norm(self.family.coupling(trial))[0], trial
-            if before - norm < SETTLED * norm:
+            if before - norm < _SETTLED * norm:
                 break
         return p
 
     def _complementarity(self, p: Array, most_sdps: int) -> Array:
         norm = self.shaping.norm(self.family.coupling(p))[0]
-        p, spent = bisect(self.family, p, norm, self._holds, most_sdps)
+        p, spent = _bisect(self.family, p, norm, self._holds, most_sdps)
         self.sdps += spent
         return p
 

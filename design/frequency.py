@@ -13,13 +13,13 @@ from controller.lti import Array, Lti
 # Integrals over frequency, by Gauss's rule on intervals that are halved until it no longer matters.
 
 
-ERROR = 1e-6  # relative, of the sum
-ROUNDING = 1e-20  # of the mean: what is left of two responses that agree to ten digits, squared
-MOST_ROUNDS, MOST_INTERVALS = 20, 1000  # of halving; in one round
+_ERROR = 1e-6  # relative, of the sum
+_ROUNDING = 1e-20  # of the mean: what is left of two responses that agree to ten digits, squared
+_MOST_ROUNDS, _MOST_INTERVALS = 20, 1000  # of halving; in one round
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 
-def integral(response: Callable[[Array], Array], grid: Array, error: float = ERROR) -> float:
+def integral(response: Callable[[Array], Array], grid: Array, error: float = _ERROR) -> float:
     """The integral of `response`, (k,) -> (k,) and not negative, from grid[0] to grid[-1].
 
     Three points of Gauss in each interval of the grid, against the same in its halves: an interval whose two figures
@@ -29,15 +29,15 @@ def integral(response: Callable[[Array], Array], grid: Array, error: float = ERR
     left, right = grid[:-1], grid[1:]
     length = grid[-1] - grid[0]
     coarse, done = _gauss(response, left, right), 0.0
-    for _ in range(MOST_ROUNDS):
+    for _ in range(_MOST_ROUNDS):
         middle = (left + right) / 2
         first, second = np.split(_gauss(response, np.append(left, middle), np.append(middle, right)), 2)
         fine = first + second
-        share = max(error * (done + fine.sum()) / length, ROUNDING) * (right - left)
+        share = max(error * (done + fine.sum()) / length, _ROUNDING) * (right - left)
         excess = np.abs(fine - coarse) - share
         rough = excess > 0
-        if rough.sum() > MOST_INTERVALS:
-            rough &= excess > np.sort(excess)[-MOST_INTERVALS - 1]
+        if rough.sum() > _MOST_INTERVALS:
+            rough &= excess > np.sort(excess)[-_MOST_INTERVALS - 1]
         done += fine[~rough].sum()
         left, right = np.append(left[rough], middle[rough]), np.append(middle[rough], right[rough])
         coarse = np.append(first[rough], second[rough])
@@ -57,13 +57,13 @@ def _gauss(response: Callable[[Array], Array], left: Array, right: Array) -> Arr
 # sweep.supremum for many functions of frequency at once: one row each, refined between grid points together.
 
 
-PEAKS = 3  # highest local maxima of a row that are refined
-POINTS, ROUNDS = 17, 8  # a round narrows a bracket by (POINTS - 1)/2, so eight locate a smooth peak to rounding
+_PEAKS = 3  # highest local maxima of a row that are refined
+_POINTS, _ROUNDS = 17, 8  # a round narrows a bracket by (POINTS - 1)/2, so eight locate a smooth peak to rounding
 
-Responses = Callable[[Array], Array]  # w (n, k) or (1, k) [rad/sample] -> real values (n, k)
+_Responses = Callable[[Array], Array]  # w (n, k) or (1, k) [rad/sample] -> real values (n, k)
 
 
-def suprema(responses: Responses, common: Array, own: Array) -> Array:
+def suprema(responses: _Responses, common: Array, own: Array) -> Array:
     """The largest value of each row, (n,), over frequencies `common` to all, (k,), and its `own`, (n, p).
 
     A row with a value that is not finite gives infinity.
@@ -78,16 +78,16 @@ def suprema(responses: Responses, common: Array, own: Array) -> Array:
     values = np.where(np.isfinite(values), values, -np.inf)
     padded = np.pad(values, ((0, 0), (1, 1)), constant_values=-np.inf)
     local = np.where((values > padded[:, :-2]) & (values >= padded[:, 2:]), values, -np.inf)  # once per plateau
-    peaks = np.argsort(local, axis=1)[:, -PEAKS:]
+    peaks = np.argsort(local, axis=1)[:, -_PEAKS:]
     left, right = _neighbours(grid, np.take_along_axis(grid, peaks, axis=1))
     top = values.max(axis=1)
-    for _ in range(ROUNDS):
-        trial = np.linspace(left, right, POINTS, axis=-1)  # (n, peaks, points)
+    for _ in range(_ROUNDS):
+        trial = np.linspace(left, right, _POINTS, axis=-1)  # (n, peaks, points)
         found = responses(trial.reshape(trial.shape[0], -1)).reshape(trial.shape)
         at = np.argmax(np.where(np.isfinite(found), found, -np.inf), axis=2)[..., None]
         top = np.maximum(top, np.take_along_axis(found, at, axis=2)[..., 0].max(axis=1))
         left = np.take_along_axis(trial, np.maximum(at - 1, 0), axis=2)[..., 0]
-        right = np.take_along_axis(trial, np.minimum(at + 1, POINTS - 1), axis=2)[..., 0]
+        right = np.take_along_axis(trial, np.minimum(at + 1, _POINTS - 1), axis=2)[..., 0]
     return np.where(endless, np.inf, top)
 
 
@@ -101,10 +101,10 @@ def _neighbours(grid: Array, at: Array) -> tuple[Array, Array]:
 
 #: [rad/sample] a figure is even at 0, so that 1e-4 stands for it up to 1e-8; what bends it nearer to 0, as slow poles
 #: of a model that is wrong do, is asked for at a few frequencies below
-LOWEST, BELOW = 1e-4, np.geomspace(1e-5, 0.9e-4, 8)
-EVEN = 192  # even frequencies, as many again evenly in their logarithm; more where delays make lobes
-PER_LOBE = 24
-NEAR_POLE = np.concatenate([-np.geomspace(0.05, 20, 10)[::-1], [0.0], np.geomspace(0.05, 20, 10)])  # in widths
+_LOWEST, _BELOW = 1e-4, np.geomspace(1e-5, 0.9e-4, 8)
+_EVEN = 192  # even frequencies, as many again evenly in their logarithm; more where delays make lobes
+_PER_LOBE = 24
+_NEAR_POLE = np.concatenate([-np.geomspace(0.05, 20, 10)[::-1], [0.0], np.geomspace(0.05, 20, 10)])  # in widths
 
 
 def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Array, Array]:
@@ -112,11 +112,11 @@ def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Arra
 
     `delay` [samples] is the longest of the loop, which makes so many lobes.
     """
-    even = np.linspace(LOWEST, np.pi, max(EVEN, PER_LOBE * (delay + 1)))
-    common = np.unique(np.concatenate([BELOW, even, np.geomspace(LOWEST, np.pi, EVEN)]))
+    even = np.linspace(_LOWEST, np.pi, max(_EVEN, _PER_LOBE * (delay + 1)))
+    common = np.unique(np.concatenate([_BELOW, even, np.geomspace(_LOWEST, np.pi, _EVEN)]))
     width = np.maximum(1 - np.abs(poles), 1e-9)
-    near = (np.abs(np.angle(poles))[..., None] + width[..., None] * NEAR_POLE).reshape(poles.shape[0], -1)
-    return common, np.clip(near, LOWEST, np.pi)
+    near = (np.abs(np.angle(poles))[..., None] + width[..., None] * _NEAR_POLE).reshape(poles.shape[0], -1)
+    return common, np.clip(near, _LOWEST, np.pi)
 
 
 Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)

@@ -42,7 +42,7 @@ def usable(loop: Loop) -> Array:
     return (1 - RESERVE) * even_damping(loop.delta, loop.T, loop.T_max)
 
 
-def low_pass(channels: int, T: float, f0: float = 80.0) -> Lti:
+def _low_pass(channels: int, T: float, f0: float = 80.0) -> Lti:
     """w(z) I, the backward Euler discretisation of 1/(1 + s/(2 pi f0)), f0 in Hz (section 6 of the paper)."""
     a = 2 * np.pi * f0 * T
     gain, pole = a / (1 + a), 1 / (1 + a)
@@ -91,11 +91,11 @@ def _check_weights(W1: Lti, W2: Lti, channels: int) -> None:
 
 
 #: Largest violation of a constraint that is taken for rounding; problems are posed in units where 1 is large.
-TOLERANCE = 1e-4
+_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
-class Settings:
+class _Settings:
     """A solver and its options."""
 
     name: str
@@ -107,19 +107,19 @@ _TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
 _LOOSE = {"tol_gap_abs": 1e-6, "tol_gap_rel": 1e-6, "tol_feas": 1e-6}
 
 LADDER = (
-    Settings("default", cp.CLARABEL),
-    Settings("tight", cp.CLARABEL, {**_TIGHT, "max_step_fraction": 0.95}),
-    Settings("as given", cp.CLARABEL, {"equilibrate_enable": False, "chordal_decomposition_enable": False}),
-    Settings("loose", cp.CLARABEL, {**_LOOSE, "static_regularization_constant": 1e-7}),
+    _Settings("default", cp.CLARABEL),
+    _Settings("tight", cp.CLARABEL, {**_TIGHT, "max_step_fraction": 0.95}),
+    _Settings("as given", cp.CLARABEL, {"equilibrate_enable": False, "chordal_decomposition_enable": False}),
+    _Settings("loose", cp.CLARABEL, {**_LOOSE, "static_regularization_constant": 1e-7}),
 )
-CROSS_CHECK = Settings("splitting", cp.SCS, {"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 200_000})
+CROSS_CHECK = _Settings("splitting", cp.SCS, {"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 200_000})
 
 
 def solve(
     problem: cp.Problem,
     what: str,
     accept: Callable[[], bool] | None = None,
-    ladder: Sequence[Settings] = LADDER,
+    ladder: Sequence[_Settings] = LADDER,
 ) -> tuple[Attempt, ...]:
     """Leave a verified optimum in the problem's variables; return the attempts, the last of which succeeded.
 
@@ -147,7 +147,7 @@ def solved(x: cp.Expression) -> Array:
     return np.asarray(x.value)
 
 
-def _attempt(problem: cp.Problem, settings: Settings, accept: Callable[[], bool] | None) -> Attempt:
+def _attempt(problem: cp.Problem, settings: _Settings, accept: Callable[[], bool] | None) -> Attempt:
     started = time.perf_counter()
     status, reason = _call(problem, settings)
     if reason is None:
@@ -156,7 +156,7 @@ def _attempt(problem: cp.Problem, settings: Settings, accept: Callable[[], bool]
     return Attempt(settings.name, status, value, time.perf_counter() - started, reason)
 
 
-def _call(problem: cp.Problem, settings: Settings) -> tuple[str, str | None]:
+def _call(problem: cp.Problem, settings: _Settings) -> tuple[str, str | None]:
     """(status, reason for refusing it or None). A cached solver would keep the options of the rung before."""
     _forget(problem)
     try:
@@ -178,7 +178,7 @@ def _doubt(problem: cp.Problem, accept: Callable[[], bool] | None) -> str | None
     if any(v.value is None or not np.isfinite(v.value).all() for v in problem.variables()):
         return "a variable has no finite value"
     worst = max((float(np.max(c.violation(), initial=0.0)) for c in problem.constraints), default=0.0)
-    if not worst <= TOLERANCE:
+    if not worst <= _TOLERANCE:
         return f"a constraint is violated by {worst:.1e}"
     return None if accept is None or accept() else "the result does not pass the caller's verification"
 
@@ -199,15 +199,15 @@ Complex = NDArray[np.complex128]
 class Shaping:
     """L (22) of a loop, evaluated fast for many couplings.
 
-    W1 and W2, diagonal, weigh it from the left and from the right; the identity and `low_pass` if they are None. Raises
-    ValueError for weights that do not fit, and for an environment that is active.
+    W1 and W2, diagonal, weigh it from the left and from the right; the identity and `_low_pass` if they are None.
+    Raises ValueError for weights that do not fit, and for an environment that is active.
     """
 
     def __init__(self, loop: Loop, W1: Lti | None = None, W2: Lti | None = None) -> None:
         N, T, E = loop.channels, loop.T, loop.E()
         one = Lti.constant(np.eye(N), T)
         self.loop, self.usable = loop, usable(loop)
-        self.W1, self.W2 = W1 or one, W2 or low_pass(N, T)
+        self.W1, self.W2 = W1 or one, W2 or _low_pass(N, T)
         _check_weights(self.W1, self.W2, N)
         check_passive(E)
         advance = [t + p - n for t, p, n in zip(loop.theta, loop.psi, loop.lam, strict=True)]
@@ -319,7 +319,7 @@ def _scaled(G: Lti, left: Array, right: Array) -> Lti:
 # is checked on a refined sweep by code that knows no solver, and the worst frequency is added.
 
 
-def real_form(H: Complex) -> Array:
+def _real_form(H: Complex) -> Array:
     """[[X, -Y], [Y, X]] of H = X + jY, (..., n, n) -> (..., 2n, 2n): Hermitian >= 0 iff symmetric >= 0."""
     return np.concatenate(
         [
@@ -336,7 +336,7 @@ def affine_lmis(constant: Complex, slopes: Complex, x: cp.Expression) -> list[cp
     constant (k, n, n) and slopes (p, k, n, n) are Hermitian in their last two axes, x is (p,). One product
     with a constant matrix each: cvxpy compiles this much faster than block matrices of complex expressions.
     """
-    fixed, by_x = real_form(constant), real_form(slopes)
+    fixed, by_x = _real_form(constant), _real_form(slopes)
     size = fixed.shape[-1]
     return [
         cp.reshape(by_x[:, k].reshape(len(by_x), -1).T @ x + fixed[k].ravel(), (size, size), order="C") >> 0
@@ -368,14 +368,14 @@ def gain_lmi(
 
 
 #: Phi is enlarged by this, relatively, so that a sweep confirms what a solver found to its own tolerance.
-ROOM = 1e-6
+_ROOM = 1e-6
 
 
 def least_phi(loop: Loop) -> Array | None:
     """`least_multiplier`, verified on a refined sweep; None where psi = 0, since a passive environment needs none."""
     if not any(loop.psi):
         return None
-    phi = least_multiplier(loop) + ROOM * even_damping(loop.delta, loop.T, loop.T_max)
+    phi = least_multiplier(loop) + _ROOM * even_damping(loop.delta, loop.T, loop.T_max)
     short = uncovered(loop.E(), loop.psi, np.diag(phi))
     if short > 0:
         raise DesignFailed(None, (), f"the multiplier Phi = {phi.tolist()} leaves {short:.2e} N s/m uncovered")
@@ -419,7 +419,7 @@ def _needs(psi: Sequence[int], delta: Array, least: float) -> str:
     )
 
 
-Matrix = Any  # Array or cvxpy expression, (rows, columns)
+_Matrix = Any  # Array or cvxpy expression, (rows, columns)
 
 
 class Ports(NamedTuple):
@@ -428,19 +428,19 @@ class Ports(NamedTuple):
     The supply is y2'u - y1' Delta y1 - u' Phi u. Plain passivity has y1 = y2.
     """
 
-    A: Matrix
-    B: Matrix
-    C2: Matrix
-    D2: Matrix
-    C1: Matrix
-    D1: Matrix
+    A: _Matrix
+    B: _Matrix
+    C2: _Matrix
+    D2: _Matrix
+    C1: _Matrix
+    D1: _Matrix
 
     @classmethod
     def same(cls, G: Lti) -> Ports:
         return cls(G.A, G.B, G.C, G.D, G.C, G.D)
 
 
-def lemma1(G: Ports, P: Matrix, Delta: Matrix, Phi: Matrix) -> Matrix:
+def lemma1(G: Ports, P: _Matrix, Delta: _Matrix, Phi: _Matrix) -> _Matrix:
     """(2), with its sign turned: x'Px - x+'Px+ + supply as a quadratic form of (x, u); it and P must be > 0."""
     A, B, C2, D2, C1, D1 = G
     corner = C2.T / 2 - A.T @ P @ B - C1.T @ Delta @ D1
@@ -449,7 +449,7 @@ def lemma1(G: Ports, P: Matrix, Delta: Matrix, Phi: Matrix) -> Matrix:
     return symmetric([[state, corner], [corner.T, port]])
 
 
-def lemma2(G: Ports, Q: Matrix, Y: Matrix, Sigma: Matrix | None, Phi: Matrix) -> Matrix:
+def lemma2(G: Ports, Q: _Matrix, Y: _Matrix, Sigma: _Matrix | None, Phi: _Matrix) -> _Matrix:
     """[[Y, R'], [R, S]] of (3); with Q > 0, Y = Q^-1 and Sigma = Delta^-1 it is Lemma 1 (Sigma None: Delta = 0).
 
     Affine in A, B, C, D, which may therefore be unknowns.
@@ -468,7 +468,7 @@ def lemma2(G: Ports, Q: Matrix, Y: Matrix, Sigma: Matrix | None, Phi: Matrix) ->
     return symmetric(rows)
 
 
-def lemma3(A: Matrix, B: Matrix, C: Matrix, D: Matrix, X: Matrix, U: Matrix, mu2: Matrix) -> Matrix:
+def lemma3(A: _Matrix, B: _Matrix, C: _Matrix, D: _Matrix, X: _Matrix, U: _Matrix, mu2: _Matrix) -> _Matrix:
     """The matrix of Lemma 3 and (24): with X = U^-1 it is positive iff ||G||_inf < mu; mu2 = mu^2 is scalar."""
     n, m, p = A.shape[0], B.shape[1], C.shape[0]
     rows = [
@@ -480,7 +480,7 @@ def lemma3(A: Matrix, B: Matrix, C: Matrix, D: Matrix, X: Matrix, U: Matrix, mu2
     return symmetric(rows)
 
 
-def lemma4(Delta_V: Matrix, Phi: Matrix) -> Matrix:
+def lemma4(Delta_V: _Matrix, Phi: _Matrix) -> _Matrix:
     """(14): the excess of passivity of devices (I) and V-hat covers the shortage Phi of E-hat; also Delta_V > 0."""
     one = np.eye(Phi.shape[0])
     return symmetric([[one - Phi, -Phi], [-Phi, Delta_V - Phi]])
@@ -502,17 +502,17 @@ def v_hat_regular(V: Lti, theta: Sequence[int]) -> Ports:
     He[(1 - 1/z) H]/|1 - 1/z|^2 = He[H/(1 - z)], and 1/(1-z) has the Hermitian part 1/2 on the circle: V-hat is
     Delta-OSP iff He y2/u >= (y1/u)* Delta (y1/u). V(1) must be symmetric. One state per channel fewer than (16).
     """
-    return shifted_ports(V - theta_hat(theta, V.T))
+    return _shifted_ports(V - theta_hat(theta, V.T))
 
 
-def shifted_ports(H: Lti) -> Ports:
+def _shifted_ports(H: Lti) -> Ports:
     """The two outputs of `v_hat_regular` for a given stable H."""
     quotient = H.quotient_at_one()
     static = H.dc()
     return Ports(H.A, H.B, -quotient.C, (static + static.T) / 4, H.C, H.D)
 
 
-def symmetric(rows: list[list[Matrix]]) -> Matrix:
+def symmetric(rows: list[list[_Matrix]]) -> _Matrix:
     """The block matrix, made exactly symmetric; an array if every block is one. Empty blocks are left out."""
     kept = [[block for block in row if 0 not in block.shape] for row in rows]
     kept = [row for row in kept if row]

@@ -154,11 +154,11 @@ def _delay_and_weights(theta: int, c: Sequence[Any], T: Number) -> Lti:
 
 
 #: Where the multiplier of a wall is looked for [samples], and the digits that are kept of it.
-LEAST_G, MOST_G, G_DIGITS = 1e-3, 1e3, 4
+_LEAST_G, _MOST_G, _G_DIGITS = 1e-3, 1e3, 4
 
 
 @dataclass(frozen=True)
-class WallsProof:
+class _WallsProof:
     """What walls that make and break contact ask of the devices."""
 
     requirement: Requirement  # condition "this-environment"
@@ -171,7 +171,7 @@ def walls_proof(
     stiffness: Sequence[float],
     g: Sequence[float] | None = None,
     T_max: float | None = None,
-) -> WallsProof:
+) -> _WallsProof:
     """The damping that `walls_demand` asks with the best multiplier found, or with g (w,) where it is given.
 
     G takes [x; p] to [f; y] while no wall touches.
@@ -179,8 +179,8 @@ def walls_proof(
     m, w = len(delta), len(stiffness)
     available = dampings(delta, m)
 
-    def refused(reason: str) -> WallsProof:
-        return WallsProof(refusal("this-environment", available, reason), tuple(g or (1.0,) * w))
+    def refused(reason: str) -> _WallsProof:
+        return _WallsProof(refusal("this-environment", available, reason), tuple(g or (1.0,) * w))
 
     if min(available) == 0:
         return refused("a device guarantees no damping, so no coupling is safe for every passive human")
@@ -208,7 +208,7 @@ def walls_proof(
     ratio, at = supremum(lambda w: least_scale(demand, w), grid)
     if np.isinf(ratio):
         return refused("no multiplier was found with which the walls are covered, whatever the damping")
-    return WallsProof(
+    return _WallsProof(
         from_ratio("this-environment", max(ratio, 0.0), available, at / (2 * np.pi * G.T)), tuple(found.tolist())
     )
 
@@ -224,7 +224,7 @@ def _best_g(needed: Callable[[Array], float], walls: int) -> Array:
         return np.where(which, value, g)
 
     for which in turns:
-        grid = np.geomspace(LEAST_G, MOST_G, 13)
+        grid = np.geomspace(_LEAST_G, _MOST_G, 13)
         values = [needed(moved(which, value)) for value in grid]
         best = int(np.argmin(values))
         ends = np.log(grid[max(best - 1, 0)]), np.log(grid[min(best + 1, grid.size - 1)])
@@ -235,7 +235,7 @@ def _best_g(needed: Callable[[Array], float], walls: int) -> Array:
             options={"xatol": 1e-2},
         )
         g = moved(which, float(np.exp(finer.x)) if finer.fun < values[best] else float(grid[best]))
-    return np.array([float(f"{value:.{G_DIGITS}g}") for value in g])
+    return np.array([float(f"{value:.{_G_DIGITS}g}") for value in g])
 
 
 # delays that switch within [lo, hi]: the best multiplier
@@ -244,19 +244,19 @@ def _best_g(needed: Callable[[Array], float], walls: int) -> Array:
 # a: at every frequency and direction u it is at least u*(..)u, a sum n + p.a + q.(1/a), and that bounds s from below
 # for all a. The worst of these bounds are collected until their least a attains them. No convex solver is needed.
 
-SETTLED = 1e-7  # relative gap between the sweep of a multiplier and the bound that no multiplier beats
+_SETTLED = 1e-7  # relative gap between the sweep of a multiplier and the bound that no multiplier beats
 
 
-MOST_ROUNDS = 60
+_MOST_ROUNDS = 60
 
 
-FIRST = 0.1  # the a that a search begins with
+_FIRST = 0.1  # the a that a search begins with
 
 
-SMALLEST, LARGEST = 1e-8, 1e6  # .. and what it may become
+_SMALLEST, LARGEST = 1e-8, 1e6  # .. and what it may become
 
 
-NEAR, MOST_PEAKS = 0.3, 8  # of the peaks within 30 % of the highest, so many give a bound
+_NEAR, _MOST_PEAKS = 0.3, 8  # of the peaks within 30 % of the highest, so many give a bound
 
 
 @dataclass(frozen=True)
@@ -286,7 +286,7 @@ def jitter_proof(
         raise ValueError(f"delays are given for {len(h)} channels, expected {G.inputs}")
     constant = this_environment(nominal(lo, hi, G.T) @ G, delta, T_max)
     if not np.isfinite(constant.ratio):
-        return jitter_refusal(available, constant.reason or "no constant delay is safe")
+        return _jitter_refusal(available, constant.reason or "no constant delay is safe")
     damping = even_damping(available, G.T, T_max)
     search, unit = _Search(G, lo, hi, damping), damping / G.T
     given = None if alpha is None else (np.asarray(alpha) / unit)[search.active]
@@ -297,12 +297,12 @@ def jitter_proof(
     return JitterProof(requirement, tuple((multiplier * unit).tolist()), bound)
 
 
-def jitter_refusal(available: tuple[float, ...], reason: str) -> JitterProof:
+def _jitter_refusal(available: tuple[float, ...], reason: str) -> JitterProof:
     """That no damping is enough, and why."""
     return JitterProof(refusal("jitter-proof", available, reason), (np.inf,) * len(available), np.inf)
 
 
-Found = tuple[Array, float, float, float]  # a, s(a), where it binds [rad/sample], a lower bound on s over all a
+_Found = tuple[Array, float, float, float]  # a, s(a), where it binds [rad/sample], a lower bound on s over all a
 
 
 class _Search:
@@ -321,23 +321,23 @@ class _Search:
         none = np.zeros((0, self.active.size))
         self._n, self._p, self._q = np.zeros(0), none, none  # the bounds collected
 
-    def only(self, a: Array) -> Found:
+    def only(self, a: Array) -> _Found:
         """s at this a."""
         ratio, w = self._swept(a)
         return a, ratio, w, ratio
 
-    def least(self) -> Found:
+    def least(self) -> _Found:
         """The least s over all a."""
-        a, bound = np.full(self.active.size, FIRST), -np.inf
+        a, bound = np.full(self.active.size, _FIRST), -np.inf
         if not a.size:
             return self.only(a)
         N, Y = self._parts(self._grid)
         best: tuple[Array, float, float] = (a, np.inf, 0.0)
-        for _ in range(MOST_ROUNDS):
-            if self._cut(a, N, Y) <= bound + SETTLED * abs(bound):  # settled on the samples: look between them
+        for _ in range(_MOST_ROUNDS):
+            if self._cut(a, N, Y) <= bound + _SETTLED * abs(bound):  # settled on the samples: look between them
                 ratio, w = self._swept(a)
                 best = min(best, (a, ratio, w), key=lambda found: found[1])
-                if best[1] <= bound + 10 * SETTLED * abs(bound):
+                if best[1] <= bound + 10 * _SETTLED * abs(bound):
                     return *best, bound
                 between = self._parts(np.array([w]))
                 N, Y = np.concatenate([N, between[0]]), np.concatenate([Y, between[1]])
@@ -369,8 +369,8 @@ class _Search:
         """Collect the bounds at the local peaks near the worst sampled frequency; the worst value."""
         values = self._largest(a, N, Y)
         top, padded = float(values.max()), np.concatenate([[-np.inf], values, [-np.inf]])
-        peaks = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]) & (values >= top - NEAR * abs(top)))
-        peaks = peaks[np.argsort(values[peaks])[-MOST_PEAKS:]]
+        peaks = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]) & (values >= top - _NEAR * abs(top)))
+        peaks = peaks[np.argsort(values[peaks])[-_MOST_PEAKS:]]
         u = np.linalg.eigh(self._matrices(a, N[peaks], Y[peaks]))[1][:, :, -1]
         self._n = np.append(self._n, np.einsum("ki,kij,kj->k", u.conj(), N[peaks], u).real)
         self._p = np.concatenate([self._p, np.abs(u[:, self.active]) ** 2 / 2])
@@ -389,7 +389,7 @@ class _Search:
 
         start = np.concatenate([[0.0], np.log(a)])
         start[0] = -below(start).min()
-        limits = [(None, None)] + [(np.log(SMALLEST), np.log(LARGEST))] * a.size
+        limits = [(None, None)] + [(np.log(_SMALLEST), np.log(LARGEST))] * a.size
         gradient = np.eye(1 + a.size)[0]
         found = minimize(
             lambda x: x[0],
@@ -412,16 +412,16 @@ class _Search:
 BETA = 0.01  # of a limiter's lag under this-environment unless another is asked for
 
 
-LARGEST_WEIGHT = 10.0  # that a search gives a c_ij
+_LARGEST_WEIGHT = 10.0  # that a search gives a c_ij
 
 
-HOPELESS = 1e6  # times the available damping
+_HOPELESS = 1e6  # times the available damping
 
 
 SPARE = 0.02  # of rho: what the block keeps, however large the damping, so that c may be rounded and the proof exact
 
 
-LIMITER_SETTLED = 1e-6  # relative gap between the sweep at the best c and the bound that no c beats
+_LIMITER_SETTLED = 1e-6  # relative gap between the sweep at the best c and the bound that no c beats
 
 
 @dataclass(frozen=True)
@@ -513,12 +513,12 @@ class _LimiterSearch:
         c, bound = np.zeros(m * lags), -np.inf
         best: tuple[Array, float, float] = (c, np.inf, 0.0)
         parts, cuts = self._parts(self._grid), np.zeros((0, m * lags + 2))
-        for _ in range(MOST_ROUNDS):
+        for _ in range(_MOST_ROUNDS):
             found, top = self._cuts(c, *parts)
-            if top <= bound + LIMITER_SETTLED * abs(bound):  # settled on the samples: look between them
+            if top <= bound + _LIMITER_SETTLED * abs(bound):  # settled on the samples: look between them
                 ratio, w = self.swept(self._rows(c), SPARE)
                 best = min(best, (c, ratio, w), key=lambda found: found[1])
-                if best[1] <= bound + 10 * LIMITER_SETTLED * abs(bound):
+                if best[1] <= bound + 10 * _LIMITER_SETTLED * abs(bound):
                     break
                 between = self._parts(np.array([w]))
                 parts = tuple(np.concatenate(pair, axis=-3) for pair in zip(parts, between, strict=True))
@@ -528,7 +528,7 @@ class _LimiterSearch:
                 np.eye(c.size + 1)[-1],
                 A_ub=-cuts[:, 1:],
                 b_ub=cuts[:, 0],
-                bounds=[*[(0.0, LARGEST_WEIGHT)] * c.size, (0.0, None)],
+                bounds=[*[(0.0, _LARGEST_WEIGHT)] * c.size, (0.0, None)],
             )
             if lowest.x is None:  # no c within the bounds makes the block positive, however large the damping
                 return self._rows(c), np.inf, self.swept(self._rows(c), SPARE)[1], np.inf
@@ -557,9 +557,9 @@ class _LimiterSearch:
         needed = least_multiple(block, gain)
         padded = np.concatenate([[-np.inf], needed, [-np.inf]])
         peaks = np.flatnonzero((needed >= padded[:-2]) & (needed >= padded[2:]))
-        peaks = peaks[np.argsort(needed[peaks])[-MOST_PEAKS:]]
+        peaks = peaks[np.argsort(needed[peaks])[-_MOST_PEAKS:]]
         # beyond any damping the worst direction is sought at one so large that only the null space of the gain counts
-        s = np.where(np.isinf(needed[peaks]), HOPELESS, needed[peaks])
+        s = np.where(np.isinf(needed[peaks]), _HOPELESS, needed[peaks])
         u = np.linalg.eigh(block[peaks] + s[:, None, None] * gain[peaks])[1][:, :, 0]
         terms = np.concatenate([free, slopes, gain[None]])[:, peaks]
         rows = np.einsum("ka,tkab,kb->kt", u.conj(), terms, u).real
@@ -584,7 +584,7 @@ def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) 
     try:
         G = loop.sent(coupling)
     except SingularLoop as error:
-        return jitter_refusal(loop.delta, str(error))
+        return _jitter_refusal(loop.delta, str(error))
     return jitter_proof(G, span.lo, span.hi, loop.delta, alpha, loop.T_max)
 
 
@@ -627,7 +627,7 @@ def limiter_requirement(loop: Loop, coupling: Coupling, beta: float = BETA, c: L
 WALL_MULTIPLIER = "g"
 
 
-def walls_of(loop: Loop, coupling: Coupling, g: Sequence[Fraction] | None = None) -> WallsProof:
+def walls_of(loop: Loop, coupling: Coupling, g: Sequence[Fraction] | None = None) -> _WallsProof:
     """What this-environment asks where walls make and break contact, with the multipliers g (w,) or the best found.
 
     Raises NotProved for walls that nothing is proved of.

@@ -44,35 +44,38 @@ from design.stored import Certificate, LimiterCertificate
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
 OBJECTIVES = ("rms", "sup")
-MARGIN = 0.002  # share of the damping that stays unused: what an exact proof always finds room in
+_MARGIN = 0.002  # share of the damping that stays unused: what an exact proof always finds room in
 LADDER = ((4, 3), (8, 6), (14, 10), (22, 16))  # taps and real poles of the rungs
-SETTLED_DB = 0.05  # a rung that gains less ends the climb
-FEWEST_RUNGS = 3
-FASTEST, SLOWEST = 0.5, 0.008  # distance to 1 of the real poles' ends
-FASTER = 0.25  # modes of smaller radius are left to the filter of the sum of all forces
-SLOWER = 0.999  # modes of larger radius get no section
-RICH, RIPPLED = 2, 14  # channels up to which, and taps from which on, there are sections within the band
-RIPPLES, RIPPLE_DAMPING = (0.1, 0.215, 0.464, 1.0), 0.1  # their frequencies beside the band's end, their damping ratio
-FULL = 4  # channels up to which every force has a filter to every device
-STATIC, STATIC_OF_MANY = 0.2, 0.35  # weight of g - 1 beside the relative mismatch; for more than RICH channels
-HIGH_HZ = 100.0  # above it the force is kept low by a soft row, or capped
-SOFT = 0.05, 0.3  # the soft row's weight: the first number times the mismatch so far, which counts up to the second
-LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # (beta, c) of a limiter to begin with: without psi the first alone
-HOPELESS = 0.9  # relative mismatch from which on the climb is compared with other couplings
-TOLERATED = 0.02  # by which a further environment may be short before it enters the design: scaling does the rest
-MOST_STATES = 200  # of the loop, up to which a rung is tried: half a minute with five devices
-MOST_WORK = 7e6  # (channels x unknowns)^2 up to which a rung is tried
-SMALL = 1e-5  # weight of the coefficients themselves: some have no effect where the environment has no inverse
-DECIMALS = 10
-GAPS = (0.05, 0.01)  # of the objective, or of what it gains over no force: gaps at which the inequalities are swept
-FORGIVEN = 5e-4  # by which an inequality may fail between its frequencies: scaling makes up for it
-MOST_SWEEPS = 6
-STEEPER = 3.0  # factor between one centre of the barrier and the next
-SMALLEST = 1e-4  # least frequency of an inequality [rad/sample]: below it nothing changes
+_SETTLED_DB = 0.05  # a rung that gains less ends the climb
+_FEWEST_RUNGS = 3
+_FASTEST, _SLOWEST = 0.5, 0.008  # distance to 1 of the real poles' ends
+_FASTER = 0.25  # modes of smaller radius are left to the filter of the sum of all forces
+_SLOWER = 0.999  # modes of larger radius get no section
+_RICH, _RIPPLED = 2, 14  # channels up to which, and taps from which on, there are sections within the band
+_RIPPLES, _RIPPLE_DAMPING = (
+    (0.1, 0.215, 0.464, 1.0),
+    0.1,
+)  # their frequencies beside the band's end, their damping ratio
+_FULL = 4  # channels up to which every force has a filter to every device
+_STATIC, _STATIC_OF_MANY = 0.2, 0.35  # weight of g - 1 beside the relative mismatch; for more than RICH channels
+_HIGH_HZ = 100.0  # above it the force is kept low by a soft row, or capped
+_SOFT = 0.05, 0.3  # the soft row's weight: the first number times the mismatch so far, which counts up to the second
+_LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # (beta, c) of a limiter to begin with: without psi the first alone
+_HOPELESS = 0.9  # relative mismatch from which on the climb is compared with other couplings
+_TOLERATED = 0.02  # by which a further environment may be short before it enters the design: scaling does the rest
+_MOST_STATES = 200  # of the loop, up to which a rung is tried: half a minute with five devices
+_MOST_WORK = 7e6  # (channels x unknowns)^2 up to which a rung is tried
+_SMALL = 1e-5  # weight of the coefficients themselves: some have no effect where the environment has no inverse
+_DECIMALS = 10
+_GAPS = (0.05, 0.01)  # of the objective, or of what it gains over no force: gaps at which the inequalities are swept
+_FORGIVEN = 5e-4  # by which an inequality may fail between its frequencies: scaling makes up for it
+_MOST_SWEEPS = 6
+_STEEPER = 3.0  # factor between one centre of the barrier and the next
+_SMALLEST = 1e-4  # least frequency of an inequality [rad/sample]: below it nothing changes
 
 
 @dataclass(frozen=True, eq=False)
-class Constraint:
+class _Constraint:
     """A linear matrix inequality that the forces G = R Psi E as they leave are to keep at every frequency.
 
     `block` is a condition's own statement, He[block(G, x)] > 0, affine in G and in own unknowns x together.
@@ -81,7 +84,7 @@ class Constraint:
     name: str
     block: Callable[[Sampled, Array], Sampled]
     unit: Array  # (r,) rows and columns of the block are scaled by it, so that its eigenvalues count in one measure
-    low: float = SMALLEST  # [rad/sample]
+    low: float = _SMALLEST  # [rad/sample]
     high: float = np.pi
     start: tuple[float, ...] = ()  # own unknowns for which R = kappa I is strictly feasible for a small kappa
     cost: tuple[float, ...] = ()  # of the own unknowns in the objective
@@ -100,7 +103,7 @@ class Options:
     high_gain: float | None = None  # largest |F|/|E| above 100 Hz; None: kept low by a soft row
     limiter: bool = False  # covered also while forces are limited
     seconds: float = 60.0  # no rung is begun later than this; the sizes of rungs end most climbs far earlier
-    margin: float = MARGIN  # share of the damping that stays unused
+    margin: float = _MARGIN  # share of the damping that stays unused
     ladder: tuple[tuple[int, int], ...] = LADDER  # (taps, real poles)
 
     def __post_init__(self) -> None:
@@ -117,7 +120,7 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Rung:
+class _Rung:
     """One step of the climb."""
 
     taps: int
@@ -141,7 +144,7 @@ class Optimal(Design):
     g: float = field(kw_only=True)  # F(1) = g E(1); of another kind than a force filter the ratio of their norms
     states: int = field(kw_only=True)  # of the loop
     certificate: Certificate | None = field(kw_only=True)  # of the loop with its ranges and its switching delays
-    ladder: tuple[Rung, ...] = field(kw_only=True, default=())
+    ladder: tuple[_Rung, ...] = field(kw_only=True, default=())
     reason: str | None = field(kw_only=True, default=None)  # why nothing is proved, where nothing is
     searched: Searched | None = field(kw_only=True, default=None)  # between the vertices of ranges
 
@@ -150,14 +153,14 @@ class Optimal(Design):
         return self.certificate is not None
 
 
-Progress = Callable[[Rung], None]
-ForEach = Callable[[Loop], Constraint]  # a constraint in one environment
+_Progress = Callable[[_Rung], None]
+_ForEach = Callable[[Loop], _Constraint]  # a constraint in one environment
 
 
 # what is asked --------------------------------------------------------------------------------------------------------
 
 
-def this_environment(loop: Loop, margin: float = MARGIN) -> Constraint:
+def this_environment(loop: Loop, margin: float = _MARGIN) -> _Constraint:
     """design.conditions.this_environment_demand with this share of the damping unused, in units of Delta/T."""
 
     def block(G: Sampled, own: Array) -> Sampled:
@@ -165,14 +168,14 @@ def this_environment(loop: Loop, margin: float = MARGIN) -> Constraint:
         return demand.free + demand.gain * (1 - margin)
 
     gain = _demand(loop, Lti.constant(np.zeros((loop.channels, loop.channels)), loop.T)).gain
-    return Constraint("this-environment", block, 1 / np.sqrt(np.diag(gain.D)))
+    return _Constraint("this-environment", block, 1 / np.sqrt(np.diag(gain.D)))
 
 
 def _demand(loop: Loop, F: Any) -> Demand[Any]:
     return this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
 
 
-def switching(loop: Loop, span: DelayRange, margin: float = MARGIN) -> Constraint:
+def switching(loop: Loop, span: DelayRange, margin: float = _MARGIN) -> _Constraint:
     """design.conditions.switching_block for delays that switch within the span; alpha T/Delta are its unknowns."""
     scale = even_damping(loop.delta, loop.T, loop.T_max) / loop.T
     moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))
@@ -184,22 +187,22 @@ def switching(loop: Loop, span: DelayRange, margin: float = MARGIN) -> Constrain
         return switching_block(G, span.lo, span.hi, usable, alpha.tolist(), loop.T_max)[0]
 
     unit = 1 / np.sqrt(np.concatenate([scale, scale[moves]]))
-    return Constraint("switching delays", block, unit, start=(0.5,) * moves.size, cost=(0.0,) * moves.size)
+    return _Constraint("switching delays", block, unit, start=(0.5,) * moves.size, cost=(0.0,) * moves.size)
 
 
 @dataclass(frozen=True)
-class Slip:
+class _Slip:
     """The limiter's lag and multiplier: its block is affine in the forces for given ones."""
 
     beta: float  # rho = beta delta/T
     c: tuple[tuple[float, ...], ...]  # (m, lags)
 
     @classmethod
-    def even(cls, loop: Loop, beta: float, c: float) -> Slip:
+    def even(cls, loop: Loop, beta: float, c: float) -> _Slip:
         return cls(beta, ((c,),) * loop.channels)
 
 
-def limiter(loop: Loop, slip: Slip, margin: float = MARGIN) -> Constraint:
+def limiter(loop: Loop, slip: _Slip, margin: float = _MARGIN) -> _Constraint:
     """design.conditions.limiter_demand: forces that are limited. A little of rho stays unused, as of the damping."""
     rho = limiter_lag(loop.delta, loop.T, slip.beta)
     spare = np.diag([*rho, *rho]) * SPARE
@@ -208,21 +211,21 @@ def limiter(loop: Loop, slip: Slip, margin: float = MARGIN) -> Constraint:
         demand = limiter_demand(G, loop.theta, loop.delta, rho, slip.c, loop.T_max)
         return demand.free + demand.gain * (1 - margin) - spare
 
-    return Constraint("limiter", block, np.tile(1 / np.sqrt(even_damping(loop.delta, loop.T, loop.T_max) / loop.T), 2))
+    return _Constraint("limiter", block, np.tile(1 / np.sqrt(even_damping(loop.delta, loop.T, loop.T_max) / loop.T), 2))
 
 
-def most_gain(loop: Loop, cap: float) -> Constraint:
+def _most_gain(loop: Loop, cap: float) -> _Constraint:
     """|F| < cap |E| above 100 Hz."""
     E = loop.E()
 
     def block(G: Sampled, own: Array) -> Sampled:
         return _within(_late(loop, G), E.at(G.z), cap)
 
-    low = min(2 * np.pi * HIGH_HZ * loop.T, np.pi)
-    return Constraint("high-frequency gain", block, np.ones(2 * E.inputs), low=low)
+    low = min(2 * np.pi * _HIGH_HZ * loop.T, np.pi)
+    return _Constraint("high-frequency gain", block, np.ones(2 * E.inputs), low=low)
 
 
-def worst_mismatch(loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> Constraint:
+def _worst_mismatch(loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> _Constraint:
     """|F - Lambda E| < tau |E| over the band, with tau its own unknown and its cost."""
     E = loop.E()
 
@@ -230,7 +233,7 @@ def worst_mismatch(loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> Constr
         return _within(_late(loop, G) - as_like(G, delay(loop.lam, loop.T) @ E), E.at(G.z), own[0])
 
     low, high = _band(loop, band_hz)
-    return Constraint("mismatch", block, np.ones(2 * E.inputs), low, high, start=(2.0,), cost=(1.0,))
+    return _Constraint("mismatch", block, np.ones(2 * E.inputs), low, high, start=(2.0,), cost=(1.0,))
 
 
 def _late(loop: Loop, G: Sampled) -> Sampled:
@@ -279,7 +282,7 @@ class Span:
 
     def filter(self, x: Array, scale: float = 1.0) -> ForceFilter:
         """The force filter in decimals: R_0 is what is missing to exactly g I."""
-        unit = 10**DECIMALS
+        unit = 10**_DECIMALS
         later = np.array([round(v * unit) for v in (scale * self.matrices(x)).ravel().tolist()], dtype=object)
         later = later.reshape(self.used.shape)
         m = self.used.shape[1]
@@ -302,18 +305,18 @@ def span_of(E: Lti, taps: int, poles: int) -> Span:
     """
     m = E.inputs
     modes = np.concatenate([E.poles(), _zeros(E)])
-    modes = modes[(np.abs(modes) < SLOWER) & (np.abs(modes) > 0.02) & (modes.imag >= 0)]
-    slow = np.round(1 - np.geomspace(FASTEST, SLOWEST, poles), 4) if poles else np.zeros(0)
+    modes = modes[(np.abs(modes) < _SLOWER) & (np.abs(modes) > 0.02) & (modes.imag >= 0)]
+    slow = np.round(1 - np.geomspace(_FASTEST, _SLOWEST, poles), 4) if poles else np.zeros(0)
     fast, real, pairs = [], slow.tolist(), []
     for mode in _distinct(modes):
         if abs(mode.imag) > 1e-6:
             pairs.append((-2 * mode.real, abs(mode) ** 2))
-        elif m > FULL and abs(mode) < FASTER:
+        elif m > _FULL and abs(mode) < _FASTER:
             fast.append(float(mode.real))
         elif not any(abs(mode.real - a) < 0.02 * (1 - abs(a)) for a in real):
             real.append(float(mode.real))
-    if m <= RICH and taps >= RIPPLED:
-        q = np.exp(np.array(RIPPLES) * 2 * np.pi * BAND_HZ[1] * E.T * (1j - RIPPLE_DAMPING))
+    if m <= _RICH and taps >= _RIPPLED:
+        q = np.exp(np.array(_RIPPLES) * 2 * np.pi * BAND_HZ[1] * E.T * (1j - _RIPPLE_DAMPING))
         pairs += [(-2 * mode.real, abs(mode) ** 2) for mode in q if mode.imag > 0]
     own = len(real) + taps - 1 + 2 * len(pairs)
     fast += [0.0] * (len(fast) % 2)
@@ -321,7 +324,7 @@ def span_of(E: Lti, taps: int, poles: int) -> Span:
     all_poles = np.concatenate([np.zeros(taps - 1), np.round(real, 4)])
     count = all_poles.size + 2 * len(pairs)
     used = np.ones((count, m, m), dtype=bool)
-    if m > FULL:
+    if m > _FULL:
         used = np.zeros((count, m, m + 1), dtype=bool)
         used[:own, np.arange(m), np.arange(m)] = True
         used[:, :, m] = True
@@ -351,7 +354,7 @@ class Case:
 
     loop: Loop  # around this environment alone
     E: Lti
-    constraints: tuple[Constraint, ...] = ()
+    constraints: tuple[_Constraint, ...] = ()
     weight: float = 1.0
 
     def delayed(self, z: Complex) -> Sampled:
@@ -370,7 +373,7 @@ class Case:
             return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
 
         chain = Span(coupling.poles, coupling.pairs, np.ones((len(coupling.R) - 1, 1, 1), dtype=bool)).chain(self.E.T)
-        return supremum(needed, frequencies(self.E, chain, low=SMALLEST / 10))[0]
+        return supremum(needed, frequencies(self.E, chain, low=_SMALLEST / 10))[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -415,7 +418,7 @@ class Problem:
                 logarithm = np.log(w)
                 weight = np.gradient(logarithm) / (logarithm[-1] - logarithm[0])
                 self._force_rows(case, w, np.sqrt(case.weight * weight), loop.lam, rows, right)
-            edge = 2 * np.pi * HIGH_HZ * loop.T
+            edge = 2 * np.pi * _HIGH_HZ * loop.T
             if edge < np.pi and self.soft > 0:
                 w = np.geomspace(edge, np.pi, 20)
                 self._force_rows(case, w, np.full(20, self.soft * np.sqrt(case.weight / 20)), None, rows, right)
@@ -423,7 +426,7 @@ class Problem:
         static[0, 0] = held = _static(self.cases[0].loop)
         cost = np.zeros(self.unknowns)
         cost[self.span.unknowns :] = [v for case in self.cases for c in case.constraints for v in c.cost]
-        small = SMALL * np.eye(self.span.unknowns, self.unknowns)
+        small = _SMALL * np.eye(self.span.unknowns, self.unknowns)
         return np.vstack([*rows, static, small]), np.concatenate([*right, [held], np.zeros(len(small))]), cost
 
     def _force_rows(
@@ -454,7 +457,7 @@ class Problem:
         G[np.arange(1, len(G)), :, which[:, 1]] = np.swapaxes(through, 0, 1)
         return Sampled(z[None], G, case.loop.T)
 
-    def block(self, case: Case, constraint: Constraint, own: tuple[int, int], w: Array) -> Block:
+    def block(self, case: Case, constraint: _Constraint, own: tuple[int, int], w: Array) -> Block:
         """The inequality of a constraint at these frequencies: an affine map, by what it makes of each unknown."""
         slopes = self._slopes(case, on_circle(w))
         nothing, units = Sampled(slopes.z, np.zeros_like(slopes.G[:1]), slopes.T), np.eye(own[1] - own[0])
@@ -473,7 +476,7 @@ class Problem:
         slope[0, 0] = 1
         return Block(np.zeros((1, 1, 1), dtype=complex), slope)
 
-    def least(self, case: Case, constraint: Constraint, own: tuple[int, int], x: Array, w: Array) -> Array:
+    def least(self, case: Case, constraint: _Constraint, own: tuple[int, int], x: Array, w: Array) -> Array:
         """The least eigenvalue of a constraint at x, (k,)."""
         z = on_circle(w)
         R = self.span.matrices(x) @ self.span.sources()
@@ -483,15 +486,15 @@ class Problem:
         G = Sampled(delayed.z, filtered @ delayed.G, delayed.T)
         return np.linalg.eigvalsh(constraint.at(G, x[own[0] : own[1]])[0])[:, 0]
 
-    def grid(self, case: Case, constraint: Constraint) -> Array:
+    def grid(self, case: Case, constraint: _Constraint) -> Array:
         """The frequencies at which a constraint is imposed first."""
         even = np.linspace(constraint.low, constraint.high, 50)
-        rising = np.geomspace(max(constraint.low, SMALLEST), constraint.high, 60)
+        rising = np.geomspace(max(constraint.low, _SMALLEST), constraint.high, 60)
         modes = np.concatenate([case.E.poles(), self.span.chain(case.E.T).poles()])
         modes = np.array(_distinct(modes[modes.imag > 1e-6]), dtype=complex)
         around = (np.angle(modes)[:, None] + (1 - np.abs(modes))[:, None] * np.array([-1.0, 0.0, 1.0])).ravel()
         w = np.unique(np.concatenate([even, rising, around]))
-        return w[(w >= max(constraint.low, SMALLEST)) & (w <= constraint.high)]
+        return w[(w >= max(constraint.low, _SMALLEST)) & (w <= constraint.high)]
 
     def room(self, x: Array, dense: bool = False) -> float:
         """The least eigenvalue of any constraint at x, where each is imposed first or over the whole sweep."""
@@ -502,9 +505,9 @@ class Problem:
                 rooms.append(self.least(case, constraint, next(own), x, w).min())
         return float(min(rooms))
 
-    def _sweep(self, case: Case, constraint: Constraint) -> Array:
+    def _sweep(self, case: Case, constraint: _Constraint) -> Array:
         """A grid that knows every pole, over the band of a constraint."""
-        return frequencies(case.E, self.span.chain(case.E.T), low=max(constraint.low, SMALLEST), high=constraint.high)
+        return frequencies(case.E, self.span.chain(case.E.T), low=max(constraint.low, _SMALLEST), high=constraint.high)
 
     def missed(self, x: Array) -> tuple[list[Array], float]:
         """(where each constraint fails, case by case and constraint by constraint; by how much the worst does)."""
@@ -525,12 +528,12 @@ class Problem:
         A, b, c = self.objective()
         _, R = np.linalg.qr(np.column_stack([A, b]))
         A, b = R[:, :-1], R[:, -1]
-        x, t, gaps = start, None, list(GAPS)
+        x, t, gaps = start, None, list(_GAPS)
         inner = start
         nothing = float(b @ b) + float(c.any())  # without any force; a supremum is 1 then
         demanding = any(len(case.constraints) > 1 for case in self.cases)  # else scaling, which is exact, does the rest
-        back = STEEPER**4 if demanding else STEEPER
-        for _ in range(MOST_SWEEPS):
+        back = _STEEPER**4 if demanding else _STEEPER
+        for _ in range(_MOST_SWEEPS):
             parts = [self.block(*one, own, w) for one, own, w in zip(asked, self.own, imposed, strict=True)]
             program = Program(A, b, c, (*parts, self.positive()))
             x = towards(start, x, program)
@@ -543,11 +546,11 @@ class Problem:
                 value = program.value(y)
                 if program.degree / t <= gaps[0] * max(min(value, nothing - value), 1e-9):
                     break
-                t *= STEEPER
+                t *= _STEEPER
                 y = centre(program, y, t)
             x = solve_triangular(U, y)
             more, worst = self.missed(x)
-            if worst < FORGIVEN and len(gaps) == 1:
+            if worst < _FORGIVEN and len(gaps) == 1:
                 break
             gaps = gaps[-1:]
             imposed = [np.union1d(w, extra) for w, extra in zip(imposed, more, strict=True)]
@@ -563,7 +566,7 @@ class Problem:
 
 
 def _static(loop: Loop) -> float:
-    return STATIC if loop.channels <= RICH else STATIC_OF_MANY
+    return _STATIC if loop.channels <= _RICH else _STATIC_OF_MANY
 
 
 def _band(loop: Loop, band_hz: tuple[float, float]) -> tuple[float, float]:
@@ -586,7 +589,7 @@ def design_with(
     """
     asked, done = Options(**options), 0
 
-    def heard(rung: Rung) -> None:
+    def heard(rung: _Rung) -> None:
         nonlocal done
         done += 1
         progress(f"{rung.mismatch_db:.2f} dB after {rung.seconds:.1f} s", done, len(asked.ladder))
@@ -598,8 +601,8 @@ def design_with(
 def design(
     loop: Loop,
     options: Options = Options(),
-    further: Sequence[ForEach] = (),
-    progress: Progress = lambda rung: None,
+    further: Sequence[_ForEach] = (),
+    progress: _Progress = lambda rung: None,
 ) -> Optimal:
     """The coupling of the least mismatch in the loop's environment, certified and proved.
 
@@ -617,7 +620,7 @@ def design(
     if exactly := climb.nothing():
         return exactly
     best: Optimal | None = None
-    rungs: list[Rung] = []
+    rungs: list[_Rung] = []
     for taps, poles in options.ladder:
         if rungs and not climb.room(taps, poles):
             break
@@ -628,11 +631,11 @@ def design(
         if rung.reason is None and (best is None or climb.merit(found) < climb.merit(best)):
             gained = np.inf if best is None else decibels(climb.merit(best)) - decibels(climb.merit(found))
             best = found
-        if (gained < SETTLED_DB and len(rungs) >= FEWEST_RUNGS) or climb.elapsed > options.seconds:
+        if (gained < _SETTLED_DB and len(rungs) >= _FEWEST_RUNGS) or climb.elapsed > options.seconds:
             break
     if best and loop.box:
         best = climb.between(best)
-    if best is None or climb.mismatch(best) > HOPELESS:
+    if best is None or climb.mismatch(best) > _HOPELESS:
         rivals = [one for one in (best, climb.scaled(), climb.spring_damper()) if one is not None]
         best = min(rivals, key=lambda one: (not one.proved, climb.merit(one)))
     return replace(best, ladder=tuple(rungs), sdps=len(rungs), wall_s=climb.elapsed)
@@ -649,7 +652,7 @@ class _Climb:
     started: float
 
     @classmethod
-    def of(cls, loop: Loop, options: Options, further: Sequence[ForEach]) -> _Climb:
+    def of(cls, loop: Loop, options: Options, further: Sequence[_ForEach]) -> _Climb:
         started = time.perf_counter()
         if loop.environment.walls:
             raise ValueError("an optimal coupling holds a linear model of the environment: walls have none")
@@ -659,10 +662,10 @@ class _Climb:
         for member in loop.members():
             there = _at(loop, member.network)
             asked = [this_environment(there, options.margin), *(constraint(there) for constraint in further)]
-            if options.high_gain is not None and 2 * HIGH_HZ * loop.T < 1 and there.E().D.any():
-                asked.append(most_gain(there, options.high_gain))
+            if options.high_gain is not None and 2 * _HIGH_HZ * loop.T < 1 and there.E().D.any():
+                asked.append(_most_gain(there, options.high_gain))
             if options.objective == "sup" and not cases:
-                asked.append(worst_mismatch(there, options.band_hz))
+                asked.append(_worst_mismatch(there, options.band_hz))
             cases.append(Case(there, there.E(), tuple(asked), weight=0.0 if cases else 1.0))
         if options.limiter and (reason := limiter_refusal(loop)):
             raise ValueError(reason)
@@ -680,17 +683,17 @@ class _Climb:
         """Whether anything but this-environment is asked."""
         return self.options.limiter or any(len(case.constraints) > 1 for case in self.cases)
 
-    def slips(self, before: Optimal | None) -> tuple[Slip | None, ...]:
+    def slips(self, before: Optimal | None) -> tuple[_Slip | None, ...]:
         """The limiters that a rung is solved for: that of the rung before, with the best multiplier that it has."""
         if not self.options.limiter:
             return (None,)
         if before and before.certificate:
             proof = before.certificate.limiter
             assert isinstance(proof, LimiterCertificate)
-            return (Slip(proof.beta, proof.c),)
-        return tuple(Slip.even(self.loop, *some) for some in (LAGS if any(self.loop.psi) else LAGS[:1]))
+            return (_Slip(proof.beta, proof.c),)
+        return tuple(_Slip.even(self.loop, *some) for some in (_LAGS if any(self.loop.psi) else _LAGS[:1]))
 
-    def asked(self, slip: Slip | None) -> tuple[Case, ...]:
+    def asked(self, slip: _Slip | None) -> tuple[Case, ...]:
         """The environments with all that holds in each."""
         if slip is None:
             return self.cases
@@ -725,31 +728,31 @@ class _Climb:
         span, loop = span_of(self.cases[0].E, taps, poles), self.loop
         m = loop.channels
         own = int((span.used.sum(axis=1) > 0)[:, :m].sum())
-        states = own + (len(span.used) - own // m if m > FULL else 0)
+        states = own + (len(span.used) - own // m if m > _FULL else 0)
         states += self.cases[0].E.order + sum(loop.theta) + sum(loop.psi)
-        return states <= MOST_STATES and (m * span.unknowns) ** 2 <= MOST_WORK
+        return states <= _MOST_STATES and (m * span.unknowns) ** 2 <= _MOST_WORK
 
-    def rung(self, taps: int, poles: int, before: Optimal | None) -> tuple[Optimal, Rung]:
+    def rung(self, taps: int, poles: int, before: Optimal | None) -> tuple[Optimal, _Rung]:
         """The optimum over a basis, scaled until every sweep passes, and proved where there are no ranges."""
         tried = [self._solved(taps, poles, before, slip) for slip in self.slips(before)]
         found = min(tried, key=lambda one: (one.reason is not None, self.merit(one)))
-        return found, Rung(taps, poles, found.states, self.decibels(found), found.g, found.reason, self.elapsed)
+        return found, _Rung(taps, poles, found.states, self.decibels(found), found.g, found.reason, self.elapsed)
 
-    def _solved(self, taps: int, poles: int, before: Optimal | None, slip: Slip | None) -> Optimal:
+    def _solved(self, taps: int, poles: int, before: Optimal | None, slip: _Slip | None) -> Optimal:
         share = self.mismatch(before) if before else 1.0
         span, cases = span_of(self.cases[0].E, taps, poles), self.asked(slip)
         active = [0]
         while True:
             chosen = tuple(cases[i] for i in active)
-            problem = Problem(span, chosen, self.options, SOFT[0] * min(share, SOFT[1]))
+            problem = Problem(span, chosen, self.options, _SOFT[0] * min(share, _SOFT[1]))
             coupling = span.filter(problem.solve(self._start(problem)))
             needs = [case.need(coupling) for case in cases]
-            missed = [int(i) for i in np.argsort(needs)[::-1] if needs[i] > 1 + TOLERATED and i not in active]
+            missed = [int(i) for i in np.argsort(needs)[::-1] if needs[i] > 1 + _TOLERATED and i not in active]
             if not missed:
                 break
             active += missed[:2]
         if slip:
-            needs.append(min(limiter_requirement(self.loop, coupling, slip.beta).requirement.ratio, 1 + TOLERATED))
+            needs.append(min(limiter_requirement(self.loop, coupling, slip.beta).requirement.ratio, 1 + _TOLERATED))
         for limit in (1 - 0.95 * self.options.margin, 1 - 2.5 * self.options.margin):
             scale = min(1.0, (1 - self.options.margin) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))
@@ -833,7 +836,7 @@ class _Climb:
             reason=None if requirement.certified else requirement.reason or "the sweep does not certify it",
         )
 
-    def _proved(self, found: Optimal, slip: Slip | None) -> Optimal:
+    def _proved(self, found: Optimal, slip: _Slip | None) -> Optimal:
         """The same with its certificate, or why it has none."""
         loop, coupling = self.loop, found.coupling
         try:
@@ -860,7 +863,7 @@ def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
 
 
 @dataclass(frozen=True)
-class Robustness:
+class _Robustness:
     """What a coupling needs where the environment is not quite the one that it was designed for."""
 
     percent: float
@@ -893,7 +896,7 @@ def vertices(network: Network, percent: float = 10.0) -> dict[str, Network]:
     return found
 
 
-def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> Robustness:
+def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> _Robustness:
     """The worst need of a coupling over `vertices`, by the refined sweep."""
     worst, where = 0.0, "nominal"
     for name, network in {"nominal": loop.environment, **vertices(loop.network, percent)}.items():
@@ -904,11 +907,11 @@ def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> Robustn
             ratio = requirement_of(there.F(coupling), loop.delta, loop.T_max, loop.latency).ratio
         if ratio > worst:
             worst, where = ratio, name
-    return Robustness(percent, worst, where, worst < 1)
+    return _Robustness(percent, worst, where, worst < 1)
 
 
 @dataclass(frozen=True)
-class Spread:
+class _Spread:
     """What it costs to keep the condition over `vertices`, too: two designs over one small basis."""
 
     mismatch_db: float  # of the design for the vertices, in the nominal environment
@@ -917,9 +920,9 @@ class Spread:
     worst: float  # times the damping that there is, over the vertices
 
 
-def spread(loop: Loop, options: Options = Options(), percent: float = 10.0) -> Spread | None:
+def spread(loop: Loop, options: Options = Options(), percent: float = 10.0) -> _Spread | None:
     """The design for `vertices` beside the nominal one, by sweeps: a price, not a coupling to run. None without one."""
-    taps, poles = options.ladder[: 2 if loop.channels <= RICH else 1][-1]
+    taps, poles = options.ladder[: 2 if loop.channels <= _RICH else 1][-1]
     climb = _Climb.of(loop.at(loop.environment), options, ())
     around = [_at(loop, network) for network in vertices(loop.network, percent).values()]
     more = tuple(Case(there, there.E(), (this_environment(there, options.margin),), 0.0) for there in around)
@@ -929,7 +932,7 @@ def spread(loop: Loop, options: Options = Options(), percent: float = 10.0) -> S
         return None
     mismatch = climb.decibels(wide)
     worst = robustness(loop, wide.coupling, percent).worst
-    return Spread(mismatch, mismatch - climb.decibels(alone), wide.g, worst)
+    return _Spread(mismatch, mismatch - climb.decibels(alone), wide.g, worst)
 
 
 def box_around(network: Network, percent: float) -> Box:

@@ -56,10 +56,10 @@ if TYPE_CHECKING:
 # end at the same gains.
 
 
-LARGEST_GRAM = 12  # samples of delay
-PER_LOBE = 8  # frequencies per ripple of y at which the inequality is imposed first
-MISSED = 2e-6  # of the usable damping: what the inequality may miss in between, far less than the reserve of a design
-MOST_ROUNDS = 12
+_LARGEST_GRAM = 12  # samples of delay
+_PER_LOBE = 8  # frequencies per ripple of y at which the inequality is imposed first
+_MISSED = 2e-6  # of the usable damping: what the inequality may miss in between, far less than the reserve of a design
+_MOST_ROUNDS = 12
 
 
 def gain_set(k: cp.Expression, b: cp.Expression, theta: int, sigma: float) -> list[cp.Constraint]:
@@ -89,23 +89,23 @@ def solve_within(
     sigma: Array,
     what: str,
     more: Sequence[cp.Constraint] = (),
-    largest_gram: int = LARGEST_GRAM,
+    largest_gram: int = _LARGEST_GRAM,
 ) -> cp.Problem:
     """The solved problem with every channel of gains = (k_1, ..., k_N, b_1, ..., b_N) in its set.
 
     Raises as `solve`, and DesignFailed where an inequality still fails after all rounds.
     """
     N = len(theta)
-    cones = {i: first_frequencies(theta[i]) for i in range(N) if theta[i] > largest_gram}
-    for _ in range(MOST_ROUNDS):
+    cones = {i: _first_frequencies(theta[i]) for i in range(N) if theta[i] > largest_gram}
+    for _ in range(_MOST_ROUNDS):
         problem = cp.Problem(objective, [*_constraints(gains, theta, sigma, cones), *more])
         solve(problem, what)
         k, b = np.split(solved(gains), 2)
-        missed = {i: missed_frequencies(k[i], b[i], theta[i], float(sigma[i])) for i in cones}
+        missed = {i: _missed_frequencies(k[i], b[i], theta[i], float(sigma[i])) for i in cones}
         if not any(w.size for w in missed.values()):
             return problem
         cones = {i: np.union1d(w, missed[i]) for i, w in cones.items()}
-    line = f"{what}: after {MOST_ROUNDS} rounds Theorem 4 still fails between the frequencies"
+    line = f"{what}: after {_MOST_ROUNDS} rounds Theorem 4 still fails between the frequencies"
     raise DesignFailed(None, (), line)
 
 
@@ -116,13 +116,13 @@ def _constraints(
     for i in range(N):
         k, b = gains[i], gains[N + i]
         if i in cones:
-            constraints += gain_cones(k, b, theta[i], float(sigma[i]), cones[i])
+            constraints += _gain_cones(k, b, theta[i], float(sigma[i]), cones[i])
         else:
             constraints += gain_set(k, b, theta[i], float(sigma[i]))
     return constraints
 
 
-def gain_cones(k: cp.Expression, b: cp.Expression, theta: int, sigma: float, w: Array) -> list[cp.Constraint]:
+def _gain_cones(k: cp.Expression, b: cp.Expression, theta: int, sigma: float, w: Array) -> list[cp.Constraint]:
     """The inequality at the frequencies w [rad/sample]: |(2c, r - 1)| <= r + 1 says |c|^2 <= r."""
     of_k, of_b = _polynomials(theta, w)
     rows = [part * k + other * b for part, other in zip(_parts(of_k), _parts(of_b), strict=True)]
@@ -133,7 +133,7 @@ def gain_cones(k: cp.Expression, b: cp.Expression, theta: int, sigma: float, w: 
     return cast(list[cp.Constraint], [cones, k >= 0, b >= 0])
 
 
-def missed_frequencies(k: float, b: float, theta: int, sigma: float) -> Array:
+def _missed_frequencies(k: float, b: float, theta: int, sigma: float) -> Array:
     """Peaks [rad/sample] at which the gains miss the inequality by more than MISSED."""
 
     def excess(w: Array) -> Array:
@@ -141,12 +141,12 @@ def missed_frequencies(k: float, b: float, theta: int, sigma: float) -> Array:
         y = k * of_k + b * of_b
         return np.abs(y) ** 2 / 4 + np.abs(1 - y / 2) ** 2 / sigma - (k / 2 + b)
 
-    return peaks(excess, first_frequencies(2 * theta + 1), MISSED)
+    return peaks(excess, _first_frequencies(2 * theta + 1), _MISSED)
 
 
-def first_frequencies(theta: int) -> Array:
+def _first_frequencies(theta: int) -> Array:
     """PER_LOBE to each ripple of y, from 0 to pi [rad/sample]."""
-    return np.linspace(0, np.pi, PER_LOBE * (theta + 1) + 1)
+    return np.linspace(0, np.pi, _PER_LOBE * (theta + 1) + 1)
 
 
 def _polynomials(theta: int, w: Array) -> tuple[Array, Array]:
@@ -206,19 +206,19 @@ def _tangent(shaping: Shaping, at: Array, norm: float, w: Array) -> tuple[Comple
 
 
 #: The sampled condition keeps half as much again as the promised reserve, for what lies between the samples.
-SAMPLED_RESERVE = 1.5 * RESERVE
-SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
-CLOSEST_POLE = 1e-5  # from the unit circle
-MOST_WEIGHT = 5.0  # of the limiter's multiplier
-STUCK = 1e-3  # a search that leaves the sampled condition violated by this has no feasible point nearby
-MOST_ROUNDS_FROZEN_ENVIRONMENT = 8
+_SAMPLED_RESERVE = 1.5 * RESERVE
+_SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
+_CLOSEST_POLE = 1e-5  # from the unit circle
+_MOST_WEIGHT = 5.0  # of the limiter's multiplier
+_STUCK = 1e-3  # a search that leaves the sampled condition violated by this has no feasible point nearby
+_MOST_ROUNDS_FROZEN_ENVIRONMENT = 8
 
 
-Responses = tuple[Complex, Complex, Complex]  # (z-1)/(Tz), Psi E and Theta at some frequencies
+_Responses = tuple[Complex, Complex, Complex]  # (z-1)/(Tz), Psi E and Theta at some frequencies
 _DIFFERENCE = 1e-7
 
 
-class SampledLoop:
+class _SampledLoop:
     """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta), shape (2N,)."""
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
@@ -233,7 +233,7 @@ class SampledLoop:
         self.target = delay(loop.lam, loop.T).at(on_circle(self.band)) @ E
         self.delta = even_damping(loop.delta, loop.T, loop.T_max)
         self.root = np.sqrt(loop.T / self.delta)
-        self._known: dict[int, tuple[Responses, Array, tuple[Complex, Array, Complex, Complex]]] = {}
+        self._known: dict[int, tuple[_Responses, Array, tuple[Complex, Array, Complex, Complex]]] = {}
 
     def coupling(self, x: Array) -> SpringDamper:
         log_k, b = np.split(x, 2)
@@ -247,19 +247,19 @@ class SampledLoop:
         self.conditions = np.append(self.conditions, w)
         self.loop_at_conditions = self._responses(self.conditions)
 
-    def _responses(self, w: Array) -> Responses:
+    def _responses(self, w: Array) -> _Responses:
         """(z-1)/(Tz), Psi E and Theta at exp(jw)."""
         loop, z = self.loop, on_circle(w)
         delayed = delay(loop.psi, loop.T).at(z) @ self.E.at(z)
         return (z - 1) / (loop.T * z), delayed, delay(loop.theta, loop.T).at(z)
 
-    def force(self, x: Array, responses: Responses) -> Complex:
+    def force(self, x: Array, responses: _Responses) -> Complex:
         """F = Theta G (G + Psi E)^-1 Psi E with G = V^-1, (k, N, N)."""
         by, b, _, right = self._solved(x, responses)
         g = by[0] + by[1] * b
         return np.diagonal(responses[2], axis1=1, axis2=2)[:, :, None] * g[:, :, None] * right
 
-    def _solved(self, x: Array, responses: Responses) -> tuple[Complex, Array, Complex, Complex]:
+    def _solved(self, x: Array, responses: _Responses) -> tuple[Complex, Array, Complex, Complex]:
         """(dG by log K and by B/delta, (2, k, N); B/delta; S = (G + Psi E)^-1; S Psi E) at x; the last is remembered.
 
         An unknown of channel i moves F by (Theta Psi E S)[:, i] (S Psi E)[i, :] times dG.
@@ -297,7 +297,7 @@ class SampledLoop:
         Delay in the environment can make the loop unstable where the sampled condition still holds, so there the
         distance of its poles from the circle is the last entry.
         """
-        room = 1 - SAMPLED_RESERVE - np.linalg.eigvalsh(self._needed(x))[:, -1]
+        room = 1 - _SAMPLED_RESERVE - np.linalg.eigvalsh(self._needed(x))[:, -1]
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
     def room_slope(self, x: Array) -> Array:
@@ -321,7 +321,7 @@ class SampledLoop:
     def stability(self, x: Array) -> float:
         """By how much more than CLOSEST_POLE the poles keep away from the circle."""
         F = force_map(self.E, self.coupling(x), self.loop.theta, self.loop.psi)
-        return float(1 - CLOSEST_POLE - np.abs(F.poles()).max(initial=0.0))
+        return float(1 - _CLOSEST_POLE - np.abs(F.poles()).max(initial=0.0))
 
     def search(self, x: Array) -> OptimizeResult:
         return self.minimised(x, [])
@@ -331,20 +331,20 @@ class SampledLoop:
         N = self.loop.channels
         from scipy.optimize import minimize  # slow to load
 
-        bounds = [(np.log(SOFTEST), np.log(STIFFEST))] * N + [(0.0, 20.0)] * N + more
+        bounds = [(np.log(_SOFTEST), np.log(STIFFEST))] * N + [(0.0, 20.0)] * N + more
         condition = {"type": "ineq", "fun": self.room, "jac": None if more else self.room_slope}  # None: differenced
         options = {"maxiter": 100, "ftol": 1e-7}
         problem = {"bounds": bounds, "constraints": condition, "options": options}
         return minimize(self.square_mismatch, x, jac=self.square_mismatch_slope, method="SLSQP", **problem)
 
 
-Optimum = Callable[[SpringDamper], tuple[SpringDamper | None, int]]  # start -> (gains or None, searches)
+_Optimum = Callable[[SpringDamper], tuple[SpringDamper | None, int]]  # start -> (gains or None, searches)
 
 
-def least_rms(
+def _least_rms(
     loop: Loop,
     starts: Iterable[SpringDamper],
-    optimum: Optimum | None = None,
+    optimum: _Optimum | None = None,
     band_hz: tuple[float, float] = BAND_HZ,
 ) -> tuple[SpringDamper | None, float, int]:
     """(gains, rms mismatch as a ratio, searches) of the best local optimum; gains None if none was found.
@@ -368,20 +368,20 @@ def _certified_optimum(
     loop: Loop, band_hz: tuple[float, float], start: SpringDamper
 ) -> tuple[SpringDamper | None, int]:
     """(a local optimum that passes the refined sweep or None, searches), adding the frequencies where one fails."""
-    sampled = SampledLoop(loop, band_hz)
+    sampled = _SampledLoop(loop, band_hz)
     x = sampled.point(start)
-    for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
+    for searches in range(1, _MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
         coupling = sampled.coupling(x)
         requirement = this_environment(loop.F(coupling), loop.delta, loop.T_max)
         if requirement.ratio <= 1 - RESERVE:
             return coupling, searches
-        stuck = sampled.room(x).min() < -STUCK
+        stuck = sampled.room(x).min() < -_STUCK
         if stuck or requirement.frequency_hz is None:  # None: unstable, so there is no frequency to add
             return None, searches
         binding = 2 * np.pi * loop.T * requirement.frequency_hz
         sampled.add(max(binding, 1e-6))
-    return None, MOST_ROUNDS_FROZEN_ENVIRONMENT
+    return None, _MOST_ROUNDS_FROZEN_ENVIRONMENT
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -391,11 +391,11 @@ def _certified_optimum(
 # passes the sweep of `jitter_proof`, which knows nothing of the multiplier found here.
 
 
-FIRST = 0.5  # the multiplier alpha T/delta that a search begins with where the start has none
-MULTIPLIERS = (1e-4, 10.0)  # ... and its bounds
+_FIRST = 0.5  # the multiplier alpha T/delta that a search begins with where the start has none
+_MULTIPLIERS = (1e-4, 10.0)  # ... and its bounds
 
 
-class SwitchingLoop(SampledLoop):
+class _SwitchingLoop(_SampledLoop):
     """As SampledLoop, with x = (log K, B/delta, log alpha T/delta of the channels whose delay varies)."""
 
     def __init__(self, loop: Loop, lo: Sequence[int], hi: Sequence[int]) -> None:
@@ -411,10 +411,10 @@ class SwitchingLoop(SampledLoop):
         loop = self.loop
         found = jitter_proof(loop.sent(coupling), *self.range, loop.delta, T_max=loop.T_max)
         a = np.array(found.alpha)[self.active] * loop.T / self.delta[self.active]
-        a = np.clip(np.where(np.isfinite(a), a, FIRST), *MULTIPLIERS)
+        a = np.clip(np.where(np.isfinite(a), a, _FIRST), *_MULTIPLIERS)
         return np.concatenate([super().point(coupling), np.log(a)])
 
-    def force(self, x: Array, responses: Responses) -> Complex:
+    def force(self, x: Array, responses: _Responses) -> Complex:
         return super().force(self._gains(x), responses)
 
     def room(self, x: Array) -> Array:
@@ -427,36 +427,36 @@ class SwitchingLoop(SampledLoop):
         block = hermitian(switching_block(G, *self.range, loop.delta, alpha, loop.T_max)[0].G[0])
         error = block[:, m:, :m]
         schur = block[:, :m, :m] - np.conj(np.swapaxes(error, 1, 2)) @ (error / (2 * alpha[self.active])[:, None])
-        room = (np.linalg.eigvalsh(self.root[:, None] * schur * self.root)[:, 0] - SAMPLED_RESERVE).astype(float)
+        room = (np.linalg.eigvalsh(self.root[:, None] * schur * self.root)[:, 0] - _SAMPLED_RESERVE).astype(float)
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
     def search(self, x: Array) -> OptimizeResult:
-        return self.minimised(x, [(np.log(MULTIPLIERS[0]), np.log(MULTIPLIERS[1]))] * self.active.size)
+        return self.minimised(x, [(np.log(_MULTIPLIERS[0]), np.log(_MULTIPLIERS[1]))] * self.active.size)
 
     def _gains(self, x: Array) -> Array:
         return x[: 2 * self.loop.channels]
 
 
-def least_rms_switching(
+def _least_rms_switching(
     loop: Loop, lo: Sequence[int], hi: Sequence[int], starts: Iterable[SpringDamper]
 ) -> tuple[SpringDamper | None, float, int]:
     """(gains, rms mismatch as a ratio, searches) of the best local optimum that is safe under any switching."""
-    return least_rms(loop, starts, lambda start: _safe_optimum(SwitchingLoop(loop, lo, hi), start))
+    return _least_rms(loop, starts, lambda start: _safe_optimum(_SwitchingLoop(loop, lo, hi), start))
 
 
-def _safe_optimum(sampled: SwitchingLoop, start: SpringDamper) -> tuple[SpringDamper | None, int]:
+def _safe_optimum(sampled: _SwitchingLoop, start: SpringDamper) -> tuple[SpringDamper | None, int]:
     """(a local optimum that passes the refined sweep or None, searches)."""
     loop, x = sampled.loop, sampled.point(start)
-    for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
+    for searches in range(1, _MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
         coupling = sampled.coupling(x)
         requirement = jitter_proof(loop.sent(coupling), *sampled.range, loop.delta, T_max=loop.T_max).requirement
         if requirement.ratio <= 1 - RESERVE:
             return coupling, searches
-        if sampled.room(x).min() < -STUCK or requirement.frequency_hz is None:
+        if sampled.room(x).min() < -_STUCK or requirement.frequency_hz is None:
             return None, searches
         sampled.add(max(2 * np.pi * loop.T * requirement.frequency_hz, 1e-6))
-    return None, MOST_ROUNDS_FROZEN_ENVIRONMENT
+    return None, _MOST_ROUNDS_FROZEN_ENVIRONMENT
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -464,7 +464,7 @@ def _safe_optimum(sampled: SwitchingLoop, start: SpringDamper) -> tuple[SpringDa
 # (design.conditions.limiter_demand) in the place of the linear one, and its multiplier among the unknowns.
 
 
-class LimiterLoop(SampledLoop):
+class _LimiterLoop(_SampledLoop):
     """As Sampled, with x = (log K, B/delta, c) and one weight c per channel, of the lag 1."""
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
@@ -484,7 +484,7 @@ class LimiterLoop(SampledLoop):
         loop = self.loop
         return limiter_proof(loop.sent(coupling), loop.theta, loop.delta, self.rho, c, T_max=loop.T_max)
 
-    def force(self, x: Array, responses: Responses) -> Complex:
+    def force(self, x: Array, responses: _Responses) -> Complex:
         return super().force(self._gains(x), responses)
 
     def room(self, x: Array) -> Array:
@@ -493,13 +493,13 @@ class LimiterLoop(SampledLoop):
         now = np.broadcast_to(np.eye(loop.channels, dtype=complex), E.shape)
         G = Sampled(on_circle(self.conditions)[None], self.force(x, (D, E, now))[None], loop.T)
         demand = limiter_demand(G, loop.theta, loop.delta, self.rho, self.weights(x), loop.T_max)
-        block = hermitian(demand.free.G[0] + (1 - SAMPLED_RESERVE) * demand.gain.G[0])
+        block = hermitian(demand.free.G[0] + (1 - _SAMPLED_RESERVE) * demand.gain.G[0])
         root = np.tile(self.root, 2)
         room = np.linalg.eigvalsh(root[:, None] * block * root)[:, 0].astype(float)
         return np.append(room, self.stability(x)) if any(loop.psi) else room
 
     def search(self, x: Array) -> OptimizeResult:
-        return self.minimised(x, [(0.0, MOST_WEIGHT)] * self.loop.channels)
+        return self.minimised(x, [(0.0, _MOST_WEIGHT)] * self.loop.channels)
 
     def weights(self, x: Array) -> list[list[float]]:
         """c, a row of one lag per channel."""
@@ -511,25 +511,25 @@ class LimiterLoop(SampledLoop):
 
 def _limited_optimum(loop: Loop, band_hz: tuple[float, float], start: SpringDamper) -> tuple[SpringDamper | None, int]:
     """(a local optimum that passes the limiter's refined sweep or None, searches)."""
-    sampled = LimiterLoop(loop, band_hz)
+    sampled = _LimiterLoop(loop, band_hz)
     x = sampled.point(start)
-    for searches in range(1, MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
+    for searches in range(1, _MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
         coupling = sampled.coupling(x)
         requirement = sampled.proof(coupling, sampled.weights(x)).requirement
         if requirement.ratio <= 1 - RESERVE:
             return coupling, searches
-        if sampled.room(x).min() < -STUCK or requirement.frequency_hz is None:
+        if sampled.room(x).min() < -_STUCK or requirement.frequency_hz is None:
             return None, searches
         sampled.add(max(2 * np.pi * loop.T * requirement.frequency_hz, 1e-6))
-    return None, MOST_ROUNDS_FROZEN_ENVIRONMENT
+    return None, _MOST_ROUNDS_FROZEN_ENVIRONMENT
 
 
 #: The sequence stops when a step improves the norm by less than this, relatively.
-SETTLED = 1e-6
-MOST_STEPS = 60
+_SETTLED = 1e-6
+_MOST_STEPS = 60
 #: A damper of less than this share of the device's damping is none: solvers leave 1e-9 where the optimum has zero.
-NEGLIGIBLE = 1e-6
+_NEGLIGIBLE = 1e-6
 
 
 def design(
@@ -587,15 +587,15 @@ def _for_any_environment(shaping: Shaping, start: SpringDamper | None) -> Design
     gains, sdps = _start(loop, sigma, start)
     norm, peak = shaping.norm(_coupling(loop, gains).compliance(loop.T))
     frequencies = [peak]
-    for _ in range(MOST_STEPS):
+    for _ in range(_MOST_STEPS):
         gains, bound = step(shaping, sigma, gains, norm, np.array(frequencies))
         sdps += 1
         before, (norm, peak) = norm, shaping.norm(_coupling(loop, gains).compliance(loop.T))
         frequencies.append(peak)
-        if abs(before - norm) < SETTLED * norm and norm < (1 + SETTLED) * bound:
+        if abs(before - norm) < _SETTLED * norm and norm < (1 + _SETTLED) * bound:
             break
     coupling = _coupling(loop, gains)
-    requirement = verified(loop, coupling, phi)
+    requirement = _verified(loop, coupling, phi)
     return Design(coupling, "any-environment", "loop-norm", norm, requirement, sdps, time.perf_counter() - started, phi)
 
 
@@ -610,12 +610,12 @@ def _for_this_environment(
     band = band_hz or BAND_HZ
     if band_hz and switching:
         raise ValueError("band_hz: designs for delays that vary count 0.5 to 80 Hz, ask for one of them")
-    search = partial(least_rms, loop, band_hz=band)
+    search = partial(_least_rms, loop, band_hz=band)
     if switching:
-        search = partial(least_rms_switching, loop, *switching)
+        search = partial(_least_rms_switching, loop, *switching)
     coupling, rms, searches = search(starts)
     if limiter:  # a little softer than without limits: nearly always found from there
-        search = partial(least_rms, loop, optimum=partial(_limited_optimum, loop, band), band_hz=band)
+        search = partial(_least_rms, loop, optimum=partial(_limited_optimum, loop, band), band_hz=band)
         linear, before = coupling, searches
         coupling, rms, searches = search([linear] if linear else starts)
         if coupling is None and linear:
@@ -632,7 +632,7 @@ def _for_this_environment(
             f"delta = {loop.delta}"
         )
         raise DesignFailed(None, (), line)
-    coupling = SpringDamper(coupling.K, np.where(NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B))
+    coupling = SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B))
     requirement = this_environment(loop.F(coupling), loop.delta, loop.T_max)
     return Design(coupling, "this-environment", "rms", rms, requirement, searches, time.perf_counter() - started)
 
@@ -658,7 +658,7 @@ def stiffest(loop: Loop) -> Design:
     phi = least_phi(loop)
     gains, sdps = _start(loop, excess_limits(loop, phi), None)
     coupling = _coupling(loop, gains)
-    requirement = verified(loop, coupling, phi)
+    requirement = _verified(loop, coupling, phi)
     total = float(coupling.K.sum())
     return Design(
         coupling, "any-environment", "stiffness", total, requirement, sdps, time.perf_counter() - started, phi
@@ -675,12 +675,12 @@ def moving_average(loop: Loop) -> Design:
     phi = least_phi(loop)
     weight, terms = loop.T / (2 * even_damping(loop.delta, loop.T, loop.T_max)), np.array(loop.theta) + 1
     coupling = MovingAverage(weight, terms.tolist(), RESERVE / (1 - RESERVE) * terms**2 * weight)
-    requirement = verified(loop, coupling, phi)
+    requirement = _verified(loop, coupling, phi)
     total = float(coupling.stiffness.sum())
     return Design(coupling, "any-environment", "stiffness", total, requirement, 0, time.perf_counter() - started, phi)
 
 
-def verified(loop: Loop, coupling: SpringDamper | MovingAverage, phi: Array | None) -> Requirement:
+def _verified(loop: Loop, coupling: SpringDamper | MovingAverage, phi: Array | None) -> Requirement:
     """Theorem 4's requirement from the coupling alone; raises DesignFailed unless it is certified."""
     requirement = any_environment_with(loop, coupling.compliance(loop.T), phi)
     if not requirement.certified:
@@ -706,7 +706,7 @@ def excess_limits(loop: Loop, phi: Array | None) -> Array:
 
 def _coupling(loop: Loop, gains: Array) -> SpringDamper:
     (k, b), spend = np.split(np.maximum(gains, 0.0), 2), usable(loop)
-    return SpringDamper(k * spend / loop.T, np.where(b < NEGLIGIBLE, 0.0, b) * spend)
+    return SpringDamper(k * spend / loop.T, np.where(b < _NEGLIGIBLE, 0.0, b) * spend)
 
 
 def _start(loop: Loop, sigma: Array, start: SpringDamper | None) -> tuple[Array, int]:

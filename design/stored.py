@@ -26,10 +26,10 @@ from design.result import OLDER_NAMES, Condition
 # error that names it.
 
 
-Rows = tuple[tuple[float, ...], ...]
+_Rows = tuple[tuple[float, ...], ...]
 
 
-Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=1000)]
+_Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=1000)]
 
 
 _Part = TypeVar("_Part", bound=msgspec.Struct)
@@ -41,7 +41,7 @@ class SwitchingProof(Strict, frozen=True):
     required: tuple[float, ...]  # (m,) [N s/m] with this multiplier, from a refined sweep
     margin: float  # available / required
     alpha: tuple[float, ...]  # (m,) multiplier [N/m], 0 where the delay does not vary
-    P: tuple[tuple[Rational, ...], ...]  # rationals "p/q"
+    P: tuple[tuple[_Rational, ...], ...]  # rationals "p/q"
 
 
 class LimiterCertificate(Strict, frozen=True):
@@ -52,7 +52,7 @@ class LimiterCertificate(Strict, frozen=True):
     c: tuple[tuple[float, ...], ...]  # (m, lags) multiplier
     required: tuple[float, ...]  # (m,) [N s/m] with this multiplier, from a refined sweep
     margin: float  # available / required
-    P: tuple[tuple[Rational, ...], ...]  # rationals "p/q"
+    P: tuple[tuple[_Rational, ...], ...]  # rationals "p/q"
 
 
 class Certificate(Strict, frozen=True):
@@ -64,7 +64,7 @@ class Certificate(Strict, frozen=True):
     margin: float  # available / required
     guarantee: Literal["any passive environment", "a set", "this environment"] = msgspec.field(name="promise")
     proof: Literal["sampled", "kyp", "rational"]
-    matrices: dict[str, tuple[tuple[Rational, ...], ...]]  # rationals "p/q"
+    matrices: dict[str, tuple[tuple[_Rational, ...], ...]]  # rationals "p/q"
     scenario: str  # digest of the loop and the coupling
     versions: dict[str, str]
     seal: str = ""  # digest of all other fields

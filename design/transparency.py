@@ -13,7 +13,7 @@ from controller.lti import Array, Lti
 from design.frequency import frequencies, integral, on_circle, supremum
 
 BAND_HZ = (0.5, 80.0)
-ROUNDING = 1e-10  # of the environment: two responses that differ by less are one
+_ROUNDING = 1e-10  # of the environment: two responses that differ by less are one
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def transparency(F: Lti, environment: Lti, lam: Sequence[int], band_hz: tuple[fl
     rounding = 1e-9 * float(np.abs(environment.D).max())  # a stiffness of zero comes out of larger numbers
     least = 0.0 if static[-1] < 1e-9 * static[0] else min(-least, float(static[-1]))
     worst = supremum(relative, grid)[0]
-    if worst < ROUNDING:
+    if worst < _ROUNDING:
         worst = peak = 0.0
     rms = _rms(mismatch, environment, frequencies(F, environment, low=low, high=high, points=60)) if worst > 0 else 0.0
     return Transparency(

@@ -67,7 +67,7 @@ class LinearController:
         return self._output[n:].copy()
 
 
-class LimitedController:
+class _LimitedController:
     """The loop whose forces leave through a limiter, from rest."""
 
     def __init__(self, limiter: Limiter) -> None:
@@ -91,14 +91,14 @@ def host_controller(
     link: int,
     lag: Sequence[float] | None = None,
     cap: Sequence[float] = (),
-) -> LinearController | LimitedController:
+) -> LinearController | _LimitedController:
     """F as the host runs it, at rest: the link adds the remaining delay. Raises ValueError where link is too long.
 
     With `lag`, rho (m,) [N/m], forces leave through a limiter of `cap` (m,) [N].
     """
     host = [n - link for n in scenario.theta]
     if lag is not None:
-        return LimitedController(limited(scenario.environment, coupling, host, scenario.psi, scenario.T, cap, lag))
+        return _LimitedController(limited(scenario.environment, coupling, host, scenario.psi, scenario.T, cap, lag))
     E = environment(scenario.environment, scenario.T)
     return LinearController(force_map(E, coupling, host, scenario.psi))
 
@@ -390,7 +390,7 @@ class CertifiedCoupling:
         span = self.chosen.switching
         return min(hi - n for hi, n in zip(span.hi, self.scenario.theta, strict=True)) if span else 0
 
-    def controller(self, cap: Sequence[float]) -> LinearController | LimitedController:
+    def controller(self, cap: Sequence[float]) -> LinearController | _LimitedController:
         return host_controller(self.scenario, self.chosen.coupling, self.link, self.limits.rho, cap)
 
     def part(self, cap: Sequence[float]) -> dict[str, Any]:

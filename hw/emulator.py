@@ -46,7 +46,7 @@ _FOREVER = 1e9  # [s]
 _STRETCH = 1000  # ticks of outside forces that are computed at once
 _SUBSTEPS = 8  # per tick where there is Coulomb friction
 _SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
-FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
+_FORCE_STEP = 400  # [uN]: 12 N are 30000 steps of an i16
 _ENCODER_STEP = 1e-6  # [m] where the scenario has ideal encoders
 _REACH = 0.1  # [m] assumed: the workspace is +-10 cm
 _SETTLED = 50  # ticks at full cap after which the person starts to move
@@ -256,8 +256,8 @@ def info_of(scenario: Scenario) -> Info:
         period_ns=round(1e9 * scenario.T),
         osp_damping=tuple(round(1e6 * delta) for delta in scenario.delta),
         encoder_step=tuple(encoder),
-        force_step=(FORCE_STEP,) * scenario.channels,
-        hard_limit=tuple(min(0x7FFF, round(1e6 * d.force_limit / FORCE_STEP)) for d in scenario.device),
+        force_step=(_FORCE_STEP,) * scenario.channels,
+        hard_limit=tuple(min(0x7FFF, round(1e6 * d.force_limit / _FORCE_STEP)) for d in scenario.device),
         range=tuple(round(1e12 * _REACH / step) for step in encoder),
     )
 

@@ -24,7 +24,7 @@ from hw.rehearsal import Plan, Rehearsal
 from hw.session import Session
 from sim.scenario import Scenario, load
 
-WHEN = 0.45  # [s] after arming: the gain is 1 after 0.25 s, the person moves after 0.31 s
+_WHEN = 0.45  # [s] after arming: the gain is 1 after 0.25 s, the person moves after 0.31 s
 _LASTS = 0.75  # [s] after arming that a case is watched
 _T_MS = 1.2
 
@@ -35,7 +35,7 @@ _WATCHDOG = 12 * _T_MS  # theta, 4 ticks held, 5 of ramp, one to notice
 _DEAD = 300.0  # a force has to change by more than 1 N first
 _SILENCE = 6.0 + 1.0 + 8 * _T_MS  # the host's time-out, looked at every millisecond, then a STOP
 
-Call = Callable[[Session, int], bytes]
+_Call = Callable[[Session, int], bytes]
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Case:
     cause: str = ""  # a regular expression
     faults: tuple[str, ...] = ()
     within: float | None = None  # [ms] from the fault to zero force; None: forces go on
-    action: Call | None = None  # done at WHEN
+    action: _Call | None = None  # done at WHEN
     host_stall: float = 0.0  # [s] at WHEN
     info: Callable[[Info], Info] | None = None  # a device that says something else of itself
     baud: int | None = None
@@ -61,7 +61,7 @@ class Case:
     lasts: float = _LASTS  # [s] after arming
 
 
-def spoiled(force: float | None) -> Call:
+def _spoiled(force: float | None) -> _Call:
     """A controller that from now on asks for `force` [N]; one that raises where that is None."""
 
     def call(session: Session, now: int) -> bytes:
@@ -77,18 +77,18 @@ def spoiled(force: float | None) -> Call:
     return call
 
 
-def person(what: str) -> Call:
+def person(what: str) -> _Call:
     """What a person asks for: stop or estop."""
     return lambda session, now: getattr(session, what)("asked to", now)
 
 
 def at(text: str) -> tuple[str, ...]:
     """The fault `text` from WHEN on."""
-    return tuple(f"{part}@{WHEN}" for part in text.split())
+    return tuple(f"{part}@{_WHEN}" for part in text.split())
 
 
 def _signed(
-    name: str, kind: str, value: float, cause: str, within: float | None, when: str = f"@{WHEN}", **more: Any
+    name: str, kind: str, value: float, cause: str, within: float | None, when: str = f"@{_WHEN}", **more: Any
 ) -> list[Case]:
     """One case for each axis and each sign of `value`."""
     cases = []
@@ -195,14 +195,14 @@ CASES = (
     Case("firmware finds a fault", G.STOPPED, "cause device", at("trip"), _STOP),
     Case("device clock runs 5 % fast", G.REFUSED, "by its own clock", period=1.05),
     # the controller
-    Case("controller asks for nan", G.STOPPED, "nan, nan N, which is no force", within=_STOP, action=spoiled(np.nan)),
-    Case("controller asks for inf", G.STOPPED, "inf, inf N, which is no force", within=_STOP, action=spoiled(np.inf)),
-    Case("controller raises", G.STOPPED, "ZeroDivisionError", within=_STOP, action=spoiled(None)),
+    Case("controller asks for nan", G.STOPPED, "nan, nan N, which is no force", within=_STOP, action=_spoiled(np.nan)),
+    Case("controller asks for inf", G.STOPPED, "inf, inf N, which is no force", within=_STOP, action=_spoiled(np.inf)),
+    Case("controller raises", G.STOPPED, "ZeroDivisionError", within=_STOP, action=_spoiled(None)),
     Case(
-        "controller asks for -inf", G.STOPPED, "-inf, -inf N, which is no force", within=_STOP, action=spoiled(-np.inf)
+        "controller asks for -inf", G.STOPPED, "-inf, -inf N, which is no force", within=_STOP, action=_spoiled(-np.inf)
     ),
-    Case("controller asks for 100 N", A, action=spoiled(100.0), counted=("clipped", "slowed"), lasts=0.48),
-    Case("controller asks for -100 N", A, action=spoiled(-100.0), counted=("clipped", "slowed"), lasts=0.48),
+    Case("controller asks for 100 N", A, action=_spoiled(100.0), counted=("clipped", "slowed"), lasts=0.48),
+    Case("controller asks for -100 N", A, action=_spoiled(-100.0), counted=("clipped", "slowed"), lasts=0.48),
     # people
     Case("planned stop", G.FINISHED, "asked to", within=100.0 + _STOP, action=person("stop")),
     Case("deadman let go", G.FINISHED, "deadman at the device", at("letgo"), 100.0 + _STOP, deadman=True),
@@ -241,7 +241,7 @@ _MEASURED = 100  # answers whose age is measured: enough for a line that does no
 
 
 @dataclass(frozen=True)
-class FaultOutcome:
+class _FaultOutcome:
     """What a case came to."""
 
     fault: str
@@ -256,7 +256,7 @@ class FaultOutcome:
         return not self.wrong
 
 
-def rehearse_faults() -> list[FaultOutcome]:
+def rehearse_faults() -> list[_FaultOutcome]:
     """Every case with the default scenario and lively people, in virtual time; some seconds in all."""
     scenario = lively(load())
     made = certified_couplings(scenario, "I", None, None, 1, spare=1)
@@ -274,7 +274,7 @@ def lively(scenario: Scenario) -> Scenario:
 
 def rehearse_case(
     case: Case, scenario: Scenario, made: tuple[CertifiedCoupling, ...]
-) -> tuple[Rehearsal, FaultOutcome]:
+) -> tuple[Rehearsal, _FaultOutcome]:
     """One case. `made` are couplings for a link of one tick, and softer ones."""
     info = info_of(scenario)
     cap = tuple(d.force_limit for d in scenario.device)
@@ -291,16 +291,16 @@ def rehearse_case(
         emulator,
         _plan(case, scenario, made),
         faults,
-        actions=[(WHEN, case.action)] if case.action else (),
-        host_stalls=[(WHEN, case.host_stall)] if case.host_stall else (),
+        actions=[(_WHEN, case.action)] if case.action else (),
+        host_stalls=[(_WHEN, case.host_stall)] if case.host_stall else (),
         clock=case.period,
     )
     rehearsal.run_until_armed(case.lasts)
     timed = case.within is not None and rehearsal.armed_us is not None
-    to_zero = rehearsal.zero_after(WHEN) if timed else None
+    to_zero = rehearsal.zero_after(_WHEN) if timed else None
     zero_ms = None if to_zero is None else 1e3 * to_zero
     wrong = tuple(_wrong(case, rehearsal, zero_ms))
-    return rehearsal, FaultOutcome(case.name, str(session.stage), session.cause, zero_ms, case.within, wrong)
+    return rehearsal, _FaultOutcome(case.name, str(session.stage), session.cause, zero_ms, case.within, wrong)
 
 
 def _plan(case: Case, scenario: Scenario, made: tuple[CertifiedCoupling, ...]) -> Plan:

@@ -297,7 +297,7 @@ def _spectral_starts(model: _Model, stiff: Array) -> list[Array]:
 
 
 @dataclass(frozen=True)
-class Transmission:
+class _Transmission:
     """Motor and handle, and the spring between them."""
 
     motor_mass: float  # [kg]
@@ -311,7 +311,7 @@ class Estimate:
     """One axis."""
 
     friction: Friction
-    transmission: Transmission | None  # None for a rigid device, and where none explains the record
+    transmission: _Transmission | None  # None for a rigid device, and where none explains the record
 
     @property
     def viscous(self) -> float:
@@ -345,7 +345,7 @@ def identify(x: Array, force: Array, used: _Flags, T: float, step: float, rigid:
     return Estimate(friction=found, transmission=transmission)
 
 
-def _transmission(model: _Model, found: Friction) -> Transmission | None:
+def _transmission(model: _Model, found: Friction) -> _Transmission | None:
     """The transmission that explains a record, None where there is none."""
     stiff = np.array([np.log(found.mass), np.log(found.viscous), found.coulomb])
     fine, ends = model.finer(), []
@@ -359,7 +359,7 @@ def _transmission(model: _Model, found: Friction) -> Transmission | None:
         return None
     m1, m2, k = np.exp(p[[0, 3, 4]])
     mode = np.sqrt(k * (m1 + m2) / (m1 * m2)) / (2 * np.pi)
-    return Transmission(float(m1), float(m2), float(k), float(mode))
+    return _Transmission(float(m1), float(m2), float(k), float(mode))
 
 
 def _search(model: _Model, start: Array) -> OptimizeResult:

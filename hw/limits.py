@@ -79,7 +79,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Shaped:
+class _Shaped:
     """A force that may be sent, and what had to be done to it."""
 
     force: tuple[float, ...]  # (m,) [N]
@@ -100,7 +100,7 @@ def shape(
     limits: Limits,
     T: float,
     test: Sequence[float] | None = None,
-) -> Shaped:
+) -> _Shaped:
     """The force to send in place of `asked` (m,) [N], after `previous` (m,) [N], at a gain within [0, 1].
 
     `test` (m,) [N] is added behind the gain: what an encoder is tested with.
@@ -120,7 +120,7 @@ def shape(
         slowed |= sent != capped
         force.append(sent)
     _require_finite(force)
-    return Shaped(tuple(force), clipped, slowed)
+    return _Shaped(tuple(force), clipped, slowed)
 
 
 def check_jump(x: Sequence[float], previous: Sequence[float], ticks: int, limits: Limits) -> None:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from zlib import crc32
 
 PROTOCOL = 2
-MAX_AXES = 8
+_MAX_AXES = 8
 MAX_THETA = 15
 MAX_RELEASE_NS = 20_000_000  # longest hold and ramp together: 12 N for 20 ms bring a free 0.25 kg to 1 m/s
 NO_MARGIN = -32768  # in State.margin_us: no FORCE came since the STATE before
@@ -232,7 +232,7 @@ def _form(kind: type, axes: int) -> _Form:
 
 #: by kind and number of axes (0 where a message has none) to write, by type byte and length to read
 _FORMS = {
-    (kind, n): _form(kind, n) for kind in LAYOUTS for n in (range(1, MAX_AXES + 1) if LAYOUTS[kind].axis else (0,))
+    (kind, n): _form(kind, n) for kind in LAYOUTS for n in (range(1, _MAX_AXES + 1) if LAYOUTS[kind].axis else (0,))
 }
 READ = {(LAYOUTS[kind].code, f.struct.size): f for (kind, _), f in _FORMS.items()}
 
@@ -247,7 +247,7 @@ def wire_bytes(kind: type, axes: int) -> int:
     """Length of a frame, delimiter included: STATE 20 + 6N, FORCE 12 + 2N."""
     f = _FORMS.get((kind, axes if LAYOUTS[kind].axis else 0))
     if f is None:
-        raise ValueError(f"axes: {axes}; the protocol carries 1 to {MAX_AXES}")
+        raise ValueError(f"axes: {axes}; the protocol carries 1 to {_MAX_AXES}")
     return f.struct.size + _OVERHEAD
 
 
@@ -298,8 +298,8 @@ def _check(message: Message) -> None:
             raise ValueError(f"{name}.{field}: {value!r}; a tuple with one integer per axis")
         else:
             axes = len(value) if axes is None else axes
-            if len(value) != axes or not 1 <= axes <= MAX_AXES:
-                raise ValueError(f"{name}.{field}: {len(value)} entries; 1 to {MAX_AXES} axes, every field the same")
+            if len(value) != axes or not 1 <= axes <= _MAX_AXES:
+                raise ValueError(f"{name}.{field}: {len(value)} entries; 1 to {_MAX_AXES} axes, every field the same")
             for axis, entry in enumerate(value):
                 _check_integer(f"{name}.{field}[{axis}]", entry, limits)
 

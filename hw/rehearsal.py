@@ -36,7 +36,7 @@ _LATENCY_US = 60  # one way, and as long for the host to answer: the measured me
 Plan = Callable[[Ages], Sequence[Program]]
 
 
-class Moment(NamedTuple):
+class _Moment(NamedTuple):
     """One tick of the device."""
 
     t_us: int
@@ -61,7 +61,7 @@ class Rehearsal:
     clock: float = 1.0  # how long a tick of the device lasts, in T
     keep: bool = True  # every tick of the device in `moments`
     glance: Callable[[Session], None] = lambda session: None  # called every millisecond
-    moments: list[Moment] = field(default_factory=list)
+    moments: list[_Moment] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._up = Line("up", self.faults, self.seed, self.latency_us)
@@ -114,7 +114,7 @@ class Rehearsal:
         data = emulator.tick(clock)
         emulator.advance()
         if self.keep:
-            self.moments.append(Moment(clock, emulator.device.phase, emulator.applied))
+            self.moments.append(_Moment(clock, emulator.device.phase, emulator.applied))
         self._at(now + self._period * emulator.stretch, "tick", None)
         if emulator.unplugged and not self._gone:
             self._gone = True

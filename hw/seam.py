@@ -116,7 +116,7 @@ class SerialDevice:
 # a device without a clock
 
 
-class Library(Protocol):
+class _Library(Protocol):
     """What is asked of the Force Dimension SDK's Python package; every call gives -1 for an error."""
 
     openID: Callable[..., int]
@@ -130,7 +130,7 @@ class Library(Protocol):
     errorGetLastStr: Callable[..., str]
 
 
-def library() -> Library:
+def library() -> _Library:
     """The package, which needs the maker's library. Raises InputError where one of them is missing."""
     try:
         found: Any = import_module(_BINDINGS)
@@ -151,7 +151,7 @@ class ForceDimension:
         self,
         scenario: Scenario,
         axes: str | None = None,
-        sdk: Library | None = None,
+        sdk: _Library | None = None,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:

@@ -56,7 +56,7 @@ _STRONGEST = 12.0  # [N] whatever a scenario allows
 _KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
 
 
-class Event(NamedTuple):
+class _Event(NamedTuple):
     """One line of the log."""
 
     t_us: int
@@ -76,7 +76,7 @@ class Session:
         self.link = LinkMonitor(self.settings, self.counters)
         self.measurement = Measurement(self.settings.measure, self.probe, scenario.T, self.settings.missed)
         self.stage, self.cause = Stage.CONNECTING, ""
-        self.log: list[Event] = []
+        self.log: list[_Event] = []
         self.info: Info | None = None  # what the device is; None before it said so
         self.config: Config | None = None  # how the device was asked to run, last
         self.programs: tuple[Program, ...] = ()
@@ -85,7 +85,7 @@ class Session:
         self.armings: list[tuple[Program, Config]] = []  # what forces came from, arming by arming
         self.budgets: list[SentBudget] = []  # arming by arming, where the settings ask for one
         self.record: Callable[[TraceRow], None] = lambda row: None
-        self.listen: Callable[[Event], None] = lambda event: None
+        self.listen: Callable[[_Event], None] = lambda event: None
         self.missed_while_driving = 0  # ticks
         self.now = self.entered = self.heard = 0  # [us]
         self._units: Units | None = None
@@ -387,7 +387,7 @@ class Session:
         self._log(cause)
 
     def _log(self, cause: str) -> None:
-        self.log.append(Event(self.now, self.stage, cause))
+        self.log.append(_Event(self.now, self.stage, cause))
         self.listen(self.log[-1])
 
     def _end(self, stage: Stage, cause: str, reason: Reason = Reason.FAULT) -> bytes:
@@ -397,7 +397,7 @@ class Session:
         return encode(Stop(reason))
 
 
-def limits_for(scenario: Scenario, cap: float = _STRONGEST, **more: Any) -> Limits:
+def _limits_for(scenario: Scenario, cap: float = _STRONGEST, **more: Any) -> Limits:
     """Limits for the scenario's devices, of at most `cap` [N]. Raises ValueError where T is none for a serial link."""
     watchdog = watchdog_for(scenario.T)
     return Limits(tuple(min(cap, d.force_limit) for d in scenario.device), watchdog_us=watchdog, **more)
@@ -406,7 +406,7 @@ def limits_for(scenario: Scenario, cap: float = _STRONGEST, **more: Any) -> Limi
 def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:
     """A session that never asks for more than `cap` [N], with `more` Limits. Raises InputError for what cannot be."""
     try:
-        return Session(scenario, limits_for(scenario, cap, **more), settings)
+        return Session(scenario, _limits_for(scenario, cap, **more), settings)
     except ValueError as error:
         raise InputError(str(error)) from None
 

@@ -108,7 +108,7 @@ def _check_common(device: Device, masses: tuple[str, ...]) -> None:
 
 
 @dataclass(frozen=True)
-class Known:
+class _Known:
     """A number that somebody has published."""
 
     value: float
@@ -128,16 +128,16 @@ class Listed:
     """A real device along one axis; None is what nobody publishes, or what we found no source for."""
 
     title: str
-    damping: tuple[Known, Known] | None = None  # [N s/m] least and most over the workspace
-    mass: Known | None = None  # [kg] felt at the handle
-    force_limit: Known | None = None  # [N]
-    encoder_step: Known | None = None  # [m] at the handle
-    friction: Known | None = None  # [N] Coulomb, at most
-    stiffness: Known | None = None  # [N/m] the most that a framework lets a programmer ask for
-    framework_damping: Known | None = None  # [N s/m] likewise
+    damping: tuple[_Known, _Known] | None = None  # [N s/m] least and most over the workspace
+    mass: _Known | None = None  # [kg] felt at the handle
+    force_limit: _Known | None = None  # [N]
+    encoder_step: _Known | None = None  # [m] at the handle
+    friction: _Known | None = None  # [N] Coulomb, at most
+    stiffness: _Known | None = None  # [N/m] the most that a framework lets a programmer ask for
+    framework_damping: _Known | None = None  # [N s/m] likewise
 
     @property
-    def known(self) -> dict[str, Known]:
+    def known(self) -> dict[str, _Known]:
         """The fields of a RigidDevice that are published; friction is an upper bound, and no guarantee: left out."""
         least = self.damping[0] if self.damping else None
         fields = {"damping": least, "mass": self.mass, "force_limit": self.force_limit}
@@ -145,58 +145,58 @@ class Listed:
         return {name: fact for name, fact in fields.items() if fact}
 
 
-_IDENTIFIED = Known(1.37, "section 6 of the paper: a first-order model identified on an Omega")
+_IDENTIFIED = _Known(1.37, "section 6 of the paper: a first-order model identified on an Omega")
 
 CATALOGUE: Mapping[str, Listed] = {
     "omega.3": Listed(
         "Force Dimension omega.3",
         damping=(_IDENTIFIED, _IDENTIFIED),
-        force_limit=Known(12.0, _DELTA),
-        stiffness=Known(5000.0, _DELTA),
-        framework_damping=Known(30.0, _DELTA),
+        force_limit=_Known(12.0, _DELTA),
+        stiffness=_Known(5000.0, _DELTA),
+        framework_damping=_Known(30.0, _DELTA),
     ),
     "delta.3": Listed(
         "Force Dimension delta.3",
-        force_limit=Known(20.0, _DELTA),
-        stiffness=Known(5000.0, _DELTA),
-        framework_damping=Known(30.0, _DELTA),
+        force_limit=_Known(20.0, _DELTA),
+        stiffness=_Known(5000.0, _DELTA),
+        framework_damping=_Known(30.0, _DELTA),
     ),
     "falcon": Listed(
         "Novint Falcon",
-        force_limit=Known(8.0, _FALCON),
-        encoder_step=Known(63.5e-6, "more than 400 dpi, H3D API's page of the Falcon"),
-        stiffness=Known(3000.0, _FALCON),
-        framework_damping=Known(20.0, _FALCON),
+        force_limit=_Known(8.0, _FALCON),
+        encoder_step=_Known(63.5e-6, "more than 400 dpi, H3D API's page of the Falcon"),
+        stiffness=_Known(3000.0, _FALCON),
+        framework_damping=_Known(20.0, _FALCON),
     ),
     "touch": Listed(
         "3D Systems Touch (SensAble Phantom Omni)",
-        mass=Known(0.045, _OMNI),
-        force_limit=Known(3.3, _OMNI),
-        encoder_step=Known(55e-6, _OMNI),
-        friction=Known(0.26, _OMNI),
-        stiffness=Known(700.0, _PHANTOM),
-        framework_damping=Known(5.0, _PHANTOM),
+        mass=_Known(0.045, _OMNI),
+        force_limit=_Known(3.3, _OMNI),
+        encoder_step=_Known(55e-6, _OMNI),
+        friction=_Known(0.26, _OMNI),
+        stiffness=_Known(700.0, _PHANTOM),
+        framework_damping=_Known(5.0, _PHANTOM),
     ),
     "phantom-premium": Listed(
         "SensAble Phantom Premium 1.5",
-        mass=Known(0.075, _PREMIUM),
-        force_limit=Known(8.5, _PREMIUM),
-        encoder_step=Known(30e-6, _PREMIUM),
-        friction=Known(0.04, _PREMIUM),
-        stiffness=Known(800.0, _PHANTOM + " (1.5 6DOF)"),
-        framework_damping=Known(5.0, _PHANTOM + " (1.5 6DOF)"),
+        mass=_Known(0.075, _PREMIUM),
+        force_limit=_Known(8.5, _PREMIUM),
+        encoder_step=_Known(30e-6, _PREMIUM),
+        friction=_Known(0.04, _PREMIUM),
+        stiffness=_Known(800.0, _PHANTOM + " (1.5 6DOF)"),
+        framework_damping=_Known(5.0, _PHANTOM + " (1.5 6DOF)"),
     ),
     "haply-2diy": Listed("Haply 2DIY"),
     "inverse3": Listed("Haply Inverse3"),
     "hapkit": Listed("Hapkit"),
 }
-OTHER_NAMES = {"omni": "touch", "omega": "omega.3", "delta": "delta.3", "2diy": "haply-2diy"}
-NEEDED = ("damping", "force_limit")  # of a simulated device; for mass and encoder a RigidDevice has an assumption
+_OTHER_NAMES = {"omni": "touch", "omega": "omega.3", "delta": "delta.3", "2diy": "haply-2diy"}
+_NEEDED = ("damping", "force_limit")  # of a simulated device; for mass and encoder a RigidDevice has an assumption
 
 
 def listed_device(name: str) -> tuple[str, Listed]:
     """The device of a name, and its name in the catalogue. Raises ValueError with those that there are."""
-    key = OTHER_NAMES.get(name.lower(), name.lower())
+    key = _OTHER_NAMES.get(name.lower(), name.lower())
     if key not in CATALOGUE:
         close = difflib.get_close_matches(key, CATALOGUE, n=1)
         hint = f" (did you mean {close[0]}?)" if close else ""
@@ -214,7 +214,7 @@ def fields_of(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
     if given.get("kind") == "compliant":  # its mass is divided between motor and handle
         fields.pop("mass", None)
     fields |= given
-    if missing := [field for field in NEEDED if field not in fields]:
+    if missing := [field for field in _NEEDED if field not in fields]:
         unknown = " and ".join(f"{field} [{'N' if field == 'force_limit' else 'N s/m'}]" for field in missing)
         raise ValueError(f"nobody publishes {unknown} of {key}: give it beside `device`, as measured by hw.identify")
     return fields

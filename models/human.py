@@ -19,8 +19,8 @@ from scipy.linalg import eig
 
 from models.device import require
 
-Array = NDArray[np.floating[Any]]
-Range = tuple[float, float]
+_Array = NDArray[np.floating[Any]]
+_Range = tuple[float, float]
 
 _ROUNDING = 1e-9  # of |Z|: what rounding may take from the real part of a lossless impedance
 
@@ -36,10 +36,10 @@ class Impedance:
     at zero) and a mass are parts of the Port. Many impedances alike have leading axes.
     """
 
-    A: Array  # (..., n, n)
-    B: Array  # (..., n, 1)
-    C: Array  # (..., 1, n)
-    D: Array  # (..., 1, 1)
+    A: _Array  # (..., n, n)
+    B: _Array  # (..., n, 1)
+    C: _Array  # (..., 1, n)
+    D: _Array  # (..., 1, 1)
 
     def __post_init__(self) -> None:
         for name in "ABCD":
@@ -57,7 +57,7 @@ class Impedance:
         return int(self.A.shape[-1])
 
 
-def _check_positive_real(A: Array, B: Array, C: Array, D: Array) -> None:
+def _check_positive_real(A: _Array, B: _Array, C: _Array, D: _Array) -> None:
     """Raise ValueError unless Z is stable and Re Z(jw) >= 0 at every frequency.
 
     Re Z(jw) = D - C A (w^2 I + A^2)^-1 B is rational in w^2, so its sign changes at the real zeros of that function
@@ -86,10 +86,10 @@ class Port:
     because no number may be negative, and an Impedance is. Many humans alike have a leading axis.
     """
 
-    mass: Array  # (..., points) [kg]; 0 is allowed at the handles only
-    across: Array  # (springs, points + 1)
-    damping: Array  # (..., springs) [N s/m]
-    stiffness: Array  # (..., springs) [N/m]
+    mass: _Array  # (..., points) [kg]; 0 is allowed at the handles only
+    across: _Array  # (springs, points + 1)
+    damping: _Array  # (..., springs) [N s/m]
+    stiffness: _Array  # (..., springs) [N/m]
     impedance: Impedance | None = None  # between the (only) handle and the base
     handles: int = 1
     pull: int = -1  # the spring-damper that the voluntary force contracts
@@ -168,19 +168,19 @@ class Hand(Protocol):
         """What the handle feels."""
         ...
 
-    def voluntary_force(self, t: Array) -> Array:
+    def voluntary_force(self, t: _Array) -> _Array:
         """Force [N] at the times t [s] that contracts the spring-damper `pull` of the port."""
         ...
 
 
-def chain_port(links: Array) -> Port:
+def chain_port(links: _Array) -> Port:
     """A chain from the handle to the base; links (..., n, 3) are mass, damping and stiffness of each."""
     n = links.shape[-2]
     across = np.eye(n, n + 1, 1) - np.eye(n, n + 1)
     return Port(links[..., 0], across, links[..., 1], links[..., 2])
 
 
-def body_port(hands: int, values: Array) -> Port:
+def body_port(hands: int, values: _Array) -> Port:
     """A body on ground, and the hands joined one to the next; values (..., 5) as in Crowd.bodies."""
     mass, damping, stiffness, cross_damping, cross_stiffness = np.moveaxis(values, -1, 0)[..., None]
     across = np.eye(hands, hands + 2, 1) - np.eye(hands, hands + 2)
@@ -235,7 +235,7 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         require("phase", self.phase, -100.0, 100.0, "rad")
         require("ease", self.ease, 0.0, 1e4, "s")
 
-    def motion(self, t: Array) -> tuple[Array, Array]:
+    def motion(self, t: _Array) -> tuple[_Array, _Array]:
         """Equilibrium position [m] and velocity [m/s] at times t [s]."""
         w = 2 * np.pi * self.frequency
         wave = self.amplitude * np.sin(w * t + self.phase)
@@ -267,7 +267,7 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The chain as the handle feels it."""
         return chain_port(np.array([(link.mass, link.damping, link.stiffness) for link in self.links]))
 
-    def voluntary_force(self, t: Array) -> Array:
+    def voluntary_force(self, t: _Array) -> _Array:
         """k x_eq + b x_eq' [N] on the last mass, at times t [s]."""
         if self.voluntary is None:
             return np.zeros_like(t)
@@ -295,7 +295,7 @@ class MeasuredHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Raises ValueError where it is not passive."""
         return state_space(self.A, self.B, self.C, self.D, self.mass)
 
-    def voluntary_force(self, t: Array) -> Array:
+    def voluntary_force(self, t: _Array) -> _Array:
         """None of its own."""
         return np.zeros_like(t)
 
@@ -353,9 +353,9 @@ def check_holds(held_by: Sequence[tuple[int, ...]], channels: int) -> None:
 class Population(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Random humans: every parameter log-uniform in its range, one link (a hand) or two (hand, grip and arm)."""
 
-    mass: Range = (0.01, 3.0)  # [kg]
-    damping: Range = (0.1, 30.0)  # [N s/m]
-    stiffness: Range = (1.0, 2000.0)  # [N/m]
+    mass: _Range = (0.01, 3.0)  # [kg]
+    damping: _Range = (0.1, 30.0)  # [N s/m]
+    stiffness: _Range = (1.0, 2000.0)  # [N/m]
     links: int = 1
 
     def __post_init__(self) -> None:

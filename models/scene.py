@@ -39,17 +39,17 @@ from models.human import Cross, Hand, Human, Impedance, Link, Person, Port, body
 # among the model's custom numbers, from where `plant` takes it, and MuJoCo itself cannot simulate it.
 
 
-Array = NDArray[np.floating[Any]]
+_Array = NDArray[np.floating[Any]]
 
 #: MuJoCo's friction constraint creeps while it sticks; this hard it stops a 0.25 kg device within 1.5e-6 m of where
 #: Coulomb's law does, and creeps at 1e-7 m/s under half its force (MuJoCo's defaults: 7e-5 m and 6e-4 m/s)
-STICK, HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
+_STICK, _HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
 FILES = Path(__file__).parent  # of the devices
-APART, STEP, HEIGHT = 0.11, 0.09, 0.03  # [m] between devices, between the bodies of one, and above the rail
+APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] between devices, between the bodies of one, and above the rail
 DRAWN = "drawn transmission"
 _GREY = {"rgb1": [0.93] * 3, "rgb2": [0.93] * 3, "builtin": mujoco.mjtBuiltin.mjBUILTIN_FLAT}
-SKY: dict[str, Any] = {"name": "sky", "type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "width": 32, "height": 192, **_GREY}
-EMPTY_CLASSES = re.compile(r" *<default>\s*(<default class=\"[^\"]*\"/>\s*)*</default>\s*\n")  # of attached files
+_SKY: dict[str, Any] = {"name": "sky", "type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "width": 32, "height": 192, **_GREY}
+_EMPTY_CLASSES = re.compile(r" *<default>\s*(<default class=\"[^\"]*\"/>\s*)*</default>\s*\n")  # of attached files
 _IMPEDANCE = "impedance_"  # custom numbers: joint of the handle, joint of the base or -1, then A, B, C, D row by row
 
 
@@ -81,9 +81,9 @@ class Plant:
     x holds n positions, n velocities, and the states of the humans' impedances where there are some.
     """
 
-    A: Array  # (2n + states, 2n + states)
-    B: Array  # (2n + states, outside + m)
-    C: Array  # (m, 2n + states)
+    A: _Array  # (2n + states, 2n + states)
+    B: _Array  # (2n + states, outside + m)
+    C: _Array  # (m, 2n + states)
 
 
 def build(devices: Sequence[Device], humans: Sequence[Hand], persons: Sequence[Person] = ()) -> Scene:
@@ -121,12 +121,12 @@ def impeded(model: mujoco.MjModel) -> bool:
 class _Felt(NamedTuple):
     """An impedance at its place: the velocity of `row` over the joints goes in, its force acts back along `row`."""
 
-    row: Array  # (n,)
+    row: _Array  # (n,)
     Z: Impedance
 
 
 def _plant(
-    solved: Callable[[Array], Array], K: Array, D: Array, forces: Array, motors: int, felt: Sequence[_Felt]
+    solved: Callable[[_Array], _Array], K: _Array, D: _Array, forces: _Array, motors: int, felt: Sequence[_Felt]
 ) -> Plant:
     """The plant M q'' = -K q - D q' + forces u and the impedances; `solved` multiplies by M^-1."""
     *many, n, _ = K.shape
@@ -219,7 +219,7 @@ def _check_linear(model: mujoco.MjModel, data: mujoco.MjData) -> None:
             raise ValueError(f"MJCF of a hand: it has {what}, expected masses, springs and dampers along x, at rest")
 
 
-def tendon_jacobian(model: mujoco.MjModel) -> Array:
+def tendon_jacobian(model: mujoco.MjModel) -> _Array:
     """How each tendon lengthens when a joint moves, shape (tendons, n)."""
     rows = np.zeros((model.ntendon, model.nv))
     for t in range(model.ntendon):
@@ -230,7 +230,7 @@ def tendon_jacobian(model: mujoco.MjModel) -> Array:
     return rows
 
 
-def actuation(model: mujoco.MjModel) -> Array:
+def actuation(model: mujoco.MjModel) -> _Array:
     """Force on each joint per unit of each input, shape (n, outside + m)."""
     columns, across = np.zeros((model.nv, model.nu)), tendon_jacobian(model)
     for a in range(model.nu):
@@ -337,7 +337,7 @@ def _amounts(devices: Sequence[Device], placed: Sequence[_Placed]) -> _Amounts:
 def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
     spec = mujoco.MjSpec()
     spec.modelname = "haptic loop"
-    spec.add_texture(**SKY)
+    spec.add_texture(**_SKY)
     spec.visual.headlight.ambient = [0.5, 0.5, 0.5]
     _only_what_the_loop_needs(spec, friction=any(device.friction for device in devices))
     mass, damping, stiffness = _amounts(devices, placed)
@@ -346,7 +346,7 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
     _attach_devices(spec, devices)
     row = {joint: -APART * min(i, len(devices) - 1) for i, part in enumerate(placed) for joint in part.joints}
     for step, name in enumerate(own, start=1):
-        body = spec.worldbody.add_body(name=name, pos=[STEP * (1 + step), row[name], HEIGHT])
+        body = spec.worldbody.add_body(name=name, pos=[STEP * (1 + step), row[name], _HEIGHT])
         body.ipos, body.inertia, body.explicitinertial = [0, 0, 0], [1e-3] * 3, True
         body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0])
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02] * 3, mass=0, contype=0, conaffinity=0)
@@ -357,7 +357,7 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
         if device.friction:
             joint = spec.joint(f"device_{i}/motor")
             joint.frictionloss = device.friction
-            joint.solref_friction, joint.solimp_friction = STICK, HARD
+            joint.solref_friction, joint.solimp_friction = _STICK, _HARD
         if isinstance(device, CompliantDevice):
             tendon = spec.tendon(f"device_{i}/transmission")
             tendon.stiffness[0], tendon.damping[0] = device.transmission_stiffness, device.transmission_damping
@@ -380,7 +380,7 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
             places = [number[joints[0]], number[base] if base else -1]
             spec.add_numeric(name=f"{_IMPEDANCE}{i}", data=[*places, *numbers], size=len(numbers) + 2)
     spec.compile()
-    xml = EMPTY_CLASSES.sub("", spec.to_xml())
+    xml = _EMPTY_CLASSES.sub("", spec.to_xml())
     for part in [*(tendon for tendon in spec.tendons if tendon.name.endswith(DRAWN)), *spec.sites]:
         spec.delete(part)
     spec.compiler.discardvisual = True
@@ -463,9 +463,9 @@ class Crowd:
     `holds` says which channels' humans are arms of one person, whose body and cross spring are in `bodies`.
     """
 
-    links: Array  # (nsim, m, links, 3): mass [kg], damping [N s/m], stiffness [N/m]
+    links: _Array  # (nsim, m, links, 3): mass [kg], damping [N s/m], stiffness [N/m]
     holds: tuple[tuple[int, ...], ...] = ()  # (persons,) channels, counted from 1
-    bodies: Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
+    bodies: _Array = field(default_factory=lambda: np.zeros((0, 0, 5)))
     # (nsim, persons, 5): mass, damping, stiffness as above, damping and stiffness from hand to hand
 
     def __post_init__(self) -> None:
@@ -540,13 +540,13 @@ class Variants:
     """The fields in which the models of a crowd differ, by MuJoCo's names, with one row per set of humans."""
 
     scene: Scene
-    fields: dict[str, Array]  # (nsim, bodies | joints | tendons)
+    fields: dict[str, _Array]  # (nsim, bodies | joints | tendons)
     impedances: tuple[_Felt, ...] = ()  # with a leading axis over the sets; MuJoCo leaves them out
 
     def __len__(self) -> int:
         return self.fields["body_mass"].shape[0]
 
-    def repeated(self, times: int) -> dict[str, Array]:
+    def repeated(self, times: int) -> dict[str, _Array]:
         """The fields with every row `times` times in succession."""
         return {name: np.repeat(rows, times, axis=0) for name, rows in self.fields.items()}
 
@@ -555,7 +555,7 @@ class Variants:
         model = self.scene.model
         across, mass = tendon_jacobian(model), self.fields["body_mass"][:, model.jnt_bodyid]
 
-        def matrix(joint: str, tendon: str) -> Array:
+        def matrix(joint: str, tendon: str) -> _Array:
             between = across.T * self.fields[tendon][:, None, :] @ across
             return between + self.fields[joint][:, :, None] * np.eye(model.nv)
 

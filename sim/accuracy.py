@@ -68,7 +68,7 @@ _TAIL = 4000  # ticks in which a limit cycle is measured
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
+class _Reference:
     """The exact engine's answers: with the coupling that was asked for, and without any."""
 
     coupled: Simulation
@@ -77,7 +77,7 @@ class Reference:
     cycle: tuple[int, float, float] | None  # channel, amplitude [N], frequency [Hz]; None where none is sustained
 
 
-def reference(coupled: Simulation, uncoupled: Simulation) -> Reference:
+def reference(coupled: Simulation, uncoupled: Simulation) -> _Reference:
     """Run the exact engine on both loops."""
     cycle = None
     if unstable(exact_growth(uncoupled)):
@@ -85,10 +85,10 @@ def reference(coupled: Simulation, uncoupled: Simulation) -> Reference:
         if free.t.size > _TAIL and not free.diverged:
             channel = int(np.argmax(free.f[-_TAIL:].std(axis=0)))
             cycle = (channel, *limit_cycle(free, channel))
-    return Reference(coupled, uncoupled, run(coupled, "exact"), cycle)
+    return _Reference(coupled, uncoupled, run(coupled, "exact"), cycle)
 
 
-def measure(truth: Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
+def measure(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
     """One row: errors of position [-], growth [1/s] and limit cycle [-], [Hz], and the cost of that very run."""
     row: Row = {"engine": engine, "integrator": integrator, "substeps": substeps}
     settings = (engine, integrator, substeps)
@@ -132,7 +132,7 @@ def _timed(simulation: Simulation, engine: str, integrator: str | None, substeps
     return trace, time.perf_counter() - begin
 
 
-def _growth(truth: Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
+def _growth(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
     """The larger growth-rate error of the two loops, and whether both verdicts are right."""
     errors, right = [], True
     for simulation in (truth.coupled, truth.uncoupled):
@@ -143,7 +143,7 @@ def _growth(truth: Reference, engine: str, integrator: str | None, substeps: int
     return {"growth_rate_error": max(errors, key=abs), "verdict_correct": right}
 
 
-def _cycle(truth: Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
+def _cycle(truth: _Reference, engine: str, integrator: str | None, substeps: int | None) -> Row:
     names = ("cycle_amplitude_n", "cycle_frequency_hz", "cycle_amplitude_error", "cycle_frequency_error_hz")
     if truth.cycle is None:
         return dict.fromkeys(names)

@@ -27,7 +27,7 @@ from sim.run import Simulation, assemble, run, run_blocks
 from sim.scenario import Scenario
 
 PAIRS, SECONDS, SLOW = 100, 10.0, 0.1  # of lossless hands, their time [s], their speed at the start [m/s]
-AUDIBLE = 40.0  # [Hz] above which a force is felt as buzzing
+_AUDIBLE = 40.0  # [Hz] above which a force is felt as buzzing
 _SEED = 1
 
 _DESIGNS = (
@@ -119,7 +119,7 @@ def _apart(f: Array, ideal: Array) -> float | None:
 def _fast(f: Array, T: float) -> float:
     """rms of what is above AUDIBLE [N]."""
     spectrum = np.fft.rfft(f, axis=0)
-    spectrum[np.fft.rfftfreq(len(f), T) < AUDIBLE] = 0
+    spectrum[np.fft.rfftfreq(len(f), T) < _AUDIBLE] = 0
     return float(np.sqrt(np.mean(np.fft.irfft(spectrum, len(f), axis=0) ** 2)))
 
 

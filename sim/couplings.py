@@ -112,14 +112,14 @@ def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
 
 
 @dataclass(frozen=True)
-class FileCheck:
+class _FileCheck:
     """What a coupling's file is worth in a loop."""
 
     notes: tuple[str, ...]  # what a reader should know of it
     switching: DelayRange | None = None  # the file proves that any switching of the delays within it is safe here
 
 
-def check_stored(stored: Stored, loop: Loop) -> FileCheck:
+def check_stored(stored: Stored, loop: Loop) -> _FileCheck:
     """Whether the certificate on file holds, and what it says of the coupling in this loop."""
     try:
         reason = verify(stored).reason if stored.certificate else None
@@ -134,7 +134,7 @@ def check_stored(stored: Stored, loop: Loop) -> FileCheck:
         if loop.theta != stored.loop.theta or loop.jitter not in (None, switching):
             here = switching_guarantee(loop.jitter) if loop.jitter else f"the constant theta = {list(loop.theta)}"
             notes.append(f"the file proves {switching_guarantee(switching)}, which covers {here}")
-        return FileCheck(tuple(notes), switching)
+        return _FileCheck(tuple(notes), switching)
     differ += ["theta"] if loop.theta != stored.loop.theta else []
     if loop.jitter and proved:
         made_for = switching_guarantee(switching) if switching else "constant delays"
@@ -143,4 +143,4 @@ def check_stored(stored: Stored, loop: Loop) -> FileCheck:
         notes.append(
             f"the coupling was stored for another loop (different {', '.join(differ)}), and is judged anew here"
         )
-    return FileCheck(tuple(notes), switching)
+    return _FileCheck(tuple(notes), switching)

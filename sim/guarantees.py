@@ -40,7 +40,7 @@ _ROUNDING = 1e-10  # of the energy that flows
 
 
 @dataclass(frozen=True)
-class Challenge:
+class _Challenge:
     """What the adversaries came to in one loop."""
 
     guarantee: str
@@ -83,7 +83,7 @@ class _Case:
 
 def challenges(
     seed: int, loops: int = 3, hands: int = 60, seconds: float = 6.0, names: Sequence[str] | None = None
-) -> Iterator[Challenge]:
+) -> Iterator[_Challenge]:
     """Every guarantee at ENOUGH and at too little, on so many random loops."""
     for name, (make, too_little) in GUARANTEES.items():
         if names is not None and name not in names:
@@ -95,7 +95,7 @@ def challenges(
 
 def _challenge(
     name: str, make: Callable[..., _Case], seed: int, number: int, factor: float, hands: int, seconds: float
-) -> Challenge:
+) -> _Challenge:
     case = make(np.random.default_rng((seed, number)), factor)
     rng = np.random.default_rng((seed, number, 1))
     balances, share = [], 0.0
@@ -109,7 +109,7 @@ def _challenge(
         grown, lowest = _held(case, rng, hands, seconds)
         tried, grew, least = hands, grown, np.append(least, lowest)
     holds = factor < 1 or (took == 0 and grew == 0)
-    return Challenge(name, number, factor, 3 * _PUSHED, took, float(least.min()), tried, grew, share, holds)
+    return _Challenge(name, number, factor, 3 * _PUSHED, took, float(least.min()), tried, grew, share, holds)
 
 
 # ---- the adversaries

@@ -20,31 +20,31 @@ from sim.stepping import check_substeps, default_substeps, simulated_growth
 CLOSE = 1e-2  # [1/s] what the growth rate of the rule's own choice may be off
 #: a setting holds if it is stable, has the exact verdict, and errs by less than both of these
 GROWTH, POSITION = 1e-3, 1e-3  # [1/s]; relative rms of the device positions over the run
-RK4, EULER = ("RK4", 1), ("Euler", 1)
-TRIED = tuple((name, 1) for name in ("RK4", "Euler", "implicitfast"))
+RK4, _EULER = ("RK4", 1), ("Euler", 1)
+_TRIED = tuple((name, 1) for name in ("RK4", "Euler", "implicitfast"))
 
-Setting = tuple[str, int]  # integrator, substeps
+_Setting = tuple[str, int]  # integrator, substeps
 
 
 @dataclass(frozen=True)
-class Hard:
+class _Hard:
     """A loop that asks much of an integrator."""
 
     name: str
     scenario: Scenario
-    fails: Setting | None  # a setting that does not hold, None where all of TRIED do
+    fails: _Setting | None  # a setting that does not hold, None where all of TRIED do
     how: str  # what is wrong with it: "refused", "verdict", "growth" or "position"
     coupling: Coupling = CASE_I
     substeps: int | None = None  # of RK4, which hold; default: what the rule picks
 
 
 @dataclass(frozen=True)
-class Row:
+class _Row:
     """What was measured of a hard loop."""
 
     name: str
     exact: float  # [1/s] growth of the exact loop
-    fails: Setting | None
+    fails: _Setting | None
     fault: str | None  # what was wrong with it; None where it failed as little as the rest of TRIED
     off: float | None  # by how much, None where it was refused
     rule: int  # RK4 substeps that the rule picks
@@ -74,21 +74,21 @@ def light(damping: float) -> Scenario:
     return devices(handle_mass=1e-3).replace(human=(Human((Link(0.0, damping, 200.0),)),) * 2)
 
 
-def cases() -> tuple[Hard, ...]:
+def cases() -> tuple[_Hard, ...]:
     """All hard loops."""
     return (
-        Hard("human stiffness 1e5 N/m", hands(0.3, 3.0, 1e5), RK4, "position"),
-        Hard("handle of 1 g, human damping 3 N s/m", light(3.0), RK4, "refused"),
-        Hard("handle of 1 g, no human damping", light(0.0), RK4, "refused", substeps=48),
-        Hard("motor 1 g", devices(motor_mass=1e-3), RK4, "refused"),
-        Hard("motor 100 kg", devices(motor_mass=100.0), EULER, "growth"),
-        Hard("human damping 1000 N s/m", hands(0.3, 1000.0, 200.0), EULER, "position"),
-        Hard("transmission 1e6 N/m", devices(transmission_stiffness=1e6), RK4, "refused"),
-        Hard("T = 4 ms", nominal().replace(T=4e-3), EULER, "refused"),
-        Hard("T = 10 us", nominal().replace(T=1e-5, duration=0.12), None, "none tried fails"),
-        Hard("50-sample delays", nominal().replace(theta=(50, 50)), EULER, "growth"),
-        Hard("zero damping", nominal().replace(delta=(0.0, 0.0)), EULER, "growth"),
-        Hard("coupling 1e5 N/m", nominal(), EULER, "verdict", SpringDamper(np.full(2, 1e5), np.zeros(2))),
+        _Hard("human stiffness 1e5 N/m", hands(0.3, 3.0, 1e5), RK4, "position"),
+        _Hard("handle of 1 g, human damping 3 N s/m", light(3.0), RK4, "refused"),
+        _Hard("handle of 1 g, no human damping", light(0.0), RK4, "refused", substeps=48),
+        _Hard("motor 1 g", devices(motor_mass=1e-3), RK4, "refused"),
+        _Hard("motor 100 kg", devices(motor_mass=100.0), _EULER, "growth"),
+        _Hard("human damping 1000 N s/m", hands(0.3, 1000.0, 200.0), _EULER, "position"),
+        _Hard("transmission 1e6 N/m", devices(transmission_stiffness=1e6), RK4, "refused"),
+        _Hard("T = 4 ms", nominal().replace(T=4e-3), _EULER, "refused"),
+        _Hard("T = 10 us", nominal().replace(T=1e-5, duration=0.12), None, "none tried fails"),
+        _Hard("50-sample delays", nominal().replace(theta=(50, 50)), _EULER, "growth"),
+        _Hard("zero damping", nominal().replace(delta=(0.0, 0.0)), _EULER, "growth"),
+        _Hard("coupling 1e5 N/m", nominal(), _EULER, "verdict", SpringDamper(np.full(2, 1e5), np.zeros(2))),
     )
 
 
@@ -108,7 +108,7 @@ def faults(loop: Simulation, integrator: str, substeps: int) -> dict[str, float]
     return found
 
 
-def measure(hard: Hard) -> Row:
+def measure(hard: _Hard) -> _Row:
     """The settings that fail and hold against the exact loop. Raises InputError where the rule finds none."""
     loop = assemble(hard.scenario, hard.coupling)
     rule, exact = default_substeps(loop, "RK4"), exact_growth(loop)
@@ -117,12 +117,12 @@ def measure(hard: Hard) -> Row:
     off = bad.get(hard.how)
     chosen = simulated_growth(loop, "RK4", rule)
     right = (
-        (off is not None if hard.fails else not any(faults(loop, *setting) for setting in TRIED)),
+        (off is not None if hard.fails else not any(faults(loop, *setting) for setting in _TRIED)),
         not faults(loop, "RK4", substeps),
         (chosen > 0) == (exact > 0) and abs(chosen - exact) <= CLOSE,
         (rule < substeps) == (hard.substeps is not None),
     )
-    return Row(
+    return _Row(
         hard.name,
         exact,
         hard.fails,

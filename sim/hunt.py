@@ -45,7 +45,7 @@ _BLOCK = 64  # ticks between two looks at a buffer
 
 
 @dataclass(frozen=True, eq=False)
-class Bounces:
+class _Bounces:
     """One row per window of equal length, one column per simulation."""
 
     made: Array  # (windows, nsim) contacts made, all walls together
@@ -53,7 +53,7 @@ class Bounces:
     clipped: Array  # (windows, nsim) ticks with a force at its limit
 
 
-def bounce(process: Process, engine: Engine, start: Array, ticks: int, windows: int = 4, outside: int = 0) -> Bounces:
+def bounce(process: Process, engine: Engine, start: Array, ticks: int, windows: int = 4, outside: int = 0) -> _Bounces:
     """Simulate from the plant states `start`, (2n, nsim), with `outside` outside forces, all zero.
 
     `ticks` is rounded down to whole windows of whole blocks. Raises ValueError where there is no wall, or no tick.
@@ -82,7 +82,7 @@ def bounce(process: Process, engine: Engine, start: Array, ticks: int, windows: 
         return np.zeros((count, outside))
 
     run_blocks(process, engine, at_rest, windows * blocks * _BLOCK, start, look, _BLOCK)
-    return Bounces(made, np.sqrt(square / (blocks * _BLOCK)), clipped)
+    return _Bounces(made, np.sqrt(square / (blocks * _BLOCK)), clipped)
 
 
 # ---- the search

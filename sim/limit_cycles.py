@@ -224,11 +224,11 @@ class Points:
 
 
 #: flat indices of cells -> their linear force maps, a stack, and what the computer does in each
-Loops = Callable[[Cells], tuple[Lti, Sequence[Process]]]
+_Loops = Callable[[Cells], tuple[Lti, Sequence[Process]]]
 
 
 def simulate_cells(
-    cells: Cells, loops: Loops, held: HeldDevices, plan: Plan, press: Array, progress: Progress
+    cells: Cells, loops: _Loops, held: HeldDevices, plan: Plan, press: Array, progress: Progress
 ) -> tuple[Points, bool]:
     """These cells, in batches of whole ones, and whether the keyboard ended it; `press` (m,) [N] is the hands' push."""
     parts: list[Points] = []

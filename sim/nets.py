@@ -27,7 +27,7 @@ from sim.run import Simulation
 from sim.scenario import Scenario
 from sim.switching import with_delays
 
-HELD = 4  # ticks for which a device goes on holding a force, beyond the largest delay, where packets are lost
+_HELD = 4  # ticks for which a device goes on holding a force, beyond the largest delay, where packets are lost
 
 _HANNAFORD = "Hannaford and Ryu, IEEE Trans. Robotics and Automation 18 (2002)"
 _KIM = "Kim and Ryu, Int. J. Robotics Research 29 (2010)"
@@ -68,10 +68,10 @@ class Plugged:
     start: float = 0.0  # W0 [J]
 
 
-Wanted = EnergyNet | Classic | Plugged
+_Wanted = EnergyNet | Classic | Plugged
 
 
-def netted(simulation: Simulation, coupling: Coupling, wanted: Wanted, ticks: int | None = None) -> Simulation:
+def netted(simulation: Simulation, coupling: Coupling, wanted: _Wanted, ticks: int | None = None) -> Simulation:
     """The same loop with a net under it, for runs of up to `ticks` (default: the scenario's).
 
     What is linear about a loop, such as certificates and modes, ask the simulation without. Delays that vary are those
@@ -105,7 +105,7 @@ def netted(simulation: Simulation, coupling: Coupling, wanted: Wanted, ticks: in
 def _budget(wanted: EnergyNet, scenario: Scenario, process: Process, spans: DelayRange, nsim: int) -> Net:
     assert process.delays is not None
     lost = bool((process.delays == LOST).any())
-    hold, delta = HELD if lost else 0, scenario.delta
+    hold, delta = _HELD if lost else 0, scenario.delta
     given: dict[str, Any] = {"eps": EPS, "start": wanted.start, "cap": wanted.cap, "nsim": nsim, "hold": hold}
     given["encoder_step"] = process.encoder_step
     longest = scenario.longest_period or scenario.T  # the most that a held force can lose grows with the period

@@ -172,7 +172,7 @@ def _figure(case: str, stability: dict[str, Any]) -> dict[str, str]:
 # What a run with varying delays says: the delays it met, whether it grew, and what certificates cover.
 
 
-JUDGED = 4.0  # [s] at most of the linear loop from which a growth is read: later numbers may overflow
+_JUDGED = 4.0  # [s] at most of the linear loop from which a growth is read: later numbers may overflow
 
 
 def delays_part(
@@ -204,7 +204,7 @@ def _delays_met(switched: Simulation, period: Period | None, ticks: int) -> dict
     assert delays is not None
     met = ages(delays[:ticks])[..., 0]
     used = met[(met >= 0).all(axis=1)]
-    growth, window = linear_growth(switched, max(4, min(ticks, round(JUDGED / switched.scenario.T))))
+    growth, window = linear_growth(switched, max(4, min(ticks, round(_JUDGED / switched.scenario.T))))
     return {
         "age": _age(used),
         "lost_packets": (delays[:ticks] == LOST).sum(axis=(0, 2)).tolist(),
@@ -270,8 +270,8 @@ def _how(jitter: dict[str, Any]) -> str:
 # What a validation found: one dictionary for machines, and the same as a table for people.
 
 
-SETTLING = 4  # decay times of the slowest mode in a trace whose hands must be slower in its last quarter than before
-ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
+_SETTLING = 4  # decay times of the slowest mode in a trace whose hands must be slower in its last quarter than before
+_ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
 
 
 def validation_part(question: Validation, findings: Findings, certified: bool, wall: float) -> dict[str, Any]:
@@ -398,7 +398,7 @@ def _traces(question: Validation, findings: Findings) -> dict[str, Any] | None:
     measured, stable = np.isfinite(findings.trace), ~unstable(findings.exact)
     duration = question.ticks * question.scenario.T
     decay = _largest(-1 / findings.exact[findings.exact < 0])
-    decides = decay is None or duration >= SETTLING * decay
+    decides = decay is None or duration >= _SETTLING * decay
     part = {
         "duration_s": duration,
         "clipped_runs": int((findings.clipped > 0).sum()),
@@ -419,7 +419,7 @@ def _traces(question: Validation, findings: Findings) -> dict[str, Any] | None:
 def _energy(question: Validation, findings: Findings) -> dict[str, Any]:
     """Forces that were clipped are covered by nothing; those of a limiter are."""
     unclipped = (findings.clipped == 0) | (question.lag is not None)
-    violated = unclipped & ~(findings.energy >= -ROUNDING * findings.audited)
+    violated = unclipped & ~(findings.energy >= -_ROUNDING * findings.audited)
     return {
         "audited": int(unclipped.sum()),
         "clipped": int((~unclipped).sum()),

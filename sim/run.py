@@ -42,7 +42,7 @@ from sim.trace import Trace
 ENGINES = ("mujoco", "exact")
 
 Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the hands (ticks, outside) [N]
-Look = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
+_Look = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
 Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 
 _COPIES = 5  # of a trace, at most, from the run to its report
@@ -182,7 +182,7 @@ def _require_memory(width: int, ticks: int, T: float) -> None:
 
 
 def run_blocks(
-    process: Process, engine: Engine, outside: Outside, ticks: int, start: Array, look: Look, block: int = 32
+    process: Process, engine: Engine, outside: Outside, ticks: int, start: Array, look: _Look, block: int = 32
 ) -> None:
     """Close the loop for `ticks` periods from the plant states `start`, (states, nsim), and look at it block by block.
 

@@ -30,13 +30,13 @@ SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
 
 LONGEST_DELAY = 1000  # [samples]; every one is a state
-MOST_DELAYS = 1000  # of all channels together: the eigenvalues of so many states take ten seconds, of 2000 a minute
-LONGEST_NAME = 200  # characters, that a table and a picture can show
+_MOST_DELAYS = 1000  # of all channels together: the eigenvalues of so many states take ten seconds, of 2000 a minute
+_LONGEST_NAME = 200  # characters, that a table and a picture can show
 _TIMING_STREAM = 6  # keeps these draws apart from those of the humans with the same seed
 _Delays = tuple[int, ...]
 
 
-class Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A short constant force on one handle."""
 
     channel: int  # counted from 1
@@ -63,7 +63,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     box: Box | None = None  # what else the environment may be
     lam: _Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
     person: tuple[Person, ...] = ()  # those who hold several devices
-    tap: Tap | None = None
+    tap: _Tap | None = None
     duration: float = 15.0  # [s]
     population: Population = Population()  # who `validate` draws
     jitter: Jitter | None = None  # how the delays of the forces vary around theta; None where they do not
@@ -72,8 +72,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     latency: tuple[tuple[float, float], ...] | None = None  # [s] least and most by which a channel's force latches late
 
     def __post_init__(self) -> None:
-        if len(self.name) > LONGEST_NAME:
-            raise ValueError(f"name has {len(self.name)} characters, allowed are {LONGEST_NAME}")
+        if len(self.name) > _LONGEST_NAME:
+            raise ValueError(f"name has {len(self.name)} characters, allowed are {_LONGEST_NAME}")
         require("T", self.T, 1e-6, 0.1, "s")
         require("duration", self.duration, self.T, 1e6, "s")
         for name in ("theta", "psi", "device", "human", "lam"):
@@ -83,8 +83,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"{name} has {len(value)} entries, but {contacts}")
             for i, n in enumerate(value if name in ("theta", "psi", "lam") and value else ()):
                 require(f"{name}[{i}]", n, 0, LONGEST_DELAY, "samples")
-        if (total := sum((*self.theta, *self.psi))) > MOST_DELAYS:
-            many = f"theta and psi are {total} samples in all, allowed are {MOST_DELAYS}"
+        if (total := sum((*self.theta, *self.psi))) > _MOST_DELAYS:
+            many = f"theta and psi are {total} samples in all, allowed are {_MOST_DELAYS}"
             raise ValueError(f"{many}: each is a state of the loop, and the work grows with the cube of their number")
         for i, lam in enumerate(self.lam or ()):
             if lam > self.theta[i] + self.psi[i]:
@@ -279,7 +279,7 @@ def require_even_ticks(scenario: Scenario, what: str) -> None:
 # ---- humans in a file of their own
 
 
-class HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The whole file."""
 
     human: tuple[Any, ...]  # Human, MeasuredHand, or a user's own
@@ -287,7 +287,7 @@ class HumanFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     population: Any = None  # of a Python file: who else is drawn, what has draw(rng, n)
 
 
-def load_humans(path: str | Path, channels: int) -> HumanFile:
+def load_humans(path: str | Path, channels: int) -> _HumanFile:
     """The humans of a file, one per channel, and who holds several devices.
 
     A Python file is run, and says who they are: `humans`, and `persons` if it likes, of any class (models.human.Hand).
@@ -307,9 +307,9 @@ def load_humans(path: str | Path, channels: int) -> HumanFile:
     return people
 
 
-def _humans_of(text: str, source: str) -> HumanFile:
+def _humans_of(text: str, source: str) -> _HumanFile:
     """A file of humans; a [[human]] with A, B, C and D is a measured transfer function, any other a chain."""
-    people: HumanFile = _converted(text, HumanFile, source)
+    people: _HumanFile = _converted(text, _HumanFile, source)
     made = []
     for i, human in enumerate(people.human):
         kind = MeasuredHand if isinstance(human, dict) and "A" in human else Human
@@ -321,16 +321,16 @@ def _humans_of(text: str, source: str) -> HumanFile:
             raise InputError(f"{source}: human[{i}]{joint}{place}") from None
         except ValueError as error:
             raise InputError(f"{source}: human[{i}]: {error}") from None
-    return HumanFile(tuple(made), people.person)
+    return _HumanFile(tuple(made), people.person)
 
 
-def _run_file(path: str | Path) -> HumanFile:
+def _run_file(path: str | Path) -> _HumanFile:
     """The people that a Python file defines. Raises InputError where it cannot be read or run, or they hold nothing."""
     read_text(path, f"--human {path}")
     try:
         names = runpy.run_path(str(path))
         hands, persons = _kept(tuple(names.get("humans", ()))), tuple(names.get("persons", ()))
-        return HumanFile(hands, persons, names.get("population"))
+        return _HumanFile(hands, persons, names.get("population"))
     except (Exception, SystemExit) as error:
         raise InputError(f"--human {path}: {type(error).__name__}: {error}") from None
 
@@ -477,6 +477,6 @@ def _hint(what: str) -> str:
 
 
 _STRUCTS = (
-    Scenario, Tap, Jitter, Human, Link, Voluntary, Person, Cross, Population, Network, Spring, Wall, Box,
+    Scenario, _Tap, Jitter, Human, Link, Voluntary, Person, Cross, Population, Network, Spring, Wall, Box,
     UncertainSpring, *get_args(Device)
 )  # fmt: skip

@@ -266,7 +266,7 @@ def _contact_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
 # summed up while the simulation runs, so that no trace is kept.
 
 _IMPULSE = 10e-3  # [s]
-TO_THE_WALL = 20.0  # [N] so that a hand of 0.3 kg swings over a few centimetres
+_TO_THE_WALL = 20.0  # [N] so that a hand of 0.3 kg swings over a few centimetres
 _NOISE_FLOOR = 1e-8  # a mode weaker than this beside the whole state is noise of the engine
 
 
@@ -307,7 +307,7 @@ def impulse_test(
     """
     nsim, states = loops.A.shape[0], loops.A.shape[1] - process.F.order
     audit = _Audit(process, scene, loops, delta, ticks)
-    push = partial(impulse_forces, scene, loops.T, size=TO_THE_WALL if process.walls else 1.0)
+    push = partial(impulse_forces, scene, loops.T, size=_TO_THE_WALL if process.walls else 1.0)
 
     def look(buffer: StepBuffer, first: int, count: int) -> None:
         audit.see(buffer, first, count)

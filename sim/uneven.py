@@ -25,14 +25,14 @@ from models.scene import Plant
 from sim.engines import hold
 from sim.stability import close
 
-T, LONG = 1e-3, 1.6e-3  # [s]
-HANDS, TICKS = 40, 4000
-ENOUGH, SHORT = 1.02, 0.5  # times the required damping
-GROWN = 100.0  # times the energy at the start
+T, _LONG = 1e-3, 1.6e-3  # [s]
+HANDS, _TICKS = 40, 4000
+ENOUGH, _SHORT = 1.02, 0.5  # times the required damping
+_GROWN = 100.0  # times the energy at the start
 
 
 @dataclass(frozen=True)
-class UnevenTicks:
+class _UnevenTicks:
     """What became of one loop under one kind of uneven ticks."""
 
     loop: str
@@ -48,7 +48,7 @@ class UnevenTicks:
         return self.energy <= 1 + 1e-9 and self.balance >= -1e-9
 
 
-def uneven_ticks(seed: int, loops: int = 8, ticks: int = TICKS) -> Iterator[UnevenTicks]:
+def uneven_ticks(seed: int, loops: int = 8, ticks: int = _TICKS) -> Iterator[_UnevenTicks]:
     """Random loops under periods up to T_max, latencies, and both."""
     for index in range(loops):
         rng = np.random.default_rng(np.random.SeedSequence((seed, index)))
@@ -58,11 +58,11 @@ def uneven_ticks(seed: int, loops: int = 8, ticks: int = TICKS) -> Iterator[Unev
         m = loop.channels
         hands = 10 ** rng.uniform(-3, 0, (HANDS, m)), 10 ** rng.uniform(0, 4, (HANDS, m))
         for drawn in (True, False):
-            runs = [_run(loop, coupling, share * required, hands, drawn, ticks, rng) for share in (ENOUGH, SHORT)]
+            runs = [_run(loop, coupling, share * required, hands, drawn, ticks, rng) for share in (ENOUGH, _SHORT)]
             name = f"{index}: {m} channel{'s'[: m - 1]}, theta = {list(loop.theta)}"
             (energy, _, balance), (_, end, _) = runs
-            grown = int((end > GROWN).sum())
-            yield UnevenTicks(name, kind, drawn, float(required[0]), float(energy.max()), float(balance.min()), grown)
+            grown = int((end > _GROWN).sum())
+            yield _UnevenTicks(name, kind, drawn, float(required[0]), float(energy.max()), float(balance.min()), grown)
 
 
 def _draw(rng: np.random.Generator, kind: str) -> tuple[Loop, SpringDamper]:
@@ -77,7 +77,7 @@ def _draw(rng: np.random.Generator, kind: str) -> tuple[Loop, SpringDamper]:
         coupling = SpringDamper(10 ** rng.uniform(2.5, 4, m), 10 ** rng.uniform(-2, 0.5, m))
         latest = rng.uniform(0.1, 0.4) * T
         latency = ((rng.uniform(0, latest), latest),) * m if kind != "periods" else None
-        longest = LONG if kind != "latency" else None
+        longest = _LONG if kind != "latency" else None
         loop = Loop(T, theta, (0,) * m, theta, (1.0,) * m, network, T_max=longest, latency=latency)
         try:
             if 0.01 < this_environment_of(loop, coupling).ratio < 20:
@@ -103,7 +103,7 @@ def _run(
     A[:, i, m + i], A[:, m + i, i], A[:, m + i, m + i], B[:, m + i, i] = 1, -stiff / mass, -damping / mass, -1 / mass
     plants, F, longest = Plant(A, B, np.eye(m, 2 * m)), loop.F(coupling), loop.T_max or loop.T
     spans = loop.latency or ((0.0, 0.0),) * m
-    periods = np.linspace(0.3 * LONG, LONG, 3) if loop.T_max else (T,)
+    periods = np.linspace(0.3 * _LONG, _LONG, 3) if loop.T_max else (T,)
     kinds = [(period, late) for period in periods for late in product(*(dict.fromkeys(span) for span in spans))]
     steps = np.stack([close(hold(plants, period, late), F).A for period, late in kinds])  # (kinds, n, order, order)
     seen = np.stack([_at_the_latch(plants, late) for _, late in kinds])  # (kinds, n, m, 3 m): x at the latch

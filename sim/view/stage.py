@@ -18,7 +18,7 @@ from sim.view.events import GIVEN, KEYS, Couple, PreparedLoop, words
 from sim.view.session import HISTORY, Frame, Grip
 
 Colour = tuple[float, float, float]
-Lines = list[tuple[str, str]]
+_Lines = list[tuple[str, str]]
 
 #: Okabe and Ito's palette, one colour per device
 PALETTE: tuple[Colour, ...] = (
@@ -86,7 +86,7 @@ def envelope(history: Array, columns: int, ticks: int) -> tuple[Array, Array]:
     return np.fmin.reduceat(padded, first, axis=0), np.fmax.reduceat(padded, first, axis=0)
 
 
-def overlay(frame: Frame, live: bool) -> Lines:
+def overlay(frame: Frame, live: bool) -> _Lines:
     """Labels and values; `live` adds the clock, which a video has none of."""
     prepared, scenario = frame.prepared, frame.prepared.scenario
     delays = f"theta {_list(scenario.theta)}, psi {_list(scenario.psi)} samples of {1e3 * scenario.T:g} ms"
@@ -126,19 +126,19 @@ def _needs(requirement: Requirement) -> str:
     return f"needs {need:.3f} of {have:g} N s/m: {'certified' if requirement.certified else 'NOT certified'}"
 
 
-def keys_help(given: bool) -> Lines:
+def keys_help(given: bool) -> _Lines:
     """The keys and what they ask for; `given` where there is a coupling from a file. The mouse comes last."""
     keys = [(name, words(event)) for name, event in KEYS.values() if given or event != Couple(GIVEN)]
     return [*keys, ("double click", "take a body"), ("Ctrl+right", "draw it")]
 
 
-def apart(lines: Lines) -> tuple[Lines, Lines]:
+def apart(lines: _Lines) -> tuple[_Lines, _Lines]:
     """The lines, and what was last refused, where that takes several lines."""
     at = next((i for i, (label, _) in enumerate(lines) if label == "last"), len(lines))
     return (lines[:at], lines[at:]) if len(lines) - at > 1 else (lines, [])
 
 
-def columns(lines: Lines) -> tuple[str, str]:
+def columns(lines: _Lines) -> tuple[str, str]:
     """Labels and values as MuJoCo's overlays take them."""
     return "\n".join(label for label, _ in lines), "\n".join(value for _, value in lines)
 
