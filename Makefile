@@ -5,13 +5,14 @@
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
 # make validate  every check that a verdict rests on: a report in out/validate/report.md, about ten minutes
 # make oldest  the tests of models, blocks and files with the oldest packages that pyproject.toml allows, in .venv-oldest
+# make installed  a plain installation in an empty environment, and its console script
 # make figures  the pictures that README and docs show, and the output in their blocks
 PYTHON ?= python3
 PY := .venv/bin/python
 # a file of tests stays on one core: its tests share fixtures, and those of the documentation files
 PARALLEL := -n auto --dist loadfile
 
-.PHONY: run test check validate lint coverage bench oldest figures clean
+.PHONY: run test check validate lint coverage bench oldest installed figures clean
 
 run: .venv/ready
 	$(PY) -m sim.run --case I
@@ -24,6 +25,7 @@ check: lint
 
 validate: .venv/ready
 	$(PY) -m sim.suite --out out/validate
+	$(PY) tests/cli/hostile.py --signals
 
 lint: .venv/ready
 	$(PY) -m ruff check .
@@ -55,6 +57,11 @@ bench: .venv/ready
 	$(PY) -m pytest tests/benchmarks --benchmark-only -s
 
 # DeprecationWarning: what an old matplotlib says of a new pyparsing
+installed:
+	$(PYTHON) -m venv .venv-installed
+	.venv-installed/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt .
+	cd out && ../.venv-installed/bin/haptic-loop audit --rigid --K 1000 --B 0 --T 1e-3 --theta 0 --delta 1.37
+
 oldest:
 	$(PYTHON) -m venv .venv-oldest
 	.venv-oldest/bin/python tests/oldest.py >.venv-oldest/floors.txt
@@ -70,4 +77,4 @@ oldest:
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-oldest out build *.egg-info .pytest_cache .ruff_cache .hypothesis .coverage*
+	rm -rf .venv .venv-oldest .venv-installed out build *.egg-info .pytest_cache .ruff_cache .hypothesis .coverage*

@@ -174,6 +174,8 @@ def credible_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
     forces: list[float | None] = []
     speeds, outside = [], np.zeros(trace.t.size, bool)
     for i, (device, handle) in enumerate(zip(devices, simulation.scene.handles, strict=True)):
+        if not trace.s.size:  # stopped before its first tick
+            break
         motor, speed = trace.s[:, i], np.abs(trace.s[:, n + i])
         outside |= speed > device.credible_speed
         speeds.append(float(speed.max(initial=0.0)))

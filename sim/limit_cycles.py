@@ -346,10 +346,7 @@ class _ManyProcesses(StepBuffer):
         made = _linear if processes[0].contact is None else _each
         if isinstance(processes[0].contact, Contact) and len(processes[0].contact.walls) == 1:
             made = _one_wall
-        self._together = made(processes)
-
-    def tick(self, k: int) -> None:
-        self._together(self.seen(k), self._output[k])
+        self._transition = made(processes)
 
 
 def _linear(processes: Sequence[Process]) -> _Transition:

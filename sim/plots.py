@@ -612,7 +612,7 @@ def _here(name: str, outcome: dict[str, Any]) -> float:
 
 def _level(row: dict[str, Any], figure: str) -> float | None:
     """The mismatch [dB]; of a coupling that is exact the least that is drawn, None where there is no coupling."""
-    return _EXACT if row[figure] is None and row["proof"] else row[figure]
+    return _EXACT if row[figure] is None and row.get("proof") else row[figure]
 
 
 def _draw_sweep(axis: Axes, name: str, sweep: dict[str, Any], figure: str, here: float) -> dict[str, Any]:

@@ -11,7 +11,27 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(name, "1")
 
+import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
 settings.register_profile("no-clock", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("no-clock")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def couplings_beside_a_run_are_designed_once():
+    """Every run shows other couplings for the same devices: the same designs again and again, seconds each."""
+    from design.stored import digest
+    from sim import alternatives
+
+    made, choose = {}, alternatives.choose
+
+    def remembered(scenario, case, kind, condition):
+        key = (digest(scenario.loop(case)), case, kind, condition)
+        if key not in made:
+            made[key] = choose(scenario, case, kind, condition)
+        return made[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(alternatives, "choose", remembered)
+        yield

@@ -709,7 +709,7 @@ def silence() -> Iterator[Case]:
         (("design", "--method", "inner"), "--method"),
         (("design", "--compare"), "--compare"),
         (("design", "--objective", "rms"), "--objective"),
-        (("design", "--band", "1,80"), "--band"),
+        (("design", "--band", "80,1"), "--band"),
         (("design", "--seconds", "9"), "--seconds"),
         (("design", "--high-gain", "2"), "--high-gain"),
         (("design", "--coupling", "ccl", "--limiter"), "limiter"),

@@ -22,7 +22,3 @@ def driven(*options: str) -> int:
 
 def test_every_hostile_case_is_answered_well():
     assert driven() >= 500
-
-
-def test_ctrl_c_and_sigterm_at_any_moment_end_in_one_line_and_leave_no_temporary_file():
-    assert driven("--signals") == 46

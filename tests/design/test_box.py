@@ -251,7 +251,7 @@ def test_a_wider_box_is_another_claim(stored):
 
 
 def test_a_coupling_for_one_environment_is_not_proved_for_the_set(nominal_only):
-    with pytest.raises(NotProved, match=r"^vertex 2 .*needs 1\.409"):
+    with pytest.raises(NotProved, match=r"^vertex 2 .*needs 1\.4029"):
         prove(LOOP, nominal_only.coupling, "this-environment")
     part = set_part(check_set(LOOP, nominal_only.coupling, samples=8))
     assert not part["certified"]

@@ -150,7 +150,7 @@ def test_the_comparison_names_every_method():
     ("options", "message"),
     [
         ({"method": "bisection"}, "method is 'bisection', allowed are complementarity, inner, fixed-poles"),
-        ({"order": 0}, "order is 0, allowed are 1 or more"),
+        ({"order": 0}, "order is 0, allowed are 1 to 10"),
         ({"order": 2, "method": "fixed-poles"}, "method 'fixed-poles' is for one state per channel"),
     ],
 )

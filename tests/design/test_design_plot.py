@@ -168,7 +168,7 @@ def test_a_design_that_does_not_exist_leaves_the_others(tmp_path, capsys):
         (["--coupling", "none,,published"], "separated by commas"),
         (["--coupling", "a.json,b.json,c.json,d.json,e.json,f.json,g.json"], "allowed are 1 to 6"),
         (["--coupling", "stiff"], "allowed are none, published"),
-        (["--coupling", ""], "expected names separated by commas"),
+        (["--coupling", ""], "--coupling is empty"),
         (["--coupling", "spring-damper:foo"], "the condition is 'foo', allowed are"),
         (["--coupling", "published:"], "the condition is '', allowed are"),
         (["--case", "none", "--coupling", "published"], "without coupling"),

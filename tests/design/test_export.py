@@ -20,8 +20,8 @@ from controller.lti import Lti
 from controller.process import Process, StepBuffer
 from design.certificate import prove, prove_limiter
 from design.export import process_block, sequential, trial
+from design.files import InputError, one_command
 from design.stored import Stored, save
-from sim.scenario import InputError
 
 SPRINGS = SpringDamper((300.0, 200.0), (0.0, 0.0))  # no state at all
 FULL = Compliance(
@@ -315,7 +315,7 @@ def test_a_hostile_name_stays_inside_the_comments(tmp_path):
 )
 def test_bad_input_is_one_line(place, options, message):
     save(Stored.of(PAIR, NoCoupling()), place / "none.json")
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=message), one_command():
         main([option.format(gains=place / "gains.json", place=place) for option in options])
 
 

@@ -113,13 +113,13 @@ def test_run_uses_and_reports_the_rule(tmp_path):
     text = (SCENARIOS / "omega-pair.toml").read_text()
     path.write_text(text.replace("transmission_stiffness = 14500", "transmission_stiffness = 1e6"))
     options = ["--scenario", str(path), "--coupling", "published", "--duration", "0.3", "--no-plot"]
-    options += ["--integrator", "RK4"]
     options += ["--out", str(tmp_path / "o"), "--json", str(tmp_path / "r.json")]
-    assert main(options) == 0
+    stepped = [*options, "--integrator", "RK4"]
+    assert main(stepped) == 0
     assert json.loads((tmp_path / "r.json").read_text())["run"]["substeps"] == 26
-    assert main([*options, "--substeps", "8"]) == 0
+    assert main([*stepped, "--substeps", "8"]) == 0
     assert "coarse" in json.loads((tmp_path / "r.json").read_text())["remarks"][0]
     with pytest.raises(InputError, match="--substeps 1: RK4 x 1: the mode at"):
-        main([*options, "--substeps", "1"])
+        main([*stepped, "--substeps", "1"])
     assert main([*options, "--engine", "exact"]) == 0
     assert json.loads((tmp_path / "r.json").read_text())["run"]["substeps"] is None
