@@ -94,9 +94,10 @@ def _parser() -> options.Parser:
     example = "python -m design --case I --coupling spring-damper --out coupling.json"
     parser = options.Parser("design", "Design a coupling, prove its certificate and store both.", example)
     options.add_loop_options(parser)
-    parser.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
+    kind = parser.add_mutually_exclusive_group()
+    kind.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
     best = "the coupling of the least transparency error: --coupling optimal"
-    parser.add_argument("--best", dest="coupling", action="store_const", const="optimal", help=best)
+    kind.add_argument("--best", dest="coupling", action="store_const", const="optimal", help=best)
     around = "certify for every stiffness and mass this much more or less, as [box] of a scenario does"
     parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
     options.add_condition_option(parser, "what to certify")

@@ -167,7 +167,7 @@ def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
     if least <= value <= most:  # False for nan
         return value
     shown, low, high = (str(n) if isinstance(n, int) else f"{n:g}" for n in (value, least, most))
-    span = f"numbers from {low}" if most == math.inf else f"{low} to {high}"
+    span = f"{low} to {high}" if most < math.inf else f"numbers from {low}" if least > -math.inf else "finite numbers"
     raise argparse.ArgumentTypeError(f"is {shown}, allowed are {span}{unit and f' {unit}'}")
 
 

@@ -705,6 +705,8 @@ def silence() -> Iterator[Case]:
         (("run", *QUICK["run"], "--engine", "exact", "--substeps", "4"), "--substeps"),
         (("run", *QUICK["run"], "--vertex", "1"), "--vertex"),
         (("run", *QUICK["run"], "--no-plot", "--no-plot", "--side-by-side"), "--side-by-side"),
+        (("design", "--best", "--coupling", "ccl"), "--coupling"),
+        (("run", *QUICK["run"], "--error", "nan"), "--error is nan, allowed are finite numbers"),
         (("design", "--order", "2"), "--order"),
         (("design", "--method", "inner"), "--method"),
         (("design", "--compare"), "--compare"),
