@@ -210,7 +210,7 @@ def _peak() -> float:
 def proved(seed: int) -> Iterator[_Row]:
     """Whether random networks are proved where the sweep says so, and only there."""
     for row in proofs(seed):
-        yield asdict(row) | {"holds": row.holds}
+        yield asdict(row) | {"required": finite(row.required), "holds": row.holds}
 
 
 def told(seed: int) -> Iterator[_Row]:
@@ -385,7 +385,7 @@ def _proof_table(report: dict[str, Any]) -> list[_Part]:
     """Of proofs of random networks: by what the sweep says."""
     rows, good = [], sum(row["holds"] for row in report["rows"])
     for says, enough in (("there is enough damping", True), ("there is too little", False)):
-        some = [row for row in report["rows"] if (row["required"] < 1) == enough]
+        some = [row for row in report["rows"] if (row["required"] is not None and row["required"] < 1) == enough]
         rows.append((says, str(len(some)), str(sum(row["proved"] for row in some))))
     columns = ("the sweep says that", "networks", "proved")
     return [_Part("", columns, tuple(rows), f"proof and sweep agree about {good} of {len(report['rows'])} networks")]
