@@ -345,7 +345,7 @@ class _Runner:
 
         builtins.__seen__ = seen  # type: ignore[attr-defined]
         telling(self.module)
-        for item, after in itertools.pairwise([*session.items, None]):  # noqa: B007
+        for item, after in itertools.pairwise([*session.items, None]):
             begin = time.process_time()
             if failed := _fails(item, after):
                 return {}, {}, failed

@@ -6,12 +6,12 @@ from fractions import Fraction
 import msgspec
 import numpy as np
 import pytest
-from worlds import SOFT, SOFT_NETWORK, STIFF
+from worlds import PAIR, SOFT, SOFT_NETWORK, STIFF
 
 from controller import coupling as controller_coupling
 from controller.coupling import Compliance, ComplianceForm, InternalModelForm, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, Network, Spring
-from controller.loop import Loop
+from controller.loop import DelayRange, Loop
 from controller.lti import Lti, rational
 from design import certificate as design_certificate
 from design import spring_damper
@@ -381,6 +381,22 @@ def test_what_is_no_regular_file_or_too_large_is_one_line(tmp_path):
     os.truncate(tmp_path / "large.json", 50_000_001)
     with pytest.raises(InputError, match=r"large\.json: is larger than 50 MB"):
         load(tmp_path / "large.json")
+
+
+# time
+
+
+def test_exact_arithmetic_that_takes_too_long_is_given_up_in_one_line(monkeypatch):
+    stored = certified(PAIR, STIFF, "this-environment")
+    monkeypatch.setattr(design_certificate, "_LONGEST", 0.0)
+    monkeypatch.setattr("controller.loop._exactly", [(None,) * 4, None])  # what an earlier proof has built
+    words = "exact arithmetic was given up after 0 s: these are too many digits over many states"
+    with pytest.raises(NotProved, match=words):
+        prove(PAIR, STIFF, "this-environment")
+    assert verify(stored) == Verdict(False, words)
+    with pytest.raises(NotProved, match=words):
+        design_certificate.prove_limiter(PAIR, SpringDamper((3000.0, 2000.0), (0.1, 0.1)))
+    assert words in str(design_certificate.prove_switching(PAIR.switching(DelayRange((1, 2), (1, 3))), SOFT))
 
 
 # bodies that drift
