@@ -289,7 +289,7 @@ def validation_part(question: Validation, findings: Findings, certified: bool, w
         "wall_s": wall,
         "simulated_s_per_s": findings.simulated / wall,
     }
-    if certified and question.ticks and question.scenario.latency is None:  # it knows positions at ticks only
+    if certified and question.ticks:
         part["energy_audit"] = _energy(question, findings)
         part["holds"] = part["holds"] and part["energy_audit"]["holds"]
     if not findings.index.size:
