@@ -15,8 +15,6 @@ import scipy
 
 from controller.coupling import (
     Coupling,
-    MovingAverage,
-    SpringDamper,
 )
 from controller.delay import delay
 from controller.environment import Member, inside
@@ -586,8 +584,8 @@ def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None)
     if loop.environment.walls and any(loop.psi):
         reason = "with delay in the environment its multiplier is of a linear one: no walls"
         return refusal("any-environment", loop.delta, reason)
-    if isinstance(coupling, SpringDamper | MovingAverage) and not any(loop.psi):
-        return any_environment_per_channel(coupling.channels(loop.T), loop.theta, loop.delta, loop.T_max)
+    if (channels := coupling.channels(loop.T)) and not any(loop.psi):
+        return any_environment_per_channel(channels, loop.theta, loop.delta, loop.T_max)
     V = coupling.compliance(loop.T)
     if V is None:
         return refusal("any-environment", loop.delta, no_compliance(coupling))

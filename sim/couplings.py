@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, MovingAverage, NoCoupling
+from controller.coupling import Coupling, NoCoupling
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design.certificate import assess, verify
@@ -118,7 +118,7 @@ def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
     if len(stored.loop.delta) != channels:
         raise InputError(f"{path} couples {len(stored.loop.delta)} channels, the loop has {channels}")
     coupling = stored.coupling.build(T)
-    if isinstance(coupling, Compliance | MovingAverage | InternalModel | ForceFilter) and stored.loop.T != T:
+    if coupling.one_period and stored.loop.T != T:
         raise InputError(f"{path}: its coefficients are for T = {stored.loop.T:g} s, the loop has {T:g} s")
     return coupling
 
