@@ -1,6 +1,8 @@
 """Periods that vary and forces that latch within them: engines against each other and against expm, by hand."""
 
+import gc
 import json
+import weakref
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from controller.timing import Periods, Timing
 from design.files import InputError
 from models.scene import plant
 from sim import load, uneven
+from sim.engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine
 from sim.run import assemble, make_engine, run
 from sim.stability import close, dominant_mode
 
@@ -177,3 +180,20 @@ def test_the_positions_at_the_latch_are_those_of_the_engine():
     whole = np.zeros((3, 3))
     whole[:2, :2], whole[:2, 2] = A[0], [0.0, -5.0]
     assert seen[0, 0] @ xi == pytest.approx((expm(whole * 3e-4) @ xi)[0], rel=1e-12)
+
+
+@pytest.mark.parametrize("timed", [True, False])
+@pytest.mark.parametrize("integrator", [EXPONENTIAL, "RK4"])
+def test_no_cycle_keeps_an_engine(integrator, timed):
+    """The last reference frees a batch, a MiB for every 125 hands: nothing waits for the collector."""
+    simulation = assemble(PAIR.replace(period=DRAWN, latency=LATE) if timed else PAIR, SOFT)
+    gc.disable()
+    try:
+        for make in (MujocoEngine, MujocoBatchEngine):
+            engine = make(simulation.scene, simulation.scenario.T, integrator, timing=simulation.timing)
+            run(simulation, engine, ticks=3)
+            kept = weakref.ref(engine._access)  # all that holds MuJoCo's memory
+            del engine
+            assert kept() is None
+    finally:
+        gc.enable()
