@@ -240,4 +240,3 @@ def test_no_cycle_keeps_an_engine(integrator, timed):
             assert kept() is None
     finally:
         gc.enable()
-
