@@ -70,7 +70,7 @@ def main(argv: list[str]) -> int:
         link = measured_link(args, ages, scenario.T)
         return [chirp(scenario.channels, scenario.T, link, force, (low, high), seconds)]
 
-    played = 2.5 * seconds + 0.1  # from full gain on: the lead has the ramp
+    played = chirp(1, scenario.T, 1, force, (low, high), seconds).seconds - 0.2  # the lead has the ramp
     live = hold_session(args, session, plan, played, seed, out, nobody=True, coulomb=coulomb)
     report, estimates = _identified(session, recorder, scenario, live.dropped, float(args.pace))
     report["files"] = [str(p) for p in _save(out, session, recorder, scenario, estimates, report)]
