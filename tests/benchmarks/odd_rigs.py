@@ -108,7 +108,7 @@ def rigs(seed: int = 7) -> list[Rig]:
     return found
 
 
-def records(many: list[Rig], signal: Array, seed: int = 3) -> Array:
+def records(many: list[Rig], signal: Array, seed: int = 3, substeps: int = SUBSTEPS) -> Array:
     """Encoder positions (ticks, rigs) [m] under the motors' forces `signal` (ticks,) [N]."""
 
     def of(name: str) -> Array:
@@ -124,15 +124,15 @@ def records(many: list[Rig], signal: Array, seed: int = 3) -> Array:
     draw = np.random.default_rng(seed)
     origin, phase = draw.uniform(size=len(many)), draw.uniform(0, 2 * np.pi, (2, len(many)))
     x, v, y, w, z, felt = (np.zeros(len(many)) for _ in range(6))
-    h, out, before = T / SUBSTEPS, np.zeros((len(signal), len(many))), 0.0
+    h, out, before = T / substeps, np.zeros((len(signal), len(many))), 0.0
     dahl = bristle > 0
     for n, force in enumerate(signal):
         seen = x + eccentric * np.sin(2 * np.pi * x / turn + phase[0])
         out[n] = step * np.round(seen / step + origin)
         shake = tremor * np.sin(2 * np.pi * 9.3 * n * T) * (1 + np.sin(2 * np.pi * 0.7 * n * T))
         outside = constant + drift * n * T
-        for i in range(SUBSTEPS):
-            now = np.where(i >= late * SUBSTEPS, force, before)
+        for i in range(substeps):
+            now = np.where(i >= late * substeps, force, before)
             felt = np.where(lag > 0, felt + (now - felt) * -np.expm1(-h / np.maximum(lag, 1e-9)), now)
             stretch = x - y
             contact = np.sign(stretch) * np.maximum(np.abs(stretch) - gap / 2, 0.0)
