@@ -19,6 +19,8 @@ from controller.lti import Array
 from hw.friction import Friction
 from hw.identify import chirp, identify
 
+#: what the fit of before, one mass and Coulomb friction by output error, made of these; "none" of all others
+EARLIER = {"coulomb 0.05, slip 0.02": "3.5 % above", "hand (0.01, 0.1, 20.0)": "7 to 17 % above"}
 T, SUBSTEPS, FORCE_STEP = 1.2e-3, 24, 4e-4
 BASE = ("viscous", "mass", "motor", "spring", "step")
 
@@ -177,12 +179,13 @@ def main() -> None:
         results = list(pool.map(judged, many, x.T, [signal] * len(many)))
     off, longest = [], max(seconds for _, seconds in results)
     for i, (rig, (found, _)) in enumerate(zip(many, results, strict=True), start=1):
+        before = "" if rig.name.startswith("mixed") else f" (earlier: {EARLIER.get(rig.name, 'none')})"
         if isinstance(found, str):
-            print(f"{i:2d} {rig.name}: none: {found}")
+            print(f"{i:2d} {rig.name}: none: {found}{before}")
             continue
         off.append(100 * (found.delta / rig.viscous - 1))
         b = 100 * (found.viscous / rig.viscous - 1)
-        print(f"{i:2d} {rig.name}: {rig.viscous:.3f} N s/m, b {b:+.2f} %, bound {off[-1]:+.2f} %")
+        print(f"{i:2d} {rig.name}: {rig.viscous:.3f} N s/m, b {b:+.2f} %, bound {off[-1]:+.2f} %{before}")
     above, near = sum(part > 0 for part in off), sum(-10 <= part <= 0 for part in off)
     print(f"{len(many)} rigs: {len(off)} bounds, {above} above the truth, {near} within 10 % below it")
     print(f"median {np.median(off):.2f} %, least {min(off):.1f} %; {longest:.1f} s for the slowest")
