@@ -41,11 +41,11 @@ from sim.scenario import InputError, Scenario, require_constant_delay, require_e
 
 _LIMITS = (
     "The bound is a statement about this record: the least viscous friction of all laws that fit it, less its scatter "
-    "between parts of the record (95 %), a part for what is left unexplained and 0.5 % for the encoder's scale. It does "
-    "not see friction that changes with temperature or wear, nor that of a handle behind its transmission apart from the motor's. A hand that rests "
-    "on the handle springs it, and from 5 N/m on is refused; one that only damps cannot be told from the device. Dry "
-    "friction is left out of delta: it dissipates too, but ever less than a viscous damper as speed grows. Lag of the "
-    "amplifier is not in delta: it belongs to the delay."
+    "between parts of the record (95 %), a part for what is left unexplained and 0.5 % for the encoder's scale. It "
+    "does not see friction that changes with temperature or wear, nor that of a handle behind its transmission apart "
+    "from the motor's. A hand that rests on the handle springs it, and from 5 N/m on is refused; one that only damps "
+    "cannot be told from the device. Dry friction is left out of delta: it dissipates too, but ever less than a "
+    "viscous damper as speed grows. Lag of the amplifier is not in delta: it belongs to the delay."
 )
 
 
