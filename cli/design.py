@@ -41,7 +41,7 @@ def main(argv: list[str]) -> int:
         raise InputError("--samples without ranges: give --ranges, or a scenario with [box]")
     design = _design(args, loop)
     best = design if isinstance(design, Optimal) else None
-    held = best and best.certificate
+    held = design.certificate
     requirements = assess(loop, design.coupling, design.phi, held)
     with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:
         whole = check_set(
@@ -54,7 +54,10 @@ def main(argv: list[str]) -> int:
             held,
         )
     certificates = report.certificates_part(requirements)
-    limits = Limits(None, "as asked") if args.limiter is False else covered_limits(loop, design.coupling, requirements)
+    if args.limiter is False:
+        limits = Limits(None, "as asked")
+    else:
+        limits = covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None)
     outcome = {
         "case": args.case,
         "seed": args.seed,
@@ -333,7 +336,7 @@ def _store(
 
 def _proved(loop: Loop, design: Design, limiter: LimiterCertificate | None) -> tuple[Certificate | None, str | None]:
     """The certificate of all that the loop claims, or why there is none."""
-    held = design.certificate if isinstance(design, Optimal) else None
+    held = design.certificate
     if held and held.scenario == digest(loop, design.coupling.form()):
         return held, None
     try:

@@ -42,7 +42,7 @@ def main(argv: list[str]) -> int:
     with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:
         whole = check_set(loop, chosen.coupling, args.seed, progress=move)
         requirements = assess(simulated.loop(args.case), chosen.coupling, chosen.phi)
-        limits = limits_of(simulated, chosen.coupling, requirements, args.limiter)
+        limits = limits_of(simulated, chosen, requirements, args.limiter)
     done = _run(args, simulated, chosen, limits.rho)
     outcome = {
         "case": args.case,

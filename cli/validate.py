@@ -44,7 +44,7 @@ def main(argv: list[str]) -> int:
     guarantee = guarantee_of(requirements, loop, proved)
     certified = guarantee is not None and (not environments or guarantee == ANY or proved)
 
-    limits = limits_of(scenario, chosen.coupling, requirements, args.limiter)
+    limits = limits_of(scenario, chosen, requirements, args.limiter)
     question = _question(args, scenario, chosen, environments, limits.rho)
     findings, wall = _findings(args, question, Table(question, out, args.resume))
     outcome = {

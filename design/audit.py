@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from typing import Any, cast, get_args
@@ -13,12 +13,7 @@ import msgspec
 import numpy as np
 
 from controller.coupling import (
-    Compliance,
     Coupling,
-    ForceFilter,
-    InternalModel,
-    MovingAverage,
-    NoCoupling,
     SpringDamper,
 )
 from controller.environment import RIGID_WALL
@@ -56,10 +51,8 @@ def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any
 
 def _at_period(loop: Loop, coupling: Coupling, condition: Condition, T: float) -> Requirement:
     """The same with the gains, or coefficients, and the delays in samples at another T [s]."""
-    if isinstance(coupling, Compliance):
-        coupling = Compliance(replace(coupling.V, T=T))
     longest = loop.T_max and loop.T_max * (T / loop.T)  # periods vary in proportion
-    return _varied(loop, coupling, condition, T=T, T_max=longest)
+    return _varied(loop, coupling.at_period(T), condition, T=T, T_max=longest)
 
 
 def check_loop(loop: Loop) -> None:
@@ -274,16 +267,6 @@ def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], s
     return _Remedy(describe(best), needs(best))
 
 
-_KINDS = {
-    NoCoupling: "none",
-    SpringDamper: "spring-damper",
-    MovingAverage: "moving-average",
-    Compliance: "compliance",
-    InternalModel: "internal-model",
-    ForceFilter: "force-filter",
-}
-
-
 def report(
     loop: Loop,
     coupling: Coupling,
@@ -302,12 +285,12 @@ def report(
     here = requirements["this-environment"].certified
     proved = bool(whole and whole.proved)
     guaranteed = guarantee_of(requirements, loop, proved)
-    gains = coupling if isinstance(coupling, SpringDamper) else None
+    figures = coupling.figures(loop.T)
     return {
         "coupling": {
-            "kind": _KINDS[type(coupling)],
-            "K": gains.K.tolist() if gains else None,
-            "B": gains.B.tolist() if gains else None,
+            "kind": coupling.kind,
+            "K": figures.get("K"),
+            "B": figures.get("B"),
         },
         "loop": {
             "T_s": loop.T,

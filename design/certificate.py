@@ -15,8 +15,6 @@ import scipy
 
 from controller.coupling import (
     Coupling,
-    MovingAverage,
-    SpringDamper,
 )
 from controller.delay import delay
 from controller.environment import Member, inside
@@ -171,27 +169,24 @@ def _limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: Lags
     return demand.gain + demand.free
 
 
-def _refuted_limiter(loop: Loop, coupling: Coupling, certificate: Certificate) -> str | None:
-    """Why what is on file does not prove the limited loop, or None if it does or claims nothing."""
-    proof = certificate.limiter
-    if proof is msgspec.UNSET:
-        return None
-    if certificate.condition != "this-environment":
-        return "limiter: any-environment needs no proof of its own, and one is on file"
+def check_limiter(loop: Loop, coupling: Coupling, proof: LimiterCertificate) -> Requirement:
+    """What the limiter on file asks of the devices, proved again. Raises NotProved where the file does not prove it."""
     if reason := limiter_refusal(loop):
-        return reason
+        raise NotProved(reason)
     if any(not (0 <= v < math.inf) for v in (*proof.rho, *(v for row in proof.c for v in row))):
-        return "limiter: rho and c must be numbers >= 0"
+        raise NotProved("limiter: rho and c must be numbers >= 0")
     if proof.rho != limiter_lag(loop.delta, loop.T, proof.beta) or len(proof.c) != loop.channels:
-        return f"limiter: rho is {list(proof.rho)}, expected beta delta/T with beta = {proof.beta:g}, one row of c each"
-    found = limiter_requirement(loop, coupling, proof.beta, proof.c)
-    required = found.requirement.required
+        expected = f"expected beta delta/T with beta = {proof.beta:g}, one row of c each"
+        raise NotProved(f"limiter: rho is {list(proof.rho)}, {expected}")
+    found = limiter_requirement(loop, coupling, proof.beta, proof.c).requirement
+    required = found.required
     if len(proof.required) != len(required) or not np.allclose(proof.required, required, rtol=_CLAIM_TOLERANCE):
-        return f"limiter: required is {list(proof.required)}, the sweep finds {list(required)}"
-    if not np.isclose(proof.margin, _margin(found.requirement), rtol=_CLAIM_TOLERANCE):
-        return f"limiter: margin is {proof.margin:.9g}, the sweep finds {_margin(found.requirement):.9g}"
-    reason = refuted_rows("P", _limiter_block(loop, coupling, proof.rho, proof.c), proof.P)
-    return reason and f"limiter: {reason}"
+        raise NotProved(f"limiter: required is {list(proof.required)}, the sweep finds {list(required)}")
+    if not np.isclose(proof.margin, _margin(found), rtol=_CLAIM_TOLERANCE):
+        raise NotProved(f"limiter: margin is {proof.margin:.9g}, the sweep finds {_margin(found):.9g}")
+    if reason := refuted_rows("P", _limiter_block(loop, coupling, proof.rho, proof.c), proof.P):
+        raise NotProved(f"limiter: {reason}")
+    return replace(found, proof="rational")
 
 
 def switching_requirement(loop: Loop, coupling: Coupling) -> JitterProof:
@@ -525,7 +520,11 @@ def _refuted_proof(loop: Loop, coupling: Coupling, certificate: Certificate) -> 
     for name, real in blocks.items():
         if reason := refuted_rows(name, real, certificate.matrices[name]):
             return f"{_place_certificate(loop, certificate.condition, name)}{reason}"
-    return refuted(loop, coupling, certificate.switching) or _refuted_limiter(loop, coupling, certificate)
+    if certificate.limiter is not msgspec.UNSET:
+        if certificate.condition != "this-environment":
+            return "limiter: any-environment needs no proof of its own, and one is on file"
+        check_limiter(loop, coupling, certificate.limiter)
+    return refuted(loop, coupling, certificate.switching)
 
 
 def _multiplier_name(loop: Loop, condition: Condition) -> str:
@@ -585,8 +584,8 @@ def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None)
     if loop.environment.walls and any(loop.psi):
         reason = "with delay in the environment its multiplier is of a linear one: no walls"
         return refusal("any-environment", loop.delta, reason)
-    if isinstance(coupling, SpringDamper | MovingAverage) and not any(loop.psi):
-        return any_environment_per_channel(coupling.channels(loop.T), loop.theta, loop.delta, loop.T_max)
+    if (channels := coupling.channels(loop.T)) and not any(loop.psi):
+        return any_environment_per_channel(channels, loop.theta, loop.delta, loop.T_max)
     V = coupling.compliance(loop.T)
     if V is None:
         return refusal("any-environment", loop.delta, no_compliance(coupling))

@@ -11,13 +11,15 @@ from controller.delay import delay
 from controller.environment import Member, environment
 from controller.loop import DelayRange, Loop, force_map
 from controller.lti import Lti
-from design.certificate import SetCheck, prove_limiter
+from design.certificate import SetCheck, check_limiter, prove_limiter
 from design.conditions import this_environment
 from design.environments import SEARCH, Searched, worst
-from design.multipliers import JitterProof, limiter_refusal, limiter_requirement
+from design.multipliers import BETA, JitterProof, limiter_refusal, limiter_requirement
 from design.result import NotProved, Requirement, certificate_part, finite
 from design.stored import LimiterCertificate
 from design.transparency import decibels, transparency
+
+_OWN_PROOF = "by a proof of its own, for this environment"
 
 
 @dataclass(frozen=True)
@@ -57,30 +59,37 @@ class Limits:
         }
 
 
-def covered_limits(loop: Loop, coupling: Coupling, requirements: Mapping[str, Requirement]) -> Limits:
-    """The limiter that a coupling may have: of no lag under any-environment, else that of its own condition."""
+def covered_limits(
+    loop: Loop, coupling: Coupling, requirements: Mapping[str, Requirement], proof: LimiterCertificate | None = None
+) -> Limits:
+    """The limiter that a coupling may have: of no lag under any-environment, else that of its own condition.
+
+    With `proof`, which the coupling comes with, it is the limiter of that proof; in a loop for which it is none, the
+    one of the same beta.
+    """
     if loop.jitter:
         return Limits(None, str(limiter_refusal(loop)))
     if requirements["any-environment"].certified and not any(loop.psi):
         return Limits((0.0,) * loop.channels, "any-environment covers limited forces")
     if not requirements["this-environment"].certified:
         return Limits(None, "no guarantee that it could extend")
-    found = limiter_requirement(loop, coupling)
+    if proof:
+        try:
+            requirement = check_limiter(loop, coupling, proof)
+            return Limits(proof.rho, _OWN_PROOF, requirement, proof.c, proof)
+        except NotProved:  # made for another loop
+            pass
+    beta = proof.beta if proof and 0 < proof.beta <= 1 else BETA
+    found = limiter_requirement(loop, coupling, beta)
     requirement = found.requirement
     if not requirement.certified:
         needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
         return Limits(None, requirement.reason or needs, requirement, found.c)
     try:
-        proved = prove_limiter(loop, coupling, c=found.c)
+        proved = prove_limiter(loop, coupling, beta, found.c)
     except NotProved as refused:
         return Limits(found.rho, f"swept, not proved: {refused}", requirement, found.c)
-    return Limits(
-        found.rho,
-        "by a proof of its own, for this environment",
-        replace(requirement, proof="rational"),
-        found.c,
-        proved,
-    )
+    return Limits(found.rho, _OWN_PROOF, replace(requirement, proof="rational"), found.c, proved)
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.coupling import Coupling, ForceFilter, InternalModel
+from controller.coupling import Coupling
 from controller.loop import DelayRange, Loop
 from design.conditions import encoder_friction
 from design.result import Requirement, finite
@@ -94,6 +94,6 @@ LATE = "a latency of a fraction of a sample is derived for this environment only
 
 def no_compliance(coupling: Coupling) -> str:
     """Why Theorem 4 has nothing to say of a coupling that is no V of its own."""
-    if isinstance(coupling, InternalModel | ForceFilter):
+    if coupling.holds_model:
         return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
     return "without a coupling there is nothing that Theorem 4 could use"

@@ -122,7 +122,7 @@ def _alternative(scenario: Scenario, case: str, kind: str, condition: str | None
         return Alternative(kind, condition, reason=str(error))
     loop = scenario.loop(case)
     requirements = assess(loop, chosen.coupling, chosen.phi)
-    simulation = assemble(scenario, chosen.coupling, limits_of(scenario, chosen.coupling, requirements).rho)
+    simulation = assemble(scenario, chosen.coupling, limits_of(scenario, chosen, requirements).rho)
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)
     made = Alternative(

@@ -121,9 +121,24 @@ def _latched(held: Callable[[float], HeldPlant], T: float, late: Sequence[float]
     A, B = np.zeros((*many, n + m, n + m)), np.zeros((*many, n + m, inputs))
     A[..., :n, :n], B[..., :n, :w], B[..., n:, w:] = whole.A, whole.B[..., :w], np.eye(m)
     for i, tau in enumerate(late):
-        B[..., :n, w + i] = held(T - tau).B[..., w + i]
+        if tau < T:
+            B[..., :n, w + i] = held(T - tau).B[..., w + i]
     A[..., :n, n:] = whole.B[..., w:] - B[..., :n, w:]
     return HeldPlant(A, B, np.pad(whole.C, ((0, 0), (0, m))), T)
+
+
+def at_the_latch(plant: Plant, late: Sequence[float]) -> Array:
+    """[s; forces held; w; f] of a tick to where each device is when its own force latches, (..., m, entries)."""
+    *many, n, inputs = plant.B.shape
+    m = len(late)
+    rows = np.zeros((*many, m, n + m + inputs))
+    for i, tau in enumerate(late):
+        if tau == 0:
+            rows[..., i, :n] = plant.C[i]
+            continue
+        held = hold(plant, tau, [min(other, tau) for other in late])  # the forces that latch before act by then
+        rows[..., i, :] = held.C[i] @ np.concatenate([held.A, held.B], axis=-1)
+    return rows
 
 
 class ExactEngine:

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, MovingAverage, SpringDamper
+from controller.coupling import Coupling
 from controller.delay import LOST, Jitter, Ticks, ages
 from controller.lti import Array
 from controller.timing import Timing
@@ -40,19 +40,7 @@ def certificates_part(requirements: Mapping[str, Requirement]) -> dict[str, Any]
 
 def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
     """Kind, gains (None where it has none) and order of V, Q or R."""
-    part: dict[str, Any] = {"kind": kind, "K": None, "B": None, "order": 0}
-    match coupling:
-        case SpringDamper(K=K, B=B):
-            part |= {"K": K.tolist(), "B": B.tolist(), "order": coupling.compliance(T).order}
-        case MovingAverage():
-            part |= {"stiffness": coupling.stiffness.tolist(), "order": coupling.compliance(T).order}
-        case Compliance(V=V):
-            part["order"] = V.order
-        case InternalModel():
-            part["order"] = coupling.parameter(T).order
-        case ForceFilter():
-            part["order"] = coupling.filter(T).order
-    return part
+    return {"kind": kind, "K": None, "B": None} | coupling.figures(T)
 
 
 def transparency_part(figures: Transparency) -> dict[str, Any]:
@@ -301,7 +289,7 @@ def validation_part(question: Validation, findings: Findings, certified: bool, w
         "wall_s": wall,
         "simulated_s_per_s": findings.simulated / wall,
     }
-    if certified and question.ticks and question.scenario.latency is None:  # it knows positions at ticks only
+    if certified and question.ticks:
         part["energy_audit"] = _energy(question, findings)
         part["holds"] = part["holds"] and part["energy_audit"]["holds"]
     if not findings.index.size:
