@@ -511,7 +511,7 @@ def _save(args: argparse.Namespace, drawn: Map, outcome: dict[str, Any], out: Pa
     """The table and the picture."""
     files = [_save_csv(drawn, out / "map.csv")]
     if not args.no_plot:
-        from sim.plots import plot_zwidth
+        from sim.map_plot import plot_zwidth
 
         files.append(plot_zwidth(drawn, outcome, out / "zwidth.png"))
     return files
