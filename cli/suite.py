@@ -18,7 +18,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from importlib import import_module
 from importlib.metadata import version
 from io import StringIO
@@ -473,20 +473,18 @@ CHECKS = (
 
 @dataclass(frozen=True)
 class _Answer:
-    """What a check found. Its files are in the folder of its name."""
+    """What a check found, as the report has it. Its files are in the folder of its name."""
 
-    check: Check
+    name: str
+    asks: str
     command: str
-    code: int | None  # the command's exit code; None where it broke off with `trouble`
+    exit_code: int | None  # the command's; None where it broke off with `trouble`
+    holds: bool
+    trouble: str | None
     wall_s: float
-    parts: tuple[_Part, ...] = ()
-    pictures: tuple[str, ...] = ()  # paths from the report's folder
-    trouble: str | None = None
-    report: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def holds(self) -> bool:
-        return self.code == options.DONE
+    parts: tuple[_Part, ...]
+    pictures: tuple[str, ...]  # paths from the report's folder
+    report: dict[str, Any]
 
 
 def ask(check: Check, out: Path, humans: int, seed: int) -> _Answer:
@@ -504,7 +502,8 @@ def ask(check: Check, out: Path, humans: int, seed: int) -> _Answer:
     report = json.loads(written.read_text()) if written.exists() else {}
     parts = tuple(check.figures(report)) if report else ()
     pictures = tuple(path.relative_to(out).as_posix() for path in sorted(place.glob("*.png")))
-    return _Answer(check, f"python -m {command}", code, wall, parts, pictures, trouble, report)
+    holds = code == options.DONE
+    return _Answer(check.name, check.asks, f"python -m {command}", code, holds, trouble, wall, parts, pictures, report)
 
 
 def _called(command: str, place: Path) -> int:
@@ -553,11 +552,11 @@ def main(argv: list[str]) -> int:
             interrupted = True
             break
         screen.print(f"{_verdict(answers[-1])} ({answers[-1].wall_s:.1f} s)")
-        if interrupted := answers[-1].code == options.INTERRUPTED:
+        if interrupted := answers[-1].exit_code == options.INTERRUPTED:
             break
     outcome = {
         "holds": len(answers) == len(checks) and all(answer.holds for answer in answers),
-        "checks": [_part(answer) for answer in answers],
+        "checks": [asdict(answer) for answer in answers],
         "left_out": [check.name for check in checks[len(answers) :]],
         "humans": args.humans,
         "seed": args.seed,
@@ -603,7 +602,7 @@ def _chosen(args: argparse.Namespace) -> list[Check]:
 
 
 def _verdict(answer: _Answer) -> str:
-    if answer.code == options.INTERRUPTED:
+    if answer.exit_code == options.INTERRUPTED:
         return "[yellow]interrupted[/]"
     return "[green]holds[/]" if answer.holds else f"[red]{answer.trouble or 'does not hold'}[/]"
 
@@ -612,21 +611,6 @@ def _show(answer: _Answer, screen: render.Screen) -> None:
     """The figures of a check that was asked for alone."""
     for part in answer.parts:
         screen.print(render.grid(part.title, part.columns, part.rows, left=range(len(part.columns))))
-
-
-def _part(answer: _Answer) -> _Row:
-    return {
-        "name": answer.check.name,
-        "asks": answer.check.asks,
-        "command": answer.command,
-        "exit_code": answer.code,
-        "holds": answer.holds,
-        "trouble": answer.trouble,
-        "wall_s": answer.wall_s,
-        "parts": [asdict(part) for part in answer.parts],
-        "pictures": list(answer.pictures),
-        "report": answer.report,
-    }
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import platform
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -15,8 +15,6 @@ import scipy
 
 from controller.coupling import (
     Coupling,
-    MovingAverage,
-    SpringDamper,
 )
 from controller.delay import delay
 from controller.environment import Member, inside
@@ -32,15 +30,15 @@ from design.conditions import (
     this_environment,
     this_environment_demand,
 )
-from design.environments import Progress, Searched, in_each, search_box, worst
+from design.environments import Progress, Searched, in_each, search_ranges, worst
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
 from design.frequency import frequencies, on_circle, rounding
 from design.guarantees import LATE, making_covered, no_compliance, switching_guarantee
 from design.multipliers import (
     BETA,
     WALL_MULTIPLIER,
-    JitterProof,
     Lags,
+    SwitchingSweep,
     limiter_demand,
     limiter_lag,
     limiter_refusal,
@@ -51,7 +49,7 @@ from design.multipliers import (
     walls_of,
 )
 from design.result import Condition, NotProved, Requirement, refusal
-from design.stored import Certificate, LimiterCertificate, Stored, SwitchingProof, digest, sealed
+from design.stored import Certificate, Guarantee, LimiterCertificate, Stored, SwitchingProof, digest, sealed
 
 # ----------------------------------------------------------------------------------------------------
 # An exact proof that no switching of the delays within a loop's range is dangerous: made, stored, proved again.
@@ -91,10 +89,10 @@ def storage(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Matrix | 
 
 def refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof | msgspec.UnsetType) -> str | None:
     """Why what is on file does not prove that the delays may switch within the loop's range, or None if it does."""
-    if loop.jitter is None:
+    if loop.varying_delay is None:
         return None if proof is msgspec.UNSET else "a proof for switching delays, but the loop's delays are constant"
     reason = "no proof is on file" if proof is msgspec.UNSET else _refuted(loop, coupling, proof)
-    return reason and f"{switching_guarantee(loop.jitter)}: {reason}"
+    return reason and f"{switching_guarantee(loop.varying_delay)}: {reason}"
 
 
 def _refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof) -> str | None:
@@ -141,7 +139,7 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
         return None
     if certificate.limiter is not msgspec.UNSET:
         return certificate.limiter.rho
-    covered = certificate.condition == "any-environment" and not any(loop.psi) and loop.jitter is None
+    covered = certificate.condition == "any-environment" and not any(loop.psi) and loop.varying_delay is None
     return (0.0,) * loop.channels if covered else None
 
 
@@ -191,8 +189,8 @@ def check_limiter(loop: Loop, coupling: Coupling, proof: LimiterCertificate) -> 
     return replace(found, proof="rational")
 
 
-def switching_requirement(loop: Loop, coupling: Coupling) -> JitterProof:
-    """The damping that switching within loop.jitter asks; `proof` is "rational" where exact arithmetic confirms it."""
+def switching_requirement(loop: Loop, coupling: Coupling) -> SwitchingSweep:
+    """The damping that switching in loop.varying_delay asks; `proof` is "rational" where it is proved exactly."""
     found = swept(loop, coupling)
     if not found.requirement.certified or not isinstance(storage(loop, coupling, found.alpha), Matrix):
         return found
@@ -218,7 +216,7 @@ def switching_requirement(loop: Loop, coupling: Coupling) -> JitterProof:
 # passive because every parameter of the network is non-negative (the Network type refuses others), so
 # Phi = 0 satisfies Lemma 4, whatever the environment.
 #
-# With a box around the environment the same is proved for the environment (P) and for every vertex (P1, P2, ..);
+# With ranges around the environment the same is proved for the environment (P) and for every vertex (P1, P2, ..);
 # nothing is proved of the environments in between, or of one that changes.
 #
 # A loop whose delays may switch within a range carries a second proof, of any switching.
@@ -257,7 +255,7 @@ def prove(
         needed = ", ".join(f"{d:.6g}" for d in requirement.required)
         have = ", ".join(f"{d:.6g}" for d in requirement.available)
         reason = requirement.reason or f"needs {needed} N s/m of damping, has {have}"
-        place = f"P{worst(in_each(loop, coupling, loop.members()))}" if loop.box else "P"
+        place = f"P{worst(in_each(loop, coupling, loop.members()))}" if loop.ranges else "P"
         raise NotProved(f"{_place_certificate(loop, condition, place)}{reason}", requirement)
     if reason := _another_system(loop, coupling):
         raise NotProved(reason, requirement)
@@ -290,7 +288,7 @@ def prove(
 
 #: More delays, states or digits than these are not looked at: a proof would take minutes.
 _MOST_BITS = 400  # of the denominator of a coefficient: a decimal of 120 places
-_MOST_COST = 8  # environments of a set, each as many as LARGEST states are
+_MOST_COST = 8  # environments of ranges, each as many as LARGEST states are
 
 
 def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:
@@ -347,11 +345,11 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
 
 def _switching(loop: Loop, coupling: Coupling, requirement: Requirement) -> SwitchingProof | msgspec.UnsetType:
     """The proof that the delays may switch, of a loop with a range of them. Raises NotProved."""
-    if loop.jitter is None:
+    if loop.varying_delay is None:
         return msgspec.UNSET
     proof = prove_switching(loop, coupling)
     if isinstance(proof, str):
-        raise NotProved(f"{switching_guarantee(loop.jitter)}: {proof}", requirement)
+        raise NotProved(f"{switching_guarantee(loop.varying_delay)}: {proof}", requirement)
     return proof
 
 
@@ -418,16 +416,16 @@ def _walls_block(loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Lti:
     return demand.gain + demand.free
 
 
-def _guarantee(loop: Loop, condition: Condition) -> Literal["any passive environment", "a set", "this environment"]:
+def _guarantee(loop: Loop, condition: Condition) -> Guarantee:
     if condition == "any-environment":
         return "this environment" if any(loop.psi) else "any passive environment"
-    # proved at every vertex; whether it is kept between them is searched by check_set and design.check
-    return "a set" if loop.box else "this environment"
+    # proved at every vertex; whether it is kept between them is searched by check_ranges and design.check
+    return "these ranges" if loop.ranges else "this environment"
 
 
 def _place_certificate(loop: Loop, condition: Condition, matrix: str) -> str:
-    """Which member of a set the matrix P, P1, P2, .. is about, as the beginning of a message."""
-    if loop.box is None or condition == "any-environment":
+    """Which member of the ranges the matrix P, P1, P2, .. is about, as the beginning of a message."""
+    if loop.ranges is None or condition == "any-environment":
         return ""
     return f"{loop.members()[int(matrix[1:] or 0)].name}: "
 
@@ -586,8 +584,8 @@ def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None)
     if loop.environment.walls and any(loop.psi):
         reason = "with delay in the environment its multiplier is of a linear one: no walls"
         return refusal("any-environment", loop.delta, reason)
-    if isinstance(coupling, SpringDamper | MovingAverage) and not any(loop.psi):
-        return any_environment_per_channel(coupling.channels(loop.T), loop.theta, loop.delta, loop.T_max)
+    if (channels := coupling.channels(loop.T)) and not any(loop.psi):
+        return any_environment_per_channel(channels, loop.theta, loop.delta, loop.T_max)
     V = coupling.compliance(loop.T)
     if V is None:
         return refusal("any-environment", loop.delta, no_compliance(coupling))
@@ -615,12 +613,12 @@ def _proved(loop: Loop, coupling: Coupling, requirement: Requirement, phi: Array
     return replace(requirement, proof="rational")
 
 
-SAMPLES = 64  # environments drawn evenly from inside the box, beside what the search looks at
+SAMPLES = 64  # environments drawn evenly from inside the ranges, beside what the search looks at
 
 
 @dataclass(frozen=True, eq=False)
-class SetCheck:
-    """The this-environment condition over a box. `members` and `at_members` are the environment and the vertices."""
+class RangesCheck:
+    """The this-environment condition over ranges. `members` and `at_members` are the environment and the vertices."""
 
     members: tuple[Member, ...]
     at_members: tuple[Requirement, ...]
@@ -629,8 +627,8 @@ class SetCheck:
     searched: Searched
     at_found: Requirement  # at the worst environment that the search has found
     seed: int
-    certificate: Certificate | None  # of the whole set, with the guarantee "a set"
-    reason: str | None  # why the set is not guaranteed
+    certificate: Certificate | None  # of all members, with the guarantee "these ranges"
+    reason: str | None  # why the ranges are not guaranteed
 
     @property
     def proved(self) -> bool:
@@ -652,7 +650,7 @@ class SetCheck:
         return places[i], requirements[i]
 
 
-def check_set(
+def check_ranges(
     loop: Loop,
     coupling: Coupling,
     seed: int = 0,
@@ -660,23 +658,23 @@ def check_set(
     progress: Progress = lambda done, total: None,
     searched: Searched | None = None,
     certificate: Certificate | None = None,
-) -> SetCheck | None:
-    """The coupling over the box of its loop, None where it has none.
+) -> RangesCheck | None:
+    """The coupling over the ranges of its loop, None where it has none.
 
     The search is the same every time; `samples` more points are drawn from inside, from the seed. `searched` and
     `certificate` are those of a design that has made them.
     """
-    if loop.box is None:
+    if loop.ranges is None:
         return None
-    searched = searched or search_box(loop, coupling, progress)
-    members, drawn = loop.members(), inside(loop.network, loop.box, samples, seed)
+    searched = searched or search_ranges(loop, coupling, progress)
+    members, drawn = loop.members(), inside(loop.network, loop.ranges, samples, seed)
     try:
         certificate, reason = certificate or prove(loop, coupling, "this-environment"), None
     except NotProved as error:
         certificate, reason = None, str(error)
     at_members, at_samples = in_each(loop, coupling, members), in_each(loop, coupling, drawn)
     (at_found,) = in_each(loop, coupling, [searched.worst[0].member])
-    check = SetCheck(
+    check = RangesCheck(
         members, tuple(at_members), drawn, tuple(at_samples), searched, at_found, seed, certificate, reason
     )
     if certificate and not check.proved:
@@ -686,6 +684,6 @@ def check_set(
 
 
 def violated_between(place: Member, ratio: float) -> str:
-    """Why a coupling that is proved at every vertex has no guarantee for the set."""
+    """Why a coupling that is proved at every vertex has no guarantee for the ranges."""
     needs = f"{ratio:.4f} of the damping is needed" if np.isfinite(ratio) else "no damping is enough"
     return f"proved at the vertices, but violated between them: {needs} at {place.name}"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.coupling import Coupling, ForceFilter, InternalModel
+from controller.coupling import Coupling
 from controller.loop import DelayRange, Loop
 from design.conditions import encoder_friction
 from design.result import Requirement, finite
@@ -16,7 +16,7 @@ from design.result import Requirement, finite
 # What may be said of a coupling: required against available damping, for which environments, and what is left out.
 
 
-ANY, SET, HERE = "any passive environment", "a set", "this environment"
+ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment"
 
 
 FROZEN = "each frozen contact state of this environment (with ranges, contact that makes and breaks is not covered)"
@@ -39,16 +39,16 @@ def switching_guarantee(span: DelayRange) -> str:
     return f"delays switching within {span}"
 
 
-def guarantee_of(requirements: Mapping[str, Requirement], loop: Loop, whole_set: bool = False) -> str | None:
+def guarantee_of(requirements: Mapping[str, Requirement], loop: Loop, whole_ranges: bool = False) -> str | None:
     """For which environments a coupling is certified, by its requirements; None for none.
 
-    The multiplier that any-environment takes for psi >= 1 is of one environment. `whole_set`: this-environment is
-    proved at every vertex of the loop's box, and a search has found no violation between them.
+    The multiplier that any-environment takes for psi >= 1 is of one environment. `whole_ranges`: this-environment is
+    proved at every vertex of the loop's ranges, and a search has found no violation between them.
     """
     if requirements["any-environment"].certified and not any(loop.psi):
         return ANY
-    if whole_set:
-        return SET
+    if whole_ranges:
+        return RANGES
     if not any(requirement.certified for requirement in requirements.values()):
         return None
     if loop.environment.walls:
@@ -79,12 +79,12 @@ def encoder_part(
 
 
 # ----------------------------------------------------------------------------------------------------
-# A coupling in every environment of a set: what the this-environment condition asks at each vertex of a box.
+# A coupling in every environment of ranges: what the this-environment condition asks at each vertex of ranges.
 
 
 def making_covered(loop: Loop) -> bool:
     """Whether this-environment covers walls that make and break contact: in one environment, not over ranges."""
-    return bool(loop.environment.walls) and not loop.box
+    return bool(loop.environment.walls) and not loop.ranges
 
 
 #: Why any-environment says nothing of forces that latch between ticks.
@@ -93,6 +93,6 @@ LATE = "a latency of a fraction of a sample is derived for this environment only
 
 def no_compliance(coupling: Coupling) -> str:
     """Why Theorem 4 has nothing to say of a coupling that is no V of its own."""
-    if isinstance(coupling, InternalModel | ForceFilter):
+    if coupling.holds_model:
         return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
     return "without a coupling there is nothing that Theorem 4 could use"

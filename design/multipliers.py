@@ -260,22 +260,22 @@ _NEAR, _MOST_PEAKS = 0.3, 8  # of the peaks within 30 % of the highest, so many 
 
 
 @dataclass(frozen=True)
-class JitterProof:
+class SwitchingSweep:
     """What switching within a range asks of the devices."""
 
-    requirement: Requirement  # condition "jitter-proof"
+    requirement: Requirement  # condition "switching"
     alpha: tuple[float, ...]  # (m,) [N/m] the multiplier that shows it, at the available damping; 0 where lo = hi
     bound: float  # no multiplier shows less than this times the available damping (on the frequencies looked at)
 
 
-def jitter_proof(
+def switching_sweep(
     G: Lti,
     lo: Sequence[int],
     hi: Sequence[int],
     delta: Sequence[float],
     alpha: Sequence[float] | None = None,
     T_max: float | None = None,
-) -> JitterProof:
+) -> SwitchingSweep:
     """The least common factor on `delta` [N s/m] with which some multiplier satisfies the condition, and which does.
 
     G is the force map without Theta. The factor is that of the refined sweep (design.frequency.sweep) at the multiplier
@@ -286,20 +286,20 @@ def jitter_proof(
         raise ValueError(f"delays are given for {len(h)} channels, expected {G.inputs}")
     constant = this_environment(nominal(lo, hi, G.T) @ G, delta, T_max)
     if not np.isfinite(constant.ratio):
-        return _jitter_refusal(available, constant.reason or "no constant delay is safe")
+        return _refused(available, constant.reason or "no constant delay is safe")
     damping = even_damping(available, G.T, T_max)
     search, unit = _Search(G, lo, hi, damping), damping / G.T
     given = None if alpha is None else (np.asarray(alpha) / unit)[search.active]
     a, ratio, w, bound = search.least() if given is None else search.only(given)
     multiplier = np.zeros(h.size)
     multiplier[search.active] = a
-    requirement = from_ratio("jitter-proof", max(ratio, 0.0), available, w / (2 * np.pi * G.T))
-    return JitterProof(requirement, tuple((multiplier * unit).tolist()), bound)
+    requirement = from_ratio("switching", max(ratio, 0.0), available, w / (2 * np.pi * G.T))
+    return SwitchingSweep(requirement, tuple((multiplier * unit).tolist()), bound)
 
 
-def _jitter_refusal(available: tuple[float, ...], reason: str) -> JitterProof:
+def _refused(available: tuple[float, ...], reason: str) -> SwitchingSweep:
     """That no damping is enough, and why."""
-    return JitterProof(refusal("jitter-proof", available, reason), (np.inf,) * len(available), np.inf)
+    return SwitchingSweep(refusal("switching", available, reason), (np.inf,) * len(available), np.inf)
 
 
 _Found = tuple[Array, float, float, float]  # a, s(a), where it binds [rad/sample], a lower bound on s over all a
@@ -578,14 +578,14 @@ def nominal(lo: Sequence[int], hi: Sequence[int], T: float) -> Lti:
     return Lti.diag(*(taps(_halves(p, q), T) for p, q in zip(lo, hi, strict=True)))
 
 
-def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) -> JitterProof:
+def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) -> SwitchingSweep:
     """What switching within the loop's range asks, by a sweep; with the multiplier `alpha` [N/m] where it is given."""
     span = loop.delays
     try:
         G = loop.sent(coupling)
     except SingularLoop as error:
-        return _jitter_refusal(loop.delta, str(error))
-    return jitter_proof(G, span.lo, span.hi, loop.delta, alpha, loop.T_max)
+        return _refused(loop.delta, str(error))
+    return switching_sweep(G, span.lo, span.hi, loop.delta, alpha, loop.T_max)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -597,11 +597,11 @@ def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) 
 
 def limiter_refusal(loop: Loop) -> str | None:
     """Why the limiter's own condition has nothing to say of a loop, or None."""
-    if loop.jitter:
+    if loop.varying_delay:
         return "limiter: forces that are limited are proved for constant delays, not for delays that switch"
     if loop.environment.walls:
         return "limiter: with walls only any-environment covers limited forces (no delay in the environment)"
-    if loop.box:
+    if loop.ranges:
         return "limiter: limited forces are proved for one environment, not for ranges"
     if loop.latency:
         return "limiter: limited forces are proved for forces that latch at ticks, not for a latency"
@@ -633,8 +633,8 @@ def walls_of(loop: Loop, coupling: Coupling, g: Sequence[Fraction] | None = None
     Raises NotProved for walls that nothing is proved of.
     """
     walls = loop.environment.walls
-    if loop.box:
-        raise NotProved("walls and a box: walls are proved in one environment")
+    if loop.ranges:
+        raise NotProved("walls and ranges: walls are proved in one environment")
     try:
         G = loop.walled(coupling)
     except (SingularLoop, ValueError) as error:

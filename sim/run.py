@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from controller.coupling import Compliance, Coupling, MovingAverage, NoCoupling, SpringDamper
+from controller.coupling import Coupling
 from controller.environment import environment, held
 from controller.loop import force_map
 from controller.lti import Array, Lti
@@ -96,7 +96,7 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
     no compliance V stands before.
     """
     network, delays = scenario.environment, (scenario.theta, scenario.psi)
-    if network.walls and not isinstance(coupling, NoCoupling | SpringDamper | MovingAverage | Compliance):
+    if network.walls and coupling.holds_model:
         raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
     E = environment(held(network), scenario.T)
     limits, steps = (np.array([getattr(d, of) for d in scenario.device]) for of in ("force_limit", "encoder_step"))

@@ -20,7 +20,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import Compliance, Coupling, InternalModel, NoCoupling, SpringDamper
+from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.delay import delay
 from controller.environment import (
     GROUND,
@@ -247,7 +247,7 @@ class EnvironmentSweep(_Sweep):
     @property
     def conditions(self) -> tuple[str, ...]:
         """What is asked of every cell."""
-        return (*CONDITIONS, MODEL_KEPT) if isinstance(self.coupling, InternalModel) else CONDITIONS
+        return (*CONDITIONS, MODEL_KEPT) if self._kept else CONDITIONS
 
     @property
     def refusals(self) -> dict[str, str]:
@@ -305,13 +305,11 @@ class EnvironmentSweep(_Sweep):
 
     def _facing(self, condition: str) -> Coupling:
         """The coupling; for MODEL_KEPT as the V whose model stays that of the scenario's environment."""
-        return self._kept if condition == MODEL_KEPT else self.coupling
+        return (self._kept if condition == MODEL_KEPT else None) or self.coupling
 
     @cached_property
-    def _kept(self) -> Coupling:
-        assert isinstance(self.coupling, InternalModel)
-        model = self.loop.sent(NoCoupling())
-        return Compliance(self.coupling.parameter(self.loop.T).feedback(-model))
+    def _kept(self) -> Coupling | None:
+        return self.coupling.with_model(self.loop.sent(NoCoupling()))
 
     def _sent(self, matrices: Matrices, coupling: Coupling) -> Lti:
         loop = self.loop

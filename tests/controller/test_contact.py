@@ -10,7 +10,7 @@ from worlds import SOFT
 
 from cli.accuracy import main as accuracy
 from cli.run import main
-from controller.coupling import NoCoupling, SpringDamper
+from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Wall, environment, held
 from controller.loop import force_map
 from controller.lti import SingularLoop
@@ -268,7 +268,9 @@ def test_a_stiffer_coupling_is_promised_for_walls_that_make_and_break():
 
 
 def test_a_coupling_with_a_model_of_its_own_cannot_face_walls():
-    class Model:
+    class Model(Coupling):
+        holds_model = True
+
         def around(self, environment, further=0):
             return environment
 

@@ -9,7 +9,7 @@ from scipy.linalg import expm
 from cli.run import main
 from cli.validate import main as validate
 from controller.coupling import NoCoupling, SpringDamper
-from controller.delay import Jitter
+from controller.delay import VaryingDelay
 from controller.timing import Periods, Timing
 from design.files import InputError
 from models.scene import Plant, plant
@@ -155,7 +155,7 @@ def test_hands_that_meet_uneven_ticks(tmp_path):
 
 
 def test_periods_vary_beside_delays():
-    scenario = PAIR.replace(period=DRAWN, jitter=Jitter((1, 2), (2, 3)), theta=(1, 2))
+    scenario = PAIR.replace(period=DRAWN, varying_delay=VaryingDelay((1, 2), (2, 3)), theta=(1, 2))
     simulation = assemble(scenario, SOFT)
     assert len(run(simulation, "exact").t) == scenario.samples
 
