@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import expm
 
 from controller.coupling import Compliance, InternalModel, SpringDamper
-from controller.environment import GROUND, Box, Network, Spring, Wall, frozen_states
+from controller.environment import GROUND, Network, Ranges, Spring, Wall, frozen_states
 from controller.loop import Loop
 from controller.lti import Lti
 from controller.process import contact
@@ -226,7 +226,7 @@ def test_longer_periods_scale_it():
 
 def test_what_is_not_covered_is_said():
     loop = held(3000.0)
-    ranged = change(loop, ranges=Box(masses={"tip": (0.04, 0.06)}))
+    ranged = change(loop, ranges=Ranges(masses={"tip": (0.04, 0.06)}))
     assert making_covered(loop)
     assert not making_covered(ranged)
     with pytest.raises(NotProved, match="walls are proved in one environment"):
