@@ -43,7 +43,7 @@ GOAL = 0.95
 #: module -> the files of tests that are about it
 TABLE = {
     "design/exact.py": "design/test_exact design/test_exact_blocks design/test_certificate",
-    "design/certificate.py": "design/test_certificate design/test_exact_blocks design/test_audit design/test_box "
+    "design/certificate.py": "design/test_certificate design/test_exact_blocks design/test_audit design/test_ranges "
     "design/test_switching_file design/test_limiter design/test_walls_making design/test_latency design/test_periods",
     "design/conditions.py": "design/test_exact_blocks design/test_certificate design/test_margin design/test_latency "
     "design/test_periods design/test_encoder_steps design/test_moving_average design/test_worst_member",
@@ -426,8 +426,8 @@ def outcomes_of(module: str, count: int, seed: int, jobs: int) -> list[Outcome]:
     runner = _Runner(module, sorted(drawn, key=lambda m: (m.place, m.kind)), jobs)
     files = [str(ROOT / "tests" / f"{name}.py") for name in TABLE[module].split()]
     pytest.main([*files, "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--no-header", "--no-summary"], [runner])
-    if runner.trouble:
-        sys.exit(f"{module}: {runner.trouble}")
+    if runner.trouble or len(runner.outcomes) < len(drawn):
+        sys.exit(f"{module}: {runner.trouble or 'its tests did not run'}")
     return runner.outcomes
 
 
