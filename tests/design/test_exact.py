@@ -144,6 +144,7 @@ def test_the_exact_inverse_is_an_inverse():
     with pytest.raises(SingularLoop):
         inverse(numbers([[1, 2], [2, 4]], Fraction(1)))
     assert block_diag(Matrix.zeros(0, 0), Matrix.eye(2)).equals(Matrix.eye(2))
+    assert str(definiteness(Matrix.eye(2))) == "positive definite"
 
 
 @pytest.mark.parametrize("coupling", COUPLINGS, ids=lambda c: type(c).__name__)
@@ -189,6 +190,7 @@ def test_a_wrong_storage_matrix_proves_nothing():
     assert prove_positive_real(unstable, Matrix.of([[-1]])) == (
         "P is not positive definite, or by so little that it is not proved"
     )
+    assert find_storage(unstable) == (None, "the block has a pole on or outside the unit circle")
     assert prove_positive_real(G, Matrix.eye(2)) == "P has shape (2, 2), the model has 1 states"
 
 
