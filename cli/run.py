@@ -353,7 +353,7 @@ def _title(what: str, outcome: dict[str, Any]) -> str:
     growth = f"growth {stability['exact_growth_rate_per_s']:+.3f} 1/s at {stability['exact_frequency_hz']:.1f} Hz"
     if _unstable(outcome) is not None:
         growth = f"{outcome['varying_delay']['pattern']} delays, {stability['verdict']}"
-    return f"{what.removesuffix(', no coupling')}, {coupling}: {growth}"
+    return f"{what.removesuffix(', no coupling').removesuffix(', case none')}, {coupling}: {growth}"
 
 
 # ----------------------------------------------------------------------------------------------------
