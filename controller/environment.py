@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.lti import Array, Complex, Lti, Number, Sampled, inverse, rational
+from controller.lti import Array, Complex, Lti, Number, Sampled, inverse, numbers, rational
 
 # ----------------------------------------------------------------------------------------------------
 # Environments that are not known exactly: ranges of a network's parameters, their vertices, and points inside.
@@ -319,6 +319,10 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"gap of the wall between {ends} is {self.gap}, expected a finite length in m")
         if self.between[0] == self.between[1]:
             raise ValueError(f"between joins {self.between[0]!r} to itself; name two different nodes")
+
+    def slope(self, T: Number) -> Number:
+        """K + 2 B/T [N/m], in the arithmetic of T: no motion that alternates between ticks is met more stiffly."""
+        return numbers(self.stiffness, T) + 2 * numbers(self.damping, T) / T
 
 
 class Environment:

@@ -205,7 +205,7 @@ def switching_requirement(loop: Loop, coupling: Coupling) -> SwitchingSweep:
 # is strictly positive real (design.exact). On |z| = 1 the Hermitian part of F(1)/(z - 1) is -F(1)/2, so
 # He[F/(z-1)] > -Delta_D/T there; the same certificate shows that F is stable.
 #
-# this-environment, forces that latch late, or walls without dampers: the blocks of latency_demand and walls_demand, the
+# this-environment, forces that latch late, or walls: the blocks of latency_demand and walls_demand, the
 # latter with the multipliers g of its walls, stored too.
 #
 # any-environment, psi = 0: with H = V - Theta-hat (11), (12), V-hat = (1 - 1/z) H/T, H(1) is exactly symmetric, and
@@ -405,8 +405,8 @@ def _walls_block(loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Lti:
     try:
         G = loop.walled(coupling, exact=True)
         _require_size(G.order)
-        stiffness = [wall.stiffness for wall in loop.environment.walls]
-        demand = walls_demand(G, loop.delta, stiffness, g, None, loop.T_max)
+        slopes = [wall.slope(G.T) for wall in loop.environment.walls]
+        demand = walls_demand(G, loop.delta, slopes, g, None, loop.T_max)
     except SingularLoop as error:
         raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
     for name, value in demand.static.items():
@@ -553,8 +553,8 @@ def assess(
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
 
     this-environment is about the nominal environment alone (ranges.check asks for the rest of its ranges) and the
-    constant theta (sim.switching.certified_part asks for the rest of its range); where there are walls it is about the
-    frozen contact state that asks for most. What `known`, a certificate just made, proves is not proved again.
+    constant theta (sim.switching.certified_part asks for the rest of its range). What `known`, a certificate just made,
+    proves is not proved again.
     """
     loop = loop.at(loop.environment).switching(None)
     here = this_environment_of(loop, coupling)
@@ -566,7 +566,7 @@ def assess(
 
 
 def this_environment_of(loop: Loop, coupling: Coupling) -> Requirement:
-    """What this-environment asks; with walls that have dampers, in their most demanding frozen contact state."""
+    """What this-environment asks; of walls over ranges, in their most demanding frozen contact state."""
     if making_covered(loop):
         try:
             return walls_of(loop, coupling).requirement
