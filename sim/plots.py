@@ -359,9 +359,8 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
     """
     columns, around = 2 if len(panels) > 1 else 1, Surroundings(names)
     rows = -(-len(panels) // columns)
-    figure, axes = _panels(
-        "the same devices, hands and object, another coupling in each panel", rows, columns, (11, 3.1 * rows + 0.6), sharex=True, sharey=True
-    )
+    title, size = "the same devices, hands and object, another coupling in each panel", (11, 3.1 * rows + 0.6)
+    figure, axes = _panels(title, rows, columns, size, sharex=True, sharey=True)
     calm = [panel.ideal for panel in panels if panel.until is None] or [panel.ideal for panel in panels]
     most = 1.5 * max(float(np.abs(force).max(initial=1e-9)) for force in calm)
     for axis, panel in zip(axes.flat, panels, strict=False):
