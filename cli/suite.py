@@ -13,7 +13,6 @@ import os
 import platform
 import resource
 import shlex
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -45,8 +44,9 @@ from sim.couplings import choose
 from sim.crowds import Validation
 from sim.guarantees import challenges
 from sim.hard import cases, measure
+from sim.random_loops import proofs, traces
 from sim.scenario import InputError, load
-from sim.shards import validate
+from sim.shards import as_worker, validate
 from sim.stability import unstable
 from sim.uneven import HANDS, uneven_ticks
 
@@ -181,8 +181,8 @@ def endurance(seed: int) -> Iterator[_Row]:
 
 
 def _alone(work: _Work, allowed: float, there: Connection) -> None:
-    """Of the process that does it: only the one that waits acts on Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Of the process that does it, which ends with the one that waits."""
+    as_worker()
     there.send(endure(work, allowed))
 
 
@@ -205,6 +205,18 @@ def _peak() -> float:
     if (status := Path("/proc/self/status")).exists():
         return float(status.read_text().partition("VmHWM:")[2].split()[0]) / 2**10
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def proved(seed: int) -> Iterator[_Row]:
+    """Whether random networks are proved where the sweep says so, and only there."""
+    for row in proofs(seed):
+        yield asdict(row) | {"required": finite(row.required), "holds": row.holds}
+
+
+def told(seed: int) -> Iterator[_Row]:
+    """What traces of random scenarios tell of their stability."""
+    for row in traces(seed):
+        yield asdict(row)
 
 
 def uneven(seed: int) -> Iterator[_Row]:
@@ -369,6 +381,38 @@ def _fault_table(report: dict[str, Any]) -> list[_Part]:
     return [_Part("", columns, tuple(rows), f"{good} of {len(rows)} faults end as they must")]
 
 
+def _proof_table(report: dict[str, Any]) -> list[_Part]:
+    """Of proofs of random networks: by what the sweep says."""
+    rows, good = [], sum(row["holds"] for row in report["rows"])
+    for says, enough in (("there is enough damping", True), ("there is too little", False)):
+        some = [row for row in report["rows"] if (row["required"] is not None and row["required"] < 1) == enough]
+        rows.append((says, str(len(some)), str(sum(row["proved"] for row in some))))
+    columns = ("the sweep says that", "networks", "proved")
+    return [_Part("", columns, tuple(rows), f"proof and sweep agree about {good} of {len(report['rows'])} networks")]
+
+
+def _told_table(report: dict[str, Any]) -> list[_Part]:
+    """Of traces of random scenarios: by what their eigenvalues say."""
+    rows, good = [], sum(row["holds"] for row in report["rows"])
+    for says, grows in (("stable", False), ("unstable", True)):
+        some = [row for row in report["rows"] if bool(unstable(row["exact_per_s"])) == grows]
+        read = [row for row in some if row["trace_per_s"] is not None]
+        same = sum(bool(unstable(row["trace_per_s"])) == grows for row in read)
+        quiet = sum(row["not_excited"] for row in some)
+        rows.append((says, *map(str, (len(some), same, len(read) - same, quiet, len(some) - len(read) - quiet))))
+    columns = (
+        "by the eigenvalues",
+        "runs",
+        "the trace agrees",
+        "says the opposite",
+        "not excited",
+        "no rate, for another reason",
+    )
+    return [
+        _Part("", columns, tuple(rows), f"{good} of {len(report['rows'])} traces tell no other than the eigenvalues")
+    ]
+
+
 def memory_table(report: dict[str, Any]) -> list[_Part]:
     """Of work that goes on for long."""
     rows = [
@@ -464,6 +508,8 @@ CHECKS = (
     Check("map", "Which springs and dampers may a device render against a wall?", _MAP, _gain_map),
     Check("accuracy", "Is MuJoCo right, and at what cost?", "sim.accuracy --duration 6", accuracy),
     Check("hard", "Numerically hard loops", hard_loops, hard),
+    Check("proofs", "Are random networks proved where the sweep says so?", proved, _proof_table),
+    Check("traces", "Does a trace ever say the opposite of the eigenvalues?", told, _told_table),
     Check("uneven", "Do uneven periods and late forces keep the guarantee?", uneven, _uneven_table),
     Check("guarantees", "Do limits, budgets, walls and friction hold at what they ask?", edges, guarantees),
     Check("faults", "Does every fault of a link end as it must?", faults, _fault_table),
