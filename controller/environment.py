@@ -435,10 +435,11 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         index = {name: i for i, name in enumerate(self.nodes())}
         M = np.diag([number(self.masses.get(name, 0.0)) for name in index])
         D, K = np.zeros_like(M), np.zeros_like(M)
-        for spring, across in zip(self.springs, self.across(self.springs), strict=True):
-            pattern = np.outer(across, across)
-            mass, damping, stiffness = spring.amounts(number)
-            M, D, K = M + mass * pattern, D + damping * pattern, K + stiffness * pattern
+        for spring in self.springs:
+            ends = [(index[node], sign) for node, sign in zip(spring.between, (1, -1), strict=True) if node != GROUND]
+            for whole, amount in zip((M, D, K), spring.amounts(number), strict=True):
+                for (i, one), (j, other) in itertools.product(ends, ends):
+                    whole[i, j] += one * other * amount
         return M, D, K
 
     def across(self, parts: Sequence[Spring | Wall]) -> NDArray[np.int64]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import platform
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -19,7 +20,7 @@ from controller.coupling import (
 from controller.delay import delay
 from controller.environment import Member, inside
 from controller.loop import Loop
-from controller.lti import Array, Lti, SingularLoop, rational
+from controller.lti import Array, Lti, SingularLoop, TooLong, rational, within
 from design.conditions import (
     any_environment,
     any_environment_delayed,
@@ -64,6 +65,19 @@ from design.stored import Certificate, Guarantee, LimiterCertificate, Stored, Sw
 _CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
 
 
+_LONGEST = 60.0  # [s] of exact arithmetic for one certificate: what fits into the limits on states takes less
+
+
+@contextmanager
+def _in_time() -> Iterator[None]:
+    """Raises NotProved where exact arithmetic takes too long, however few states and digits there seem to be."""
+    try:
+        with within(_LONGEST):
+            yield
+    except TooLong as error:
+        raise NotProved(str(error)) from None
+
+
 def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
     """An exact proof of any switching within the loop's range, or why there is none."""
     found = swept(loop, coupling)
@@ -80,10 +94,10 @@ def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
 def storage(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Matrix | str:
     """The matrix that proves the condition for these alpha [N/m] at the loop's damping, or why there is none."""
     try:
-        condition = condition_block(loop, coupling, alpha)
+        with within(_LONGEST):
+            P, reason = find_storage(condition_block(loop, coupling, alpha))
     except (SingularLoop, ValueError) as error:
         return str(error)
-    P, reason = find_storage(condition)
     return str(reason) if P is None else P
 
 
@@ -143,6 +157,7 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
     return (0.0,) * loop.channels if covered else None
 
 
+@_in_time()
 def prove_limiter(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | None = None) -> LimiterCertificate:
     """An exact proof with the multiplier `c` or the best one. Raises NotProved with the reason."""
     found = limiter_requirement(loop, coupling, beta, c)
@@ -232,6 +247,7 @@ class Verdict:
     reason: str | None = None
 
 
+@_in_time()
 def prove(
     loop: Loop,
     coupling: Coupling,
@@ -364,7 +380,8 @@ def verify(stored: Stored) -> Verdict:
         return Verdict(False, "seal differs: the certificate was changed after it was made")
     coupling = stored.built()
     try:
-        reason = _refuted_claims(loop, coupling, certificate) or _refuted_proof(loop, coupling, certificate)
+        with _in_time():
+            reason = _refuted_claims(loop, coupling, certificate) or _refuted_proof(loop, coupling, certificate)
     except NotProved as refusal:
         reason = str(refusal)
     return Verdict(reason is None, reason)
