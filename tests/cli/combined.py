@@ -22,7 +22,7 @@ REFUSED = {
         --ranges 10 --varying-delay 0,2 | --limiter --no-limiter | --best --coupling ccl | --best --order 2
         --method inner | --compare | --objective sup | --full | --order 0 --coupling ccl
         --order 1e9 --coupling ccl | --high-gain 0 | --high-gain 2 | --seconds -1 --best | --band 1,0 --best
-        --latency 1e-3 --varying-delay 0,2 | --best --varying-delay 0,2""",
+        --latency 1e-3 --varying-delay 0,2""",
     "audit": """--device nix | --devices --K 5 | --rigid | --rigid --K 5 --B 0 --theta 1,2 | --rigid --K 5 --B 0 --psi 1
         --rigid --K 0 --B 0 | --rigid --K 1e300 --B 0 | --K 1,2,3 --B 0 | --K 1,2 --B 0,0,0 | --K -1,2 --B 0
         --rigid --K 5 --B 0 --T-max 1e-9 | --K 1,2 --B 0 --coupling c.json""",
@@ -30,7 +30,7 @@ REFUSED = {
         --fault axis9:jump | --fault axis3:jump | --fault up:jump | --fault jump=1e9 | --fault stall=99
         --fault leap=0 | --fault period=0 | --fault = | --fault '' | --quantile 0 | --quantile 1.01 | --guard -1
         --guard 1e9 | --measure 0 | --measure 1e9 | --force-cap 0 | --force-cap 13 | --max-speed 0
-        --latch arrival --theta 3 | --energy-budget -1 | --pace 0 | --pace 1e-9 | --baud -1 | --continuous-force 0
+        --energy-budget -1 | --pace 0 | --pace 1e-9 | --baud -1 | --continuous-force 0
         --continuous-force 13 | --continuous-force 1,2,3 | --thermal-time 0 | --T 0.05 | --T 1e-6
         --varying-delay 0,2 | --port nix | --emulate | --duration -1""",
     "identify": """--force 0 | --force 100 | --force -1 | --band 200,3 | --band 0,0 | --band 1,1e9 | --band 3

@@ -263,6 +263,11 @@ def test_a_riccati_equation_with_a_wrong_answer_proves_nothing(monkeypatch):
         assert "negative direction" in reason
 
 
+def test_a_model_of_more_states_than_are_tried_is_told_so():
+    assert exact.too_large(exact.LARGEST) is None
+    assert exact.too_large(exact.LARGEST + 1) == "a proof over 301 states takes long: up to 300 are tried"
+
+
 def test_products_are_in_lowest_terms():
     half = Matrix.of([["1/2", "3/2"]])
     assert (half @ Matrix.of([[2], [2]])).den == 1
