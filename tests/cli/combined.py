@@ -15,7 +15,7 @@ REFUSED = {
         --band nan,5 | --theta 1,2,3 | --theta 1.5 | --psi -1,0 | --delta -1 | --T 1e-7 | --T 1 | --theta 1001,0
         --theta 1000,1000 | --case none --lam 0,0,0 | --condition any-environment --case III
         --no-limiter --energy-budget x | --human h.py --vertex 3""",
-    "validate": """--resume | --environments ranges | --dask x | --dask :1 | --dask h:99999 | --dask h:-1
+    "validate": """--resume | --environments ranges | --dask x
         --dask h:1 --shards 2 | --generations 5 | --links 3 | --humans 0 | --humans 1e3 | --shards 0
         --duration 1e-9 | --duration -1 | --latency 2e-3 | --T-max 1e-4 | --period 1e-3""",
     "design": """--ranges 0 | --ranges -5 | --ranges 101% | --ranges 1e9 | --ranges 10%% | --samples 5

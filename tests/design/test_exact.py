@@ -263,6 +263,13 @@ def test_a_riccati_equation_with_a_wrong_answer_proves_nothing(monkeypatch):
         assert "negative direction" in reason
 
 
+def test_numbers_beyond_floating_point_are_left_to_exact_arithmetic(recwarn):
+    G = Lti(*([[v]] for v in (0.5, 1, 0.5, 10**308)), Fraction(1))  # D + D' overflows
+    assert prove_positive_real(G, Matrix.of([[1]])) is None
+    assert prove_positive_real(G, Matrix.of([[-1]])) is not None
+    assert not recwarn.list
+
+
 def test_a_model_of_more_states_than_are_tried_is_told_so():
     assert exact.too_large(exact.LARGEST) is None
     assert exact.too_large(exact.LARGEST + 1) == "a proof over 301 states takes long: up to 300 are tried"
