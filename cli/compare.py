@@ -313,8 +313,9 @@ def _rung(row: dict[str, Any]) -> tuple[str, ...]:
 
 def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
     require_even_ticks(scenario, "--baselines")
-    if scenario.box or scenario.switches:
-        raise InputError("--baselines compares in one environment with constant delays: leave out [box] and jitter")
+    if scenario.ranges or scenario.switches:
+        given = "[ranges]" if scenario.ranges else "[varying_delay]"
+        raise InputError(f"--baselines compares in one environment with constant delays: leave out {given}")
     if any(device.friction for device in scenario.device):
         raise InputError("--baselines runs in the exact plant, which has no Coulomb friction; the devices have")
     out, rows, interrupted = options.out_folder(args, "compare"), [], False

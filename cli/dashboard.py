@@ -16,6 +16,7 @@ from rich.live import Live
 from rich.table import Table
 
 from cli.render import Screen
+from hw.limits import Stage
 from hw.session import Session
 
 _WIDTH = 72  # columns
@@ -29,6 +30,7 @@ def _snapshot(session: Session) -> dict[str, Any]:
     return {
         "stage": str(session.stage),
         "cause": session.cause,
+        "doing": _doing(session),
         "x_mm": [1e3 * x for x in (drive.x or ())] if drive else [],
         "f": list(drive.force) if drive else [],
         "cap": list(session.limits.cap),
@@ -40,11 +42,20 @@ def _snapshot(session: Session) -> dict[str, Any]:
     }
 
 
+def _doing(session: Session) -> str:
+    """What takes longer than a moment."""
+    if session.stage == Stage.MEASURING:
+        return f"measuring the delay: {len(session.measurement.ages)} of {session.settings.measure} answers"
+    return "designing the coupling" if session.stage == Stage.MEASURED else ""
+
+
 def view(data: dict[str, Any], width: int = _WIDTH) -> Table:
     """One snapshot as a table, in a terminal of `width` columns."""
     table = Table(title=f"{data['stage']}: {data['cause']}", width=min(width, _WIDTH), show_header=False)
     table.add_column("what", width=16 if width >= _WIDTH else 7)
     table.add_column("now")
+    if data["doing"]:
+        table.add_row("now", data["doing"])
     for i, (x, f, cap) in enumerate(zip(data["x_mm"], data["f"], data["cap"], strict=False), start=1):
         table.add_row(f"axis {i}", f"{x:+8.3f} mm  {f:+7.3f} N  {_bar(f / cap) if width >= _WIDTH else ''}")
     margin = "-" if data["margin_us"] is None else f"at least {data['margin_us']} us in the last ticks"

@@ -41,11 +41,11 @@ from sim.scenario import InputError, Scenario, require_constant_delay, require_e
 
 _LIMITS = (
     "The bound is a statement about this record: the least viscous friction of all laws that fit it, less its scatter "
-    "between parts of the record (95 %) and a part for what is left unexplained. It does not see friction that changes "
-    "with temperature or wear, nor that of a handle behind its transmission apart from the motor's. A hand that rests "
-    "on the handle springs it, and from 5 N/m on is refused; one that only damps cannot be told from the device. Dry "
-    "friction is left out of delta: it dissipates too, but ever less than a viscous damper as speed grows. Lag of the "
-    "amplifier is not in delta: it belongs to the delay."
+    "between parts of the record (95 %), a part for what is left unexplained and 0.5 % for the encoder's scale. It "
+    "does not see friction that changes with temperature or wear, nor that of a handle behind its transmission apart "
+    "from the motor's. A hand that rests on the handle springs it, and from 5 N/m on is refused; one that only damps "
+    "cannot be told from the device. Dry friction is left out of delta: it dissipates too, but ever less than a "
+    "viscous damper as speed grows. Lag of the amplifier is not in delta: it belongs to the delay."
 )
 
 
@@ -70,7 +70,7 @@ def main(argv: list[str]) -> int:
         link = measured_link(args, ages, scenario.T)
         return [chirp(scenario.channels, scenario.T, link, force, (low, high), seconds)]
 
-    played = 2.5 * seconds + 0.1  # from full gain on: the lead has the ramp
+    played = chirp(1, scenario.T, 1, force, (low, high), seconds).seconds - 0.2  # the lead has the ramp
     live = hold_session(args, session, plan, played, seed, out, nobody=True, coulomb=coulomb)
     report, estimates = _identified(session, recorder, scenario, live.dropped, float(args.pace))
     report["files"] = [str(p) for p in _save(out, session, recorder, scenario, estimates, report)]

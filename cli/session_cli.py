@@ -15,7 +15,7 @@ from typing import Any
 
 from cli.dashboard import Dashboard
 from cli.options import numbers, scenario_from
-from cli.render import console
+from cli.render import console, progress
 from hw.control import Program, link_delay
 from hw.emulator import Emulator, FaultInjection, spawned
 from hw.emulator import nobody as without_hands
@@ -29,6 +29,7 @@ from sim.scenario import InputError, Scenario
 
 _USUAL_BAUD = 921_600
 _SPARE = 600.0  # [s] beside the run, after which an orphan of --emulate would end by itself
+_SHOWN_US = 100_000  # of a rehearsal, between two looks
 _PASSED_ON = ("case", "scenario", "theta", "psi", "lam", "delta", "T")
 
 
@@ -204,10 +205,13 @@ def hold_session(
                 )
         else:
             options = [*_emulator_options(args, seed, seconds), *["--nobody"][:nobody], f"--coulomb={coulomb}"]
-            path = args.port or stack.enter_context(spawned(options))
+            with progress("starting the emulator" if args.emulate else "opening the port"):
+                path = args.port or stack.enter_context(spawned(options))
             port = stack.enter_context(SerialPort(path, session.settings.baud))
         if args.port and not getattr(args, "no_preflight", True):
-            console(args).print(preflight(args.port).line(), soft_wrap=True, highlight=False)
+            with progress("looking at this machine"):
+                found = preflight(args.port)
+            console(args).print(found.line(), soft_wrap=True, highlight=False)
         keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
         show = _view(stack)
 
@@ -250,10 +254,21 @@ def _rehearsed(
         emulator = Emulator(scenario, faults, coulomb=coulomb)
     except ValueError as error:
         raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
-    operator = Operator(True, seconds)
-    Rehearsal(
-        session, emulator, plan, faults, seed, operator=operator, keep=False, glance=incidents.glance
-    ).run_to_the_end(seconds + _SPARE)
+    with progress("rehearsing") as move:
+
+        def planned(ages: Ages) -> Sequence[Program]:
+            move(0, 1, "designing the coupling")
+            return plan(ages)
+
+        def glance(session: Session) -> None:
+            incidents.glance(session)
+            if session.now % _SHOWN_US < 1000:
+                move(session.now, round(1e6 * (1 + seconds)), f"rehearsing: {session.stage}")
+
+        operator = Operator(True, seconds)
+        Rehearsal(
+            session, emulator, planned, faults, seed, operator=operator, keep=False, glance=glance
+        ).run_to_the_end(seconds + _SPARE)
     return _Held()
 
 

@@ -21,8 +21,8 @@ from cli import options, render
 from controller.environment import RIGID_WALL
 from controller.loop import Loop
 from controller.lti import Array
-from design.certificate import CONDITIONS, assess, check_set
-from design.coverage import set_part
+from design.certificate import CONDITIONS, assess, check_ranges
+from design.coverage import ranges_part
 from design.files import write
 from design.guarantees import CAVEATS, guarantee_of
 from design.result import certificate_part, finite
@@ -448,7 +448,7 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
     """The fixed coupling and what is guaranteed of it where it was designed, in the scenario's own environment."""
     loop = scenario.loop(args.case)
     with render.progress("searching the ranges") as move:
-        whole = check_set(loop, chosen.coupling, args.seed, progress=move)
+        whole = check_ranges(loop, chosen.coupling, args.seed, progress=move)
     requirements = assess(loop, chosen.coupling, chosen.phi)
     limits = limits_of(scenario, chosen, requirements, args.limiter)
     springs = contact_springs(loop.network)
@@ -459,7 +459,7 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
             "contact_springs": [{"between": s.between, "K": s.stiffness, "B": s.damping} for s in springs],
             "certificates": report.certificates_part(requirements),
             "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
-            "set": whole and set_part(whole),
+            "ranges": whole and ranges_part(whole),
         },
         "limiter": limits.part([device.force_limit for device in scenario.device]),
         "remarks": list(chosen.notes),
@@ -482,7 +482,7 @@ def _coupling_sweep(args: argparse.Namespace, scenario: Scenario) -> CouplingSwe
 
 def _nominal(loop: Loop) -> Loop:
     """With the environment itself and constant delays: what a map is about."""
-    return msgspec.structs.replace(loop, box=None, jitter=None)
+    return msgspec.structs.replace(loop, ranges=None, varying_delay=None)
 
 
 def _marks(args: argparse.Namespace) -> tuple[Range, ...]:
@@ -511,7 +511,7 @@ def _save(args: argparse.Namespace, drawn: Map, outcome: dict[str, Any], out: Pa
     """The table and the picture."""
     files = [_save_csv(drawn, out / "map.csv")]
     if not args.no_plot:
-        from sim.plots import plot_zwidth
+        from sim.map_plot import plot_zwidth
 
         files.append(plot_zwidth(drawn, outcome, out / "zwidth.png"))
     return files

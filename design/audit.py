@@ -18,9 +18,9 @@ from controller.coupling import (
 )
 from controller.environment import RIGID_WALL
 from controller.loop import DelayRange, Loop
-from design.certificate import SetCheck, any_environment_of, switching_requirement, this_environment_of
+from design.certificate import RangesCheck, any_environment_of, switching_requirement, this_environment_of
 from design.conditions import any_environment
-from design.coverage import set_part, switching_part
+from design.coverage import ranges_part, switching_part
 from design.guarantees import ANY, CAVEATS, LATE, guarantee_of
 from design.result import Condition, Requirement, certificate_part, listed, refusal
 
@@ -271,12 +271,12 @@ def report(
     loop: Loop,
     coupling: Coupling,
     switching: DelayRange | None = None,
-    whole: SetCheck | None = None,
+    whole: RangesCheck | None = None,
 ) -> dict[str, Any]:
     """Both conditions with what surrounds them; SI units, null with a "reason" where a figure does not exist.
 
     They are about the loop's own environment and constant delays. With a range of delays also the damping that any
-    switching within it asks; `whole` is the same coupling over the box around the environment, if there is one.
+    switching within it asks; `whole` is the same coupling over the ranges around the environment, if there is one.
     Raises ValueError naming the field of the loop that is wrong.
     """
     loop = loop.at(loop.environment).switching(None)
@@ -302,8 +302,8 @@ def report(
             "rigid": loop.environment is RIGID_WALL,
         },
         **{name: _condition_part(loop, coupling, needs) for name, needs in requirements.items()},
-        "jitter-proof": _switching_part(loop, coupling, switching) if switching else None,
-        "set": whole and set_part(whole),
+        "switching": _switching_part(loop, coupling, switching) if switching else None,
+        "ranges": whole and ranges_part(whole),
         "certified": here and (whole is None or proved or guaranteed == ANY),
         "promise": guaranteed,
         "helps": _helps(loop, coupling, requirements["any-environment" if here else "this-environment"]),

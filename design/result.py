@@ -17,7 +17,7 @@ from controller.lti import Array, Lti
 Condition = Literal["this-environment", "any-environment"]
 
 
-C = TypeVar("C", bound=str)  # a Condition, "jitter-proof" or "limiter"
+C = TypeVar("C", bound=str)  # a Condition, "switching" or "limiter"
 
 
 # How much damping a condition asks: sweeps, without a solver.

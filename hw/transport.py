@@ -250,6 +250,7 @@ class Live:
     def _load(self) -> None:
         """Design while the device rests at zero force; what it says meanwhile is of no use."""
         session = self.session
+        self._glance(session)  # for it takes a while
         try:
             with _interruptible():
                 programs = self._plan(session.measurement.result)

@@ -251,12 +251,13 @@ def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> For
 
 def response(G: Lti, x: Array) -> Array:
     """y = G x from rest; x (N, inputs), y (N, outputs)."""
-    states = np.zeros((x.shape[0] + 1, G.order))
-    driven = x @ G.B.T
+    rows = np.zeros((x.shape[0] + 1, G.order + x.shape[1]))  # [state, x] of every tick
+    rows[:-1, G.order :] = x
+    step = np.hstack([G.A, G.B]).dot
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable run may leave the range of numbers
-        for k in range(x.shape[0]):
-            states[k + 1] = G.A @ states[k] + driven[k]
-        return states[:-1] @ G.C.T + x @ G.D.T
+        for row, state in zip(rows, rows[1:, : G.order], strict=False):
+            step(row, state)
+        return rows[:-1] @ np.hstack([G.C, G.D]).T
 
 
 def _rms(values: Array) -> float:

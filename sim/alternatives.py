@@ -109,7 +109,7 @@ def alternatives(
 def _possible(scenario: Scenario, case: str, kind: str, condition: str | None) -> bool:
     if kind == "published":
         return scenario.loop(case) == load().loop(case)
-    one_environment = scenario.environment.walls or scenario.box
+    one_environment = scenario.environment.walls or scenario.ranges
     if condition == "this-environment" and one_environment:
         return False
     return kind != "optimal" or scenario.channels <= _QUICK

@@ -96,7 +96,7 @@ def limits_of(
     """How forces are limited in a loop: by the limiter that a guarantee covers, unless `limiter` is False."""
     if limiter is False:
         return Limits(None, "forces are clipped, as asked")
-    if scenario.jitter:
+    if scenario.varying_delay:
         return Limits(None, "limiter: limited forces are proved for constant delays")
     loop = scenario.loop("I")  # the reference does not matter
     coupling, proof = chosen.coupling, chosen.limiter
@@ -138,19 +138,20 @@ def check_stored(stored: Stored, loop: Loop) -> _FileCheck:
     except (ValueError, ArithmeticError) as error:
         reason = str(error)
     notes = [f"the certificate in the coupling's file does not hold: {reason}"] if reason else []
-    delays = ("theta", "jitter", "lam")  # lam matters to transparency only
+    delays = ("theta", "varying_delay", "lam")  # lam matters to transparency only
     differ = [n for n in loop.__struct_fields__ if n not in delays and getattr(loop, n) != getattr(stored.loop, n)]
     proved = stored.certificate is not None and not reason and not differ
-    switching = stored.loop.jitter if proved else None
-    if switching and switching.contains(loop.jitter or DelayRange(loop.theta, loop.theta)):
-        if loop.theta != stored.loop.theta or loop.jitter not in (None, switching):
-            here = switching_guarantee(loop.jitter) if loop.jitter else f"the constant theta = {list(loop.theta)}"
+    switching = stored.loop.varying_delay if proved else None
+    if switching and switching.contains(loop.varying_delay or DelayRange(loop.theta, loop.theta)):
+        if loop.theta != stored.loop.theta or loop.varying_delay not in (None, switching):
+            constant = f"the constant theta = {list(loop.theta)}"
+            here = switching_guarantee(loop.varying_delay) if loop.varying_delay else constant
             notes.append(f"the file proves {switching_guarantee(switching)}, which covers {here}")
         return _FileCheck(tuple(notes), switching)
     differ += ["theta"] if loop.theta != stored.loop.theta else []
-    if loop.jitter and proved:
+    if loop.varying_delay and proved:
         made_for = switching_guarantee(switching) if switching else "constant delays"
-        notes.append(f"the file proves {made_for}: {switching_guarantee(loop.jitter)} are judged anew here")
+        notes.append(f"the file proves {made_for}: {switching_guarantee(loop.varying_delay)} are judged anew here")
     if differ:
         notes.append(
             f"the coupling was stored for another loop (different {', '.join(differ)}), and is judged anew here"

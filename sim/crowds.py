@@ -220,7 +220,7 @@ def examine(
     """
     scenario, member = validation.scenario, validation.environment(indices[0])
     if member:
-        scenario = scenario.replace(environment=member.network, box=None)
+        scenario = scenario.replace(environment=member.network, ranges=None)
     simulation = assemble(scenario, validation.coupling, validation.lag)
     return _merge([_group(validation, simulation, *group, ticked) for group in validation.crowds(indices)])
 

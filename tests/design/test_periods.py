@@ -29,12 +29,12 @@ def test_a_report_on_switching_delays_is_for_the_longest_period(tmp_path):
     needs = []
     for more in ([], ["--T-max", "1.8e-3"]):
         file, soft = tmp_path / "r.json", ["--condition", "this-environment"]
-        cli_design(["--jitter", "1,2", *soft, *more, "--json", str(file), "--out", str(tmp_path / "c.json")])
+        cli_design(["--varying-delay", "1,2", *soft, *more, "--json", str(file), "--out", str(tmp_path / "c.json")])
         report = json.loads(file.read_text())
         stored = msgspec.json.decode((tmp_path / "c.json").read_bytes(), type=Stored)
         loop = stored.loop.switching(None)
         buffered = required_damping(change(loop, theta=(2, 2)), stored.coupling.build(loop.T), "this-environment")
-        needs.append((report["jitter_proof"]["playout"]["required_damping"], list(buffered.required)))
+        needs.append((report["switching"]["playout"]["required_damping"], list(buffered.required)))
     for shown, swept_alone in needs:
         assert shown == pytest.approx(swept_alone, rel=1e-6)
 
@@ -48,7 +48,7 @@ def test_the_longest_period_scales_the_required_damping(condition):
 
 
 def test_so_it_does_with_delays_that_switch_and_with_the_multiplier_of_a_delayed_environment():
-    switching = change(LOOP, jitter=DelayRange((0, 1), (1, 2)))
+    switching = change(LOOP, varying_delay=DelayRange((0, 1), (1, 2)))
     even, uneven = (swept(change(switching, T_max=longest), SOFT).requirement for longest in (None, LONG))
     assert uneven.required == pytest.approx([1.6 * b for b in even.required], rel=1e-6)  # of the search for alpha
     soft = msgspec.structs.replace(

@@ -1,6 +1,8 @@
 """Periods that vary and forces that latch within them: engines against each other and against expm, by hand."""
 
+import gc
 import json
+import weakref
 
 import numpy as np
 import pytest
@@ -9,13 +11,13 @@ from scipy.linalg import expm
 from cli.run import main
 from cli.validate import main as validate
 from controller.coupling import NoCoupling, SpringDamper
-from controller.delay import Jitter
+from controller.delay import VaryingDelay
 from controller.timing import Periods, Timing
 from design.files import InputError
 from models.scene import Plant, plant
 from sim import load, uneven
 from sim.crowds import Validation, examine
-from sim.engines import at_the_latch, hold
+from sim.engines import EXPONENTIAL, MujocoBatchEngine, MujocoEngine, at_the_latch, hold
 from sim.run import assemble, make_engine, run
 from sim.stability import close, dominant_mode
 
@@ -155,7 +157,7 @@ def test_hands_that_meet_uneven_ticks(tmp_path):
 
 
 def test_periods_vary_beside_delays():
-    scenario = PAIR.replace(period=DRAWN, jitter=Jitter((1, 2), (2, 3)), theta=(1, 2))
+    scenario = PAIR.replace(period=DRAWN, varying_delay=VaryingDelay((1, 2), (2, 3)), theta=(1, 2))
     simulation = assemble(scenario, SOFT)
     assert len(run(simulation, "exact").t) == scenario.samples
 
@@ -221,3 +223,20 @@ def test_the_audit_of_late_forces_sees_what_a_coupling_gives():
         gave = found.energy < -1e-9 * found.audited
         assert gave.any() == gives
         assert (found.exact[gave] > 0).all()
+
+
+@pytest.mark.parametrize("timed", [True, False])
+@pytest.mark.parametrize("integrator", [EXPONENTIAL, "RK4"])
+def test_no_cycle_keeps_an_engine(integrator, timed):
+    """The last reference frees a batch, a MiB for every 125 hands: nothing waits for the collector."""
+    simulation = assemble(PAIR.replace(period=DRAWN, latency=LATE) if timed else PAIR, SOFT)
+    gc.disable()
+    try:
+        for make in (MujocoEngine, MujocoBatchEngine):
+            engine = make(simulation.scene, simulation.scenario.T, integrator, timing=simulation.timing)
+            run(simulation, engine, ticks=3)
+            kept = weakref.ref(engine._access)  # all that holds MuJoCo's memory
+            del engine
+            assert kept() is None
+    finally:
+        gc.enable()
