@@ -9,8 +9,6 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import os
-import platform
 import resource
 import shlex
 import sys
@@ -19,7 +17,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stdout
 from dataclasses import asdict, dataclass
 from importlib import import_module
-from importlib.metadata import version
 from io import StringIO
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -27,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from cli import options, render
+from cli import options, render, suite_report
 from controller.coupling import NoCoupling
 from controller.lti import SingularLoop
 from design.files import folder, write, write_json
@@ -49,19 +46,6 @@ from sim.scenario import InputError, load
 from sim.shards import as_worker, validate
 from sim.stability import unstable
 from sim.uneven import HANDS, uneven_ticks
-
-_INTRODUCTION = """\
-Several force-feedback devices share one simulated object; the loop of hands, devices, delays and computer must not
-start to oscillate by itself, whoever holds the devices. A *coupling* is the filter between devices and object that
-ensures this; it is *certified* when the devices have more damping than a proved condition requires. This report puts
-every such verdict to the test. *Growth* is the rate at which the loop's strongest oscillation grows: below zero it
-dies out. It is computed from the exact solution of the loop and, independently, from what MuJoCo simulates; both must
-tell the same of every hand. The *adversary* searches for the worst passive hand instead of drawing hands at random.
-
-"Holds" means: both engines agree about everyone, nobody destabilises a certified loop, and its energy balance is
-never negative. An uncertified loop may be unstable; it holds as long as the engines agree.
-"""
-
 
 # ----------------------------------------------------------------------------------------------------
 # Checks of our own: what they measure, row by row.
@@ -608,12 +592,12 @@ def main(argv: list[str]) -> int:
         "seed": args.seed,
         "interrupted": interrupted,
         "wall_s": time.perf_counter() - begin,
-        "machine": machine(),
+        "machine": suite_report.machine(),
     }
-    screen.print(_headline(outcome))
+    screen.print(suite_report.headline(outcome))
     if len(checks) == 1 and answers:
         _show(answers[0], screen)
-    render.publish(args, outcome, (), (), out, [write(out / "report.md", _markdown(outcome))])
+    render.publish(args, outcome, (), (), out, [write(out / "report.md", suite_report.markdown(outcome))])
     if interrupted:
         return options.INTERRUPTED
     return options.DONE if outcome["holds"] else options.DOES_NOT_HOLD
@@ -657,80 +641,3 @@ def _show(answer: _Answer, screen: render.Screen) -> None:
     """The figures of a check that was asked for alone."""
     for part in answer.parts:
         screen.print(render.grid(part.title, part.columns, part.rows, left=range(len(part.columns))))
-
-
-# ----------------------------------------------------------------------------------------------------
-# The report for a stranger.
-
-
-def _headline(outcome: dict[str, Any]) -> str:
-    """One sentence."""
-    checks = outcome["checks"]
-    good = sum(check["holds"] for check in checks)
-    if outcome["holds"]:
-        text = f"All {good} checks hold."
-    else:
-        failed = ", ".join(check["name"] for check in checks if not check["holds"])
-        text = f"{good} of {len(checks) + len(outcome['left_out'])} checks hold"
-        text += f"; not: {failed}." if failed else "."
-    return text + (" Interrupted." if outcome["interrupted"] else "")
-
-
-def _markdown(outcome: dict[str, Any]) -> str:
-    """The whole report."""
-    machine = outcome["machine"]
-    lines = ["# Validation report", "", f"**{_headline(outcome)}** {outcome['wall_s']:.0f} s, seed {outcome['seed']}."]
-    lines += ["", "## Verdicts", "", *_verdict_table(outcome), "", _INTRODUCTION]
-    for check in outcome["checks"]:
-        lines += _section(check)
-    lines += ["## Where this was run", "", ", ".join(f"{name} {value}" for name, value in machine.items()) + ".", ""]
-    return "\n".join(lines)
-
-
-def machine() -> dict[str, str]:
-    """What figures of speed, and the last digits of all others, depend on."""
-    packages = {name: version(name) for name in ("mujoco", "numpy", "scipy", "cvxpy", "clarabel")}
-    return {
-        "Python": platform.python_version(),
-        **packages,
-        "on": f"{platform.platform()}, {os.cpu_count()} processors",
-    }
-
-
-def _verdict_table(outcome: dict[str, Any]) -> list[str]:
-    rows = [
-        (
-            "holds" if check["holds"] else "**does not hold**",
-            f"[{check['asks']}](#{_anchor(check['asks'])})",
-            check["trouble"] or next((part["answer"] for part in check["parts"]), ""),
-            f"`{check['command']}`",
-        )
-        for check in outcome["checks"]
-    ]
-    rows += [("not run", name, "", "") for name in outcome["left_out"]]
-    return _table(("verdict", "check", "answer", "reproduce with"), rows)
-
-
-def _section(check: dict[str, Any]) -> list[str]:
-    lines = [f"## {check['asks']}", "", "```sh", check["command"], "```", ""]
-    verdict = "Holds" if check["holds"] else "Does not hold"
-    lines += [
-        f"{verdict} (exit code {check['exit_code']}, {check['wall_s']:.1f} s). {check['trouble'] or ''}".rstrip(),
-        "",
-    ]
-    for part in check["parts"]:
-        lines += [f"### {part['title']}", ""] if part["title"] else []
-        lines += [*_table(part["columns"], part["rows"]), ""]
-    for picture in check["pictures"]:
-        lines += [f"![{check['asks']}]({picture})", ""]
-    return lines
-
-
-def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    rule = "|" + "---|" * len(columns)
-    return [f"| {' | '.join(columns)} |", rule, *(f"| {' | '.join(cells)} |" for cells in rows)]
-
-
-def _anchor(title: str) -> str:
-    """As GitHub makes it from a heading."""
-    return "".join(c for c in title.lower() if c.isalnum() or c in " -").replace(" ", "-")
