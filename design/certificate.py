@@ -49,7 +49,7 @@ from design.multipliers import (
     walls_demand,
     walls_of,
 )
-from design.result import Condition, NotProved, Requirement, listed, refusal
+from design.result import Condition, NotProved, Requirement, refusal
 from design.stored import Certificate, Guarantee, LimiterCertificate, Stored, SwitchingProof, digest, sealed
 
 # ----------------------------------------------------------------------------------------------------
@@ -83,7 +83,7 @@ def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
     found = swept(loop, coupling)
     requirement = found.requirement
     if not requirement.certified:
-        return _shortfall(requirement)
+        return requirement.shortfall
     P = storage(loop, coupling, found.alpha)
     if isinstance(P, str):
         return P
@@ -151,14 +151,6 @@ def _margin(requirement: Requirement) -> float:
     return 1 / max(requirement.ratio, 1e-12)
 
 
-def _shortfall(requirement: Requirement) -> str:
-    """Why a sweep does not certify."""
-    return (
-        requirement.reason
-        or f"needs {listed(requirement.required)} N s/m of damping, has {listed(requirement.available)}"
-    )
-
-
 def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None:
     """rho (m,) [N/m] of the limiter that the certificate covers, or None where limited forces are not covered."""
     if certificate is None:
@@ -175,7 +167,7 @@ def prove_limiter(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | 
     found = limiter_requirement(loop, coupling, beta, c)
     requirement = found.requirement
     if not requirement.certified:
-        raise NotProved(requirement.reason or f"limiter: {_shortfall(requirement)}", requirement)
+        raise NotProved(requirement.reason or f"limiter: {requirement.shortfall}", requirement)
     P, refused = find_storage(_limiter_block(loop, coupling, found.rho, found.c))
     if P is None:
         raise NotProved(f"limiter: {refused}; the sweep asks {requirement.ratio:.9f} of the damping", requirement)
@@ -275,7 +267,7 @@ def prove(
     requirement = swept or required_damping(loop, coupling, condition, multiplier)
     if not requirement.certified:
         place = f"P{worst(in_each(loop, coupling, loop.members()))}" if loop.ranges else "P"
-        raise NotProved(f"{_place_certificate(loop, condition, place)}{_shortfall(requirement)}", requirement)
+        raise NotProved(f"{_place_certificate(loop, condition, place)}{requirement.shortfall}", requirement)
     if reason := _another_system(loop, coupling):
         raise NotProved(reason, requirement)
     proof: dict[str, Matrix] = {}
