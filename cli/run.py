@@ -353,7 +353,7 @@ def _title(what: str, outcome: dict[str, Any]) -> str:
     growth = f"growth {stability['exact_growth_rate_per_s']:+.3f} 1/s at {stability['exact_frequency_hz']:.1f} Hz"
     if _unstable(outcome) is not None:
         growth = f"{outcome['varying_delay']['pattern']} delays, {stability['verdict']}"
-    return f"{what.removesuffix(', no coupling')}, {coupling}: {growth}"
+    return f"{what.removesuffix(', no coupling').removesuffix(', case none')}, {coupling}: {growth}"
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -402,8 +402,9 @@ def _beside(others: list[Alternative], outcome: dict[str, Any]) -> Any:
         error = "grows" if grows else render.optional(other.error_percent, "{:.3g} %")
         cells.append((other.name + mark, *needs, other.guarantee or "none", _share(other.rendered, "-"), error))
     heads = ("coupling", "this-env.", "any-env.", "guarantee", "stiffness", "error")
-    title = "the same devices with other couplings (*: this run): required damping in % of theirs,"
-    return render.grid(f"{title}\nguarantee, rendered stiffness and force error", heads, cells, left=(0, 3))
+    marked = " (*: this run)" if any(cell[0].endswith("*") for cell in cells) else ""
+    title = f"the same devices with other couplings{marked}: required damping\nin % of theirs"
+    return render.grid(f"{title}, guarantee, rendered stiffness and force error", heads, cells, left=(0, 3))
 
 
 def _share(value: float | None, absent: str) -> str:
@@ -469,7 +470,7 @@ def _net_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
 def _force_error(part: dict[str, Any]) -> str:
     if part["error_percent"] is None:
         return f"- ({part['reason']})"
-    return f"{part['error_percent']:.3g} % rms of Lambda E's, before the force limits"
+    return f"{part['error_percent']:.3g} % rms of the ideal force, before the force limits"
 
 
 def _growth(part: dict[str, Any]) -> str:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.lti import Array, Complex, Lti, Number, Sampled, inverse, rational
+from controller.lti import Array, Complex, Lti, Number, Sampled, inverse, numbers, rational
 
 # ----------------------------------------------------------------------------------------------------
 # Environments that are not known exactly: ranges of a network's parameters, their vertices, and points inside.
@@ -320,6 +320,10 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.between[0] == self.between[1]:
             raise ValueError(f"between joins {self.between[0]!r} to itself; name two different nodes")
 
+    def slope(self, T: Number) -> Number:
+        """K + 2 B/T [N/m], in the arithmetic of T: no motion that alternates between ticks is met more stiffly."""
+        return numbers(self.stiffness, T) + 2 * numbers(self.damping, T) / T
+
 
 class Environment:
     """What a loop asks of its environment. One of your own says its `contacts` and its `E(T)`."""
@@ -431,10 +435,11 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         index = {name: i for i, name in enumerate(self.nodes())}
         M = np.diag([number(self.masses.get(name, 0.0)) for name in index])
         D, K = np.zeros_like(M), np.zeros_like(M)
-        for spring, across in zip(self.springs, self.across(self.springs), strict=True):
-            pattern = np.outer(across, across)
-            mass, damping, stiffness = spring.amounts(number)
-            M, D, K = M + mass * pattern, D + damping * pattern, K + stiffness * pattern
+        for spring in self.springs:
+            ends = [(index[node], sign) for node, sign in zip(spring.between, (1, -1), strict=True) if node != GROUND]
+            for whole, amount in zip((M, D, K), spring.amounts(number), strict=True):
+                for (i, one), (j, other) in itertools.product(ends, ends):
+                    whole[i, j] += one * other * amount
         return M, D, K
 
     def across(self, parts: Sequence[Spring | Wall]) -> NDArray[np.int64]:

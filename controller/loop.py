@@ -135,7 +135,14 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
 
     def sent(self, coupling: Coupling, exact: bool = False) -> Lti:
         """G = (I + Psi E V)^-1 Psi E: the forces as they leave for the devices. Raises SingularLoop."""
-        return self.environment.sent(coupling, self.psi, self.period(exact))
+        if not exact:
+            return self.environment.sent(coupling, self.psi, self.T)
+        asked = (self.environment, coupling, self.psi, self.T)
+        known, found = _exactly
+        if found is None or not all(one is other for one, other in zip(asked, known, strict=True)):
+            found = self.environment.sent(coupling, self.psi, self.period(exact))
+            _exactly[:] = asked, found
+        return found
 
     def sent_at(self, coupling: Coupling, z: Complex) -> Sampled:
         """The same at points z of the circle, (n, k) or (1, k)."""
@@ -181,6 +188,10 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
     def delays(self) -> DelayRange:
         """What the delays of the forces may be; of no width where they are constant."""
         return self.varying_delay or DelayRange(self.theta, self.theta)
+
+
+#: What was built last over Fractions, and of what: a proof asks for it three times, and it is most of its work.
+_exactly: list[Any] = [(None,) * 4, None]
 
 
 def force_map(E: Lti, coupling: Coupling, theta: Sequence[int], psi: Sequence[int]) -> Lti:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import platform
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
@@ -19,7 +20,7 @@ from controller.coupling import (
 from controller.delay import delay
 from controller.environment import Member, inside
 from controller.loop import Loop
-from controller.lti import Array, Lti, SingularLoop, rational
+from controller.lti import Array, Lti, SingularLoop, TooLong, rational, within
 from design.conditions import (
     any_environment,
     any_environment_delayed,
@@ -64,6 +65,19 @@ from design.stored import Certificate, Guarantee, LimiterCertificate, Stored, Sw
 _CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
 
 
+_LONGEST = 60.0  # [s] of exact arithmetic for one certificate: what fits into the limits on states takes less
+
+
+@contextmanager
+def _in_time() -> Iterator[None]:
+    """Raises NotProved where exact arithmetic takes too long, however few states and digits there seem to be."""
+    try:
+        with within(_LONGEST):
+            yield
+    except TooLong as error:
+        raise NotProved(str(error)) from None
+
+
 def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
     """An exact proof of any switching within the loop's range, or why there is none."""
     found = swept(loop, coupling)
@@ -80,10 +94,10 @@ def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
 def storage(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Matrix | str:
     """The matrix that proves the condition for these alpha [N/m] at the loop's damping, or why there is none."""
     try:
-        condition = condition_block(loop, coupling, alpha)
+        with within(_LONGEST):
+            P, reason = find_storage(condition_block(loop, coupling, alpha))
     except (SingularLoop, ValueError) as error:
         return str(error)
-    P, reason = find_storage(condition)
     return str(reason) if P is None else P
 
 
@@ -143,6 +157,7 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
     return (0.0,) * loop.channels if covered else None
 
 
+@_in_time()
 def prove_limiter(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | None = None) -> LimiterCertificate:
     """An exact proof with the multiplier `c` or the best one. Raises NotProved with the reason."""
     found = limiter_requirement(loop, coupling, beta, c)
@@ -205,7 +220,7 @@ def switching_requirement(loop: Loop, coupling: Coupling) -> SwitchingSweep:
 # is strictly positive real (design.exact). On |z| = 1 the Hermitian part of F(1)/(z - 1) is -F(1)/2, so
 # He[F/(z-1)] > -Delta_D/T there; the same certificate shows that F is stable.
 #
-# this-environment, forces that latch late, or walls without dampers: the blocks of latency_demand and walls_demand, the
+# this-environment, forces that latch late, or walls: the blocks of latency_demand and walls_demand, the
 # latter with the multipliers g of its walls, stored too.
 #
 # any-environment, psi = 0: with H = V - Theta-hat (11), (12), V-hat = (1 - 1/z) H/T, H(1) is exactly symmetric, and
@@ -232,6 +247,7 @@ class Verdict:
     reason: str | None = None
 
 
+@_in_time()
 def prove(
     loop: Loop,
     coupling: Coupling,
@@ -364,7 +380,8 @@ def verify(stored: Stored) -> Verdict:
         return Verdict(False, "seal differs: the certificate was changed after it was made")
     coupling = stored.built()
     try:
-        reason = _refuted_claims(loop, coupling, certificate) or _refuted_proof(loop, coupling, certificate)
+        with _in_time():
+            reason = _refuted_claims(loop, coupling, certificate) or _refuted_proof(loop, coupling, certificate)
     except NotProved as refusal:
         reason = str(refusal)
     return Verdict(reason is None, reason)
@@ -405,8 +422,8 @@ def _walls_block(loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Lti:
     try:
         G = loop.walled(coupling, exact=True)
         _require_size(G.order)
-        stiffness = [wall.stiffness for wall in loop.environment.walls]
-        demand = walls_demand(G, loop.delta, stiffness, g, None, loop.T_max)
+        slopes = [wall.slope(G.T) for wall in loop.environment.walls]
+        demand = walls_demand(G, loop.delta, slopes, g, None, loop.T_max)
     except SingularLoop as error:
         raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
     for name, value in demand.static.items():
@@ -553,8 +570,8 @@ def assess(
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
 
     this-environment is about the nominal environment alone (ranges.check asks for the rest of its ranges) and the
-    constant theta (sim.switching.certified_part asks for the rest of its range); where there are walls it is about the
-    frozen contact state that asks for most. What `known`, a certificate just made, proves is not proved again.
+    constant theta (sim.switching.certified_part asks for the rest of its range). What `known`, a certificate just made,
+    proves is not proved again.
     """
     loop = loop.at(loop.environment).switching(None)
     here = this_environment_of(loop, coupling)
@@ -566,7 +583,7 @@ def assess(
 
 
 def this_environment_of(loop: Loop, coupling: Coupling) -> Requirement:
-    """What this-environment asks; with walls that have dampers, in their most demanding frozen contact state."""
+    """What this-environment asks; of walls over ranges, in their most demanding frozen contact state."""
     if making_covered(loop):
         try:
             return walls_of(loop, coupling).requirement

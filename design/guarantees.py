@@ -19,18 +19,17 @@ from design.result import Requirement, finite
 ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment"
 
 
-FROZEN = "each frozen contact state of this environment (contact that makes and breaks is not covered)"
+FROZEN = "each frozen contact state of this environment (with ranges, contact that makes and breaks is not covered)"
 
 
-MAKING = "this environment, with walls up to their stiffness that make and break contact"
+MAKING = "this environment, with walls up to their stiffness and damping that make and break contact"
 
 
 #: What no certificate covers.
 CAVEATS = (
     "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted) "
     "or leave through the limiter that a report names, "
-    "not for walls with dampers that make and break contact (except under any-environment without delay in the "
-    "environment), periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb "
+    "not for periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb "
     "friction pays for, velocity filters or friction compensation."
 )
 
@@ -74,7 +73,8 @@ def encoder_part(
     enough = (
         f"friction of {', '.join(f'{f:.4g}' for f in needed)} N is enough for {widths} um, the devices declare {has} N"
     )
-    words = f"encoder steps {'are covered' if covered else 'are not covered'}: {enough}"
+    verdict = "are covered while forces stay below the limits" if covered else "are not covered"
+    words = f"encoder steps {verdict}: {enough}"
     return part | {"friction_needed": [finite(f) for f in needed], "covered": covered, "words": words}
 
 
@@ -83,9 +83,8 @@ def encoder_part(
 
 
 def making_covered(loop: Loop) -> bool:
-    """Whether this-environment covers walls that make and break contact: those without dampers."""
-    walls = loop.environment.walls
-    return bool(walls) and not loop.ranges and not any(wall.damping for wall in walls)
+    """Whether this-environment covers walls that make and break contact: in one environment, not over ranges."""
+    return bool(loop.environment.walls) and not loop.ranges
 
 
 #: Why any-environment says nothing of forces that latch between ticks.

@@ -50,27 +50,27 @@ Lags = Sequence[Sequence[Any]]
 def walls_demand(
     G: Block,
     delta: Sequence[Any],
-    stiffness: Sequence[Any],
+    slopes: Sequence[Any],
     g: Any,
     lam: Sequence[Any] | None = None,
     T_max: float | None = None,
 ) -> Demand[Block]:
-    """this-environment for walls p = k max(0, y - gap) of any slope k up to `stiffness` (w,) [N/m] and any gap.
+    """this-environment for walls of any stiffness and damping with k + 2 b/T up to `slopes` (w,) [N/m], and any gap.
 
     G takes [x; p] to [f; y], displacements (m,) and wall forces to the forces of the devices and the ways into the
     walls, [[F, J], [H, Y]]. With a multiplier g >= 0 and a weight lam > 0 for each wall (1 if not given) and
     M = g (z-1) - 1 the block is, on (dx, dp),
-        [[F, J], [-lam M H, -lam M Y]]/(z-1) + diag(s Delta_D/T, lam g/stiffness),
+        [[F, J], [-lam M H, -lam M Y]]/(z-1) + diag(s Delta_D/T, lam g/slopes),
     whose static part must be symmetric, J(1) = H(1)' lam and lam Y(1) = Y(1)' lam, with F(1) >= 0 >= lam Y(1).
     """
-    T, m, w = G.T, len(delta), len(stiffness)
+    T, m, w = G.T, len(delta), len(slopes)
     gains, one = numbers(g, T), numbers(np.eye(m + w), T)
     weights = numbers([1] * w if lam is None else lam, T)
     weigh = np.diag(np.concatenate([numbers([1] * m, T), weights]))
     S1, R = (weigh @ G).split_at_one()
-    slopes = np.diag(np.concatenate([numbers([0] * m, T), weights * gains]))
-    limits = np.concatenate([numbers([0] * m, T), weights * gains / numbers(stiffness, T)])
-    free = np.hstack([one, -slopes]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
+    steep = np.diag(np.concatenate([numbers([0] * m, T), weights * gains]))
+    limits = np.concatenate([numbers([0] * m, T), weights * gains / numbers(slopes, T)])
+    free = np.hstack([one, -steep]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
     damping = np.concatenate([even_damping(delta, T, T_max) / T, numbers([0] * w, T)])
     F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]
     static = {"F(1)": F1, "-Y(1)": -Y1, "the static map of devices and walls": S1}
@@ -168,7 +168,7 @@ class _WallsProof:
 def walls_proof(
     G: Lti,
     delta: Sequence[float],
-    stiffness: Sequence[float],
+    slopes: Sequence[float],
     g: Sequence[float] | None = None,
     T_max: float | None = None,
 ) -> _WallsProof:
@@ -176,7 +176,7 @@ def walls_proof(
 
     G takes [x; p] to [f; y] while no wall touches.
     """
-    m, w = len(delta), len(stiffness)
+    m, w = len(delta), len(slopes)
     available = dampings(delta, m)
 
     def refused(reason: str) -> _WallsProof:
@@ -200,11 +200,11 @@ def walls_proof(
     sampled = Sampled(z[None], G.at(z)[None], G.T)
 
     def needed(values: Array) -> float:
-        demand = walls_demand(sampled, available, stiffness, values, None, T_max)
+        demand = walls_demand(sampled, available, slopes, values, None, T_max)
         return float(least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G)).max())
 
     found = _best_g(needed, w) if g is None else np.asarray(g, dtype=float)
-    demand = walls_demand(G, available, stiffness, found, None, T_max)
+    demand = walls_demand(G, available, slopes, found, None, T_max)
     ratio, at = supremum(lambda w: least_scale(demand, w), grid)
     if np.isinf(ratio):
         return refused("no multiplier was found with which the walls are covered, whatever the damping")
@@ -633,18 +633,14 @@ def walls_of(loop: Loop, coupling: Coupling, g: Sequence[Fraction] | None = None
     Raises NotProved for walls that nothing is proved of.
     """
     walls = loop.environment.walls
-    if any(wall.damping for wall in walls):
-        raise NotProved(
-            "of walls with dampers only each frozen contact state is judged, and any-environment proves all"
-        )
     if loop.ranges:
         raise NotProved("walls and ranges: walls are proved in one environment")
     try:
         G = loop.walled(coupling)
     except (SingularLoop, ValueError) as error:
         raise NotProved(str(error)) from None
-    stiffness = [wall.stiffness for wall in walls]
+    slopes = [float(wall.slope(loop.T)) for wall in walls]
     values = None if g is None else [float(value) for value in g]
     if values is not None and (len(values) != len(walls) or min(values) < 0):
         raise NotProved(f"{WALL_MULTIPLIER} is {values}, expected a number >= 0 for each of {len(walls)} walls")
-    return walls_proof(G, loop.delta, stiffness, values, loop.T_max)
+    return walls_proof(G, loop.delta, slopes, values, loop.T_max)

@@ -259,7 +259,8 @@ def _budget(rng: np.random.Generator, factor: float) -> _Case:
 def _walls(rng: np.random.Generator, factor: float) -> _Case:
     K, B, mass = (float(np.exp(rng.uniform(np.log(a), np.log(b)))) for a, b in ((800, 3000), (0.3, 1), (0.02, 0.1)))
     springs = (Spring(("tip", "mass"), 800.0, 0.3), Spring(("mass", GROUND), 20.0, 0.3))
-    walls = Wall(("tip", GROUND), 3000.0, gap=1e-3), Wall((GROUND, "mass"), 2000.0, gap=2e-3)
+    damping = rng.choice([0.0, 0.3, 3.0], 2).tolist()
+    walls = Wall(("tip", GROUND), 3000.0, damping[0], 1e-3), Wall((GROUND, "mass"), 2000.0, damping[1], 2e-3)
     network, theta = Network(("tip",), springs, {"mass": mass}, walls), (int(rng.integers(0, 3)),)
     loop, coupling = Loop(1e-3, theta, (0,), theta, (1.0,), network), SpringDamper([K], [B])
     needed = np.array(walls_of(loop, coupling).requirement.required)

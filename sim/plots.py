@@ -183,12 +183,12 @@ def plot_run(
 
 
 def _ordered(entries: dict[str, Any], around: Surroundings) -> dict[str, Any]:
-    """Channel by channel, and then the rest."""
+    """Channel by channel, of each what the hand holds first, and then the rest."""
     names = around.names or [f"device {i}" for i in range(1, 100)]
 
-    def place(label: str) -> tuple[int, str]:
+    def place(label: str) -> tuple[int, bool, str]:
         mine = [i for i, name in enumerate(names) if label == name or label.startswith((f"{name},", f"{name} ("))]
-        return (mine[0] if mine else len(names), label)
+        return (mine[0] if mine else len(names), "handle" not in label, label)
 
     return dict(sorted(entries.items(), key=lambda entry: place(entry[0])))
 
@@ -359,9 +359,8 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
     """
     columns, around = 2 if len(panels) > 1 else 1, Surroundings(names)
     rows = -(-len(panels) // columns)
-    figure, axes = _panels(
-        "the same devices and hands", rows, columns, (11, 3.1 * rows + 0.6), sharex=True, sharey=True
-    )
+    title, size = "the same devices, hands and object, another coupling in each panel", (11, 3.1 * rows + 0.6)
+    figure, axes = _panels(title, rows, columns, size, sharex=True, sharey=True)
     calm = [panel.ideal for panel in panels if panel.until is None] or [panel.ideal for panel in panels]
     most = 1.5 * max(float(np.abs(force).max(initial=1e-9)) for force in calm)
     for axis, panel in zip(axes.flat, panels, strict=False):

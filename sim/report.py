@@ -86,8 +86,7 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
         lines.append(f"{what} {condition}: it needs {worst:.3g} times the damping that the devices guarantee.")
     if "contact" in outcome["stability"]:
         covered = {ANY: "any-environment", MAKING: "this-environment"}.get(outcome["promise"], "no certificate")
-        frozen = "this-environment is about frozen contact states where walls have dampers"
-        lines.append(f"Contact that makes and breaks: {covered} covers it in this loop; {frozen}.")
+        lines.append(f"Contact that makes and breaks: {covered} covers it in this loop.")
     for name in ("stability", "error", "transparency", "credible"):
         if "reason" in outcome[name]:
             lines.append(f"{name}: {outcome[name]['reason']}.")

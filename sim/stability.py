@@ -174,6 +174,7 @@ def exact_growth(simulation: Simulation) -> float:
 
 
 NOT_EXCITED = "not excited: nothing in this run moves the dominant mode; the verdict is that of the eigenvalues"
+_VECTOR_ROUNDING = 1e-12  # of the largest entry: what an eigenvector's entries may be off
 _UNLIKE = 0.05  # rms of what y does beside the mode, relative to it: above, it is no such mode but noise
 
 
@@ -196,7 +197,8 @@ def measured_growth(
     pushed = trace.w[:usable] @ (loop.B.T @ left)
     weight = float(np.vdot(y[:-1], y[:-1]).real)
     states = np.concatenate([trace.s[:usable], trace.z[:usable]], axis=1)
-    summed = np.abs(states) @ np.abs(left)  # what rounding is relative to, where large parts cancel in y
+    # what rounding is relative to: large parts that cancel in y, and the eigenvector's own zeros
+    summed = np.abs(states) @ (np.abs(left) + _VECTOR_ROUNDING / _NOISE_FLOOR * np.abs(left).max())
     eigenvalue = np.array(np.vdot(y[:-1], y[1:] - pushed) / weight if weight else 0.0, dtype=np.complex128)
     rest = y[1:] - pushed - eigenvalue * y[:-1]
     if weight <= _NOISE_FLOOR**2 * float(summed @ summed) or float(np.vdot(rest, rest).real) > _UNLIKE**2 * weight:

@@ -143,7 +143,6 @@ QUICK = {  # what a command needs beside the option in question
     "trace": ("t.npz",),
     "accuracy": (),
     "suite": ("--only", "I"),
-    "hunt": ("--draws", "1"),
     "design": (),
     "audit": ("--K", "400,300", "--B", ".1,.1"),
     "check": ("c.json",),
@@ -164,7 +163,6 @@ NUMERIC = {
     "view": "fps duration",
     "accuracy": "duration",
     "suite": "humans",
-    "hunt": "draws hands duration",
     "design": "ranges samples band high-gain seconds order varying-delay delta",
     "audit": "K B varying-delay",
     "compare": "points band seconds",
@@ -753,7 +751,6 @@ def silence() -> Iterator[Case]:
         (("view", "--video", ""), "--video"),
         (("view", "--video", "v.gif", "--script", "x"), "--script"),
         (("view", "--video", "v.gif", "--script", "-1:quit"), "--script"),
-        (("hunt", "--draws", "0"), "--draws"),
     ]:
         yield Case(" ".join(words), words, says=says)
     yield Case("accuracy of a feather", ("accuracy", "--scenario", "s.toml"), (BUT,), before=feather)

@@ -12,9 +12,9 @@ from cli.design import main as cli_design
 from controller.coupling import SpringDamper
 from controller.environment import FIGURE_4, Network, Spring
 from controller.loop import DelayRange, Loop
-from design.certificate import assess, prove, required_damping, verify
+from design.certificate import assess, prove, prove_limiter, required_damping, verify
 from design.conditions import any_environment, any_environment_demand, even_damping, this_environment_demand
-from design.multipliers import swept
+from design.multipliers import limiter_requirement, swept
 from design.spring_damper import design
 from design.stored import Stored, digest
 
@@ -60,6 +60,15 @@ def test_so_it_does_with_delays_that_switch_and_with_the_multiplier_of_a_delayed
     asked = [required_damping(one, found.coupling, "any-environment", found.phi) for one in (delayed, longer)]
     assert asked[1].ratio == pytest.approx(asked[0].ratio, rel=1e-7)
     assert verify(Stored.of(longer, found.coupling, prove(longer, found.coupling, "any-environment", found.phi))).proved
+
+
+def test_so_it_does_while_forces_are_limited():
+    """The lag of the limiter is a number of the controller, which no period changes; proved exactly, too."""
+    loop, c = change(LOOP, delta=(3.0, 3.0)), ((0.3,), (0.3,))
+    longer = change(loop, T_max=LONG)
+    even, uneven = (limiter_requirement(one, SOFT, c=c).requirement for one in (loop, longer))
+    assert uneven.required == pytest.approx([1.6 * b for b in even.required], rel=1e-9)
+    assert prove_limiter(longer, SOFT, c=c).required == uneven.required
 
 
 def test_the_any_environment_line_by_hand():

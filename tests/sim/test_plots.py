@@ -111,7 +111,7 @@ def test_an_onset_is_drawn_at_its_size_and_slope_and_what_is_not_credible_is_gre
     figure = drawn(plots.plot_run, result, title="t", frequency_hz=84.0, onset=onset)
     curve = lines(figure.axes[1])["slope predicted: +1.4 1/s"]
     assert np.diff(np.log(curve[:, 1]))[0] == pytest.approx(1.4 * np.diff(curve[:, 0])[0])
-    names = [f"device 1, {what}" for what in ("encoder (thin)", "force", "handle (thick)")]
+    names = [f"device 1, {what}" for what in ("handle (thick)", "encoder (thin)", "force")]
     assert legend(figure)[:3] == names
     handles, encoders = (lines(figure.axes[0])[f"device 1, {what}"] for what in ("handle (thick)", "encoder (thin)"))
     np.testing.assert_allclose(handles[:, 1], 1e3 * handle)
