@@ -28,12 +28,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.fft import fft, ifft, next_fast_len
-from scipy.ndimage import binary_dilation
-from scipy.optimize import lsq_linear
-from scipy.signal import fftconvolve
-from scipy.special import erf
 
 from controller.lti import Array
 
@@ -87,17 +83,18 @@ def _window(order: int, sigma: float, T: float) -> Array:
 
 
 def _filtered(signal: Array, order: int, sigma: float, T: float) -> Array:
-    return fftconvolve(signal, _window(order, sigma, T), mode="same")
+    return scipy.signal.fftconvolve(signal, _window(order, sigma, T), mode="same")
 
 
 def _held(force: Array, sigma: float, T: float) -> tuple[Array, Array, Array]:
     """A force held for each tick, filtered, and its two derivatives."""
     n = round(_REACH * sigma / T)
     t = np.arange(-n, n + 1) * T
-    step = (erf(t / (np.sqrt(2) * sigma)) - erf((t - T) / (np.sqrt(2) * sigma))) / 2
+    step = (scipy.special.erf(t / (np.sqrt(2) * sigma)) - scipy.special.erf((t - T) / (np.sqrt(2) * sigma))) / 2
     bells = [np.exp(-((s / sigma) ** 2) / 2) / (np.sqrt(2 * np.pi) * sigma) for s in (t, t - T)]
     slope = (bells[1] * (t - T) - bells[0] * t) / sigma**2
-    first, second, third = (fftconvolve(force, kernel, mode="same") for kernel in (step, bells[0] - bells[1], slope))
+    kernels = (step, bells[0] - bells[1], slope)
+    first, second, third = (scipy.signal.fftconvolve(force, kernel, mode="same") for kernel in kernels)
     return first, second, third
 
 
@@ -136,14 +133,14 @@ class _Balance:
         self._reach = round(_REACH * self.sigma / T)
         # what holds a body at rest, or dithers it, is not in g
         clear = _moving(x, step, T) & _slow(force, self.sigma, T)
-        clear = ~binary_dilation(~clear, iterations=round(_NEARBY * self.sigma / T))
+        clear = ~scipy.ndimage.binary_dilation(~clear, iterations=round(_NEARBY * self.sigma / T))
         rows = np.flatnonzero(clear[self._reach : -self._reach]) + self._reach
         if len(rows) < _FEW:
             raise ValueError(f"the axis moves in {len(rows)} samples only, at least {_FEW} are needed")
         self.independent = len(rows) * T / (2 * np.sqrt(np.pi) * self.sigma)  # samples behind so long a window
         self.rows = rows[:: max(1, int(_SPACING * self.sigma / T))]
-        self._length = next_fast_len(len(x) + 2 * self._reach)
-        self._filters = {n: fft(_window(n, self.sigma, T), self._length) for n in range(5)}
+        self._length = scipy.fft.next_fast_len(len(x) + 2 * self._reach)
+        self._filters = {n: scipy.fft.fft(_window(n, self.sigma, T), self._length) for n in range(5)}
         short = (step**2 / 12 * T / (4 * np.sqrt(np.pi) * _SPEED_NOISE**2)) ** (1 / 3)
         self.speed = _filtered(self.x, 1, float(np.clip(short, T, self.sigma / 2)), T)
         applied, rate, bend = _held(force, self.sigma, T)
@@ -158,8 +155,8 @@ class _Balance:
 
     def _of(self, signal: NDArray[Any], *orders: int) -> list[NDArray[Any]]:
         """Derivatives (rows,) of the filtered signal (N,), which may be complex."""
-        spectrum = fft(signal, self._length)
-        found = [ifft(spectrum * self._filters[order])[self.rows + self._reach] for order in orders]
+        spectrum = scipy.fft.fft(signal, self._length)
+        found = [scipy.fft.ifft(spectrum * self._filters[order])[self.rows + self._reach] for order in orders]
         return found if np.iscomplexobj(signal) else [one.real for one in found]
 
     def laws(self, step: float) -> list[tuple[float, Array]]:
@@ -181,7 +178,7 @@ class _Balance:
     def waves(self, periods: Array) -> list[_Pair]:
         """For every period [m] a force that repeats with position, and an encoder's error that does."""
         waves = [(p, wave) for p in periods.tolist() for wave in self._of(np.exp(2j * np.pi * self.x / p), 0, 2)]
-        return [_Pair(period, np.stack([wave.real, wave.imag], axis=1)) for period, wave in waves]
+        return [_Pair(period, np.stack([np.real(wave), np.imag(wave)], axis=1)) for period, wave in waves]
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +211,7 @@ def _solve(columns: Array, force: Array) -> Array:
     q, r = np.linalg.qr(columns / scale)
     low = np.full(columns.shape[1], -np.inf)
     low[list(_NOT_NEGATIVE)] = 0.0
-    return lsq_linear(r, q.T @ force, (low, np.inf), method="bvls").x / scale
+    return scipy.optimize.lsq_linear(r, q.T @ force, (low, np.inf), method="bvls").x / scale
 
 
 def _fitted(balance: _Balance, dry: Array, periodic: list[_Pair]) -> _Fit:
