@@ -1,4 +1,4 @@
-"""How a session's bytes travel in real time: the serial port, by pyserial, and one thread that waits for nothing else.
+"""Wire: how a session's bytes travel (a serial port here, by pyserial), and one thread that waits for nothing else.
 
 Python holds up a loop by itself: a full garbage collection takes 40 ms with MuJoCo and cvxpy loaded. So what is loaded
 is frozen and the collector is off while forces act.
