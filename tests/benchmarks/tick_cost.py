@@ -22,6 +22,7 @@ from hw.limits import Stage
 from hw.monitor import LinkSettings
 from hw.protocol import Command, Decoder, Force, State, encode
 from hw.recording import Recorder
+from hw.seam import SerialDevice
 from hw.session import session_for
 from hw.transport import Live, SerialPort
 from sim.scenario import load
@@ -36,12 +37,13 @@ def tick_cost(ticks: int) -> tuple[list[float], list[float]]:
     session, terminal, emulator = session_for(scenario, LinkSettings(measure=60)), Terminal(), Emulator(scenario)
     session.record = Recorder(scenario.channels)
     port = SerialPort(terminal.path, None)
-    live = Live(session, port, lambda ages: made, True, 3600.0)
+    live = Live(session, SerialDevice(port), lambda ages: made, True, 3600.0)
     clock = [0]
-    live.now = lambda: clock[0]  # the clock of the ticks: what is measured here takes longer than they do
+    live.clock = lambda: clock[0]  # the clock of the ticks: what is measured here takes longer than they do
     controller, decoder = made[0].controller(), Decoder()
     bare, whole = [], []
-    live._write(session.start(0))
+    session.start(0)
+    live.turn()
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -62,8 +64,7 @@ def tick_cost(ticks: int) -> tuple[list[float], list[float]]:
         if data:
             terminal.write(data)
         begun = time.perf_counter_ns()
-        live._step()
-        live._steer()
+        live.turn()
         if session.stage == Stage.ARMED and number % (2 * BLOCK) < BLOCK:
             whole.append(1e-3 * (time.perf_counter_ns() - begun))
         number += 1
