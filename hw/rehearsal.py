@@ -79,8 +79,6 @@ class Rehearsal:
         device = SerialDevice(self, lambda: 1e-6 * self._now)
         self._driver = Driver(self.session, device, self.plan, lambda: round(self._now))
         self._at(0, "tick", 0)
-        self._pass(_BEGIN_US)
-        self.session.start(round(self._now))
 
     def run(self, seconds: float) -> Session:
         """Until `seconds` of virtual time are over. Returns the session."""
@@ -106,6 +104,9 @@ class Rehearsal:
 
     def _turn(self) -> None:
         """One call of the device, then what a person does."""
+        if not self.session.log:
+            self._pass(_BEGIN_US)
+            self.session.start(round(self._now))
         if self.session.stage == Stage.LOST and self._gone:
             self._pass(1000)
         else:
@@ -128,13 +129,13 @@ class Rehearsal:
 
     def wait(self, seconds: float) -> bool:
         """Time goes on until something has come in, or so many seconds are over, and as long as the host is frozen."""
-        if (frozen := self._frozen_for()) > 0:
-            self._pass(frozen)
         until = self._now + 1e6 * seconds
         while not self._read and not self._gone and self._queue[0][0] <= until:
             self._next()
         if not self._read and not self._gone:
             self._now = until
+        if (frozen := self._frozen_for()) > 0:
+            self._pass(frozen)
         return bool(self._read) or self._gone
 
     def read(self) -> bytes:

@@ -1,7 +1,7 @@
 """The seam for devices: four calls that a session needs of them, and the loop that makes these calls.
 
 A device at a serial port (docs/protocol.md) is one implementation, one that the host clocks another
-(hw/force_dimension.py). None of the calls waits for longer than a tick, or a millisecond: keys, signals and time-outs
+(hw/force_dimension.py). None of the calls waits for longer than a tick: keys, signals and time-outs
 are looked at between any two.
 """
 
@@ -33,7 +33,7 @@ from hw.session import Said, Session
 
 _RESEND = 0.1  # [s] after which a question is asked again
 _STOPPING = 0.05  # [s] in which a device that was told to stop must rest
-_LONGEST_WAIT = 1e-3  # [s] of one call
+_LONGEST_WAIT = 5e-4  # [s] of one call
 
 
 class PortLost(OSError):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from worlds import FakePort
 
 from hw.control import certified_couplings
 from hw.device import Device
@@ -30,7 +31,6 @@ from hw.seam import Driver, SerialDevice
 from hw.session import Session
 from sim.scenario import load as scenario_of
 from sim.trace import growths
-from worlds import FakePort
 
 T_US = 1200
 CONFIG = Config(2, 4, 5, 50, (20000, 20000), (600, 600))

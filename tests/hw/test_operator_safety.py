@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from worlds import FakePort
 
 from cli import bridge, identify, replay
 from cli.bridge import _parser
@@ -27,7 +28,6 @@ from hw.session import Operator, Session, session_for
 from hw.transport import Preflight, preflight
 from sim.scenario import InputError
 from sim.scenario import load as scenario_of
-from worlds import FakePort
 
 ROOT = Path(__file__).parent.parent.parent
 

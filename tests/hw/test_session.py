@@ -7,6 +7,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 from rich.console import Console
+from worlds import FakePort
 
 from cli import bridge
 from cli import replay as replay_command
@@ -32,7 +33,6 @@ from sim.scenario import InputError
 from sim.scenario import load as scenario_of
 from sim.stability import close, dominant_mode
 from sim.trace import Trace
-from worlds import FakePort
 
 FAST = LinkSettings(measure=100)
 AT_REST = LinkSettings(measure=100, test_encoders=False)  # nothing moves the handles before the person does
