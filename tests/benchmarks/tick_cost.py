@@ -40,7 +40,7 @@ def tick_cost(ticks: int) -> tuple[list[float], list[float]]:
     live = Live(session, SerialDevice(port), lambda ages: made, True, 3600.0)
     clock = [0]
     live.clock = lambda: clock[0]  # the clock of the ticks: what is measured here takes longer than they do
-    controller, decoder = made[0].controller(), Decoder()
+    controller, decoder = made[0].controller(session.limits.cap), Decoder()
     bare, whole = [], []
     session.start(0)
     live.turn()
