@@ -12,7 +12,10 @@ and a stored float stands for its shortest decimal, the one that a person wrote:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -29,6 +32,33 @@ Number = float | Fraction
 
 class SingularLoop(ValueError):
     """A feedback interconnection whose algebraic loop has no solution, or an exact system with a pole at z = 1."""
+
+
+class TooLong(ValueError):
+    """Exact arithmetic that has used up the time it was given."""
+
+
+_until: ContextVar[tuple[float, float]] = ContextVar("until", default=(float("inf"), 0.0))
+
+
+@contextmanager
+def within(seconds: float) -> Iterator[None]:
+    """Exact arithmetic here may take so many seconds of this thread's processor, or what is left of a time around it.
+
+    Else it raises TooLong, at the next row of a product or of an elimination.
+    """
+    token = _until.set(min(_until.get(), (time.thread_time() + seconds, seconds)))
+    try:
+        yield
+    finally:
+        _until.reset(token)
+
+
+def on_time() -> None:
+    """Raises TooLong where the time of `within` is over."""
+    until, seconds = _until.get()
+    if time.thread_time() > until:
+        raise TooLong(f"exact arithmetic was given up after {seconds:g} s: these are too many digits over many states")
 
 
 def rational(value: Any) -> Fraction:
@@ -486,6 +516,7 @@ def _solve_exactly(M: Any, right: Any) -> Any:
     columns: list[set[int]] = [{i for i in range(n) if j in rows[i]} for j in range(n)]
     active, order = set(range(n)), []
     while active:
+        on_time()
         i = min(active, key=lambda r: len(rows[r]))
         if not rows[i]:
             raise SingularLoop(f"a {n} x {n} matrix is singular: a pole at z = 1 or an algebraic loop without solution")
@@ -501,6 +532,7 @@ def _solve_exactly(M: Any, right: Any) -> Any:
         columns[j].clear()
     solution: list[dict[int, Fraction]] = [{} for _ in range(n)]
     for i, j in reversed(order):
+        on_time()
         total = values[i]
         for c, v in rows[i].items():
             if c != j:

@@ -40,7 +40,7 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     For any environment where this-environment covers less than the loop: walls that make and break contact, ranges,
     delays that vary. Other kinds for their own condition.
     """
-    less = loop.environment.walls or loop.box or loop.jitter
+    less = loop.environment.walls or loop.ranges or loop.varying_delay
     return "any-environment" if less and "any-environment" in KINDS[kind] else KINDS[kind][0]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cholesky, solve_discrete_are, solve_triangular
 
-from controller.lti import Array, Lti, rational
+from controller.lti import Array, Lti, on_time, rational
 from design.frequency import frequencies, hermitian, on_circle, supremum
 
 # ----------------------------------------------------------------------------------------------------
@@ -70,7 +70,11 @@ class Matrix:
         return self if common == 1 else Matrix(self.num // common, self.den // common)
 
     def __matmul__(self, other: Matrix) -> Matrix:
-        return Matrix(self.num @ other.num, self.den * other.den).reduced()
+        num = np.empty((self.shape[0], other.shape[1]), dtype=object)
+        for i, row in enumerate(self.num):
+            on_time()
+            num[i] = row @ other.num
+        return Matrix(num, self.den * other.den).reduced()
 
     def __add__(self, other: Matrix) -> Matrix:
         den = math.lcm(self.den, other.den)

@@ -21,14 +21,14 @@ from scipy.linalg import solve_triangular
 
 from controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling, basis
 from controller.delay import delay
-from controller.environment import Box, Network, UncertainSpring
+from controller.environment import Network, Ranges, UncertainSpring
 from controller.loop import DelayRange, Loop
 from controller.lti import Array, Complex, Lti, Sampled, as_like
 from design.barrier import Block, Program, centre, towards
 from design.certificate import prove, prove_limiter
 from design.conditions import Demand, even_damping, least_multiple, this_environment_demand
 from design.conditions import this_environment as requirement_of
-from design.environments import Searched, in_each, search_box, worst
+from design.environments import Searched, in_each, search_ranges, worst
 from design.frequency import frequencies, hermitian, on_circle, peaks, supremum
 from design.multipliers import (
     BETA,
@@ -633,7 +633,7 @@ def design(
             best = found
         if (gained < _SETTLED_DB and len(rungs) >= _FEWEST_RUNGS) or climb.elapsed > options.seconds:
             break
-    if best and loop.box:
+    if best and loop.ranges:
         best = climb.between(best)
     if best is None or climb.mismatch(best) > _HOPELESS:
         rivals = [one for one in (best, climb.scaled(), climb.spring_damper()) if one is not None]
@@ -656,8 +656,8 @@ class _Climb:
         started = time.perf_counter()
         if loop.environment.walls:
             raise ValueError("an optimal coupling holds a linear model of the environment: walls have none")
-        if loop.jitter:
-            further = (*further, lambda there, span=loop.jitter: switching(there, span, options.margin))
+        if loop.varying_delay:
+            further = (*further, lambda there, span=loop.varying_delay: switching(there, span, options.margin))
         cases: list[Case] = []
         for member in loop.members():
             there = _at(loop, member.network)
@@ -757,18 +757,18 @@ class _Climb:
             scale = min(1.0, (1 - self.options.margin) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))
             found = self._assessed(scaled, scaled.g)
-            if self.loop.box or (found := self._proved(found, slip)).proved:
+            if self.loop.ranges or (found := self._proved(found, slip)).proved:
                 break
         return found
 
     def between(self, found: Optimal) -> Optimal:
-        """The coupling for a box after the search between the vertices, and proved at each of them.
+        """The coupling for ranges after the search between the vertices, and proved at each of them.
 
         Where the worst environment that was found asks for more damping than there is, the forces are scaled down.
         """
         whole = found.coupling
         assert isinstance(whole, ForceFilter)
-        searched = search_box(self.loop, whole)
+        searched = search_ranges(self.loop, whole)
         ratio, last = searched.worst[0].ratio, found
         for limit in (1 - self.options.margin / 2, 1 - 2.5 * self.options.margin):
             share = min(1.0, limit / ratio)
@@ -935,11 +935,11 @@ def spread(loop: Loop, options: Options = Options(), percent: float = 10.0) -> _
     return _Spread(mismatch, mismatch - climb.decibels(alone), wide.g, worst)
 
 
-def box_around(network: Network, percent: float) -> Box:
+def ranges_around(network: Network, percent: float) -> Ranges:
     """Every stiffness and every mass this much more or less, each independent of the others."""
 
     def near(value: float) -> tuple[float, float]:
         return tuple(float(f"{value * (1 + sign * percent / 100):.12g}") for sign in (-1, 1))  # type: ignore[return-value]
 
     springs = tuple(UncertainSpring(s.between, near(s.stiffness)) for s in network.springs if s.stiffness > 0)
-    return Box(springs, {node: near(mass) for node, mass in network.masses.items() if mass > 0})
+    return Ranges(springs, {node: near(mass) for node, mass in network.masses.items() if mass > 0})

@@ -25,11 +25,11 @@ from design.multipliers import (
     Lags,
     LimiterProof,
     half_widths,
-    jitter_proof,
     limiter_demand,
     limiter_lag,
     limiter_refusal,
     switching_block,
+    switching_sweep,
 )
 from design.multipliers import limiter as limiter_proof
 from design.result import Design, DesignFailed, Infeasible, Requirement
@@ -388,7 +388,7 @@ def _certified_optimum(
 # Spring-damper gains that are safe under any switching of their delays: a local search as in frozen_environment.py.
 #
 # Its sampled condition is `switching_block`: the multiplier is searched together with the gains. What is returned
-# passes the sweep of `jitter_proof`, which knows nothing of the multiplier found here.
+# passes the sweep of `switching_sweep`, which knows nothing of the multiplier found here.
 
 
 _FIRST = 0.5  # the multiplier alpha T/delta that a search begins with where the start has none
@@ -409,7 +409,7 @@ class _SwitchingLoop(_SampledLoop):
     def point(self, coupling: SpringDamper) -> Array:
         """The gains with their best multiplier."""
         loop = self.loop
-        found = jitter_proof(loop.sent(coupling), *self.range, loop.delta, T_max=loop.T_max)
+        found = switching_sweep(loop.sent(coupling), *self.range, loop.delta, T_max=loop.T_max)
         a = np.array(found.alpha)[self.active] * loop.T / self.delta[self.active]
         a = np.clip(np.where(np.isfinite(a), a, _FIRST), *_MULTIPLIERS)
         return np.concatenate([super().point(coupling), np.log(a)])
@@ -450,7 +450,7 @@ def _safe_optimum(sampled: _SwitchingLoop, start: SpringDamper) -> tuple[SpringD
     for searches in range(1, _MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
         coupling = sampled.coupling(x)
-        requirement = jitter_proof(loop.sent(coupling), *sampled.range, loop.delta, T_max=loop.T_max).requirement
+        requirement = switching_sweep(loop.sent(coupling), *sampled.range, loop.delta, T_max=loop.T_max).requirement
         if requirement.ratio <= 1 - RESERVE:
             return coupling, searches
         if sampled.room(x).min() < -_STUCK or requirement.frequency_hz is None:

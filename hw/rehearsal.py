@@ -256,7 +256,8 @@ def rehearse(
     Raises InputError for a scenario that cannot stand behind a serial link, TypeError for an argument of another type.
     """
     of_kind("scenario", scenario, Scenario, 'a Scenario, as load("omega-pair") gives it')
-    alone = None if coupling is None else bare(coupling, f"{COUPLING}, or None to have one designed")
+    if coupling is not None:
+        bare(coupling, f"{COUPLING}, or None to have one designed")
     if case not in ("I", "II"):
         raise InputError(f"case is {case!r}, allowed are I, II")
     seconds, seed = number("seconds", seconds, "a number of seconds"), whole("seed", seed, 0)
@@ -277,10 +278,10 @@ def rehearse(
     def plan(ages: Ages) -> list[CertifiedCoupling]:
         delays.append(1e-6 * ages.median)
         met, link = timed(scenario, ages, _QUANTILE, _GUARD_US, latch_on_arrival)
-        if alone is None:
+        if coupling is None:
             programs.extend(certified_couplings(met, case, None, None, link))
         else:
-            programs.append(certified_coupling(met, case, None, None, link, alone))
+            programs.append(certified_coupling(met, case, None, None, link, coupling))
         return programs
 
     stopped: list[float] = []  # [s] after arming

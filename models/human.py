@@ -240,7 +240,7 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         w = 2 * np.pi * self.frequency
         wave = self.amplitude * np.sin(w * t + self.phase)
         wave_rate = self.amplitude * w * np.cos(w * t + self.phase)
-        if self.ease == 0:
+        if self.ease == 0 or t.min(initial=self.ease) >= self.ease:
             return wave, wave_rate
         rising = t < self.ease
         gain = np.where(rising, (1 - np.cos(np.pi * t / self.ease)) / 2, 1.0)

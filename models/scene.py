@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from models.device import CompliantDevice, Device
+from models.device import Device
 from models.human import Cross, Hand, Human, Impedance, Link, Person, Port, body_port, chain_port, check_holds
 
 # ----------------------------------------------------------------------------------------------------
@@ -252,7 +252,7 @@ def _only_what_the_loop_needs(spec: mujoco.MjSpec, friction: bool) -> None:
 
 
 def _handle(i: int, device: Device) -> str:
-    return f"device_{i}/handle" if isinstance(device, CompliantDevice) else f"device_{i}/motor"
+    return f"device_{i}/{list(device.bodies)[-1]}"
 
 
 class _Placed(NamedTuple):
@@ -315,15 +315,13 @@ def _amounts(devices: Sequence[Device], placed: Sequence[_Placed]) -> _Amounts:
     damping: dict[str, Any] = {}
     stiffness: dict[str, Any] = {}
     for i, device in enumerate(devices, start=1):
-        compliant = isinstance(device, CompliantDevice)
         motor = f"device_{i}/motor"
-        mass[motor] = device.motor_mass if compliant else device.mass
-        damping[motor], stiffness[motor] = device.damping, 0.0
+        mass[motor], damping[motor], stiffness[motor] = device.bodies["motor"], device.damping, 0.0
     for i, device in enumerate(devices, start=1):
-        if isinstance(device, CompliantDevice):
-            mass[f"device_{i}/handle"] = device.handle_mass
-            damping[f"device_{i}/transmission"] = device.transmission_damping
-            stiffness[f"device_{i}/transmission"] = device.transmission_stiffness
+        mass |= {f"device_{i}/{name}": amount for name, amount in device.bodies.items()}
+        if device.transmission:
+            between = f"device_{i}/transmission"
+            damping[between], stiffness[between] = device.transmission
     for port, joints, _, springs in placed:
         for k, joint in enumerate(joints):
             mass[joint] = mass.get(joint, 0.0) + port.mass[..., k]
@@ -358,9 +356,9 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
             joint = spec.joint(f"device_{i}/motor")
             joint.frictionloss = device.friction
             joint.solref_friction, joint.solimp_friction = _STICK, _HARD
-        if isinstance(device, CompliantDevice):
+        if device.transmission:
             tendon = spec.tendon(f"device_{i}/transmission")
-            tendon.stiffness[0], tendon.damping[0] = device.transmission_stiffness, device.transmission_damping
+            tendon.damping[0], tendon.stiffness[0] = device.transmission
         _add_springs(spec, placed[i - 1], damping, stiffness)
     for part in placed[len(devices) :]:
         _add_springs(spec, part, damping, stiffness)
@@ -397,7 +395,7 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
 
 def _attach_devices(spec: mujoco.MjSpec, devices: Sequence[Device]) -> None:
     """Motors and handles of the devices' own files, side by side: first all motors, then all handles."""
-    parts = [_file("compliant" if isinstance(device, CompliantDevice) else "rigid").copy() for device in devices]
+    parts = [_file(device.file).copy() for device in devices]
     for name in ("motor", "handle"):
         for i, part in enumerate(parts, start=1):
             if part.body(name):

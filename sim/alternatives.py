@@ -109,7 +109,7 @@ def alternatives(
 def _possible(scenario: Scenario, case: str, kind: str, condition: str | None) -> bool:
     if kind == "published":
         return scenario.loop(case) == load().loop(case)
-    one_environment = scenario.environment.walls or scenario.box
+    one_environment = scenario.environment.walls or scenario.ranges
     if condition == "this-environment" and one_environment:
         return False
     return kind != "optimal" or scenario.channels <= _QUICK
@@ -122,7 +122,7 @@ def _alternative(scenario: Scenario, case: str, kind: str, condition: str | None
         return Alternative(kind, condition, reason=str(error))
     loop = scenario.loop(case)
     requirements = assess(loop, chosen.coupling, chosen.phi)
-    simulation = assemble(scenario, chosen.coupling, limits_of(scenario, chosen.coupling, requirements).rho)
+    simulation = assemble(scenario, chosen.coupling, limits_of(scenario, chosen, requirements).rho)
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)
     made = Alternative(

@@ -22,7 +22,7 @@ SOFT_NETWORK = Network(
     (Spring(("contact 1", "mass"), 200.0, 0.25), Spring(("mass", "contact 2"), 175.0, 0.25)),
     {"mass": 1.0},
 )
-#: of version 0.1: eight functions of a diagonal Q, optimal at the vertices of omega-pair-box and at nothing else
+#: of version 0.1: eight functions of a diagonal Q, optimal at the vertices of omega-pair-ranges and at nothing else
 POLES = (0.0, 0.0, 0.5, 0.822172, 0.936754, 0.977506, 0.992)
 DIAGONAL = (
     (-3.6184269801e-05, -2.9144270496e-05),

@@ -9,7 +9,7 @@ from worlds import DELTA, PAIR, T
 
 from cli.design import main as design_main
 from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Box, Network, Spring, Wall
+from controller.environment import FIGURE_4, GROUND, Network, Ranges, Spring, Wall
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled, taps
 from controller.process import Limiter, Process, StepBuffer, limited
@@ -241,8 +241,8 @@ def test_a_storage_matrix_of_something_else_proves_nothing(stored):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"jitter": DelayRange((1, 2), (1, 3))}, "not for delays that switch"),
-        ({"box": Box(masses={"mass": (0.9, 1.1)})}, "not for ranges"),
+        ({"varying_delay": DelayRange((1, 2), (1, 3))}, "not for delays that switch"),
+        ({"ranges": Ranges(masses={"mass": (0.9, 1.1)})}, "not for ranges"),
         ({"environment": Network(("a", "b"), walls=(Wall(("a", "b"), 1000.0, 0.0, 0.0),))}, "with walls only"),
     ],
 )

@@ -23,7 +23,7 @@ from design.bound import bound
 from design.certificate import verify
 from design.conditions import this_environment
 from design.frequency import hermitian, on_circle
-from design.optimal import Case, Options, Span, box_around, design, robustness, span_of, vertices
+from design.optimal import Case, Options, Span, design, ranges_around, robustness, span_of, vertices
 from design.stored import Stored, save
 from design.stored import load as load_file
 from design.transparency import transparency
@@ -239,11 +239,11 @@ def test_a_coupling_for_ranges_is_proved_at_every_vertex_and_searched_between():
     loop = loop_of("n3")
     nominal = best("n3")
     assert not robustness(loop, nominal.coupling).kept
-    ranged = msgspec.structs.replace(loop, box=box_around(loop.environment, 10.0))
+    ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
     found = design(ranged, SHORT)
     assert found.proved
     assert len(found.certificate.matrices) == len(ranged.members())
-    assert found.certificate.guarantee == "a set"
+    assert found.certificate.guarantee == "these ranges"
     spread = robustness(loop, found.coupling)
     assert spread.kept
     for network in vertices(loop.environment).values():
@@ -451,6 +451,6 @@ def test_forces_that_are_limited_are_part_of_the_design(name):
 
 def test_limited_forces_are_not_proved_for_ranges():
     loop = loop_of("n3")
-    ranged = msgspec.structs.replace(loop, box=box_around(loop.environment, 10.0))
+    ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
     with pytest.raises(ValueError, match="limited forces are proved for one environment"):
         design(ranged, replace(SHORT, limiter=True))

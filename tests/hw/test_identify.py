@@ -25,14 +25,14 @@ from sim.trace import Trace
 STEP = 5e-6  # [m] a coarse encoder: half of an Omega's 0.01 mm
 
 
-def record_of(scenario, *faults):
+def record_of(scenario, *faults, seconds=1.5):
     """A chirp of 1 N and a release, recorded through the whole link."""
     recorder = Recorder(scenario.channels)
     session = Session(
         scenario.replace(delta=(1e-6,) * scenario.channels), Limits((1.0, 1.0)), LinkSettings(measure=100)
     )
     session.record = recorder
-    excitation = chirp(scenario.channels, scenario.T, 1, 1.0, (3.0, 200.0), 1.5)
+    excitation = chirp(scenario.channels, scenario.T, 1, 1.0, (3.0, 200.0), seconds)
     faults = tuple(map(FaultInjection.parse, faults))
     rehearsal = Rehearsal(session, Emulator(nobody(scenario)), lambda ages: [excitation], faults)
     rehearsal.run_until_armed(excitation.seconds + 0.1)
@@ -45,7 +45,7 @@ def test_known_parameters_come_back():
     """A compliant and a rigid device, neither of them the ones the search begins with.
 
     All to 0.2 %. The bound of the lighter axis is a hundredth below; that of the heavier one more, since which law dry
-    friction has is not known, and 1.5 s a sweep do not exclude all.
+    friction has is not known, and the record does not exclude all.
     """
     scenario = load()
     compliant = msgspec.structs.replace(
@@ -57,7 +57,7 @@ def test_known_parameters_come_back():
         encoder_step=STEP,
     )
     scenario = scenario.replace(device=(compliant, RigidDevice(mass=0.16, damping=2.0, encoder_step=STEP)))
-    recorder, session = record_of(scenario)
+    recorder, session = record_of(scenario, seconds=2.5)
     first, second = estimate(recorder, session, scenario)
     found = first.transmission
     assert first.friction.mass == pytest.approx(0.38, rel=2e-3)

@@ -25,7 +25,7 @@ from cli import bridge, identify, replay
 from cli import emulator as emulator_command
 from cli.options import Parser
 from cli.session_cli import add_link_options, check_link
-from controller.delay import Jitter
+from controller.delay import VaryingDelay
 from hw.control import certified_coupling, certified_couplings
 from hw.limits import ENDED, Limits, Stage
 from hw.monitor import LinkSettings
@@ -404,6 +404,8 @@ def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
 @pytest.mark.parametrize("module", [bridge, emulator_command, identify])
 def test_delays_that_vary_in_the_scenario_are_refused_by_name(module, scenario, tmp_path, monkeypatch):
     """The link has the delays that it has; a table that nothing reads would promise something else."""
-    monkeypatch.setattr(module, "scenario_from", lambda args: scenario.replace(jitter=Jitter((1, 1), (2, 2))))
-    with pytest.raises(InputError, match=r"jitter: hw\.\w+ takes the delays that its link has"):
+    monkeypatch.setattr(
+        module, "scenario_from", lambda args: scenario.replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
+    )
+    with pytest.raises(InputError, match=r"varying_delay: hw\.\w+ takes the delays that its link has"):
         module.main([] if module is emulator_command else ["--emulate", "--out", str(tmp_path)])

@@ -562,7 +562,7 @@ def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, 
     if made is None:
         chosen = choose(scenario, "I", name, None)
         requirements = assess(scenario.loop("I"), chosen.coupling)
-        made = Dared(1, scenario, "I", chosen, requirements, limits_of(scenario, chosen.coupling, requirements))
+        made = Dared(1, scenario, "I", chosen, requirements, limits_of(scenario, chosen, requirements))
     recorder = Recorder(2)
     rehearsal = rehearsal_of(scenario, [made], recorder=recorder)
     session = rehearsal.run_until_armed(2.0 if settles else 7.0)

@@ -25,7 +25,7 @@ HOMES = {
     "cvxpy": {"design/lmi.py", "design/fixed_order.py", "design/spring_damper.py"},
     "distributed": {"sim/shards.py"},
     "serial": {"hw/transport.py", "hw/port.py"},
-    "matplotlib": {"sim/plots.py"},
+    "matplotlib": {"sim/map_plot.py", "sim/plots.py"},
     "PIL": {"sim/view/"},
 }
 
