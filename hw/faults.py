@@ -72,7 +72,7 @@ def _spoiled(force: float | None) -> _Call:
 
         assert session.drive is not None
         session.drive.controller.step = step
-        return b""
+        return ()
 
     return call
 
