@@ -451,7 +451,7 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
         whole = check_ranges(loop, chosen.coupling, args.seed, progress=move)
     requirements = assess(loop, chosen.coupling, chosen.phi)
     limits = limits_of(scenario, chosen, requirements, args.limiter)
-    springs = contact_springs(loop.network)
+    springs, ranges = contact_springs(loop.network), whole and ranges_part(whole)
     return {
         "axes": "environment",
         "coupling": report.coupling_part(chosen.kind, chosen.coupling, scenario.T),
@@ -459,7 +459,8 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
             "contact_springs": [{"between": s.between, "K": s.stiffness, "B": s.damping} for s in springs],
             "certificates": report.certificates_part(requirements),
             "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
-            "ranges": whole and ranges_part(whole),
+            "ranges": ranges,
+            "set": ranges,  # its older name
         },
         "limiter": limits.part([device.force_limit for device in scenario.device]),
         "remarks": list(chosen.notes),

@@ -22,8 +22,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import schur
 
 Array = NDArray[np.floating[Any]]
 Complex = NDArray[np.complex128]
@@ -211,7 +211,7 @@ class Lti(ReadOnly):
         """S, U with A = U S U* and S upper triangular: once per block, however often it is evaluated."""
         if not self.order:
             return np.zeros((0, 0), dtype=np.complex128), np.zeros((0, 0), dtype=np.complex128)
-        S, U, *_ = schur(self.A, output="complex")
+        S, U, *_ = scipy.linalg.schur(self.A, output="complex")
         return S, U
 
     def dc(self) -> Array:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, qr, solve_triangular
+import scipy  # its parts load when they are used
 
 from controller.lti import Array, Complex
 
@@ -72,10 +72,10 @@ class Program:
         scale = np.linalg.norm(np.vstack([self.A, *rows]), axis=0)
         scale = np.where(scale > 0, scale, 1.0)
         stacked = np.vstack([self.A, *rows, _RIDGE * np.diag(scale)])
-        U = np.asarray(qr(stacked, mode="r")[0])[: x.size]
-        A = solve_triangular(U, self.A.T, trans=1).T
+        U = np.asarray(scipy.linalg.qr(stacked, mode="r")[0])[: x.size]
+        A = scipy.linalg.solve_triangular(U, self.A.T, trans=1).T
         blocks = tuple(Block(block.constant, _changed(block.slope, U)) for block in self.blocks)
-        return Program(A, self.b, solve_triangular(U, self.c, trans=1), blocks), U
+        return Program(A, self.b, scipy.linalg.solve_triangular(U, self.c, trans=1), blocks), U
 
 
 def centre(program: Program, x: Array, t: float) -> Array:
@@ -112,8 +112,9 @@ def _solved(hessian: Array, right: Array) -> Array:
     ridge = 0.0
     while True:
         try:
-            return scale * cho_solve(cho_factor(unit + ridge * np.eye(len(unit))), scale * right)
-        except LinAlgError:
+            factor = scipy.linalg.cho_factor(unit + ridge * np.eye(len(unit)))
+            return scale * scipy.linalg.cho_solve(factor, scale * right)
+        except np.linalg.LinAlgError:
             ridge = max(10 * ridge, 1e-14)
 
 
@@ -177,6 +178,6 @@ def _changed(slope: Complex, U: Array) -> Complex:
     """The slopes of y where x = U^-1 y."""
     k, n, r, _ = slope.shape
     columns = np.moveaxis(slope, 1, 0).reshape(n, -1)
-    solved = solve_triangular(U, np.hstack([np.real(columns), np.imag(columns)]), trans=1)
+    solved = scipy.linalg.solve_triangular(U, np.hstack([np.real(columns), np.imag(columns)]), trans=1)
     half = columns.shape[1]
     return np.moveaxis((solved[:, :half] + 1j * solved[:, half:]).reshape(n, k, r, r), 0, 1)

@@ -25,7 +25,7 @@ from fractions import Fraction
 from typing import Any, Generic
 
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
+import scipy  # its parts load when they are used
 
 from controller.delay import delay, moving_sum
 from controller.lti import (
@@ -361,7 +361,7 @@ def l1_gain(F: Lti) -> Array:
     if not F.order:
         return total
     r = (1 + radius) / 2
-    P = solve_discrete_lyapunov(A.T / r, np.eye(F.order))
+    P = scipy.linalg.solve_discrete_lyapunov(A.T / r, np.eye(F.order))
     P = (P + P.T) / 2
     reach = np.sqrt(np.einsum("in,ni->i", F.C, np.linalg.solve(P, F.C.T)))
     powers = [F.C]

@@ -9,8 +9,8 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cholesky, solve_discrete_are, solve_triangular
 
 from controller.lti import Array, Lti, on_time, rational
 from design.frequency import frequencies, hermitian, on_circle, supremum
@@ -231,10 +231,10 @@ def _whitening(W: Floats) -> _Integers | None:
         return None
     for added in (0.0, GROWTH):
         try:
-            L = cholesky(unit + added * np.eye(W.shape[0]), lower=True)
-        except LinAlgError:
+            L = scipy.linalg.cholesky(unit + added * np.eye(W.shape[0]), lower=True)
+        except np.linalg.LinAlgError:
             continue
-        inverse = scale[:, None] * solve_triangular(L, np.eye(W.shape[0]), lower=True).T
+        inverse = scale[:, None] * scipy.linalg.solve_triangular(L, np.eye(W.shape[0]), lower=True).T
         size = _FACTOR_BITS - np.ceil(np.log2(np.abs(inverse).max()))
         return np.vectorize(int, otypes=[object])(np.round(np.ldexp(inverse, int(size))))
     return None
@@ -349,7 +349,7 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     for share in (0.5, 0.9, 0.1):
         try:
             P = _riccati(block, margin, share)
-        except (LinAlgError, ValueError) as error:
+        except (np.linalg.LinAlgError, ValueError) as error:
             reason = f"the Riccati equation has no solution: {error}"
             continue
         stored = _rounded_positive_real(back[:, None] * P * back)
@@ -391,7 +391,8 @@ def _riccati(G: Lti, margin: float, share: float) -> Array:
     n, m = G.B.shape
     gain = np.linalg.norm(_states(G), 2, axis=(1, 2)).max() ** 2
     drive = (1 - share) * margin / max(gain, 1.0)  # the gain is at least one unless no input reaches any state
-    return -solve_discrete_are(G.A, G.B, -drive * np.eye(n), G.D + G.D.T - 2 * share * margin * np.eye(m), s=G.C.T)
+    R = G.D + G.D.T - 2 * share * margin * np.eye(m)
+    return -scipy.linalg.solve_discrete_are(G.A, G.B, -drive * np.eye(n), R, s=G.C.T)
 
 
 def _rounded_positive_real(P: Array) -> Matrix:

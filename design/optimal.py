@@ -16,8 +16,8 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling, basis
 from controller.delay import delay
@@ -541,14 +541,14 @@ class Problem:
             y = U @ x
             t = program.degree / max(program.value(y), 1e-12) if t is None else t / back
             y = centre(program, y, t)
-            inner = solve_triangular(U, y)
+            inner = scipy.linalg.solve_triangular(U, y)
             while True:
                 value = program.value(y)
                 if program.degree / t <= gaps[0] * max(min(value, nothing - value), 1e-9):
                     break
                 t *= _STEEPER
                 y = centre(program, y, t)
-            x = solve_triangular(U, y)
+            x = scipy.linalg.solve_triangular(U, y)
             more, worst = self.missed(x)
             if worst < _FORGIVEN and len(gaps) == 1:
                 break

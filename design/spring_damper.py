@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
-import cvxpy as cp
 import numpy as np
 
 from controller.coupling import MovingAverage, SpringDamper
@@ -35,7 +34,8 @@ from design.multipliers import limiter as limiter_proof
 from design.result import Design, DesignFailed, Infeasible, Requirement
 from design.transparency import BAND_HZ, transparency
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # slow to load
+    import cvxpy as cp
     from scipy.optimize import OptimizeResult
 
 # ----------------------------------------------------------------------------------------------------
@@ -68,6 +68,8 @@ def gain_set(k: cp.Expression, b: cp.Expression, theta: int, sigma: float) -> li
     Gram form: a trigonometric polynomial r - |c(z)|^2 is non-negative iff c c' <= Q for some Q >= 0 whose
     diagonals sum to r on the main one and to zero on the others.
     """
+    import cvxpy as cp
+
     n = theta + 1
     y = cp.hstack([k + b, *[k] * (n - 1), -b])  # coefficients of 1, 1/z, ..., z^-n
     columns = [y / 2]
@@ -95,6 +97,8 @@ def solve_within(
 
     Raises as `solve`, and DesignFailed where an inequality still fails after all rounds.
     """
+    import cvxpy as cp
+
     N = len(theta)
     cones = {i: _first_frequencies(theta[i]) for i in range(N) if theta[i] > largest_gram}
     for _ in range(_MOST_ROUNDS):
@@ -124,6 +128,8 @@ def _constraints(
 
 def _gain_cones(k: cp.Expression, b: cp.Expression, theta: int, sigma: float, w: Array) -> list[cp.Constraint]:
     """The inequality at the frequencies w [rad/sample]: |(2c, r - 1)| <= r + 1 says |c|^2 <= r."""
+    import cvxpy as cp
+
     of_k, of_b = _polynomials(theta, w)
     rows = [part * k + other * b for part, other in zip(_parts(of_k), _parts(of_b), strict=True)]
     if np.isfinite(sigma):
@@ -172,6 +178,8 @@ def _parts(values: Array) -> tuple[Array, Array]:
 
 def step(shaping: Shaping, sigma: Array, at: Array, norm: float, w: Array) -> tuple[Array, float]:
     """(gains, bound on the norm at the frequencies w) of one convex-concave step from the gains `at`."""
+    import cvxpy as cp
+
     loop = shaping.loop
     gains, t = cp.Variable(2 * loop.channels), cp.Variable()
     constant, slopes = _tangent(shaping, at, norm, w)
@@ -711,6 +719,8 @@ def _coupling(loop: Loop, gains: Array) -> SpringDamper:
 
 def _start(loop: Loop, sigma: Array, start: SpringDamper | None) -> tuple[Array, int]:
     """The gains of the set nearest to `start`, or the stiffest of the set; and the number of SDPs, one."""
+    import cvxpy as cp
+
     N = loop.channels
     gains = cp.Variable(2 * N)
     objective = cp.Maximize(cp.sum(gains[:N]))

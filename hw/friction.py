@@ -27,12 +27,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.fft import next_fast_len
-from scipy.ndimage import binary_dilation
-from scipy.optimize import lsq_linear
-from scipy.signal import fftconvolve
-from scipy.special import erf
 
 from controller.lti import Array
 
@@ -86,17 +82,18 @@ def _window(order: int, sigma: float, T: float) -> Array:
 
 
 def _filtered(signal: Array, order: int, sigma: float, T: float) -> Array:
-    return fftconvolve(signal, _window(order, sigma, T), mode="same")
+    return scipy.signal.fftconvolve(signal, _window(order, sigma, T), mode="same")
 
 
 def _held(force: Array, sigma: float, T: float) -> tuple[Array, Array, Array]:
     """A force held for each tick, filtered, and its two derivatives."""
     n = round(_REACH * sigma / T)
     t = np.arange(-n, n + 1) * T
-    step = (erf(t / (np.sqrt(2) * sigma)) - erf((t - T) / (np.sqrt(2) * sigma))) / 2
+    step = (scipy.special.erf(t / (np.sqrt(2) * sigma)) - scipy.special.erf((t - T) / (np.sqrt(2) * sigma))) / 2
     bells = [np.exp(-((s / sigma) ** 2) / 2) / (np.sqrt(2 * np.pi) * sigma) for s in (t, t - T)]
     slope = (bells[1] * (t - T) - bells[0] * t) / sigma**2
-    first, second, third = (fftconvolve(force, kernel, mode="same") for kernel in (step, bells[0] - bells[1], slope))
+    kernels = (step, bells[0] - bells[1], slope)
+    first, second, third = (scipy.signal.fftconvolve(force, kernel, mode="same") for kernel in kernels)
     return first, second, third
 
 
@@ -135,13 +132,13 @@ class _Balance:
         self._reach = round(_REACH * self.sigma / T)
         # what holds a body at rest, or dithers it, is not in g
         clear = _moving(x, step, T) & _slow(force, self.sigma, T)
-        spoilt = np.asarray(binary_dilation(~clear, iterations=round(_NEARBY * self.sigma / T)), dtype=bool)
+        spoilt = np.asarray(scipy.ndimage.binary_dilation(~clear, iterations=round(_NEARBY * self.sigma / T)), dtype=bool)
         rows = np.flatnonzero(~spoilt[self._reach : -self._reach]) + self._reach
         if len(rows) < _FEW:
             raise ValueError(f"the axis moves in {len(rows)} samples only, at least {_FEW} are needed")
         self.independent = len(rows) * T / (2 * np.sqrt(np.pi) * self.sigma)  # samples behind so long a window
         self.rows = rows[:: max(1, int(_SPACING * self.sigma / T))]
-        self._length = next_fast_len(len(x) + 2 * self._reach)
+        self._length = scipy.fft.next_fast_len(len(x) + 2 * self._reach)
         self._filters = {n: np.fft.fft(_window(n, self.sigma, T), self._length) for n in range(5)}
         short = (step**2 / 12 * T / (4 * np.sqrt(np.pi) * _SPEED_NOISE**2)) ** (1 / 3)
         self.speed = _filtered(self.x, 1, float(np.clip(short, T, self.sigma / 2)), T)
@@ -215,7 +212,7 @@ def _solve(columns: Array, force: Array) -> Array:
     q, r = np.linalg.qr(columns / scale)
     low = np.full(columns.shape[1], -np.inf)
     low[list(_NOT_NEGATIVE)] = 0.0
-    return lsq_linear(r, q.T @ force, (low, np.inf), method="bvls").x / scale
+    return scipy.optimize.lsq_linear(r, q.T @ force, (low, np.inf), method="bvls").x / scale
 
 
 def _fitted(balance: _Balance, dry: Array, periodic: list[_Pair]) -> _Fit:

@@ -15,9 +15,8 @@ from math import tanh
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.linalg import expm
-from scipy.optimize import OptimizeResult, least_squares
 
 from controller.lti import Array, frozen
 from hw.control import Controller
@@ -175,7 +174,7 @@ class _Model:
             a[0, 2] = a[1, 3] = 1.0
             a[2] = [-k / m1, k / m1, -b / m1, 0.0, 1 / m1]
             a[3, :2] = [k / m2, -k / m2]
-        step = np.asarray(expm(a * T), dtype=np.float64)
+        step = np.asarray(scipy.linalg.expm(a * T), dtype=np.float64)
         return step[:-1, :-1], step[:-1, -1]
 
     def simulate(self, p: Array) -> Array:
@@ -275,7 +274,8 @@ class _Spectrum:
         def apart(p: Array) -> Array:
             return self.apart(np.insert(p, _COULOMB, point[_COULOMB]))
 
-        fit = least_squares(apart, np.delete(point, _COULOMB), loss="soft_l1", f_scale=_OUTLIER, max_nfev=40)
+        start, robust = np.delete(point, _COULOMB), {"loss": "soft_l1", "f_scale": _OUTLIER}
+        fit = scipy.optimize.least_squares(apart, start, max_nfev=40, **robust)
         return float(fit.cost), np.insert(fit.x, _COULOMB, point[_COULOMB])
 
 
@@ -374,7 +374,7 @@ def _transmission(model: _Model, found: Friction) -> _Transmission | None:
     return _Transmission(float(m1), float(m2), float(k), float(mode))
 
 
-def _search(model: _Model, start: Array) -> OptimizeResult:
+def _search(model: _Model, start: Array) -> scipy.optimize.OptimizeResult:
     strongest = np.ptp(model.force)
     start = start.copy()
     start[_COULOMB] = np.clip(start[_COULOMB], _LEAST_FRICTION * strongest, strongest / 2)
@@ -383,7 +383,7 @@ def _search(model: _Model, start: Array) -> OptimizeResult:
     # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
     options: dict[str, Any] = {"x_scale": "jac", "max_nfev": _EVALUATIONS, "ftol": 1e-4}
     slopes: Any = lambda p: -model.slopes(p)  # noqa: E731 - SciPy's stub takes names only
-    return least_squares(model.residual, start, slopes, bounds=bounds, **options)
+    return scipy.optimize.least_squares(model.residual, start, slopes, bounds=bounds, **options)
 
 
 def _polished(model: _Model, p: Array) -> Array:

@@ -23,15 +23,12 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from itertools import pairwise
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-import mujoco
 import numpy as np
-from mujoco.batch import Batch
+import scipy  # its parts load when they are used
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
-from scipy.linalg import expm
-from scipy.sparse.csgraph import connected_components
 
 from controller.lti import Array
 from controller.process import StepBuffer
@@ -39,17 +36,20 @@ from controller.timing import Timing
 from design.files import InputError
 from models.scene import Plant, Scene, Variants, impeded, plant
 
+if TYPE_CHECKING:
+    import mujoco
+
 #: the integrator of ours, which reads MuJoCo's accelerations
 EXPONENTIAL = "exponential"
 
 #: name -> what MuJoCo's model is set to, for the exponential one, where it decides nothing, to RK4
 INTEGRATORS = {
-    EXPONENTIAL: mujoco.mjtIntegrator.mjINT_RK4,
-    "RK4": mujoco.mjtIntegrator.mjINT_RK4,
-    "Euler": mujoco.mjtIntegrator.mjINT_EULER,
-    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
-    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
+    EXPONENTIAL: "mjINT_RK4",
+    "RK4": "mjINT_RK4",
+    "Euler": "mjINT_EULER",
+    "implicit": "mjINT_IMPLICIT",
+    "implicitfast": "mjINT_IMPLICITFAST",
+    "discrete": "mjINT_DISCRETE",
 }
 
 _MOST_MAPS = 256  # of ticks that differ, kept by an engine
@@ -110,7 +110,7 @@ def hold(plant: Plant, T: float, late: Sequence[float] | None = None) -> HeldPla
     if many:
         step = _expm_in_units(generator * T, np.concatenate([_units(plant.A, T), np.ones((*many, inputs))], axis=1))
     else:
-        step = expm(generator * T)
+        step = scipy.linalg.expm(generator * T)
     return HeldPlant(step[..., :n, :n], step[..., :n, n:], plant.C, T)
 
 
@@ -305,7 +305,7 @@ def _blocks(pattern: NDArray[np.bool_]) -> tuple[_Which, _Which]:
     n, width = pattern.shape
     graph = np.zeros((width, width), dtype=bool)
     graph[:n] = pattern
-    count, label = connected_components(graph, directed=False)
+    count, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
     rows = [np.flatnonzero(label[:n] == c) for c in range(count)]
     columns = [np.flatnonzero(label == c) for c in range(count)]
     # an input that moves nothing is a block without rows
@@ -434,6 +434,8 @@ class MujocoEngine:
     def __init__(
         self, scene: Scene, T: float, integrator: str = "RK4", substeps: int = 4, timing: Timing | None = None
     ) -> None:
+        import mujoco
+
         self.model = discretised(scene, T, integrator, substeps)
         self.data = mujoco.MjData(self.model)
         self.advance: Callable[[int], None]  # from `start` on
@@ -477,13 +479,18 @@ class MujocoBatchEngine:
         timing: Timing | None = None,
     ) -> None:
         """`fields` gives fields of the model a row per simulation, such as masses: (nsim, ...)."""
+        import mujoco
+        from mujoco.batch import Batch
+
         model = discretised(scene, T, integrator, substeps)
         self.batch = batch = Batch(model, nsim, nthread)
         for name, rows in (fields or {}).items():
             batch.expand(name)[...] = rows
         if fields:
             batch.set_const()
-        time, motion = (mujoco.mj_stateSize(model, part) for part in (_TIME, _TIME | _MOTION))
+        parts, before = mujoco.mjtState, int(mujoco.mjtState.mjSTATE_TIME)
+        moved = before | int(parts.mjSTATE_QPOS) | int(parts.mjSTATE_QVEL)
+        time, motion = (mujoco.mj_stateSize(model, part) for part in (before, moved))
 
         def move(h: float) -> _Product:
             moves = _rosenbrock(_rates(scene, fields), h)
@@ -534,6 +541,8 @@ def _rosenbrock(J: Array, h: float) -> Array:
 
 def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
     """A copy of the scene's model that makes `substeps` steps of `integrator` in a period T."""
+    import mujoco
+
     if integrator not in INTEGRATORS:
         raise ValueError(f"integrator is {integrator!r}, allowed are {', '.join(INTEGRATORS)}")
     if substeps < 1:
@@ -542,12 +551,8 @@ def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoc
         raise InputError("a human has an impedance (A, B, C, D), which MuJoCo does not simulate: use the exact engine")
     model = copy(scene.model)
     model.opt.timestep = T / substeps
-    model.opt.integrator = INTEGRATORS[integrator]
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, INTEGRATORS[integrator])
     return model
-
-
-_TIME = int(mujoco.mjtState.mjSTATE_TIME)
-_MOTION = int(mujoco.mjtState.mjSTATE_QPOS) | int(mujoco.mjtState.mjSTATE_QVEL)
 
 
 @contextmanager
@@ -572,6 +577,8 @@ def profiler_off() -> Iterator[bool]:
 @contextmanager
 def quiet_warnings() -> Iterator[None]:
     """Keep MuJoCo from printing and logging its warnings: the engine counts and reports them."""
+    import mujoco
+
     previous = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:
@@ -581,6 +588,8 @@ def quiet_warnings() -> Iterator[None]:
 
 
 def _profiler_clock() -> ctypes.c_void_p | None:
+    import mujoco
+
     folder = os.path.dirname(mujoco.__file__)
     for library in glob.glob(os.path.join(folder, "libmujoco*")):
         try:

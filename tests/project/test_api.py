@@ -238,3 +238,12 @@ def test_an_argument_of_another_type_is_named(call, message):
 def test_numbers_of_numpy_are_numbers():
     findings = validate(SHORT, SOFT, humans=np.int64(2), seed=np.int64(1), engine="exact", duration=np.float64(0))
     assert findings.index.size == 2
+
+
+def test_help_waits_for_no_library_that_it_does_not_need():
+    """MuJoCo, SciPy's parts, cvxpy and matplotlib take a quarter of a second to one each."""
+    slow = ("mujoco", "scipy.linalg", "scipy.optimize", "scipy.sparse", "cvxpy", "matplotlib.pyplot")
+    commands = "run, design, audit, check, validate, identify"
+    code = f"import sys\nfrom cli import {commands}\nprint([name for name in {slow} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
