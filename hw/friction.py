@@ -132,7 +132,7 @@ class _Balance:
         self._reach = round(_REACH * self.sigma / T)
         # what holds a body at rest, or dithers it, is not in g
         clear = _moving(x, step, T) & _slow(force, self.sigma, T)
-        spoilt = np.asarray(scipy.ndimage.binary_dilation(~clear, iterations=round(_NEARBY * self.sigma / T)), dtype=bool)
+        spoilt = scipy.ndimage.binary_dilation(~clear, iterations=round(_NEARBY * self.sigma / T)).astype(bool)
         rows = np.flatnonzero(~spoilt[self._reach : -self._reach]) + self._reach
         if len(rows) < _FEW:
             raise ValueError(f"the axis moves in {len(rows)} samples only, at least {_FEW} are needed")
