@@ -1,4 +1,4 @@
-"""What conditions ask of a coupling in its loop, proved over the rationals, and proved again from a file."""
+"""A coupling judged (`assess`), proved over the rationals (`prove`), and its stored proof checked again (`verify`)."""
 
 from __future__ import annotations
 
@@ -560,9 +560,9 @@ def assess(
 ) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
 
-    this-environment is about the nominal environment alone (ranges.check asks for the rest of its ranges) and the
-    constant theta (sim.switching.certified_part asks for the rest of its range). What `known`, a certificate just made,
-    proves is not proved again.
+    this-environment is about the nominal environment alone (design.coverage.ranges_part asks for the rest of its
+    ranges) and the constant theta (sim.switching.certified_part asks for the rest of its range). What `known`, a
+    certificate just made, proves is not proved again.
     """
     loop = loop.at(loop.environment).switching(None)
     here = this_environment_of(loop, coupling)

@@ -1,4 +1,4 @@
-"""The matrix of a proof as a file holds it: rows of rationals "p/q"."""
+"""Exact arithmetic: definiteness and positive realness over the rationals, and a proof's matrix as a file holds it."""
 
 from __future__ import annotations
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.coupling import Form
+from controller.loop import named_today
 from controller.lti import Array
 from design.files import read_arrays, write, write_json
 from hw.control import BudgetPlan, CertifiedCoupling, Controller, Program, SentBudget, TraceRow, host_controller
@@ -379,8 +380,12 @@ class Comparison:
 def recipes_of(result: Trace) -> list[_Recipe]:
     """The recipes in a trace, one for each arming. Raises InputError where there is none."""
     try:
-        _require_limits(result.meta.get("replay"))
-        return msgspec.convert(result.meta.get("replay"), Annotated[list[_Recipe], msgspec.Meta(min_length=1)])
+        raw = result.meta.get("replay")
+        _require_limits(raw)
+        for recipe in raw if isinstance(raw, list) else []:
+            if isinstance(recipe, dict) and isinstance(scenario := recipe.get("scenario"), dict):
+                recipe["scenario"] = named_today(scenario)
+        return msgspec.convert(raw, Annotated[list[_Recipe], msgspec.Meta(min_length=1)])
     except (msgspec.ValidationError, ValueError) as error:
         raise InputError(f"the trace cannot be replayed: {error}") from None
 

@@ -1,4 +1,7 @@
-"""What a run and a validation came to, as plain data: SI units, null with a "reason" where a figure does not exist."""
+"""What a run and a validation came to, as plain data in SI units: null with a "reason" where a figure does not exist.
+
+The rows on the screen are made of it in the commands: cli/run.py, cli/validate.py.
+"""
 
 from __future__ import annotations
 

@@ -715,7 +715,7 @@ def silence() -> Iterator[Case]:
         (("design", "--seconds", "9"), "--seconds"),
         (("design", "--high-gain", "2"), "--high-gain"),
         (("design", "--coupling", "ccl", "--limiter"), "limiter"),
-        (("design", "--varying-delay", "1-2,0-3", "--condition", "any-environment"), "varying_delay"),
+        (("design", "--varying-delay", "1-2,0-3", "--condition", "any-environment"), "varying-delay"),
         (("design", "--coupling", "ccl", "--order", "99"), "--order"),
         (("design", "--samples", "5"), "--samples"),
         (("export", "c.json", "--without-theta"), "--without-theta"),
