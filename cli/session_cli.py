@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 import termios
+import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -207,7 +208,8 @@ def hold_session(
             options = [*_emulator_options(args, seed, seconds), *["--nobody"][:nobody], f"--coulomb={coulomb}"]
             with progress("starting the emulator" if args.emulate else "opening the port"):
                 path = args.port or stack.enter_context(spawned(options))
-            device = serial = SerialDevice(stack.enter_context(SerialPort(path, session.settings.baud)))
+            port, pace = stack.enter_context(SerialPort(path, session.settings.baud)), float(args.pace)
+            device = serial = SerialDevice(port, lambda: pace * time.monotonic())
         if args.port and not getattr(args, "no_preflight", True):
             with progress("looking at this machine"):
                 found = preflight(args.port)

@@ -111,10 +111,8 @@ class SerialDevice:
     def exchange(self, force: Force | None) -> State | None:
         if force is not None:
             self._write(encode(force))
-        while (message := self._next()) is not None:
-            if isinstance(message, State):
-                return message
-        return None
+        message = self._next()  # one a call: a flood of other frames must not keep anybody from looking at the time
+        return message if isinstance(message, State) else None
 
     def stop(self, reason: Reason) -> None:
         self._write(encode(Stop(reason)))

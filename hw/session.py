@@ -194,30 +194,20 @@ class Session:
 
     def met(self, info: Info, now: int) -> Said:
         """Who the device is."""
-        self.now = now
-        if reasons := objections(info, self.scenario, self.limits, self.settings.baud):
-            return self._end(Stage.REFUSED, "; ".join(reasons))
-        self.info, self._units = info, Units.of(info)
-        name = "".join(c if c.isprintable() else "?" for c in info.firmware) or "device"
-        return self._configure(self.probe, f"{name} {info.serial}, to be measured")
+        return self._guarded(now, lambda: self._on_info(info))
 
     def configured(self, refused: int, now: int) -> Said:
         """The device runs as `config` says, or why not."""
-        self.now = now
-        assert self.config
-        if refused != Refused.ACCEPTED:
-            known = [r.name.lower() for r in Refused if r == refused]
-            return self._end(Stage.REFUSED, f"the device refuses the configuration: {(known or [refused])[0]}")
-        self.link.restart()
-        self.heard = now
-        self._enter(Stage.DISARMED if self.program else Stage.MEASURING, f"theta = {self.config.theta}")
-        return ()
+        return self._guarded(now, lambda: self._on_answer(refused))
 
     def take(self, state: State, now: int) -> Said:
         """What answers a STATE."""
+        return self._guarded(now, lambda: self._on_state(state))
+
+    def _guarded(self, now: int, understand: Callable[[], Said]) -> Said:
         self.now = now
         try:
-            return self._on_state(state)
+            return understand()
         except Fault as fault:
             return self.fail(str(fault), now)
         except Exception as error:  # whatever it is: first the force to zero, then the explanation
@@ -242,6 +232,23 @@ class Session:
         noise = f"; {n} unreadable frame{'s' if n > 1 else ''}: wrong baud rate?" if n else ""
         waited = 1e-6 * (self.now - self.entered)
         return self._end(Stage.LOST, f"no answer to {question} within {waited:.1f} s{noise}")
+
+    def _on_info(self, info: Info) -> Said:
+        if reasons := objections(info, self.scenario, self.limits, self.settings.baud):
+            return self._end(Stage.REFUSED, "; ".join(reasons))
+        self.info, self._units = info, Units.of(info)
+        name = "".join(c if c.isprintable() else "?" for c in info.firmware) or "device"
+        return self._configure(self.probe, f"{name} {info.serial}, to be measured")
+
+    def _on_answer(self, refused: int) -> Said:
+        assert self.config
+        if refused != Refused.ACCEPTED:
+            known = [r.name.lower() for r in Refused if r == refused]
+            return self._end(Stage.REFUSED, f"the device refuses the configuration: {(known or [refused])[0]}")
+        self.link.restart()
+        self.heard = self.now
+        self._enter(Stage.DISARMED if self.program else Stage.MEASURING, f"theta = {self.config.theta}")
+        return ()
 
     def _configure(self, theta: int, cause: str) -> Said:
         assert self.info

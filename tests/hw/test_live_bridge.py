@@ -87,7 +87,8 @@ def rungs(scenario):
 def run(emulator, scenario, plan, glance=lambda session: None, pace=PACE):
     session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=150))
     with SerialPort(emulator.path, 921_600) as port:
-        live = Live(session, SerialDevice(port), plan, True, seconds=60.0, glance=glance, pace=pace)
+        device = SerialDevice(port, lambda: pace * time.monotonic())
+        live = Live(session, device, plan, True, seconds=60.0, glance=glance, pace=pace)
         live.run()
     return session, live
 

@@ -17,7 +17,7 @@ from hw.emulator import info_of
 from hw.force_dimension import ForceDimension, library
 from hw.limits import Limits, Stage
 from hw.monitor import Ages, LinkSettings
-from hw.protocol import Command, Config, Decoder, Force, Hello, Phase, Reason, Refused, State
+from hw.protocol import Command, Config, Decoder, Force, Hello, Phase, Reason, Refused, State, encode
 from hw.recording import Recorder, save
 from hw.seam import PortLost, SerialDevice
 from hw.session import Session
@@ -391,3 +391,11 @@ def test_a_silent_line_is_asked_again_and_never_waited_for():
     assert [device.info() for _ in range(700)] == [None] * 700
     assert port.now == 350_000
     assert [type(m) for m in Decoder().feed(port.sent)] == [Hello] * 4
+
+
+def test_a_flood_of_other_frames_keeps_nobody_from_looking_at_the_time():
+    """INFO for ever: every call comes back, so that the session's time-outs end it."""
+    flood = FakePort()
+    flood.wait, flood.read = lambda seconds: True, lambda: encode(info_of(scenario_of())) * 50
+    device = SerialDevice(flood)
+    assert [device.exchange(None) for _ in range(100)] == [None] * 100
