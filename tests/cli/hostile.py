@@ -13,6 +13,7 @@ import json
 import os
 import re
 import resource
+import shlex
 import shutil
 import signal
 import sys
@@ -31,6 +32,7 @@ import numpy as np
 
 mpl.use("Agg")
 import matplotlib.pyplot  # noqa: F401 - once, before the forks
+from combined import combined
 
 from cli import options
 from cli.main import COMMANDS
@@ -133,6 +135,9 @@ def cases() -> Iterator[Case]:
     yield from streams()
     yield from silence()
     yield from names_in_pictures()
+    for command, words, codes, people in combined():
+        quick = QUICK[command] if command != "audit" else ()
+        yield Case(f"{command} {words}", (command, *quick, *shlex.split(words)), codes, before=written("h.py", people))
 
 
 QUICK = {  # what a command needs beside the option in question
