@@ -1,11 +1,11 @@
-"""What is to be made safe: all that a design, a check, a map or a bridge knows of a haptic loop.
+"""Loop, the specification: all that a design, a check, a map or a bridge knows of what is to be made safe.
 
                  x  sampled                                     Delta_D  damping that the devices guarantee
     devices ---------------> (+) ---> Psi E ---+---> Theta ---> f  held for T
                               ^-               |
                               +----- V <-------+                F = Theta (I + Psi E V)^-1 Psi E     (6)
 
-No device is known but by its damping, and no human at all.
+No device is known but by its damping, and no human at all. It computes nothing in time: the tick is controller.process.
 """
 
 from __future__ import annotations

@@ -102,6 +102,9 @@ class ReadOnly:
         self.__dict__.update(state)
 
 
+_ROWS, _POINTS = 32, 1024  # of a response at once: what stays in the processor's cache
+
+
 @dataclass(frozen=True, eq=False)
 class Lti(ReadOnly):
     """A state-space block with n states, m inputs and p outputs; `...` are the axes of a stack, none for one system."""
@@ -197,14 +200,20 @@ class Lti(ReadOnly):
             A, B, C, D = (getattr(self, name)[..., None, :, :] for name in "ABCD")
             return C @ np.linalg.solve(z[..., None, None] * one - A, B + 0j) + D
         points = z.ravel()
-        S, U = self._schur
-        rhs = U.conj().T @ self.B
-        X = np.empty((self.order, self.inputs * points.size), dtype=np.complex128)
-        for i in reversed(range(self.order)):
-            later = (S[i, i + 1 :] @ X[i + 1 :]).reshape(self.inputs, points.size)
-            X[i] = ((rhs[i][:, None] + later) / (points - S[i, i])).ravel()
-        G = (self.C @ U @ X).reshape(self.outputs, self.inputs, points.size) + self.D[:, :, None]
+        parts = [self._resolved(points[i : i + _POINTS]) for i in range(0, max(points.size, 1), _POINTS)]
+        G = np.concatenate(parts, axis=2) + self.D[:, :, None]
         return np.moveaxis(G, -1, 0).reshape(*z.shape, self.outputs, self.inputs)
+
+    def _resolved(self, points: Complex) -> Complex:
+        """C (z I - A)^-1 B, shape (p, m, points): row by row from the last one up, _ROWS of them into those above."""
+        S, U = self._schur
+        at, X = np.tile(points, self.inputs), np.repeat(U.conj().T @ self.B, points.size, axis=1)
+        for end in range(self.order, 0, -_ROWS):
+            first = max(end - _ROWS, 0)
+            for i in reversed(range(first, end)):
+                X[i] = (X[i] + S[i, i + 1 : end] @ X[i + 1 : end]) / (at - S[i, i])
+            X[:first] += S[:first, first:end] @ X[first:end]
+        return (self.C @ U @ X).reshape(self.outputs, self.inputs, points.size)
 
     @cached_property
     def _schur(self) -> tuple[Complex, Complex]:

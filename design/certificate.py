@@ -1,4 +1,4 @@
-"""What conditions ask of a coupling in its loop, proved over the rationals, and proved again from a file."""
+"""A coupling judged (`assess`), proved over the rationals (`prove`), and its stored proof checked again (`verify`)."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from design.conditions import (
 from design.environments import Progress, Searched, in_each, search_ranges, worst
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
 from design.frequency import frequencies, on_circle, rounding
-from design.guarantees import LATE, making_covered, no_compliance, switching_guarantee
+from design.guarantees import LATE, no_compliance, switching_guarantee
 from design.multipliers import (
     BETA,
     WALL_MULTIPLIER,
@@ -83,8 +83,7 @@ def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
     found = swept(loop, coupling)
     requirement = found.requirement
     if not requirement.certified:
-        needed, have = (", ".join(f"{d:.6g}" for d in side) for side in (requirement.required, requirement.available))
-        return requirement.reason or f"needs {needed} N s/m of damping, has {have}"
+        return requirement.shortfall
     P = storage(loop, coupling, found.alpha)
     if isinstance(P, str):
         return P
@@ -114,13 +113,18 @@ def _refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof) -> str | Non
         condition = condition_block(loop, coupling, proof.alpha)
     except (SingularLoop, ValueError) as error:
         return str(error)
-    found = swept(loop, coupling, proof.alpha)
-    required = found.requirement.required
-    if len(proof.required) != len(required) or not np.allclose(proof.required, required, rtol=_CLAIM_TOLERANCE):
-        return f"required is {list(proof.required)}, the sweep finds {list(required)}"
-    if not np.isclose(proof.margin, _margin(found.requirement), rtol=_CLAIM_TOLERANCE):
-        return f"margin is {proof.margin:.9g}, the sweep finds {_margin(found.requirement):.9g}"
-    return refuted_rows("P", condition, proof.P)
+    other = _other_figures(proof, swept(loop, coupling, proof.alpha).requirement)
+    return other or refuted_rows("P", condition, proof.P)
+
+
+def _other_figures(claim: Certificate | SwitchingProof | LimiterCertificate, found: Requirement) -> str | None:
+    """Where the figures on file are not those of the sweep, or None."""
+    required = found.required
+    if len(claim.required) != len(required) or not np.allclose(claim.required, required, rtol=_CLAIM_TOLERANCE):
+        return f"required is {list(claim.required)}, the sweep finds {list(required)}"
+    if not np.isclose(claim.margin, _margin(found), rtol=_CLAIM_TOLERANCE):
+        return f"margin is {claim.margin:.9g}, the sweep finds {_margin(found):.9g}"
+    return None
 
 
 def condition_block(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Lti:
@@ -163,13 +167,11 @@ def prove_limiter(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | 
     found = limiter_requirement(loop, coupling, beta, c)
     requirement = found.requirement
     if not requirement.certified:
-        needed, have = (", ".join(f"{d:.6g}" for d in side) for side in (requirement.required, requirement.available))
-        reason = requirement.reason or f"limiter: needs {needed} N s/m of damping, has {have}"
-        raise NotProved(reason, requirement)
+        raise NotProved(requirement.reason or f"limiter: {requirement.shortfall}", requirement)
     P, refused = find_storage(_limiter_block(loop, coupling, found.rho, found.c))
     if P is None:
         raise NotProved(f"limiter: {refused}; the sweep asks {requirement.ratio:.9f} of the damping", requirement)
-    return LimiterCertificate(beta, found.rho, found.c, requirement.required, _margin(found.requirement), rows_of(P))
+    return LimiterCertificate(beta, found.rho, found.c, requirement.required, _margin(requirement), rows_of(P))
 
 
 def _limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: Lags) -> Lti:
@@ -194,12 +196,8 @@ def check_limiter(loop: Loop, coupling: Coupling, proof: LimiterCertificate) -> 
         expected = f"expected beta delta/T with beta = {proof.beta:g}, one row of c each"
         raise NotProved(f"limiter: rho is {list(proof.rho)}, {expected}")
     found = limiter_requirement(loop, coupling, proof.beta, proof.c).requirement
-    required = found.required
-    if len(proof.required) != len(required) or not np.allclose(proof.required, required, rtol=_CLAIM_TOLERANCE):
-        raise NotProved(f"limiter: required is {list(proof.required)}, the sweep finds {list(required)}")
-    if not np.isclose(proof.margin, _margin(found), rtol=_CLAIM_TOLERANCE):
-        raise NotProved(f"limiter: margin is {proof.margin:.9g}, the sweep finds {_margin(found):.9g}")
-    if reason := refuted_rows("P", _limiter_block(loop, coupling, proof.rho, proof.c), proof.P):
+    reason = _other_figures(proof, found)
+    if reason := reason or refuted_rows("P", _limiter_block(loop, coupling, proof.rho, proof.c), proof.P):
         raise NotProved(f"limiter: {reason}")
     return replace(found, proof="rational")
 
@@ -268,11 +266,8 @@ def prove(
     multiplier = None if phi is None else [rational(float(p)) for p in phi]
     requirement = swept or required_damping(loop, coupling, condition, multiplier)
     if not requirement.certified:
-        needed = ", ".join(f"{d:.6g}" for d in requirement.required)
-        have = ", ".join(f"{d:.6g}" for d in requirement.available)
-        reason = requirement.reason or f"needs {needed} N s/m of damping, has {have}"
         place = f"P{worst(in_each(loop, coupling, loop.members()))}" if loop.ranges else "P"
-        raise NotProved(f"{_place_certificate(loop, condition, place)}{reason}", requirement)
+        raise NotProved(f"{_place_certificate(loop, condition, place)}{requirement.shortfall}", requirement)
     if reason := _another_system(loop, coupling):
         raise NotProved(reason, requirement)
     proof: dict[str, Matrix] = {}
@@ -290,7 +285,7 @@ def prove(
             condition=condition,
             required=requirement.required,
             available=loop.delta,
-            margin=1 / max(requirement.ratio, 1e-12),
+            margin=_margin(requirement),
             guarantee=_guarantee(loop, condition),
             proof="rational",
             matrices={name: rows_of(M) for name, M in proof.items()},
@@ -513,12 +508,8 @@ def _refuted_claims(loop: Loop, coupling: Coupling, certificate: Certificate) ->
         return f"available is {list(certificate.available)}, the loop has delta = {list(loop.delta)}"
     _require_limits(loop, coupling, certificate.condition)
     requirement = required_damping(loop, coupling, certificate.condition, _multiplier(loop, certificate))
-    if len(certificate.required) != len(loop.delta) or not np.allclose(
-        certificate.required, requirement.required, rtol=_CLAIM_TOLERANCE
-    ):
-        return f"required is {list(certificate.required)}, the sweep finds {list(requirement.required)}"
-    if not np.isclose(certificate.margin, 1 / max(requirement.ratio, 1e-12), rtol=_CLAIM_TOLERANCE):
-        return f"margin is {certificate.margin:.9g}, the sweep finds {1 / max(requirement.ratio, 1e-12):.9g}"
+    if reason := _other_figures(certificate, requirement):
+        return reason
     if not requirement.certified:
         return f"the sweep asks {requirement.ratio:.6g} times the available damping, whatever the matrices prove"
     return _another_system(loop, coupling)
@@ -569,9 +560,9 @@ def assess(
 ) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
 
-    this-environment is about the nominal environment alone (ranges.check asks for the rest of its ranges) and the
-    constant theta (sim.switching.certified_part asks for the rest of its range). What `known`, a certificate just made,
-    proves is not proved again.
+    this-environment is about the nominal environment alone (design.coverage.ranges_part asks for the rest of its
+    ranges) and the constant theta (sim.switching.certified_part asks for the rest of its range). What `known`, a
+    certificate just made, proves is not proved again.
     """
     loop = loop.at(loop.environment).switching(None)
     here = this_environment_of(loop, coupling)
@@ -583,15 +574,13 @@ def assess(
 
 
 def this_environment_of(loop: Loop, coupling: Coupling) -> Requirement:
-    """What this-environment asks; of walls over ranges, in their most demanding frozen contact state."""
-    if making_covered(loop):
+    """What this-environment asks of the environment itself, its walls making and breaking contact."""
+    if loop.environment.walls:
         try:
             return walls_of(loop, coupling).requirement
         except NotProved as error:
             return refusal("this-environment", loop.delta, str(error))
-    maps = (state.F(coupling) for state in loop.frozen())
-    requirements = [this_environment(F, loop.delta, loop.T_max, loop.latency) for F in maps]
-    return max(requirements, key=lambda requirement: requirement.ratio)
+    return this_environment(loop.F(coupling), loop.delta, loop.T_max, loop.latency)
 
 
 def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Requirement:

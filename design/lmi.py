@@ -1,7 +1,7 @@
 """The paper's matrix inequalities, one function per equation, with a remedy where the printed strict form is empty.
 
-Units: T = 1 and Delta_D = I (design.semidefinite.coordinates). Every function returns a symmetric matrix that must be
-positive (semi)definite; its arguments are numbers or cvxpy expressions.
+Units: T = 1 and Delta_D = I (the scaling at the end of this file). Every function returns a symmetric matrix that must
+be positive (semi)definite; its arguments are numbers or cvxpy expressions.
 
 Two transfer matrices of the paper can never satisfy the strict inequalities printed for them:
   E-hat = z/(z-1) Psi E has a pole at z = 1 wherever E has static stiffness, and A'PA - P < 0 excludes it (15), (17).

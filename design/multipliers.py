@@ -590,7 +590,7 @@ def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) 
 
 # ----------------------------------------------------------------------------------------------------
 # An exact proof that a coupling is safe in this environment also while its forces are limited: made, stored, proved
-# again. F(1) is exactly symmetric and positive semidefinite, and design.conditions.limiter_demand is strictly
+# again. F(1) is exactly symmetric and positive semidefinite, and design.multipliers.limiter_demand is strictly
 # positive real. any-environment without delay in the environment needs no proof of its own: with rho = 0 the limiter
 # and the environment together are a passive environment.
 

@@ -176,7 +176,7 @@ def _demand(loop: Loop, F: Any) -> Demand[Any]:
 
 
 def switching(loop: Loop, span: DelayRange, margin: float = _MARGIN) -> _Constraint:
-    """design.conditions.switching_block for delays that switch within the span; alpha T/Delta are its unknowns."""
+    """design.multipliers.switching_block for delays that switch within the span; alpha T/Delta are its unknowns."""
     scale = even_damping(loop.delta, loop.T, loop.T_max) / loop.T
     moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))
 
@@ -203,7 +203,7 @@ class _Slip:
 
 
 def limiter(loop: Loop, slip: _Slip, margin: float = _MARGIN) -> _Constraint:
-    """design.conditions.limiter_demand: forces that are limited. A little of rho stays unused, as of the damping."""
+    """design.multipliers.limiter_demand: forces that are limited. A little of rho stays unused, as of the damping."""
     rho = limiter_lag(loop.delta, loop.T, slip.beta)
     spare = np.diag([*rho, *rho]) * SPARE
 

@@ -44,6 +44,12 @@ class Requirement(Generic[C]):
     def certified(self) -> bool:
         return self.ratio < 1
 
+    @property
+    def shortfall(self) -> str:
+        """Why it is not certified."""
+        have = listed(self.available)
+        return self.reason or f"needs {listed(self.required)} N s/m of damping, has {have}"
+
 
 def from_ratio(condition: C, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement[C]:
     """The requirement of `ratio` times what is available, on every channel."""

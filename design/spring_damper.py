@@ -408,7 +408,7 @@ def _certified_optimum(
 
 
 # ----------------------------------------------------------------------------------------------------
-# Spring-damper gains that are safe under any switching of their delays: a local search as in frozen_environment.py.
+# Spring-damper gains that are safe under any switching of their delays: a local search like the one above.
 #
 # Its sampled condition is `switching_block`: the multiplier is searched together with the gains. What is returned
 # passes the sweep of `switching_sweep`, which knows nothing of the multiplier found here.
@@ -484,7 +484,7 @@ def _safe_optimum(sampled: _SwitchingLoop, start: SpringDamper) -> tuple[SpringD
 
 # ----------------------------------------------------------------------------------------------------
 # Spring-damper gains that are safe also while forces are limited: the same search with the limiter's block
-# (design.conditions.limiter_demand) in the place of the linear one, and its multiplier among the unknowns.
+# (design.multipliers.limiter_demand) in the place of the linear one, and its multiplier among the unknowns.
 
 
 class _LimiterLoop(_SampledLoop):

@@ -93,7 +93,7 @@ def alternatives(
 ) -> list[Alternative]:
     """Every coupling that can stand in the place of the run's own; none where the delays switch.
 
-    Walls and ranges are covered by any-environment alone: the couplings for one linear environment are left out there.
+    Of ranges only couplings for any environment are shown, and the optimal one holds a linear model: none before walls.
     """
     if scenario.switches:
         return []
@@ -109,10 +109,9 @@ def alternatives(
 def _possible(scenario: Scenario, case: str, kind: str, condition: str | None) -> bool:
     if kind == "published":
         return scenario.loop(case) == load().loop(case)
-    one_environment = scenario.environment.walls or scenario.ranges
-    if condition == "this-environment" and one_environment:
+    if condition == "this-environment" and scenario.ranges:
         return False
-    return kind != "optimal" or scenario.channels <= _QUICK
+    return kind != "optimal" or (scenario.channels <= _QUICK and not scenario.environment.walls)
 
 
 def _alternative(scenario: Scenario, case: str, kind: str, condition: str | None) -> Alternative:

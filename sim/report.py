@@ -1,4 +1,7 @@
-"""What a run and a validation came to, as plain data: SI units, null with a "reason" where a figure does not exist."""
+"""What a run and a validation came to, as plain data in SI units: null with a "reason" where a figure does not exist.
+
+The rows on the screen are made of it in the commands: cli/run.py, cli/validate.py.
+"""
 
 from __future__ import annotations
 
@@ -86,7 +89,9 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
         lines.append(f"{what} {condition}: it needs {worst:.3g} times the damping that the devices guarantee.")
     if "contact" in outcome["stability"]:
         covered = {ANY: "any-environment", MAKING: "this-environment"}.get(outcome["promise"], "no certificate")
-        lines.append(f"Contact that makes and breaks: {covered} covers it in this loop.")
+        slopes = listed(outcome["stability"]["contact"]["slopes_n_per_m"])
+        softer = f", and any walls with K + 2 B/T up to {slopes} N/m" if outcome["promise"] == MAKING else ""
+        lines.append(f"Contact that makes and breaks: {covered} covers it in this loop{softer}.")
     for name in ("stability", "error", "transparency", "credible"):
         if "reason" in outcome[name]:
             lines.append(f"{name}: {outcome[name]['reason']}.")

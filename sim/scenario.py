@@ -334,7 +334,13 @@ def _run_file(path: str | Path) -> _HumanFile:
     try:
         names = runpy.run_path(str(path))
         hands, persons = _kept(tuple(names.get("humans", ()))), tuple(names.get("persons", ()))
-        return _HumanFile(hands, persons, names.get("population"))
+        for i, person in enumerate(persons):
+            if not isinstance(person, Person):
+                raise ValueError(f"persons[{i}] is {person!r}, expected a models.human.Person")
+        population = names.get("population")
+        if population is not None and len(_kept(tuple(population.draw(np.random.default_rng(0), 2)))) != 2:
+            raise ValueError("population.draw(rng, 2) gives not two humans")
+        return _HumanFile(hands, persons, population)
     except (Exception, SystemExit) as error:
         raise InputError(f"--human {path}: {type(error).__name__}: {error}") from None
 
@@ -425,6 +431,9 @@ def _plain(name: str, value: Any) -> Any:
 _NOBODY = Human((Link(0.0, 0.0, 0.0),))
 
 
+_TIMES = np.array([0.0, 0.1])  # [s] at which a hand's own force is tried
+
+
 def _is_own(name: str, value: Any) -> bool:
     """Whether some of these humans, or this population, are of a user's own class, which no file could have given."""
     if name == "population":
@@ -442,6 +451,10 @@ def _kept(value: Any) -> Any:
             raise ValueError(f"human[{i}] is {human!r}, expected a Human, or what has port() and voluntary_force(t)")
         if not isinstance(port := human.port(), Port):  # which raises ValueError where it is not passive
             raise ValueError(f"human[{i}].port() is {port!r}, expected a models.human.Port")
+        with np.errstate(all="ignore"):
+            force = np.asarray(human.voluntary_force(_TIMES))
+        if force.shape != _TIMES.shape or force.dtype.kind not in "fiu" or not np.isfinite(force).all():
+            raise ValueError(f"human[{i}].voluntary_force(t) is {force!r} for two times, expected as many forces in N")
     return tuple(value)
 
 

@@ -259,6 +259,7 @@ def _contact_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
     return {
         "made": int((touching[1:] & ~touching[:-1]).sum() + touching[:1].sum()),
         "ticks": int(touching.any(axis=1).sum()),
+        "slopes_n_per_m": [wall.slope(simulation.scenario.T) for wall in walls.walls],
         "frozen": states,
     }
 

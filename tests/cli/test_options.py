@@ -9,6 +9,7 @@ import pytest
 from cli import options, render
 from cli.audit import main as audit
 from cli.run import main as run
+from design.files import one_line
 from sim.scenario import InputError
 
 
@@ -98,3 +99,12 @@ def test_a_figure_is_a_field(capsys):
     screen.print(render.facts("a loop", render.rows_of(reports[0])))
     lines = capsys.readouterr().out.splitlines()
     assert [part.strip() for part in lines[3].strip("│").split("│")] == ["growth [1/s]", "+1.00"]
+
+
+def test_a_message_quotes_eighty_characters_and_no_control_character():
+    long, path = "y" * 300, "/tmp/" + "p" * 100 + "/a.toml"
+    line = one_line(f"{path}: T = '{long}' and the device's\n x{long}\x1b[31m, 'I', 'II'")
+    assert path in line
+    assert line.endswith("x1b[31m, 'I', 'II'")
+    assert max(len(word) for word in line.split() if "/" not in word) == 80
+    assert one_line("the scenario's words " + "and more " * 20 + "'x'").endswith("'x'")

@@ -14,6 +14,7 @@ from controller.lti import Lti
 from controller.process import contact
 from design.certificate import assess, prove, verify
 from design.conditions import any_environment, this_environment
+from design.designs import design_by_kind
 from design.exact import find_storage
 from design.guarantees import MAKING, guarantee_of, making_covered
 from design.multipliers import walls_demand, walls_of, walls_proof
@@ -291,3 +292,14 @@ def test_hands_come_to_rest_at_the_requirement_and_some_swing_below(damping, sho
     assert made > 300
     assert fastest < 0.02  # and falling: 60 hands, the slowest of them heavy
     assert swinging(loop, coupling, short * need)[0] > 0.5  # for ever, the wall made and left
+
+
+def test_a_design_before_a_wall_with_a_damper_spends_the_damping_and_is_proved():
+    """Stiffer than any passive environment allows, and softer than what every frozen state alone allows (1772 N/m)."""
+    wall = Wall(("tip", GROUND), 3000.0, 2.0, 0.005)
+    loop = Loop(1e-3, (1,), (0,), (1,), (1.37,), Network(("tip",), walls=(wall,)))
+    made = design_by_kind(loop, condition="this-environment")
+    assert 0.99 < made.requirement.ratio < 1
+    assert 1100 < made.coupling.K[0] < 1300
+    assert prove(loop, made.coupling, "this-environment").proof == "rational"
+    assert not any_environment(made.coupling.compliance(loop.T), loop.theta, loop.delta).certified
