@@ -8,7 +8,13 @@ from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.loop import force_map
 from controller.lti import Lti
-from design.conditions import any_environment, any_environment_per_channel, delayed_demand, this_environment
+from design.conditions import (
+    any_environment,
+    any_environment_per_channel,
+    delayed_demand,
+    regular_part,
+    this_environment,
+)
 from design.frequency import frequencies, hermitian, on_circle, supremum
 from design.result import CASE_I, CASE_II
 
@@ -152,11 +158,30 @@ def test_refusals_say_why():
     assert "not symmetric" in this_environment(twisted, (1.0, 1.0)).reason
     assert "pushes outwards" in this_environment(Lti.constant([[-1.0]], T), [1.0]).reason
     assert "no damping" in this_environment(default(CASE_I), (0.0, 1.0)).reason
+    assert "no damping" in any_environment(Lti.constant([[1.0, 0.0], [0.0, 1.0]], T), [0, 0], (1.0, 0.0)).reason
     assert "not passive enough" in any_environment(Lti.constant([[0.0]], T), [0], [1.0]).reason
     with pytest.raises(ValueError, match="delta has 1 entries for 2 channels"):
         this_environment(default(CASE_I), [1.0])
     with pytest.raises(ValueError, match="expected dampings >= 0"):
         this_environment(default(CASE_I), (-1.0, 1.0))
+
+
+def test_the_frequency_at_which_a_condition_binds():
+    """Against a dense grid of the definition, -He[F/(z-1)] T/delta."""
+    F, w = default(CASE_I), np.linspace(1e-3, np.pi, 200_001)
+    z = np.exp(1j * w)
+    G = F.at(z) / (z - 1)[:, None, None]
+    needed = np.linalg.eigvalsh(-(G + np.conj(np.swapaxes(G, -1, -2))) / 2)[:, -1] * T
+    found = this_environment(F, (1.0, 1.0))
+    assert found.ratio == pytest.approx(needed.max(), rel=1e-6)
+    assert found.frequency_hz == pytest.approx(w[needed.argmax()] / (2 * np.pi * T), rel=1e-3)
+
+
+def test_the_regular_part_has_the_hermitian_part_of_the_whole():
+    """E z/(z-1) less its pole, on the circle."""
+    z = np.exp(1j * np.array([0.1, 0.7, 2.9]))
+    whole = E.at(z) * (z / (z - 1))[:, None, None]
+    np.testing.assert_allclose(hermitian(regular_part(E).at(z)), hermitian(whole), rtol=1e-9, atol=1e-6)
 
 
 def test_supremum_finds_a_needle():
