@@ -99,6 +99,11 @@ def both(demand):
 # this-environment
 
 
+def test_the_exact_block_holds_the_damping_exactly():
+    F, delta = Lti.constant([[1000]], rational(T)), Fraction(1, 3)
+    assert both(this_environment_demand(F, [delta])).D[0, 0] == delta / rational(T) - 500
+
+
 @pytest.mark.parametrize("theta", [0, 1, 4])
 def test_this_environment_against_a_spring(theta):
     """(theta + 1/2) K T."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.linalg import eig
+from scipy.linalg import eig, eigh
 
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
@@ -12,6 +12,7 @@ from design.conditions import (
     any_environment,
     any_environment_per_channel,
     delayed_demand,
+    least_multiple,
     regular_part,
     this_environment,
 )
@@ -159,6 +160,7 @@ def test_refusals_say_why():
     assert "pushes outwards" in this_environment(Lti.constant([[-1.0]], T), [1.0]).reason
     assert "no damping" in this_environment(default(CASE_I), (0.0, 1.0)).reason
     assert "no damping" in any_environment(Lti.constant([[1.0, 0.0], [0.0, 1.0]], T), [0, 0], (1.0, 0.0)).reason
+    assert "V(1) is not symmetric" in any_environment(twisted, [0, 0], (1.0, 1.0)).reason
     assert "not passive enough" in any_environment(Lti.constant([[0.0]], T), [0], [1.0]).reason
     with pytest.raises(ValueError, match="delta has 1 entries for 2 channels"):
         this_environment(default(CASE_I), [1.0])
@@ -175,6 +177,13 @@ def test_the_frequency_at_which_a_condition_binds():
     found = this_environment(F, (1.0, 1.0))
     assert found.ratio == pytest.approx(needed.max(), rel=1e-6)
     assert found.frequency_hz == pytest.approx(w[needed.argmax()] / (2 * np.pi * T), rel=1e-3)
+
+
+def test_the_least_multiple_is_a_generalised_eigenvalue():
+    free, half = RNG.normal(size=(5, 3, 3)), RNG.normal(size=(5, 3, 3))
+    free, gain = free + np.swapaxes(free, 1, 2), half @ np.swapaxes(half, 1, 2) + 0.1 * np.eye(3)
+    expected = [eigh(-one, other, eigvals_only=True)[-1] for one, other in zip(free, gain, strict=True)]
+    np.testing.assert_allclose(least_multiple(free, gain), expected, rtol=1e-9)
 
 
 def test_the_regular_part_has_the_hermitian_part_of_the_whole():
