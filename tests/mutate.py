@@ -48,6 +48,7 @@ TABLE = {
     "design/conditions.py": "design/test_exact_blocks design/test_certificate design/test_margin design/test_latency "
     "design/test_periods design/test_encoder_steps design/test_moving_average design/test_worst_member",
     "controller/process.py": "controller/test_process controller/test_contact controller/test_limiter",
+    "controller/contact.py": "controller/test_process controller/test_contact controller/test_limiter",
     "hw/limits.py": "hw/test_limits hw/test_operator_safety hw/test_protocol hw/test_hardware_page",
     "hw/device.py": "hw/test_device hw/test_latch_on_arrival",
 }
