@@ -27,6 +27,7 @@ check: lint
 validate: .venv/ready
 	$(PY) -m sim.suite --out out/validate
 	$(PY) tests/cli/hostile.py --signals
+	$(PY) docs/regenerate.py --check
 
 mutate: .venv/ready
 	$(PY) tests/mutate.py

@@ -36,6 +36,9 @@ def main(argv: list[str]) -> int:
     """Audit a coupling. 0: safe in this environment and at every vertex of its ranges, 1: not."""
     args = _parser().parse_args(argv)
     if args.devices:
+        beside = [name for name in ("K", "B", "coupling", "device", "preset", "rigid") if getattr(args, name)]
+        if beside:
+            raise InputError(f"--devices with --{beside[0]}: the list is of the whole catalogue, give one of them")
         return _list_devices(args)
     args = _with_device(args)
     scenario = options.scenario_from(args)

@@ -107,8 +107,9 @@ def _parser() -> options.Parser:
     varying = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"
     options.add_varying_delay_option(parser, varying)
     limiter = "for this-environment: proved also while forces are limited, or not made (spring-damper: if it can)"
-    parser.add_argument("--limiter", action="store_const", const=True, help=limiter)
-    options.add_limiter_option(parser, "design and prove as if forces were never at their limits")
+    one_of = parser.add_mutually_exclusive_group()
+    one_of.add_argument("--limiter", action="store_const", const=True, help=limiter)
+    options.add_limiter_option(one_of, "design and prove as if forces were never at their limits")
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
     ccl.add_argument("--method", choices=METHODS, help="complementarity is as printed (default inner)")

@@ -35,10 +35,12 @@ from sim.trace import Trace
 def main(argv: list[str]) -> int:
     """Simulate and report. 0: the run was completed, stable or not; 130: interrupted."""
     args = _parser().parse_args(argv)
+    if args.error is not None and (args.engine == "exact" or args.integrator or args.substeps):
+        raise InputError("--error chooses integrator and substeps of MuJoCo: give no --engine exact, --integrator, ..")
     scenario, out = _scenario(args), options.out_folder(args, "run")
     loop = scenario.loop(args.case)
-    chosen = _chosen(args, scenario)
     environment, simulated = _environment(args, scenario)
+    chosen = _chosen(args, scenario)
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
         whole = check_ranges(loop, chosen.coupling, args.seed, progress=move)
         requirements = assess(simulated.loop(args.case), chosen.coupling, chosen.phi)
@@ -90,7 +92,7 @@ def _parser() -> options.Parser:
     asked = (
         "relative rms of the positions: compare engines and steps on this scene, run with the cheapest that keeps it"
     )
-    parser.add_argument("--error", type=options.number(), metavar="E", help=asked)
+    parser.add_argument("--error", type=options.number(1e-18, 1.0), metavar="E", help=asked)
     check = "run RK4 beside the exponential engine, with which it shares no matrix"
     parser.add_argument("--cross-check", action="store_true", help=check)
     options.add_human_option(parser)
@@ -224,8 +226,6 @@ def _compared(args: argparse.Namespace, simulation: Simulation) -> tuple[EngineC
     """Every engine and step on this scene, where an error is asked for. Raises InputError."""
     if args.error is None:
         return ()
-    if args.engine == "exact" or args.integrator or args.substeps:
-        raise InputError("--error chooses integrator and substeps of MuJoCo: give no --engine exact, --integrator, ..")
     with render.progress("comparing engines"):
         return compare_engines(simulation, args.error)
 
@@ -382,7 +382,7 @@ def _speed_against_error(run: dict[str, Any]) -> Any:
         mark = " *" if (row["integrator"], row["substeps"]) == (run["integrator"], run["substeps"]) else ""
         error = render.optional(row["position_relative_rms"], "{:.1e}")
         right = "right" if row["verdict_correct"] else "[red]WRONG[/]"
-        speed = f"{run['duration_s'] / row['cpu_s']:.0f}"
+        speed = f"{run['duration_s'] / row['cpu_s']:.0f}" if row["cpu_s"] else "-"  # too short for the clock
         cells.append((f"{row['integrator']} x {row['substeps']}{mark}", error, right, f"{row['cpu_s']:.3f}", speed))
     heads = ("engine x steps", "position error", "verdict", "CPU s", "x real time")
     return render.grid("speed against error on this scene (*: the cheapest that keeps --error, this run)", heads, cells)

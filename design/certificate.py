@@ -34,7 +34,7 @@ from design.conditions import (
 from design.environments import Progress, Searched, in_each, search_ranges, worst
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
 from design.frequency import frequencies, on_circle, rounding
-from design.guarantees import LATE, making_covered, no_compliance, switching_guarantee
+from design.guarantees import LATE, no_compliance, switching_guarantee
 from design.multipliers import (
     BETA,
     WALL_MULTIPLIER,
@@ -574,15 +574,13 @@ def assess(
 
 
 def this_environment_of(loop: Loop, coupling: Coupling) -> Requirement:
-    """What this-environment asks; of walls over ranges, in their most demanding frozen contact state."""
-    if making_covered(loop):
+    """What this-environment asks of the environment itself, its walls making and breaking contact."""
+    if loop.environment.walls:
         try:
             return walls_of(loop, coupling).requirement
         except NotProved as error:
             return refusal("this-environment", loop.delta, str(error))
-    maps = (state.F(coupling) for state in loop.frozen())
-    requirements = [this_environment(F, loop.delta, loop.T_max, loop.latency) for F in maps]
-    return max(requirements, key=lambda requirement: requirement.ratio)
+    return this_environment(loop.F(coupling), loop.delta, loop.T_max, loop.latency)
 
 
 def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Requirement:

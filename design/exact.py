@@ -298,9 +298,9 @@ def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
     F, p = G.floats(), P.floats()
     A, B, C, D = F.A, F.B, F.C, F.D
     J = np.hstack([A, B])
-    direct = np.block([[p, C.T], [C, D + D.T]])
     with np.errstate(all="ignore"):
-        M = direct.copy() - J.T @ p @ J
+        direct = np.block([[p, C.T], [C, D + D.T]])
+        M = direct - J.T @ p @ J
     if not np.isfinite(M).all():
         return False
     k = (2 * G.order + 8) * _UNIT

@@ -9,8 +9,7 @@ import numpy as np
 
 from controller.coupling import SpringDamper
 from controller.environment import RIGID_WALL
-from controller.loop import Loop
-from design import certify
+from design import Loop, certify
 from hw import rehearse
 from models.device import RigidDevice
 from sim import InputError, load

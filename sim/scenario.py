@@ -10,7 +10,10 @@ import difflib
 import hashlib
 import re
 import runpy
+import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any, Self, get_args
 
@@ -21,7 +24,7 @@ from controller.delay import VaryingDelay
 from controller.environment import Network, Ranges, Spring, UncertainSpring, Wall, environment
 from controller.loop import DelayRange, Loop, named_first, named_today
 from controller.timing import Periods, Timing, drawn
-from design.files import InputError, read_text, toml, write
+from design.files import InputError, printable, read_text, toml, write
 from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
 from models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
 
@@ -331,10 +334,20 @@ def _humans_of(text: str, source: str) -> _HumanFile:
 def _run_file(path: str | Path) -> _HumanFile:
     """The people that a Python file defines. Raises InputError where it cannot be read or run, or they hold nothing."""
     read_text(path, f"--human {path}")
+    heard: Any = StringIO()
+    heard.close = lambda: None
     try:
-        names = runpy.run_path(str(path))
+        with redirect_stdout(heard):  # where a report may be written to
+            names = runpy.run_path(str(path))
+        sys.stderr.write(printable(heard.getvalue()))
         hands, persons = _kept(tuple(names.get("humans", ()))), tuple(names.get("persons", ()))
-        return _HumanFile(hands, persons, names.get("population"))
+        for i, person in enumerate(persons):
+            if not isinstance(person, Person):
+                raise ValueError(f"persons[{i}] is {person!r}, expected a models.human.Person")
+        population = names.get("population")
+        if population is not None and len(_kept(tuple(population.draw(np.random.default_rng(0), 2)))) != 2:
+            raise ValueError("population.draw(rng, 2) gives not two humans")
+        return _HumanFile(hands, persons, population)
     except (Exception, SystemExit) as error:
         raise InputError(f"--human {path}: {type(error).__name__}: {error}") from None
 
@@ -425,6 +438,9 @@ def _plain(name: str, value: Any) -> Any:
 _NOBODY = Human((Link(0.0, 0.0, 0.0),))
 
 
+_TIMES = np.array([0.0, 0.1])  # [s] at which a hand's own force is tried
+
+
 def _is_own(name: str, value: Any) -> bool:
     """Whether some of these humans, or this population, are of a user's own class, which no file could have given."""
     if name == "population":
@@ -442,6 +458,10 @@ def _kept(value: Any) -> Any:
             raise ValueError(f"human[{i}] is {human!r}, expected a Human, or what has port() and voluntary_force(t)")
         if not isinstance(port := human.port(), Port):  # which raises ValueError where it is not passive
             raise ValueError(f"human[{i}].port() is {port!r}, expected a models.human.Port")
+        with np.errstate(all="ignore"):
+            force = np.asarray(human.voluntary_force(_TIMES))
+        if force.shape != _TIMES.shape or force.dtype.kind not in "fiu" or not np.isfinite(force).all():
+            raise ValueError(f"human[{i}].voluntary_force(t) is {force!r} for two times, expected as many forces in N")
     return tuple(value)
 
 

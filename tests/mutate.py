@@ -17,12 +17,12 @@ import ast
 import builtins
 import contextlib
 import copy
+import hashlib
 import importlib
 import io
 import itertools
 import os
 import pickle
-import random
 import resource
 import signal
 import sys
@@ -42,17 +42,16 @@ JUDGED = ROOT / "tests/mutate.survivors.md"
 GOAL = 0.95
 #: module -> the files of tests that are about it
 TABLE = {
-    "design/exact.py": "design/test_exact design/test_exact_blocks design/test_certificate",
-    "design/certificate.py": "design/test_certificate design/test_exact_blocks design/test_audit design/test_box "
-    "design/test_switching_file design/test_limiter design/test_walls_making design/test_latency design/test_periods",
-    "design/conditions.py": "design/test_exact_blocks design/test_certificate design/test_margin design/test_latency "
-    "design/test_periods design/test_encoder_steps design/test_moving_average design/test_worst_member",
-    "controller/process.py": "controller/test_process controller/test_contact controller/test_limiter",
+    "design/exact.py": "design/test_exact design/test_exact_blocks",
+    "design/certificate.py": "design/test_certificate design/test_exact_blocks design/test_switching_file "
+    "design/test_limiter",
+    "design/conditions.py": "design/test_exact_blocks design/test_margin design/test_latency design/test_encoder_steps",
+    "controller/process.py": "controller/test_process controller/test_contact",
     "controller/contact.py": "controller/test_process controller/test_contact controller/test_limiter",
-    "hw/limits.py": "hw/test_limits hw/test_operator_safety hw/test_protocol hw/test_hardware_page",
+    "hw/limits.py": "hw/test_limits",
     "hw/device.py": "hw/test_device hw/test_latch_on_arrival",
 }
-_ENOUGH = 20.0  # [s] of CPU that the tests of one mutant may take when nothing is wrong; the quickest are taken
+_ENOUGH = 6.0  # [s] of CPU that the tests of one mutant may take when nothing is wrong; the quickest are taken
 _TIMEOUT = 3.0  # times as long, and some seconds, end a mutant
 
 _COMPARISONS = {
@@ -423,12 +422,13 @@ def _forked(work: Callable[[], Any]) -> Callable[[], Any]:
 def outcomes_of(module: str, count: int, seed: int, jobs: int) -> list[Outcome]:
     """The fate of `count` mutants of a module."""
     all_of_them = mutants(module)
-    drawn = random.Random(f"{seed} {module}").sample(all_of_them, min(count, len(all_of_them)))
+    # by what they are, so that a change of one line leaves the others drawn
+    drawn = sorted(all_of_them, key=lambda m: hashlib.sha256(f"{seed} {m.key}".encode()).digest())[:count]
     runner = _Runner(module, sorted(drawn, key=lambda m: (m.place, m.kind)), jobs)
     files = [str(ROOT / "tests" / f"{name}.py") for name in TABLE[module].split()]
     pytest.main([*files, "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--no-header", "--no-summary"], [runner])
-    if runner.trouble:
-        sys.exit(f"{module}: {runner.trouble}")
+    if runner.trouble or len(runner.outcomes) < len(drawn):
+        sys.exit(f"{module}: {runner.trouble or 'its tests did not run'}")
     return runner.outcomes
 
 
@@ -457,14 +457,14 @@ def main() -> int:
         open_ones += [m for m in survived if m.key not in known]
         ends = [sum(o.end == end for o in found) for end in ("killed", "timeout", "survived")]
         rows.append((module, len(found), *ends, len(accepted)))
-    print(f"\n{'module':24}{'mutants':>8}{'killed':>8}{'timeout':>8}{'survived':>9}{'judged':>8}  killed")
+    print(f"\n{'module':24}{'mutants':>8}{'killed':>8}{'timeout':>8}{'survived':>9}{'judged':>8}  score")
     totals = ("together", *(sum(row[i] for row in rows) for i in range(1, 6)))
     for name, n, killed, late, survived, fine in (*rows, totals):
-        print(f"{name:24}{n:8}{killed:8}{late:8}{survived:9}{fine:8}  {(killed + late) / max(n, 1):.1%}")
-    print(f"seed {args.seed}, {time.monotonic() - begin:.0f} s; a timeout counts as killed")
+        print(f"{name:24}{n:8}{killed:8}{late:8}{survived:9}{fine:8}  {(killed + late) / max(n - fine, 1):.1%}")
+    print(f"seed {args.seed}, {time.monotonic() - begin:.0f} s; a timeout counts as killed, the judged are not counted")
     for mutant in open_ones:
         print(f"survived, not judged: {mutant.key}  [line {mutant.line}]")
-    score = (totals[2] + totals[3]) / max(totals[1], 1)
+    score = (totals[2] + totals[3]) / max(totals[1] - totals[5], 1)
     return 0 if not open_ones and score >= GOAL else 1
 
 

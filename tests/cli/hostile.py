@@ -13,6 +13,7 @@ import json
 import os
 import re
 import resource
+import shlex
 import shutil
 import signal
 import sys
@@ -31,6 +32,7 @@ import numpy as np
 
 mpl.use("Agg")
 import matplotlib.pyplot  # noqa: F401 - once, before the forks
+from combined import combined
 
 from cli import options
 from cli.main import COMMANDS
@@ -133,6 +135,9 @@ def cases() -> Iterator[Case]:
     yield from streams()
     yield from silence()
     yield from names_in_pictures()
+    for command, words, codes, people in combined():
+        quick = QUICK[command] if command != "audit" else ()
+        yield Case(f"{command} {words}", (command, *quick, *shlex.split(words)), codes, before=written("h.py", people))
 
 
 QUICK = {  # what a command needs beside the option in question
@@ -715,7 +720,7 @@ def silence() -> Iterator[Case]:
         (("design", "--seconds", "9"), "--seconds"),
         (("design", "--high-gain", "2"), "--high-gain"),
         (("design", "--coupling", "ccl", "--limiter"), "limiter"),
-        (("design", "--varying-delay", "1-2,0-3", "--condition", "any-environment"), "varying_delay"),
+        (("design", "--varying-delay", "1-2,0-3", "--condition", "any-environment"), "varying-delay"),
         (("design", "--coupling", "ccl", "--order", "99"), "--order"),
         (("design", "--samples", "5"), "--samples"),
         (("export", "c.json", "--without-theta"), "--without-theta"),

@@ -144,6 +144,7 @@ def test_the_exact_inverse_is_an_inverse():
     with pytest.raises(SingularLoop):
         inverse(numbers([[1, 2], [2, 4]], Fraction(1)))
     assert block_diag(Matrix.zeros(0, 0), Matrix.eye(2)).equals(Matrix.eye(2))
+    assert str(definiteness(Matrix.eye(2))) == "positive definite"
 
 
 @pytest.mark.parametrize("coupling", COUPLINGS, ids=lambda c: type(c).__name__)
@@ -189,6 +190,7 @@ def test_a_wrong_storage_matrix_proves_nothing():
     assert prove_positive_real(unstable, Matrix.of([[-1]])) == (
         "P is not positive definite, or by so little that it is not proved"
     )
+    assert find_storage(unstable) == (None, "the block has a pole on or outside the unit circle")
     assert prove_positive_real(G, Matrix.eye(2)) == "P has shape (2, 2), the model has 1 states"
 
 
@@ -259,6 +261,18 @@ def test_a_riccati_equation_with_a_wrong_answer_proves_nothing(monkeypatch):
         P, reason = find_storage(G)
         assert P is None
         assert "negative direction" in reason
+
+
+def test_numbers_beyond_floating_point_are_left_to_exact_arithmetic(recwarn):
+    G = Lti(*([[v]] for v in (0.5, 1, 0.5, 10**308)), Fraction(1))  # D + D' overflows
+    assert prove_positive_real(G, Matrix.of([[1]])) is None
+    assert prove_positive_real(G, Matrix.of([[-1]])) is not None
+    assert not recwarn.list
+
+
+def test_a_model_of_more_states_than_are_tried_is_told_so():
+    assert exact.too_large(exact.LARGEST) is None
+    assert exact.too_large(exact.LARGEST + 1) == "a proof over 301 states takes long: up to 300 are tried"
 
 
 def test_products_are_in_lowest_terms():
