@@ -11,24 +11,10 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
+from hw import protocol as wire
 from hw.control import Program
 from hw.limits import Fault, Stage
 from hw.monitor import Ages
-from hw.protocol import (
-    Ack,
-    Config,
-    Decoder,
-    Force,
-    Hello,
-    Info,
-    Message,
-    Reason,
-    Refused,
-    State,
-    Stop,
-    config_crc,
-    encode,
-)
 from hw.session import Said, Session
 
 _RESEND = 0.1  # [s] after which a question is asked again
@@ -48,19 +34,19 @@ class HapticDevice(Protocol):
         """Frames that could not be read, so far."""
         ...
 
-    def info(self) -> Info | None:
+    def info(self) -> wire.Info | None:
         """Who it is; None as long as it has not answered."""
         ...
 
-    def configure(self, config: Config) -> int | None:
+    def configure(self, config: wire.Config) -> int | None:
         """How to run; Refused.ACCEPTED, or why not, or None as long as it has not answered."""
         ...
 
-    def exchange(self, force: Force | None) -> State | None:
+    def exchange(self, force: wire.Force | None) -> wire.State | None:
         """Give the force that answers the last STATE (None: there is none), and wait for the next, if one comes."""
         ...
 
-    def stop(self, reason: Reason) -> None:
+    def stop(self, reason: wire.Reason) -> None:
         """To zero force: by the device's ramp, for an emergency stop at once."""
         ...
 
@@ -87,8 +73,8 @@ class SerialDevice:
 
     def __init__(self, port: Port, clock: Callable[[], float] = time.monotonic) -> None:
         self._port, self._clock = port, clock
-        self._decoder, self._waiting = Decoder(), list[Message]()
-        self._question: Hello | Config | None = None
+        self._decoder, self._waiting = wire.Decoder(), list[wire.Message]()
+        self._question: wire.Hello | wire.Config | None = None
         self._begun = self._asked = 0.0  # [s] when the question was asked first, and last
         self.dropped = 0  # bytes that the port would not take at once
 
@@ -96,28 +82,32 @@ class SerialDevice:
     def errors(self) -> int:
         return self._decoder.rejected
 
-    def info(self) -> Info | None:
-        answer = self._answer(Hello())
-        return answer if isinstance(answer, Info) else None
+    def info(self) -> wire.Info | None:
+        answer = self._answer(wire.Hello())
+        return answer if isinstance(answer, wire.Info) else None
 
-    def configure(self, config: Config) -> int | None:
+    def configure(self, config: wire.Config) -> int | None:
         """Asked again while the device is still on its way to zero force. Raises Fault where it drives by itself."""
         answer = self._answer(config)
-        if not isinstance(answer, Ack) or answer.crc != config_crc(config) or answer.refused == Refused.RUNNING:
+        if (
+            not isinstance(answer, wire.Ack)
+            or answer.crc != wire.config_crc(config)
+            or answer.refused == wire.Refused.RUNNING
+        ):
             return None
         self._question = None
         return answer.refused
 
-    def exchange(self, force: Force | None) -> State | None:
+    def exchange(self, force: wire.Force | None) -> wire.State | None:
         if force is not None:
-            self._write(encode(force))
+            self._write(wire.encode(force))
         message = self._next()  # one a call: a flood of other frames must not keep anybody from looking at the time
-        return message if isinstance(message, State) else None
+        return message if isinstance(message, wire.State) else None
 
-    def stop(self, reason: Reason) -> None:
-        self._write(encode(Stop(reason)))
+    def stop(self, reason: wire.Reason) -> None:
+        self._write(wire.encode(wire.Stop(reason)))
 
-    def _answer(self, question: Hello | Config) -> Message | None:
+    def _answer(self, question: wire.Hello | wire.Config) -> wire.Message | None:
         """What came, to a question that is asked now and then; a device that drives meanwhile is told to stop."""
         now = self._clock()
         if question != self._question:  # what came before is of no use
@@ -126,15 +116,15 @@ class SerialDevice:
             self._question, self._begun, self._asked = question, now, now - _RESEND
         if now - self._asked >= _RESEND:
             self._asked = now
-            self._write(b"\0" + encode(question))  # the zero ends whatever was left in the line
+            self._write(b"\0" + wire.encode(question))  # the zero ends whatever was left in the line
         message = self._next()
-        if isinstance(message, State) and message.drives:
-            self.stop(Reason.FAULT)
-            if isinstance(question, Config) and now - self._begun > _STOPPING:
+        if isinstance(message, wire.State) and message.drives:
+            self.stop(wire.Reason.FAULT)
+            if isinstance(question, wire.Config) and now - self._begun > _STOPPING:
                 raise Fault("the device drives, and nobody asked it to")
         return message
 
-    def _next(self) -> Message | None:
+    def _next(self) -> wire.Message | None:
         if not self._waiting and self._port.wait(_LONGEST_WAIT):
             self._waiting += self._decoder.feed(self._port.read())
         return self._waiting.pop(0) if self._waiting else None
@@ -155,16 +145,16 @@ class Driver:
     ) -> None:
         """`plan` gives couplings for the delay that was measured, `clock` the time [us]."""
         self.session, self.device, self.plan, self.clock = session, device, plan, clock
-        self._force: Force | None = None
+        self._force: wire.Force | None = None
 
     def do(self, said: Said) -> None:
         """What the session says."""
         for message in said:
-            if isinstance(message, Force):
+            if isinstance(message, wire.Force):
                 self._force = message
             else:
                 self._force = None
-                self.device.stop(Reason(message.reason))
+                self.device.stop(wire.Reason(message.reason))
 
     def turn(self) -> None:
         """One call of the device, and what the session makes of it."""

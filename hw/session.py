@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from hw import protocol as wire
 from hw.control import BudgetPlan, Drive, Program, SentBudget, TraceRow
 from hw.limits import (
     DRIVING,
@@ -27,17 +28,6 @@ from hw.limits import (
     watchdog_for,
 )
 from hw.monitor import Counters, LinkMonitor, LinkSettings, Measurement, check_state
-from hw.protocol import (
-    Command,
-    Config,
-    Force,
-    Info,
-    Phase,
-    Reason,
-    Refused,
-    State,
-    Stop,
-)
 from sim.scenario import InputError, Scenario
 
 _PATIENCE_US = 2_000_000  # after which a question is given up
@@ -50,7 +40,7 @@ _STRONGEST = 12.0  # [N] whatever a scenario allows
 _KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
 
 
-Said = tuple[Force | Stop, ...]  # to the device
+Said = tuple[wire.Force | wire.Stop, ...]  # to the device
 
 
 class _Event(NamedTuple):
@@ -74,12 +64,12 @@ class Session:
         self.measurement = Measurement(self.settings.measure, self.probe, scenario.T, self.settings.missed)
         self.stage, self.cause = Stage.CONNECTING, ""
         self.log: list[_Event] = []
-        self.info: Info | None = None  # what the device is; None before it said so
-        self.config: Config | None = None  # how the device was asked to run, last
+        self.info: wire.Info | None = None  # what the device is; None before it said so
+        self.config: wire.Config | None = None  # how the device was asked to run, last
         self.programs: tuple[Program, ...] = ()
         self.program: Program | None = None
         self.drive: Drive | None = None  # the coupling at work, from one arming to the next end
-        self.armings: list[tuple[Program, Config]] = []  # what forces came from, arming by arming
+        self.armings: list[tuple[Program, wire.Config]] = []  # what forces came from, arming by arming
         self.budgets: list[SentBudget] = []  # arming by arming, where the settings ask for one
         self.record: Callable[[TraceRow], None] = lambda row: None
         self.listen: Callable[[_Event], None] = lambda event: None
@@ -171,7 +161,7 @@ class Session:
         if self.stage == Stage.ARMED or (self.stage == Stage.ARMING and self.gain > 0):
             self._ramp_out(Stage.FINISHED, cause)
             return ()
-        return self._end(Stage.FINISHED, cause, Reason.DONE)
+        return self._end(Stage.FINISHED, cause, wire.Reason.DONE)
 
     def fail(self, cause: str, now: int) -> Said:
         """A fault found outside of the session: zero force at once."""
@@ -183,7 +173,7 @@ class Session:
         self.now = now
         if self.stage == Stage.ESTOP:
             return ()
-        return self._end(Stage.ESTOP, cause, Reason.ESTOP)
+        return self._end(Stage.ESTOP, cause, wire.Reason.ESTOP)
 
     def lost(self, cause: str, now: int) -> Said:
         """The port is gone."""
@@ -192,7 +182,7 @@ class Session:
 
     # what the link does
 
-    def met(self, info: Info, now: int) -> Said:
+    def met(self, info: wire.Info, now: int) -> Said:
         """Who the device is."""
         return self._guarded(now, lambda: self._on_info(info))
 
@@ -200,7 +190,7 @@ class Session:
         """The device runs as `config` says, or why not."""
         return self._guarded(now, lambda: self._on_answer(refused))
 
-    def take(self, state: State, now: int) -> Said:
+    def take(self, state: wire.State, now: int) -> Said:
         """What answers a STATE."""
         return self._guarded(now, lambda: self._on_state(state))
 
@@ -233,7 +223,7 @@ class Session:
         waited = 1e-6 * (self.now - self.entered)
         return self._end(Stage.LOST, f"no answer to {question} within {waited:.1f} s{noise}")
 
-    def _on_info(self, info: Info) -> Said:
+    def _on_info(self, info: wire.Info) -> Said:
         if reasons := objections(info, self.scenario, self.limits, self.settings.baud):
             return self._end(Stage.REFUSED, "; ".join(reasons))
         self.info, self._units = info, Units.of(info)
@@ -242,8 +232,8 @@ class Session:
 
     def _on_answer(self, refused: int) -> Said:
         assert self.config
-        if refused != Refused.ACCEPTED:
-            known = [r.name.lower() for r in Refused if r == refused]
+        if refused != wire.Refused.ACCEPTED:
+            known = [r.name.lower() for r in wire.Refused if r == refused]
             return self._end(Stage.REFUSED, f"the device refuses the configuration: {(known or [refused])[0]}")
         self.link.restart()
         self.heard = self.now
@@ -263,7 +253,7 @@ class Session:
 
     # the stream of STATEs
 
-    def _on_state(self, state: State) -> Said:
+    def _on_state(self, state: wire.State) -> Said:
         if self.info is None or state.axes != self.info.axes:
             self.counters.unexpected += 1
             return ()
@@ -273,7 +263,7 @@ class Session:
         if not ticks:
             return ()
         self.heard = self.now
-        if state.phase == Phase.ESTOP:
+        if state.phase == wire.Phase.ESTOP:
             return self.estop(f"pressed, {state.cause.name.lower()}", self.now)
         assert self.config is not None
         check_state(state, self.config, self.stage, self.gain)
@@ -282,9 +272,9 @@ class Session:
             return ended or self._on_driving(state, ticks)
         if self.stage == Stage.MEASURING:
             return self._measure(state)
-        return self._answer(state, Command.IDLE)
+        return self._answer(state, wire.Command.IDLE)
 
-    def _on_state_after_the_end(self, state: State) -> Said:
+    def _on_state_after_the_end(self, state: wire.State) -> Said:
         assert self._shutdown
         if cause := self._shutdown.disobeyed(state, self.now):
             if self.stage == Stage.FINISHED:
@@ -293,9 +283,9 @@ class Session:
                 self._log(cause)
         return self._shutdown.heard(state)
 
-    def _on_driving(self, state: State, ticks: int) -> Said:
+    def _on_driving(self, state: wire.State, ticks: int) -> Said:
         assert self.drive
-        ready = state.phase != Phase.DISARMED
+        ready = state.phase != wire.Phase.DISARMED
         direction = (-1 if self.stage == Stage.DISARMING else 1) if ready else 0
         self.missed_while_driving += self.link.missed
         first = self.drive.reference is None
@@ -309,18 +299,18 @@ class Session:
             self._enter(Stage.ARMED, "full gain")
         if self.stage == Stage.DISARMING and self.gain == 0.0:
             return self._ramped_out()
-        return self._answer(state, Command.RUN if ready else Command.ARM, steps)
+        return self._answer(state, wire.Command.RUN if ready else wire.Command.ARM, steps)
 
-    def _answer(self, state: State, command: Command, steps: tuple[int, ...] | None = None) -> Said:
+    def _answer(self, state: wire.State, command: wire.Command, steps: tuple[int, ...] | None = None) -> Said:
         """The FORCE for a STATE: zero where no `steps` are given."""
         assert self.config
         apply_at = (state.tick + self.config.theta) & 0xFFFF
-        return (Force(command, apply_at, state.tick, steps or (0,) * state.axes),)
+        return (wire.Force(command, apply_at, state.tick, steps or (0,) * state.axes),)
 
-    def _measure(self, state: State) -> Said:
+    def _measure(self, state: wire.State) -> Said:
         try:
             if not self.measurement.note(state, self.link.margin, self.link.missed):
-                return self._answer(state, Command.IDLE)
+                return self._answer(state, wire.Command.IDLE)
         except Fault as fault:
             return self._end(Stage.REFUSED, str(fault))
         ages = self.measurement.result
@@ -341,10 +331,10 @@ class Session:
 
     def _ramped_out(self) -> Said:
         if self._after:
-            return self._end(self._after, self.cause, Reason.DONE)
+            return self._end(self._after, self.cause, wire.Reason.DONE)
         assert self.program is not None
         softer = self.programs.index(self.program) + 1
-        return (Stop(Reason.DONE), *self._take(softer, f"softer, since {self.cause}"))
+        return (wire.Stop(wire.Reason.DONE), *self._take(softer, f"softer, since {self.cause}"))
 
     def _enter(self, stage: Stage, cause: str) -> None:
         self.stage, self.cause, self.entered = stage, cause, self.now
@@ -354,11 +344,11 @@ class Session:
         self.log.append(_Event(self.now, self.stage, cause))
         self.listen(self.log[-1])
 
-    def _end(self, stage: Stage, cause: str, reason: Reason = Reason.FAULT) -> Said:
+    def _end(self, stage: Stage, cause: str, reason: wire.Reason = wire.Reason.FAULT) -> Said:
         self.drive = None
         self._shutdown = _Shutdown(reason, bool(self.armings), self.now, self.scenario.T)
         self._enter(stage, cause)
-        return (Stop(reason),)
+        return (wire.Stop(reason),)
 
 
 def _limits_for(scenario: Scenario, cap: float = _STRONGEST, **more: Any) -> Limits:
@@ -378,16 +368,16 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONG
 class _Shutdown:
     """STOP, told until the device says that it rests; an emergency stop, until it says that it has latched it."""
 
-    def __init__(self, reason: Reason, acted: bool, now: int, T: float) -> None:
+    def __init__(self, reason: wire.Reason, acted: bool, now: int, T: float) -> None:
         """`acted`: forces have acted, so that a device which says nothing is told again, every T seconds."""
-        self._stop, self._latch = (Stop(reason),), reason == Reason.ESTOP
+        self._stop, self._latch = (wire.Stop(reason),), reason == wire.Reason.ESTOP
         self._repeat, self._every = acted or self._latch, 1e6 * T
         self._began = self._told = now
         self._rests, self._obeys = False, True
 
-    def heard(self, state: State) -> Said:
+    def heard(self, state: wire.State) -> Said:
         """The answer to a STATE that came after the end."""
-        self._rests = not state.drives and (not self._latch or state.phase == Phase.ESTOP)
+        self._rests = not state.drives and (not self._latch or state.phase == wire.Phase.ESTOP)
         return () if self._rests else self._stop
 
     def again(self, now: int) -> Said:
@@ -398,7 +388,7 @@ class _Shutdown:
         self._told = now
         return self._stop
 
-    def disobeyed(self, state: State, now: int) -> str | None:
+    def disobeyed(self, state: wire.State, now: int) -> str | None:
         """Said once, of a device that goes on driving."""
         if not self._obeys or now - self._began <= _OBEYING_US or not state.drives:
             return None
