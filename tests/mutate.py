@@ -46,7 +46,8 @@ TABLE = {
     "design/certificate.py": "design/test_certificate design/test_exact_blocks design/test_switching_file "
     "design/test_limiter",
     "design/conditions.py": "design/test_exact_blocks design/test_margin design/test_latency design/test_encoder_steps",
-    "controller/process.py": "controller/test_process controller/test_contact controller/test_limiter",
+    "controller/process.py": "controller/test_process controller/test_contact",
+    "controller/contact.py": "controller/test_process controller/test_contact controller/test_limiter",
     "hw/limits.py": "hw/test_limits",
     "hw/device.py": "hw/test_device hw/test_latch_on_arrival",
 }
