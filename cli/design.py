@@ -19,8 +19,10 @@ from design.coverage import Limits, cost_part, covered_limits, price, set_part, 
 from design.designs import KINDS, NO_LONGER, design_by_kind, usual_condition
 from design.files import out_file
 from design.guarantees import ANY, HERE, guarantee_of, switching_guarantee
-from design.optimal import OBJECTIVES, Optimal, Options, box_around, robustness, spread
+from design.optimal import Optimal
+from design.program import OBJECTIVES, Options
 from design.result import METHODS, Design, DesignFailed, NotProved, finite, listed
+from design.robustness import box_around, robustness, spread
 from design.spring_damper import STIFFEST
 from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency

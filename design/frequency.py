@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import schur, solve_triangular
 
 from controller.lti import Array, Lti
 
@@ -149,9 +150,15 @@ def rounding(G: Lti, z: NDArray[np.complex128]) -> float:
     """
     part = (2 * G.order + 8) * 2.0**-53
     worst = np.abs(G.D).max(initial=0.0)
-    for some in np.array_split(z, 1 + z.size * G.order**2 // 10**6) if G.order else ():
-        R = np.linalg.inv(some[:, None, None] * np.eye(G.order) - G.A)
-        states, outputs = np.abs(R @ G.B), np.abs(G.C @ R)
+    if not G.order:
+        return part * float(worst)
+    triangle, Q = schur(G.A, output="complex")[:2]  # one for all frequencies, each of which is solved by substitution
+    B, C, diagonal = Q.conj().T @ G.B, (G.C @ Q).T, np.diag_indices(G.order)
+    for value in z:
+        shifted = -triangle
+        shifted[diagonal] += value
+        states = np.abs(Q @ solve_triangular(shifted, B))
+        outputs = np.abs(Q.conj() @ solve_triangular(shifted, C, trans=1)).T
         terms = outputs @ (np.abs(G.A) @ states + np.abs(G.B)) + np.abs(G.C) @ states + np.abs(G.D)
         worst = max(worst, float(terms.max()))
     return part * worst

@@ -21,7 +21,7 @@ from controller.loop import Loop, force_map
 from design import optimal
 from design.certificate import check_set, prove, verify
 from design.coverage import set_part
-from design.optimal import Options
+from design.program import Options
 from design.result import NotProved
 from design.stored import Stored, digest, load, sealed
 from sim.scenario import SCENARIOS, InputError, parse
