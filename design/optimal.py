@@ -53,6 +53,7 @@ _LAGS = ((BETA, 0.05), (0.1, 0.5), (0.5, 2.0))  # (beta, c) of a limiter to begi
 _HOPELESS = 0.9  # relative mismatch from which on the climb is compared with other couplings
 _TOLERATED = 0.02  # by which a further environment may be short before it enters the design: scaling does the rest
 _MOST_STATES = 200  # of the loop, up to which a rung is tried: half a minute with five devices
+_MOST_PROOFS = 30 * 112**2.7  # and (environments) states^2.7: a minute
 _MOST_WORK = 7e6  # (channels x unknowns)^2 up to which a rung is tried
 
 
@@ -261,7 +262,8 @@ class _Climb:
         own = int((span.used.sum(axis=1) > 0)[:, :m].sum())
         states = own + (len(span.used) - own // m if m > FULL else 0)
         states += self.cases[0].E.order + sum(loop.theta) + sum(loop.psi)
-        return states <= _MOST_STATES and (m * span.unknowns) ** 2 <= _MOST_WORK
+        proofs = len(self.cases) * states**2.7  # what they take, in seconds
+        return states <= _MOST_STATES and (m * span.unknowns) ** 2 <= _MOST_WORK and proofs <= _MOST_PROOFS
 
     def rung(self, taps: int, poles: int, before: Optimal | None) -> tuple[Optimal, _Rung]:
         """The optimum over a basis, scaled until every sweep passes, and proved where there are no ranges."""

@@ -30,8 +30,9 @@ from design.transparency import BAND_HZ
 OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # share of the damping that stays unused: what an exact proof always finds room in
 LADDER = ((4, 3), (8, 6), (14, 10), (22, 16))  # taps and real poles of the rungs
-_FASTEST, _SLOWEST = 0.5, 0.0015  # distance to 1 of the real poles' ends
+_FASTEST, _SLOWEST, _SLOWEST_OF_MANY = 0.5, 0.0015, 0.008  # distance to 1 of the real poles' ends
 _FASTER = 0.25  # modes of smaller radius are left to the filter of the sum of all forces
+_NEAR = 0.3  # of its distance to 1: a real pole so close to a mode gives way to it
 _SLOWER = 0.999  # modes of larger radius get no section
 RICH, _EDGED = 2, 14  # channels up to which, and taps from which on, there are sections at the band's end
 _EDGES = (0.2, 0.07, 0.02)  # their damping ratios: they crowd at the band's end, where the error may jump
@@ -243,8 +244,10 @@ def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1]) -> Span:
     m = E.inputs
     modes = np.concatenate([E.poles(), _zeros(E)])
     modes = modes[(np.abs(modes) < _SLOWER) & (np.abs(modes) > 0.02) & (modes.imag >= 0)]
-    slow = np.round(1 - np.geomspace(_FASTEST, _SLOWEST, poles), 4) if poles else np.zeros(0)
-    fast, real, pairs = [], slow.tolist(), []
+    slowest = _SLOWEST if m <= RICH else _SLOWEST_OF_MANY
+    slow = np.round(1 - np.geomspace(_FASTEST, slowest, poles), 4) if poles else np.zeros(0)
+    own_real = modes[np.abs(modes.imag) <= 1e-6].real
+    fast, real, pairs = [], [a for a in slow.tolist() if not (np.abs(own_real - a) < _NEAR * (1 - a)).any()], []
     for mode in _distinct(modes):
         if abs(mode.imag) > 1e-6:
             pairs.append((-2 * mode.real, abs(mode) ** 2))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import msgspec
 
@@ -11,9 +12,10 @@ from controller.coupling import Coupling, ForceFilter
 from controller.environment import Box, Network, UncertainSpring
 from controller.loop import Loop
 from design.conditions import this_environment
-from design.optimal import at, compromise
+from design.environments import in_each
+from design.optimal import at, compromise, design
 from design.program import DEFAULT, Case, Options
-from design.result import DesignFailed
+from design.result import DesignFailed, finite
 
 _MINIMISED = {"rms": "rms_mismatch_db", "sup": "relative_mismatch_db"}
 
@@ -26,6 +28,16 @@ class _Robustness:
     worst: float  # times the damping that there is
     where: str  # which parameter, and which way
     kept: bool  # whether it is certified there
+
+    def part(self) -> dict[str, Any]:
+        """As plain data."""
+        worst = finite(self.worst)
+        return {
+            "percent": self.percent,
+            "required_over_available": worst,
+            "where": self.where,
+            "certified": self.kept,
+        }
 
 
 def vertices(network: Network, percent: float = 10.0) -> dict[str, Network]:
@@ -84,6 +96,50 @@ def spread(loop: Loop, options: Options = DEFAULT, percent: float = 10.0) -> _Sp
         return None
     mismatch, before = (getattr(one.figures, _MINIMISED[options.objective]) for one in (wide, alone))
     return _Spread(mismatch, mismatch - before, wide.g, robustness(loop, wide.coupling, percent).worst)
+
+
+def robustness_parts(loop: Loop, coupling: Coupling, options: Options = DEFAULT) -> dict[str, Any]:
+    """A report's `robustness` of a coupling for this environment, and what a design for that range would cost.
+
+    Both are null with walls, the latter also with ranges, and for a coupling that is no force filter.
+    """
+    if loop.environment.walls:
+        return {"robustness": None, "designed_for_it": None}
+    price = spread(loop, options) if isinstance(coupling, ForceFilter) and not loop.box else None
+    parts = price and {name: finite(value) for name, value in asdict(price).items()}
+    return {"robustness": robustness(loop, coupling).part(), "designed_for_it": parts}
+
+
+_MOST_RANGES = 6  # whose 64 vertices can all be proved
+
+
+def ranges(loop: Loop, percent: float) -> tuple[Box, str | None]:
+    """Every stiffness and every mass this much more or less, and a note.
+
+    Of more than MOST_RANGES those stay for which a small nominal design needs the most damping at their ends: the note
+    names the others, which are taken as known.
+    """
+    whole = box_around(loop.network, percent)
+    single = [Box(springs=(spring,)) for spring in whole.springs]
+    single += [Box(masses={node: span}) for node, span in whole.masses.items()]
+    if len(single) <= _MOST_RANGES:
+        return whole, None
+    small = design(loop.at(loop.network), replace(DEFAULT, ladder=DEFAULT.ladder[:1])).coupling
+
+    def need(box: Box) -> float:
+        there = msgspec.structs.replace(loop, box=box)
+        return max(found.ratio for found in in_each(there, small, there.members()))
+
+    ranked = sorted(single, key=need, reverse=True)
+    kept, known = ranked[:_MOST_RANGES], ranked[_MOST_RANGES:]
+    names = [f"stiffness {' and '.join(spring.between)}" for box in known for spring in box.springs]
+    names += [f"mass {node}" for box in known for node in box.masses]
+    note = (
+        f"{len(single)} ranges have {2 ** len(single)} vertices, {2**_MOST_RANGES} can be proved: those that matter "
+        f"most are kept, taken as known: {', '.join(names)}"
+    )
+    springs = tuple(spring for box in kept for spring in box.springs)
+    return Box(springs, {node: span for box in kept for node, span in box.masses.items()}), note
 
 
 def box_around(network: Network, percent: float) -> Box:
