@@ -4,6 +4,7 @@
 # make lint   ruff and pyright, without a finding: to be run, with make test, before anything is committed
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
 # make validate  every check that a verdict rests on: a report in out/validate/report.md, about ten minutes
+# make mutate  small mistakes in what verdicts rest on, and whether a test notices: about ten minutes
 # make oldest  the tests of models, blocks and files with the oldest packages that pyproject.toml allows, in .venv-oldest
 # make installed  a plain installation in an empty environment, and its console script
 # make figures  the pictures that README and docs show, and the output in their blocks
@@ -12,7 +13,7 @@ PY := .venv/bin/python
 # a file of tests stays on one core: its tests share fixtures, and those of the documentation files
 PARALLEL := -n auto --dist loadfile
 
-.PHONY: run test check validate lint coverage bench oldest installed figures clean
+.PHONY: run test check validate lint coverage bench mutate oldest installed figures clean
 
 run: .venv/ready
 	$(PY) -m sim.run --case I
@@ -26,6 +27,10 @@ check: lint
 validate: .venv/ready
 	$(PY) -m sim.suite --out out/validate
 	$(PY) tests/cli/hostile.py --signals
+	$(PY) docs/regenerate.py --check
+
+mutate: .venv/ready
+	$(PY) tests/mutate.py
 
 lint: .venv/ready
 	$(PY) -m ruff check .

@@ -35,7 +35,7 @@ def main(argv: list[str]) -> int:
     out = options.out_folder(args, "accuracy")
     with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
         chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
-    lag = limits_of(scenario, chosen.coupling, limiter=args.limiter).rho
+    lag = limits_of(scenario, chosen, limiter=args.limiter).rho
     coupled, uncoupled = assemble(scenario, chosen.coupling, lag), assemble(scenario, NoCoupling())
     default = max(default_substeps(loop, "RK4") for loop in (coupled, uncoupled))
 

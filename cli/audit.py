@@ -16,8 +16,8 @@ from cli import options, render
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY, report
-from design.certificate import check_set
-from design.coverage import set_rows
+from design.certificate import check_ranges
+from design.coverage import ranges_rows
 from design.designs import KINDS
 from design.result import OLDER_NAMES, listed
 from models.device import CATALOGUE, Listed, listed_device
@@ -27,7 +27,7 @@ from sim.scenario import InputError, Scenario
 
 _EXAMPLE = """python -m design.audit --case I --K 2870,2320 --B 5.47,5.55
   python -m design.audit --rigid --K 5000 --B 0 --T 1e-3 --theta 0 --delta 1.37
-  python -m design.audit --case I --K 879,552 --B 0.39,0.52 --jitter 1,2
+  python -m design.audit --case I --K 879,552 --B 0.39,0.52 --varying-delay 1,2
   python -m design.audit --device falcon --delta 0.5
   python -m design.audit --devices"""
 
@@ -36,6 +36,9 @@ def main(argv: list[str]) -> int:
     """Audit a coupling. 0: safe in this environment and at every vertex of its ranges, 1: not."""
     args = _parser().parse_args(argv)
     if args.devices:
+        beside = [name for name in ("K", "B", "coupling", "device", "preset", "rigid") if getattr(args, name)]
+        if beside:
+            raise InputError(f"--devices with --{beside[0]}: the list is of the whole catalogue, give one of them")
         return _list_devices(args)
     args = _with_device(args)
     scenario = options.scenario_from(args)
@@ -45,8 +48,8 @@ def main(argv: list[str]) -> int:
     out = options.out_folder(args, "audit")
 
     begin = time.perf_counter()
-    with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:
-        whole = check_set(loop, coupling, args.seed, progress=move)
+    with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
+        whole = check_ranges(loop, coupling, args.seed, progress=move)
     try:
         judged = report(loop, coupling, switching, whole)
     except ValueError as error:
@@ -61,9 +64,9 @@ def main(argv: list[str]) -> int:
         "notes": _notes(args, scenario, switching),
         "wall_s": time.perf_counter() - begin,
     }
-    outcome |= {older: outcome[name] for older, name in OLDER_NAMES.items()}
+    outcome |= {older: outcome[name] for older, name in (*OLDER_NAMES.items(), ("jitter-proof", "switching"))}
     render.publish(args, outcome, _tables(outcome), _remarks(outcome), out)
-    proof = outcome["jitter-proof"]
+    proof = outcome["switching"]
     holds = outcome["certified"] and (proof is None or proof["certified"])
     return options.DONE if holds else options.DOES_NOT_HOLD
 
@@ -84,7 +87,7 @@ def _parser() -> options.Parser:
     options.add_loop_options(parser)
     options.add_rigid_option(parser)
     switching = "also any switching of the forces' delays in this range [samples]; or LO-HI,LO-HI,.. per channel"
-    parser.add_argument("--jitter", type=options.delay_ranges, metavar="LO,HI", help=switching)
+    options.add_varying_delay_option(parser, switching)
     options.add_output_options(parser)
     return parser
 
@@ -180,17 +183,17 @@ def _coupling(args: argparse.Namespace, channels: int, scenario: Scenario) -> Co
 
 
 def _switching(args: argparse.Namespace, loop: Loop) -> DelayRange | None:
-    """The range of --jitter, or of the scenario, around the constant theta that the other conditions are about.
+    """The range of --varying-delay, or of the scenario, around the constant theta that the other conditions are about.
 
     Raises InputError.
     """
-    if args.jitter is None:
-        return loop.jitter
-    lo, hi = options.ranges_per_channel("--jitter", args.jitter, loop.channels)
+    if args.varying_delay is None:
+        return loop.varying_delay
+    lo, hi = options.ranges_per_channel("--varying-delay", args.varying_delay, loop.channels)
     for i, (least, n, largest) in enumerate(zip(lo, loop.theta, hi, strict=True)):
         if not 0 <= least <= n <= largest <= LONGEST_DELAY:
             allowed = f"0 <= LO <= theta = {n} <= HI <= {LONGEST_DELAY} samples (--theta gives another)"
-            raise InputError(f"--jitter on channel {i + 1} is {least} to {largest}, expected {allowed}")
+            raise InputError(f"--varying-delay on channel {i + 1} is {least} to {largest}, expected {allowed}")
     return DelayRange(lo, hi)
 
 
@@ -211,9 +214,9 @@ def _tables(outcome: dict[str, Any]) -> list[Table]:
     table = Table("", *render.ORDER, title=_verdict(outcome), title_justify="left")
     for name, cell in _ROWS.items():
         table.add_row(name, *(cell(part) for part in parts))
-    if not outcome["set"]:
+    if not outcome["ranges"]:
         return [table]
-    return [table, render.facts("the ranges around the environment", set_rows(outcome["set"]), left=True)]
+    return [table, render.facts("the ranges around the environment", ranges_rows(outcome["ranges"]), left=True)]
 
 
 def _verdict(outcome: dict[str, Any]) -> str:
@@ -269,7 +272,7 @@ def _remarks(outcome: dict[str, Any]) -> list[str]:
         lines += [f"{condition}{of}: {reason}." for of, reason in reasons.items() if reason]
     if not outcome["certified"]:
         lines += _proposed(outcome["helps"])
-    if (part := outcome["jitter-proof"]) is not None:
+    if (part := outcome["switching"]) is not None:
         lines += _switching_remarks(part)
     if part := outcome["encoder"]:
         lines.append(f"{part['words'][0].upper()}{part['words'][1:]}.")

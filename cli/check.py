@@ -12,8 +12,8 @@ from rich.table import Table
 from cli import options, render
 from design.certificate import Verdict, lag, verify, violated_between
 from design.coverage import search_part, search_words
-from design.environments import Searched, search_box
-from design.guarantees import HERE, SET, switching_guarantee
+from design.environments import Searched, search_ranges
+from design.guarantees import HERE, RANGES, switching_guarantee
 from design.result import listed
 from design.stored import Stored, SwitchingProof
 from sim.couplings import read_coupling
@@ -79,10 +79,10 @@ def _parser() -> options.Parser:
 
 def _searched(stored: Stored) -> Searched | None:
     """The search between the vertices, again, where the file guarantees ranges of parameters."""
-    if not (stored.certificate and stored.certificate.guarantee == SET):
+    if not (stored.certificate and stored.certificate.guarantee == RANGES):
         return None
     with render.progress("searching the ranges between their vertices") as move:
-        return search_box(stored.loop, stored.coupling.build(stored.loop.T), move)
+        return search_ranges(stored.loop, stored.coupling.build(stored.loop.T), move)
 
 
 def _checked(stored: Stored, verdict: Verdict, searched: Searched | None, seconds: float) -> _Checked:
@@ -93,7 +93,7 @@ def _checked(stored: Stored, verdict: Verdict, searched: Searched | None, second
         claim and claim.condition,
         claim.guarantee if claim and verdict.proved else None,
         claim.proof if claim and verdict.proved else None,
-        len(stored.loop.members()) - 1 if stored.loop.box else None,
+        len(stored.loop.members()) - 1 if stored.loop.ranges else None,
         searched and search_part(searched),
         claim and claim.required,
         stored.loop.delta,
@@ -105,7 +105,7 @@ def _checked(stored: Stored, verdict: Verdict, searched: Searched | None, second
 
 
 def _switching(stored: Stored, verdict: Verdict) -> _Switching | None:
-    span, claim = stored.loop.jitter, stored.certificate and stored.certificate.switching
+    span, claim = stored.loop.varying_delay, stored.certificate and stored.certificate.switching
     if span is None or not isinstance(claim, SwitchingProof):
         return None
     guarantee = f"{switching_guarantee(span)}, in {HERE}" if verdict.proved else None

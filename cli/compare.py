@@ -64,6 +64,7 @@ def _parser() -> options.Parser:
     classics = "on the same runs: no coupling, the classics (PO/PC, energy bounding), the energy budget, our designs"
     parser.add_argument("--baselines", action="store_true", help=classics)
     axes, names = ",".join(AXES), "damping, delay, period, order"
+    options.add_limiter_option(parser, "with --baselines clip the forces of our designs")
     over = f"the best coupling along these axes: {names} (default: all of them)"
     parser.add_argument("--over", nargs="?", const=axes, metavar="NAME[=LOW:HIGH],..", help=over)
     curve = parser.add_argument_group("with --over")
@@ -89,6 +90,7 @@ _MODES = {
     "coupling": ("",),
     "condition": ("",),
     "no_plot": ("", "--over", "--baselines"),
+    "limiter": ("--baselines",),
     **dict.fromkeys(("points", "keep", "beside", "objective", "band_hz", "high_gain", "seconds"), ("--over",)),
     **dict.fromkeys((*RETIRED_WITH_VALUE, "diagonal"), ("--over",)),
 }
@@ -106,14 +108,9 @@ def _check_mode(args: argparse.Namespace, parser: options.Parser) -> None:
         raise InputError("--case none has no coupling to design: give I or II")
     for name, modes in _MODES.items():
         if mode not in modes and getattr(args, name) != parser.get_default(name):
-            takes = (
-                f"for --over, not for {mode}"
-                if "--over" in modes and mode
-                else f"not for {mode}"
-                if mode
-                else "for --over"
-            )
-            raise InputError(f"--{name.removesuffix('_hz').replace('_', '-')} is {takes}")
+            where = [f"for {modes[0]}"] * bool(modes[0]) + [f"not for {mode}"] * bool(mode)
+            option = {"limiter": "no-limiter"}.get(name, name.removesuffix("_hz").replace("_", "-"))
+            raise InputError(f"--{option} is {', '.join(where)}")
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -316,15 +313,16 @@ def _rung(row: dict[str, Any]) -> tuple[str, ...]:
 
 def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
     require_even_ticks(scenario, "--baselines")
-    if scenario.box or scenario.switches:
-        raise InputError("--baselines compares in one environment with constant delays: leave out [box] and jitter")
+    if scenario.ranges or scenario.switches:
+        given = "[ranges]" if scenario.ranges else "[varying_delay]"
+        raise InputError(f"--baselines compares in one environment with constant delays: leave out {given}")
     if any(device.friction for device in scenario.device):
         raise InputError("--baselines runs in the exact plant, which has no Coulomb friction; the devices have")
     out, rows, interrupted = options.out_folder(args, "compare"), [], False
     begin = time.perf_counter()
     with render.progress("comparing") as move:
         try:
-            rows.extend(rivals(scenario, args.case, move))
+            rows.extend(rivals(scenario, args.case, move, args.limiter))
         except KeyboardInterrupt:
             interrupted = True
     outcome: dict[str, Any] = {"scenario": scenario.name, "case": args.case, "seed": args.seed}

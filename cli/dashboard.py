@@ -16,11 +16,12 @@ from rich.live import Live
 from rich.table import Table
 
 from cli.render import Screen
+from hw.limits import Stage
 from hw.session import Session
 
 _WIDTH = 72  # columns
 _BAR = 30  # characters of a bar
-_COUNTED = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale")
+_COUNTED = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale", "host_errors")
 
 
 def _snapshot(session: Session) -> dict[str, Any]:
@@ -29,15 +30,22 @@ def _snapshot(session: Session) -> dict[str, Any]:
     return {
         "stage": str(session.stage),
         "cause": session.cause,
+        "doing": _doing(session),
         "x_mm": [1e3 * x for x in (drive.x or ())] if drive else [],
         "f": list(drive.force) if drive else [],
         "cap": list(session.limits.cap),
         "gain": session.gain,
         "theta": session.config.theta if session.config else None,
         "margin_us": session.link.least_margin,
-        "counters": {name: getattr(session.counters, name) for name in _COUNTED}
-        | {"host_errors": session.decoder.rejected},
+        "counters": {name: getattr(session.counters, name) for name in _COUNTED},
     }
+
+
+def _doing(session: Session) -> str:
+    """What takes longer than a moment."""
+    if session.stage == Stage.MEASURING:
+        return f"measuring the delay: {len(session.measurement.ages)} of {session.settings.measure} answers"
+    return "designing the coupling" if session.stage == Stage.MEASURED else ""
 
 
 def view(data: dict[str, Any], width: int = _WIDTH) -> Table:
@@ -45,6 +53,8 @@ def view(data: dict[str, Any], width: int = _WIDTH) -> Table:
     table = Table(title=f"{data['stage']}: {data['cause']}", width=min(width, _WIDTH), show_header=False)
     table.add_column("what", width=16 if width >= _WIDTH else 7)
     table.add_column("now")
+    if data["doing"]:
+        table.add_row("now", data["doing"])
     for i, (x, f, cap) in enumerate(zip(data["x_mm"], data["f"], data["cap"], strict=False), start=1):
         table.add_row(f"axis {i}", f"{x:+8.3f} mm  {f:+7.3f} N  {_bar(f / cap) if width >= _WIDTH else ''}")
     margin = "-" if data["margin_us"] is None else f"at least {data['margin_us']} us in the last ticks"

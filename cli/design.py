@@ -14,15 +14,15 @@ from cli import options, render
 from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY
 from design.bound import bound
-from design.certificate import SAMPLES, SetCheck, assess, check_set, lag, prove, switching_requirement
-from design.coverage import Limits, cost_part, covered_limits, price, set_part, set_rows, switching_part
+from design.certificate import SAMPLES, RangesCheck, assess, check_ranges, lag, prove, switching_requirement
+from design.coverage import Limits, cost_part, covered_limits, price, ranges_part, ranges_rows, switching_part
 from design.designs import KINDS, NO_LONGER, design_by_kind, usual_condition
 from design.files import out_file
 from design.guarantees import ANY, HERE, guarantee_of, switching_guarantee
 from design.optimal import Optimal
 from design.program import DEFAULT, OBJECTIVES, Options
 from design.result import METHODS, Design, DesignFailed, NotProved, finite, listed
-from design.robustness import ranges, robustness_parts
+from design.robustness import robustness_parts, widest_ranges
 from design.spring_damper import STIFFEST
 from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
@@ -39,14 +39,14 @@ def main(argv: list[str]) -> int:
     out = out_file(args.out, f"out/design-{options.place(args)}.json", "the file of the coupling")
     scenario = options.scenario_from(args)
     loop = _loop(args, scenario)
-    if args.samples is not None and loop.box is None:
-        raise InputError("--samples without ranges: give --ranges, or a scenario with [box]")
+    if args.samples is not None and loop.ranges is None:
+        raise InputError("--samples without ranges: give --ranges, or a scenario with [ranges]")
     design = _design(args, loop)
     best = design if isinstance(design, Optimal) else None
-    held = best and best.certificate
+    held = design.certificate
     requirements = assess(loop, design.coupling, design.phi, held)
-    with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:
-        whole = check_set(
+    with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
+        whole = check_ranges(
             loop,
             design.coupling,
             args.seed,
@@ -56,7 +56,10 @@ def main(argv: list[str]) -> int:
             held,
         )
     certificates = report.certificates_part(requirements)
-    limits = Limits(None, "as asked") if args.limiter is False else covered_limits(loop, design.coupling, requirements)
+    if args.limiter is False:
+        limits = Limits(None, "as asked")
+    else:
+        limits = covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None)
     outcome = {
         "case": args.case,
         "seed": args.seed,
@@ -64,7 +67,7 @@ def main(argv: list[str]) -> int:
         "certificate": certificates[design.condition],
         "certificates": certificates,
         "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
-        "set": whole and set_part(whole),
+        "ranges": whole and ranges_part(whole),
         "price": _robustness_loss(args, loop, design) if whole else None,
         "transparency": report.transparency_part(
             transparency(loop.F(design.coupling), loop.E(), loop.lam, args.band_hz or BAND_HZ)
@@ -75,7 +78,7 @@ def main(argv: list[str]) -> int:
         "wall_s": design.wall_s,
         "stored": _store(loop, design, whole, out, limits.certificate),
         "limiter": limits.part([device.force_limit for device in scenario.device]),
-        "jitter_proof": _switching_figures(loop, design),
+        "switching": _switching_figures(loop, design),
         "robustness": None,
     }
     with render.progress("working out robustness and its price, and the bound"):
@@ -90,7 +93,7 @@ def main(argv: list[str]) -> int:
             outcome["comparison"] = [asdict(row) for row in fixed_order.compare(loop)]
     render.publish(args, outcome, _tables(scenario, outcome), outcome.get("notes", args.notes))
     holds = outcome["certificate"]["certified"] and (outcome["promise"] == ANY or not whole or whole.proved)
-    switching = outcome["jitter_proof"]
+    switching = outcome["jitter_proof"] = outcome["switching"]  # and by its older name
     return options.DONE if holds and (switching is None or switching["certified"]) else options.DOES_NOT_HOLD
 
 
@@ -102,14 +105,15 @@ def _parser() -> options.Parser:
     kind.add_argument("--coupling", choices=tuple(KINDS), default="spring-damper", help="(default spring-damper)")
     best = "the coupling of the least transparency error: --coupling optimal"
     kind.add_argument("--best", dest="coupling", action="store_const", const="optimal", help=best)
-    around = "certify for every stiffness and mass this much more or less, as [box] of a scenario does"
+    around = "certify for every stiffness and mass this much more or less, as [ranges] of a scenario does"
     parser.add_argument("--ranges", type=_percent, metavar="PERCENT", help=around)
     options.add_condition_option(parser, "what to certify")
-    jitter = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"
-    parser.add_argument("--jitter", type=options.delay_ranges, metavar="LO,HI", help=jitter)
+    varying = "safe under any switching of the forces' delays in this range too [samples]; for this-environment designs"
+    options.add_varying_delay_option(parser, varying)
     limiter = "for this-environment: proved also while forces are limited, or not made (spring-damper: if it can)"
-    parser.add_argument("--limiter", action="store_const", const=True, help=limiter)
-    options.add_limiter_option(parser, "design and prove as if forces were never at their limits")
+    one_of = parser.add_mutually_exclusive_group()
+    one_of.add_argument("--limiter", action="store_const", const=True, help=limiter)
+    options.add_limiter_option(one_of, "design and prove as if forces were never at their limits")
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
     ccl.add_argument("--method", choices=METHODS, help="complementarity is as printed (default inner)")
@@ -179,30 +183,30 @@ _OPTIONS = {
 
 
 def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
-    """The scenario's loop with the range of delays that --jitter gives. Raises InputError."""
+    """The scenario's loop with the range of delays that --varying-delay gives. Raises InputError."""
     loop, args.notes = scenario.loop(args.case), []
     if args.ranges is not None:
-        if loop.box or loop.environment.walls:
-            raise InputError(f"--ranges and {'[box]' if loop.box else 'environment.walls'}: give one of them")
+        if loop.ranges or loop.environment.walls:
+            raise InputError(f"--ranges and {'[ranges]' if loop.ranges else 'environment.walls'}: give one of them")
         try:
-            box, note = ranges(loop, args.ranges)
-            loop, args.notes = msgspec.structs.replace(loop, box=box), [note] if note else []
+            around, note = widest_ranges(loop, args.ranges)
+            loop, args.notes = msgspec.structs.replace(loop, ranges=around), [note] if note else []
         except ValueError as error:
             raise InputError(f"--ranges {args.ranges:g}: {error}") from None
     args.condition = args.condition or usual_condition(loop, args.coupling)
-    if args.jitter is not None:
+    if args.varying_delay is not None:
         if not _for_switching(args):
-            raise InputError("--jitter is for --coupling optimal, or spring-damper with --condition this-environment")
-        if loop.box:
-            raise InputError("--jitter and [box]: switching delays are judged in one environment; give one of them")
-        lo, hi = options.ranges_per_channel("--jitter", args.jitter, len(loop.theta))
-        asked = ",".join(f"{a}-{b}" for a, b in args.jitter)
+            raise InputError("--varying-delay is for --coupling optimal or --condition this-environment")
+        if loop.ranges:
+            raise InputError("--varying-delay and [ranges]: switching delays are judged in one environment; give one")
+        lo, hi = options.ranges_per_channel("--varying-delay", args.varying_delay, len(loop.theta))
+        asked = ",".join(f"{a}-{b}" for a, b in args.varying_delay)
         if any(not 0 <= a <= b <= LONGEST_DELAY for a, b in zip(lo, hi, strict=True)):
-            raise InputError(f"--jitter is {asked}, expected 0 <= LO <= HI <= {LONGEST_DELAY} samples")
+            raise InputError(f"--varying-delay is {asked}, expected 0 <= LO <= HI <= {LONGEST_DELAY} samples")
         try:
             loop = loop.switching(DelayRange(lo, hi))
         except ValueError as error:
-            raise InputError(f"--jitter is {asked}: {error}") from None
+            raise InputError(f"--varying-delay is {asked}: {error}") from None
     if args.coupling == "optimal" and loop.environment.walls:
         raise InputError("environment.walls: an optimal coupling holds a linear model, so it cannot face walls")
     return loop
@@ -236,8 +240,8 @@ def _asked(args: argparse.Namespace, loop: Loop) -> dict[str, Any]:
 def _design(args: argparse.Namespace, loop: Loop) -> Design:
     """Raises InputError for a request that contradicts itself, DesignFailed where there is no such coupling."""
     asked = _asked(args, loop)
-    if loop.jitter and _for_switching(args):
-        asked["switching"] = (loop.jitter.lo, loop.jitter.hi)
+    if loop.varying_delay and _for_switching(args):
+        asked["switching"] = (loop.varying_delay.lo, loop.varying_delay.hi)
     try:
         with render.designing(loop, args.coupling, args.condition) as heard:
             return design_by_kind(loop, args.coupling, args.condition, heard, **asked)
@@ -273,31 +277,31 @@ def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[s
 
 def _switching_figures(loop: Loop, design: Design) -> dict[str, Any] | None:
     """What any switching asks of the designed coupling, from the coupling alone."""
-    if loop.jitter is None:
+    if loop.varying_delay is None:
         return None
     found, sent = switching_requirement(loop, design.coupling), loop.sent(design.coupling)
-    return switching_part(found, sent, loop.jitter, loop.T_max)
+    return switching_part(found, sent, loop.varying_delay, loop.T_max)
 
 
 def _robustness_loss(args: argparse.Namespace, loop: Loop, design: Design) -> list[dict[str, Any]]:
     """The coupling over the ranges; an optimal one beside the one for the nominal environment alone."""
     couplings = {args.coupling: design.coupling}
     if args.coupling == "optimal":
-        couplings = {"whole set": design.coupling}
+        couplings = {"whole ranges": design.coupling}
         try:
             alone = design_by_kind(loop.at(loop.environment), "optimal", None, **_asked(args, loop))
             couplings = {"nominal only": alone.coupling, **couplings}
-        except DesignFailed:  # the set is given another basis by default
+        except DesignFailed:  # ranges are given another basis by default
             pass
     return [cost_part(row) for row in price(loop, couplings)]
 
 
 def _store(
-    loop: Loop, design: Design, whole: SetCheck | None, out: Path, limiter: LimiterCertificate | None = None
+    loop: Loop, design: Design, whole: RangesCheck | None, out: Path, limiter: LimiterCertificate | None = None
 ) -> dict[str, Any]:
     """Save the coupling with the proof of its condition, and that of limited forces, or without a proof.
 
-    What is not proved for a whole set, or for switching delays, is kept as what it is: a coupling for the nominal
+    What is not proved for whole ranges, or for switching delays, is kept as what it is: a coupling for the nominal
     environment, or for constant delays.
     """
     if whole and whole.proved and design.condition == "this-environment":
@@ -306,9 +310,10 @@ def _store(
         loop = loop if design.condition == "any-environment" else loop.at(loop.environment)
         certificate, reason = _proved(loop, design, limiter)
     switching = None
-    if loop.jitter:
+    if loop.varying_delay:
         proof = certificate.proof if certificate else None
-        switching = {"promise": f"{switching_guarantee(loop.jitter)}, in {HERE}", "proof": proof, "reason": reason}
+        words = f"{switching_guarantee(loop.varying_delay)}, in {HERE}"
+        switching = {"promise": words, "proof": proof, "reason": reason}
         if certificate is None:
             loop = loop.switching(None)
             certificate, reason = _proved(loop, design, limiter)
@@ -323,7 +328,7 @@ def _store(
 
 def _proved(loop: Loop, design: Design, limiter: LimiterCertificate | None) -> tuple[Certificate | None, str | None]:
     """The certificate of all that the loop claims, or why there is none."""
-    held = design.certificate if isinstance(design, Optimal) else None
+    held = design.certificate
     if held and held.scenario == digest(loop, design.coupling.form()):
         return held, None
     try:
@@ -355,7 +360,7 @@ def _tables(scenario: Scenario, outcome: dict[str, Any]) -> list[Table]:
 
 def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
     coupling, stored, transparent = outcome["coupling"], outcome["stored"], outcome["transparency"]
-    switching, proof = stored["switching"] or {}, outcome["jitter_proof"]
+    switching, proof = stored["switching"] or {}, outcome["switching"]
     end = f"{STIFFEST:g} N/m is where the search ends, no optimum of its own"
     return [
         ("K [N/m]", coupling["K"] and listed(coupling["K"])),
@@ -364,7 +369,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("stiffness, static [N/m]", coupling.get("stiffness") and listed(coupling["stiffness"])),
         *render.certificate_rows(outcome["certificates"], proof=False),
         ("damping, any switching", proof and _switching_words(proof)),
-        *(set_rows(outcome["set"]) if outcome["set"] else []),
+        *(ranges_rows(outcome["ranges"]) if outcome["ranges"] else []),
         ("guarantee", outcome["promise"] or "none"),
         ("guarantee, forces", outcome["limiter"]["words"]),
         ("guarantee, delays", switching["promise"] if switching.get("proof") else None),

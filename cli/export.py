@@ -28,7 +28,7 @@ from design.export import (
     trial,
 )
 from design.files import out_file, write
-from design.guarantees import HERE, SET, switching_guarantee
+from design.guarantees import HERE, RANGES, switching_guarantee
 from design.result import listed
 from design.stored import Stored
 from sim.couplings import read_coupling
@@ -123,9 +123,9 @@ def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
     if claim is None or not verdict.proved:
         return f"NOT CERTIFIED: {verdict.reason}"
     needs = f"needs {listed(claim.required)} of {listed(claim.available)} N s/m of device damping"
-    delays = f"; {switching_guarantee(stored.loop.jitter)}, in {HERE}" if stored.loop.jitter else ""
+    delays = f"; {switching_guarantee(stored.loop.varying_delay)}, in {HERE}" if stored.loop.varying_delay else ""
     how = f"{claim.condition}, proof: {claim.proof}"
-    if claim.guarantee == SET:
+    if claim.guarantee == RANGES:
         how += "; at the vertices, between them nothing is proved: design.check searches there"
     return f"Certified for {claim.guarantee}{delays} ({how}): {needs}; " + (
         "also while forces are limited." if limited else "linear forces only."

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
+from cli import render
 from cli.options import (
     DOES_NOT_HOLD,
     DONE,
@@ -28,9 +28,8 @@ from cli.options import (
     scenario_from,
     seed_from,
 )
-from cli.render import console, progress
 from cli.session_cli import add_link_options, check_link, hold_session, measured_link, number
-from design.files import write, write_json
+from design.files import write
 from hw.identify import Estimate, Excitation, capped, chirp, estimate, held
 from hw.limits import Stage
 from hw.monitor import Ages
@@ -41,11 +40,11 @@ from sim.scenario import InputError, Scenario, require_constant_delay, require_e
 
 _LIMITS = (
     "The bound is a statement about this record: the least viscous friction of all laws that fit it, less its scatter "
-    "between parts of the record (95 %) and a part for what is left unexplained. It does not see friction that changes "
-    "with temperature or wear, nor that of a handle behind its transmission apart from the motor's. A hand that rests "
-    "on the handle springs it, and from 5 N/m on is refused; one that only damps cannot be told from the device. Dry "
-    "friction is left out of delta: it dissipates too, but ever less than a viscous damper as speed grows. Lag of the "
-    "amplifier is not in delta: it belongs to the delay."
+    "between parts of the record (95 %), a part for what is left unexplained and 0.5 % for the encoder's scale. It "
+    "does not see friction that changes with temperature or wear, nor that of a handle behind its transmission apart "
+    "from the motor's. A hand that rests on the handle springs it, and from 5 N/m on is refused; one that only damps "
+    "cannot be told from the device. Dry friction is left out of delta: it dissipates too, but ever less than a "
+    "viscous damper as speed grows. Lag of the amplifier is not in delta: it belongs to the delay."
 )
 
 
@@ -70,13 +69,11 @@ def main(argv: list[str]) -> int:
         link = measured_link(args, ages, scenario.T)
         return [chirp(scenario.channels, scenario.T, link, force, (low, high), seconds)]
 
-    played = 2.5 * seconds + 0.1  # from full gain on: the lead has the ramp
+    played = chirp(1, scenario.T, 1, force, (low, high), seconds).seconds - 0.2  # the lead has the ramp
     live = hold_session(args, session, plan, played, seed, out, nobody=True, coulomb=coulomb)
     report, estimates = _identified(session, recorder, scenario, live.dropped, float(args.pace))
-    report["files"] = [str(p) for p in _save(out, session, recorder, scenario, estimates, report)]
-    _print(report, console(args))
-    if args.json:
-        write_json(args.json, report)
+    files = _save(out, session, recorder, scenario, estimates, report)
+    render.publish(args, report, [_figures(report)], _lines(report), out, files)
     if live.signals:
         return INTERRUPTED
     return DONE if session.stage == Stage.FINISHED and report["bounded"] else DOES_NOT_HOLD
@@ -105,7 +102,7 @@ def _identified(
     estimates: list[Estimate] = []
     if session.stage == Stage.FINISHED and len(recorder):
         try:
-            with progress("estimating") as move:
+            with render.progress("estimating") as move:
                 estimates = estimate(recorder, session, scenario, move)
         except ValueError as error:
             report["reason"] = str(error)
@@ -134,8 +131,6 @@ def _save(
     if report["bounded"]:
         tables = [_table(e, scenario, i) for i, e in enumerate(estimates)]
         files.append(write(out / "devices.toml", "\n".join(tables)))
-    files.append(out / "report.json")
-    write_json(files[-1], report | {"files": [str(p) for p in files]})
     return files
 
 
@@ -155,20 +150,18 @@ def _table(e: Estimate, scenario: Scenario, i: int) -> str:
     return "\n".join([*lines, 'kind = "compliant"', *masses, f"transmission_stiffness = {stiffness:.6g}", ""])
 
 
-def _print(report: dict[str, Any], console: Console) -> None:
-    table = Table(title=f"{report['scenario']}, identified")
-    for column in ("axis", "mass [kg]", "viscous [N s/m]", "dry [N]", "to ground [N/m]", "mode [Hz]", "delta at least"):
-        table.add_column(column, justify="right")
+def _figures(report: dict[str, Any]) -> Table:
+    cells = []
     for i, axis in enumerate(report["axes"], start=1):
         found = axis["friction"]
         mode = "-" if axis["transmission"] is None else f"{axis['transmission']['mode_hz']:.2f}"
         names = ("mass", "viscous", "coulomb", "stiffness")
         figures = [f"{found[name]:.5g} ± {2 * found['errors'][name]:.2g}" for name in names]
-        table.add_row(str(i), *figures, mode, f"{found['delta']:.4f}")
-    console.print(table)
-    if "reason" in report:
-        console.print(f"nothing was identified: {report['reason']}")
-    for warning in report["warnings"]:
-        console.print(f"[yellow]{warning}[/]")
-    console.print(f"[dim]·[/] {_LIMITS}")
-    console.print("files: " + ", ".join(report["files"]), soft_wrap=True)
+        cells.append((str(i), *figures, mode, f"{found['delta']:.4f}"))
+    heads = ("axis", "mass [kg]", "viscous [N s/m]", "dry [N]", "to ground [N/m]", "mode [Hz]", "delta at least")
+    return render.grid(f"{report['scenario']}, identified", heads, cells, left=())
+
+
+def _lines(report: dict[str, Any]) -> list[str]:
+    reason = [f"nothing was identified: {report['reason']}"] if "reason" in report else []
+    return [*reason, *(f"[yellow]{warning}[/]" for warning in report["warnings"]), _LIMITS]

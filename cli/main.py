@@ -19,7 +19,6 @@ COMMANDS = {
     "trace": ("sim.trace", "what grows in a stored trace"),
     "accuracy": ("sim.accuracy", "speed against error, engine by engine"),
     "suite": ("sim.suite", "every check that a verdict rests on, in one report"),
-    "hunt": ("sim.hunt", "search for a loop that contact keeps in motion"),
     "design": ("design", "design a coupling, prove its certificate and store both"),
     "audit": ("design.audit", "are these gains safe, and how far"),
     "check": ("design.check", "prove a stored coupling again, from its file alone"),

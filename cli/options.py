@@ -23,7 +23,7 @@ from typing import Any, NoReturn, TypeVar
 import msgspec
 from threadpoolctl import threadpool_limits
 
-from controller.delay import LOST, Jitter
+from controller.delay import LOST, VaryingDelay
 from controller.environment import RIGID_WALL
 from controller.loop import Loop
 from controller.lti import SingularLoop
@@ -31,7 +31,7 @@ from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
 from design.result import OLDER_NAMES, DesignFailed
 from models.device import MOST_DAMPING
-from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load, load_humans
+from sim.scenario import CASES, DEFAULT, OLDER_SCENARIOS, InputError, Scenario, built_in, load, load_humans
 
 DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -225,6 +225,8 @@ def add_loop_options(parser: argparse.ArgumentParser) -> None:
 def scenario_from(args: argparse.Namespace) -> Scenario:
     """The scenario that the loop options describe. Raises InputError."""
     scenario = load(args.scenario)
+    if args.scenario in OLDER_SCENARIOS:
+        print(f"scenario {args.scenario} is called {scenario.name} now", file=sys.stderr)
     given = {name: getattr(args, name) for name in ("theta", "psi", "lam") if getattr(args, name) is not None}
     changes: dict[str, Any] = {name: per_channel(f"--{name}", n, scenario.channels) for name, n in given.items()}
     for name in ("T", "T_max"):
@@ -370,13 +372,19 @@ def rigid_loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 _DRAWN = ("constant", "random", "bursty", "adversarial")
 
 
+def add_varying_delay_option(parser: argparse._ActionsContainer, what: str) -> None:
+    """--varying-delay, and --jitter, as it was called."""
+    parser.add_argument("--varying-delay", type=delay_ranges, metavar="LO,HI", help=what)
+    parser.add_argument("--jitter", dest="varying_delay", type=delay_ranges, help=argparse.SUPPRESS)
+
+
 def add_varying_delay_options(parser: argparse.ArgumentParser) -> None:
-    """--period, --jitter, --pattern, --loss and --playout."""
+    """--period, --varying-delay, --pattern, --loss and --playout."""
     group = parser.add_argument_group("delays and periods that vary")
     periods = "periods [s], drawn anew at every tick between two of them, or a file of recorded ones"
     group.add_argument("--period", metavar="MIN,MAX|FILE", help=periods)
     span = "range of the forces' delays [samples]; or LO-HI,LO-HI,.. per channel"
-    group.add_argument("--jitter", type=delay_ranges, metavar="LO,HI", help=span)
+    add_varying_delay_option(group, span)
     pattern = f"{', '.join(_DRAWN)} (default random), or a file of recorded delays, a row per tick"
     group.add_argument("--pattern", metavar="NAME|FILE", help=pattern)
     loss = "probability that a force is lost and the last one held"
@@ -391,26 +399,26 @@ def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenari
     changes: dict[str, Any] = {}
     if args.pattern is not None:
         changes |= _pattern(args.pattern, scenario.channels)
-    if args.jitter is not None:
-        changes["lo"], changes["hi"] = ranges_per_channel("--jitter", args.jitter, scenario.channels)
+    if args.varying_delay is not None:
+        changes["lo"], changes["hi"] = ranges_per_channel("--varying-delay", args.varying_delay, scenario.channels)
     if args.loss is not None:
         changes["loss"] = args.loss
     if args.playout:
         changes["playout"] = True
     if not changes:
         return scenario
-    if scenario.jitter is None and "lo" not in changes:
+    if scenario.varying_delay is None and "lo" not in changes:
         if "loss" not in changes or len(changes) > 1:
             option = "--playout" if args.playout else "--pattern"
-            raise InputError(f"{option} without a range of delays: give --jitter LO,HI")
+            raise InputError(f"{option} without a range of delays: give --varying-delay LO,HI")
         changes |= {"lo": scenario.theta, "hi": scenario.theta}
     try:
-        old = scenario.jitter
-        jitter = msgspec.structs.replace(old, **changes) if old else Jitter(**changes)
+        old = scenario.varying_delay
+        varying = msgspec.structs.replace(old, **changes) if old else VaryingDelay(**changes)
     except ValueError as error:
         raise InputError(str(error)) from None
-    theta = jitter.hi if jitter.playout and args.theta is None else scenario.theta
-    return scenario.replace(theta=theta, jitter=jitter)
+    theta = varying.hi if varying.playout and args.theta is None else scenario.theta
+    return scenario.replace(theta=theta, varying_delay=varying)
 
 
 def _periods(text: str) -> Periods:

@@ -121,6 +121,10 @@ def designing(loop: Loop | None = None, kind: str | None = None, condition: str 
 # A whole report: files, tables, lines below them, JSON.
 
 
+#: parts of reports -> their other name in JSON, an older one but for the last
+_OTHER_NAMES = {"ranges": "set", "varying_delay": "jitter", "promise": "guarantee"}
+
+
 def publish(
     args: argparse.Namespace,
     outcome: dict[str, Any],
@@ -131,8 +135,9 @@ def publish(
 ) -> None:
     """Keep the outcome as report.json in the folder, print tables and lines, and write what --json asks for.
 
-    `files` are those written before; the outcome names them and its own.
+    `files` are those written before; the outcome names them and its own. A part stands there by its older name, too.
     """
+    outcome |= {other: outcome[name] for name, other in _OTHER_NAMES.items() if name in outcome}
     if folder:
         kept = folder / "report.json"
         outcome["files"] = [*map(str, files), str(kept)]
@@ -288,6 +293,6 @@ def delay_rows(part: Mapping[str, Any]) -> _Rows:
     if period := part.get("period"):
         growth = f"{period['growth_rate_per_s']:+.4f} 1/s with a period of {period['ticks']} ticks"
         yield "worst switching found", f"{growth}: {verdict(period['verdict'])}"
-    if proof := part.get("jitter_proof"):
+    if proof := part.get("switching"):
         yield "damping, any switching", f"needs {needs(proof, 5)}: {certified(proof)}"
     yield "these delays covered", "[green]yes[/]" if part["covered"] else "[yellow]no[/]"

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rich.table import Table
 
+from cli import render
 from cli.options import DOES_NOT_HOLD, DONE, Parser, check_json
-from cli.render import console
-from design.files import write_json
-from hw.recording import Comparison, load, replay
-from sim.trace import Trace
+from hw.recording import load, replay
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """The machine-readable result."""
+
+    trace: str = render.figure("trace")
+    ticks: int = render.figure("ticks")
+    filled_in: int = render.figure("filled in")
+    asked_differ: int = render.figure("asked differ")
+    sent_differ: int = render.figure("sent differ")
+    largest_difference_n: float = render.figure("largest difference [N]")
+    first_difference_s: float | None = render.figure("first difference [s]")
+    identical: bool = render.figure("identical")
 
 
 def main(argv: list[str]) -> int:
@@ -28,25 +40,16 @@ def main(argv: list[str]) -> int:
     result, link = load(Path(args.trace))
     compared = replay(result, link)
     ticks, received = result.t.size, int(link["received"].sum())
-    outcome = {
-        "trace": args.trace,
-        "ticks": ticks,
-        "filled_in": ticks - received,
-        "asked_differ": int(compared.asked.sum()),
-        "sent_differ": int(compared.sent.sum()),
-        "largest_difference_n": compared.largest,
-        "first_difference_s": _first(compared, result),
-        "identical": compared.identical,
-    }
-    table = Table(title=args.trace, show_header=False)
-    for name, value in outcome.items():
-        table.add_row(name.replace("_", " "), "-" if value is None else str(value))
-    console(args).print(table)
-    if args.json:
-        write_json(args.json, outcome)
-    return DONE if compared.identical else DOES_NOT_HOLD
-
-
-def _first(compared: Comparison, result: Trace) -> float | None:
     different = compared.asked | compared.sent
-    return float(result.t[np.argmax(different)]) if different.any() else None
+    compared_ticks = _Compared(
+        args.trace,
+        ticks,
+        ticks - received,
+        int(compared.asked.sum()),
+        int(compared.sent.sum()),
+        compared.largest,
+        float(result.t[np.argmax(different)]) if different.any() else None,
+        compared.identical,
+    )
+    render.publish(args, render.plain(compared_ticks), [render.facts(args.trace, render.rows_of(compared_ticks))])
+    return DONE if compared.identical else DOES_NOT_HOLD

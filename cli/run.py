@@ -11,8 +11,8 @@ from typing import Any
 from cli import options, render
 from controller.environment import GROUND
 from controller.loop import Loop
-from design.certificate import SetCheck, assess, check_set
-from design.coverage import set_part, set_rows
+from design.certificate import RangesCheck, assess, check_ranges
+from design.coverage import ranges_part, ranges_rows
 from design.files import write
 from design.guarantees import ANY, guarantee_of
 from design.result import listed
@@ -36,14 +36,16 @@ from sim.trace import Trace
 def main(argv: list[str]) -> int:
     """Simulate and report. 0: the run was completed, stable or not; 130: interrupted."""
     args = _parser().parse_args(argv)
+    if args.error is not None and (args.engine == "exact" or args.integrator or args.substeps):
+        raise InputError("--error chooses integrator and substeps of MuJoCo: give no --engine exact, --integrator, ..")
     scenario, out = _scenario(args), options.out_folder(args, "run")
     loop = scenario.loop(args.case)
-    chosen = _chosen(args, scenario)
     environment, simulated = _environment(args, scenario)
-    with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:
-        whole = check_set(loop, chosen.coupling, args.seed, progress=move)
+    chosen = _chosen(args, scenario)
+    with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
+        whole = check_ranges(loop, chosen.coupling, args.seed, progress=move)
         requirements = assess(simulated.loop(args.case), chosen.coupling, chosen.phi)
-        limits = limits_of(simulated, chosen.coupling, requirements, args.limiter)
+        limits = limits_of(simulated, chosen, requirements, args.limiter)
     done = _run(args, simulated, chosen, limits.rho)
     outcome = {
         "case": args.case,
@@ -92,7 +94,7 @@ def _parser() -> options.Parser:
     asked = (
         "relative rms of the positions: compare engines and steps on this scene, run with the cheapest that keeps it"
     )
-    parser.add_argument("--error", type=options.number(), metavar="E", help=asked)
+    parser.add_argument("--error", type=options.number(1e-18, 1.0), metavar="E", help=asked)
     check = "run RK4 beside the exponential engine, with which it shares no matrix"
     parser.add_argument("--cross-check", action="store_true", help=check)
     options.add_human_option(parser)
@@ -130,9 +132,9 @@ def _environment(args: argparse.Namespace, scenario: Scenario) -> tuple[str, Sce
     """Which environment is simulated, and the scenario with that one, known exactly. Raises InputError."""
     members = scenario.loop(args.case).members()
     if not 0 <= args.vertex < len(members):
-        why = f"allowed are 0 to {len(members) - 1}" if scenario.box else "but the scenario has no ranges ([box])"
+        why = f"allowed are 0 to {len(members) - 1}" if scenario.ranges else "but the scenario has no ranges ([ranges])"
         raise InputError(f"--vertex is {args.vertex}, {why}")
-    return members[args.vertex].name, scenario.replace(environment=members[args.vertex].network, box=None)
+    return members[args.vertex].name, scenario.replace(environment=members[args.vertex].network, ranges=None)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -226,8 +228,6 @@ def _compared(args: argparse.Namespace, simulation: Simulation) -> tuple[EngineC
     """Every engine and step on this scene, where an error is asked for. Raises InputError."""
     if args.error is None:
         return ()
-    if args.engine == "exact" or args.integrator or args.substeps:
-        raise InputError("--error chooses integrator and substeps of MuJoCo: give no --engine exact, --integrator, ..")
     with render.progress("comparing engines"):
         return compare_engines(simulation, args.error)
 
@@ -263,13 +263,13 @@ def _panel_title(other: Alternative) -> str:
     return f"{'no coupling' if other.kind == 'none' else other.name + kind}\n{felt}; {guarantee}"
 
 
-def _certified(chosen: Chosen, requirements: dict[str, Any], loop: Loop, whole: SetCheck | None) -> dict[str, Any]:
+def _certified(chosen: Chosen, requirements: dict[str, Any], loop: Loop, whole: RangesCheck | None) -> dict[str, Any]:
     certificates = report.certificates_part(requirements)
     return {
         "certificate": certificates[chosen.condition],
         "certificates": certificates,
         "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
-        "set": whole and set_part(whole),
+        "ranges": whole and ranges_part(whole),
     }
 
 
@@ -283,15 +283,17 @@ def _robustness(chosen: Chosen, loop: Loop, outcome: dict[str, Any]) -> dict[str
 
 
 def _stability(chosen: Chosen, run: _Run, certified: bool) -> dict[str, Any]:
-    jitter = report.delays_part(run.simulation, chosen, run.period, run.trace.t.size, certified)
-    if jitter and run.simulation.scenario.switches:
-        return {"stability": report.switched_stability_part(run.simulation, run.trace, jitter), "jitter": jitter}
-    return {"stability": stability_part(run.simulation, run.trace), "jitter": jitter}
+    delays = report.delays_part(run.simulation, chosen, run.period, run.trace.t.size, certified)
+    if delays and run.simulation.scenario.switches:
+        stability = report.switched_stability_part(run.simulation, run.trace, delays)
+    else:
+        stability = stability_part(run.simulation, run.trace)
+    return {"stability": stability, "varying_delay": delays}
 
 
 def _unstable(outcome: dict[str, Any]) -> bool | None:
     """Whether switching makes the loop grow; None where the eigenvalues say whether it does."""
-    switched = "verdict" in (outcome["jitter"] or {})
+    switched = "verdict" in (outcome["varying_delay"] or {})
     return outcome["stability"]["verdict"] == "unstable" if switched else None
 
 
@@ -361,8 +363,8 @@ def _title(what: str, outcome: dict[str, Any]) -> str:
     coupling = "no virtual coupling" if kind == "none" else f"{kind} coupling"
     growth = f"growth {stability['exact_growth_rate_per_s']:+.3f} 1/s at {stability['exact_frequency_hz']:.1f} Hz"
     if _unstable(outcome) is not None:
-        growth = f"{outcome['jitter']['pattern']} delays, {stability['verdict']}"
-    return f"{what.removesuffix(', no coupling')}, {coupling}: {growth}"
+        growth = f"{outcome['varying_delay']['pattern']} delays, {stability['verdict']}"
+    return f"{what.removesuffix(', no coupling').removesuffix(', case none')}, {coupling}: {growth}"
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -391,7 +393,7 @@ def _speed_against_error(run: dict[str, Any]) -> Any:
         mark = " *" if (row["integrator"], row["substeps"]) == (run["integrator"], run["substeps"]) else ""
         error = render.optional(row["position_relative_rms"], "{:.1e}")
         right = "right" if row["verdict_correct"] else "[red]WRONG[/]"
-        speed = f"{run['duration_s'] / row['cpu_s']:.0f}"
+        speed = f"{run['duration_s'] / row['cpu_s']:.0f}" if row["cpu_s"] else "-"  # too short for the clock
         cells.append((f"{row['integrator']} x {row['substeps']}{mark}", error, right, f"{row['cpu_s']:.3f}", speed))
     heads = ("engine x steps", "position error", "verdict", "CPU s", "x real time")
     return render.grid("speed against error on this scene (*: the cheapest that keeps --error, this run)", heads, cells)
@@ -411,8 +413,9 @@ def _beside(others: list[Alternative], outcome: dict[str, Any]) -> Any:
         error = "grows" if grows else render.optional(other.error_percent, "{:.3g} %")
         cells.append((other.name + mark, *needs, other.guarantee or "none", _share(other.rendered, "-"), error))
     heads = ("coupling", "this-env.", "any-env.", "guarantee", "stiffness", "error")
-    title = "the same devices with other couplings (*: this run): required damping in % of theirs,"
-    return render.grid(f"{title}\nguarantee, rendered stiffness and force error", heads, cells, left=(0, 3))
+    marked = " (*: this run)" if any(cell[0].endswith("*") for cell in cells) else ""
+    title = f"the same devices with other couplings{marked}: required damping\nin % of theirs"
+    return render.grid(f"{title}, guarantee, rendered stiffness and force error", heads, cells, left=(0, 3))
 
 
 def _share(value: float | None, absent: str) -> str:
@@ -420,7 +423,8 @@ def _share(value: float | None, absent: str) -> str:
 
 
 def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
-    coupling, stability, run, jitter = (outcome[name] for name in ("coupling", "stability", "run", "jitter"))
+    names = ("coupling", "stability", "run", "varying_delay")
+    coupling, stability, run, delays = (outcome[name] for name in names)
     transparent, error, contact = outcome["transparency"], outcome["error"], stability.get("contact")
     gains = coupling["K"] and f"{listed(coupling['K'], 5)} N/m / {listed(coupling['B'], 5)} N s/m"
     rendered = transparent["dc_ratio"] and f"{100 * transparent['dc_ratio']:.1f} %"
@@ -436,7 +440,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("coupling K / B", gains or None),
         ("coupling, static", coupling.get("stiffness") and f"{listed(coupling['stiffness'], 5)} N/m"),
         *render.certificate_rows(outcome["certificates"], 5),
-        *(set_rows(outcome["set"]) if outcome["set"] else []),
+        *(ranges_rows(outcome["ranges"]) if outcome["ranges"] else []),
         ("guarantee", f"holds for {outcome['promise']}" if outcome["promise"] else "none"),
         ("transparency error", render.transparency_error(transparent)),
         *render.robustness_rows(outcome),
@@ -446,9 +450,9 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("growth, eigenvalues", _growth(stability)),
         (how, f"{measured}: {render.verdict(stability['verdict'])}"),
         render.timing_row(run["timing"]),
-        *(render.delay_rows(jitter) if jitter else []),
+        *(render.delay_rows(delays) if delays else []),
         *(_contact_rows(contact, run["samples"]) if contact else []),
-        ("simulated in", run["environment"] if outcome["set"] else None),
+        ("simulated in", run["environment"] if outcome["ranges"] else None),
         ("force limits", outcome["limiter"]["words"]),
         ("limited ticks", f"{stability['clipped_ticks']} of {run['samples']}"),
         ("speed", speed),
@@ -478,7 +482,7 @@ def _net_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
 def _force_error(part: dict[str, Any]) -> str:
     if part["error_percent"] is None:
         return f"- ({part['reason']})"
-    return f"{part['error_percent']:.3g} % rms of Lambda E's, before the force limits"
+    return f"{part['error_percent']:.3g} % rms of the ideal force, before the force limits"
 
 
 def _growth(part: dict[str, Any]) -> str:

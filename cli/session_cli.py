@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 import termios
+import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -15,20 +16,22 @@ from typing import Any
 
 from cli.dashboard import Dashboard
 from cli.options import numbers, scenario_from
-from cli.render import console
+from cli.render import console, progress
 from hw.control import Program, link_delay
 from hw.emulator import Emulator, FaultInjection, spawned
 from hw.emulator import nobody as without_hands
+from hw.force_dimension import FORCE_DIMENSION, ForceDimension
 from hw.monitor import Ages, LinkSettings
 from hw.recording import IncidentLog
 from hw.rehearsal import Rehearsal
-from hw.seam import FORCE_DIMENSION, DeviceWire, ForceDimension
+from hw.seam import HapticDevice, SerialDevice
 from hw.session import Operator, Session
-from hw.transport import Live, SerialPort, Wire, preflight
+from hw.transport import Live, SerialPort, preflight
 from sim.scenario import InputError, Scenario
 
 _USUAL_BAUD = 921_600
 _SPARE = 600.0  # [s] beside the run, after which an orphan of --emulate would end by itself
+_SHOWN_US = 100_000  # of a rehearsal, between two looks
 _PASSED_ON = ("case", "scenario", "theta", "psi", "lam", "delta", "T")
 
 
@@ -192,22 +195,25 @@ def hold_session(
         incidents.attach(session)
         if args.rehearse:
             return _rehearsed(args, session, plan, seconds, seed, incidents, nobody, coulomb)
-        port: Wire
+        device: HapticDevice
+        serial: SerialDevice | None = None
         if host_clocked(args):
             axes = args.port.partition(":")[2] or None
-            device = stack.enter_context(ForceDimension(session.scenario, axes))
-            port = DeviceWire(device)
-            stack.callback(port.close)
-            if not device.guarded:
+            device = adapter = stack.enter_context(ForceDimension(session.scenario, axes))
+            if not adapter.guarded:
                 console(args).print(
                     "the device has no watchdog of its own: were this program killed, its force would stay"
                 )
         else:
             options = [*_emulator_options(args, seed, seconds), *["--nobody"][:nobody], f"--coulomb={coulomb}"]
-            path = args.port or stack.enter_context(spawned(options))
-            port = stack.enter_context(SerialPort(path, session.settings.baud))
+            with progress("starting the emulator" if args.emulate else "opening the port"):
+                path = args.port or stack.enter_context(spawned(options))
+            port, pace = stack.enter_context(SerialPort(path, session.settings.baud)), float(args.pace)
+            device = serial = SerialDevice(port, lambda: pace * time.monotonic())
         if args.port and not getattr(args, "no_preflight", True):
-            console(args).print(preflight(args.port).line(), soft_wrap=True, highlight=False)
+            with progress("looking at this machine"):
+                found = preflight(args.port)
+            console(args).print(found.line(), soft_wrap=True, highlight=False)
         keyboard = stack.enter_context(_keys()) if sys.stdin.isatty() else None
         show = _view(stack)
 
@@ -220,7 +226,7 @@ def hold_session(
         auto_arm = args.arm or args.emulate
         live = Live(
             session,
-            port,
+            device,
             plan,
             auto_arm,
             seconds,
@@ -230,7 +236,7 @@ def hold_session(
             deadman,
         )
         live.run()
-    return _Held(live.signals, live.dropped)
+    return _Held(live.signals, serial.dropped if serial else 0)
 
 
 def _rehearsed(
@@ -250,10 +256,21 @@ def _rehearsed(
         emulator = Emulator(scenario, faults, coulomb=coulomb)
     except ValueError as error:
         raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
-    operator = Operator(True, seconds)
-    Rehearsal(
-        session, emulator, plan, faults, seed, operator=operator, keep=False, glance=incidents.glance
-    ).run_to_the_end(seconds + _SPARE)
+    with progress("rehearsing") as move:
+
+        def planned(ages: Ages) -> Sequence[Program]:
+            move(0, 1, "designing the coupling")
+            return plan(ages)
+
+        def glance(session: Session) -> None:
+            incidents.glance(session)
+            if session.now % _SHOWN_US < 1000:
+                move(session.now, round(1e6 * (1 + seconds)), f"rehearsing: {session.stage}")
+
+        operator = Operator(True, seconds)
+        Rehearsal(
+            session, emulator, planned, faults, seed, operator=operator, keep=False, glance=glance
+        ).run_to_the_end(seconds + _SPARE)
     return _Held()
 
 

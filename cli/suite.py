@@ -9,18 +9,14 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing
-import os
-import platform
 import resource
 import shlex
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from importlib import import_module
-from importlib.metadata import version
 from io import StringIO
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -28,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from cli import options, render
+from cli import options, render, suite_report
 from controller.coupling import NoCoupling
 from controller.lti import SingularLoop
 from design.files import folder, write, write_json
@@ -45,23 +41,11 @@ from sim.couplings import choose
 from sim.crowds import Validation
 from sim.guarantees import challenges
 from sim.hard import cases, measure
+from sim.random_loops import proofs, traces
 from sim.scenario import InputError, load
-from sim.shards import validate
+from sim.shards import as_worker, validate
 from sim.stability import unstable
 from sim.uneven import HANDS, uneven_ticks
-
-_INTRODUCTION = """\
-Several force-feedback devices share one simulated object; the loop of hands, devices, delays and computer must not
-start to oscillate by itself, whoever holds the devices. A *coupling* is the filter between devices and object that
-ensures this; it is *certified* when the devices have more damping than a proved condition requires. This report puts
-every such verdict to the test. *Growth* is the rate at which the loop's strongest oscillation grows: below zero it
-dies out. It is computed from the exact solution of the loop and, independently, from what MuJoCo simulates; both must
-tell the same of every hand. The *adversary* searches for the worst passive hand instead of drawing hands at random.
-
-"Holds" means: both engines agree about everyone, nobody destabilises a certified loop, and its energy balance is
-never negative. An uncertified loop may be unstable; it holds as long as the engines agree.
-"""
-
 
 # ----------------------------------------------------------------------------------------------------
 # Checks of our own: what they measure, row by row.
@@ -181,8 +165,8 @@ def endurance(seed: int) -> Iterator[_Row]:
 
 
 def _alone(work: _Work, allowed: float, there: Connection) -> None:
-    """Of the process that does it: only the one that waits acts on Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Of the process that does it, which ends with the one that waits."""
+    as_worker()
     there.send(endure(work, allowed))
 
 
@@ -205,6 +189,18 @@ def _peak() -> float:
     if (status := Path("/proc/self/status")).exists():
         return float(status.read_text().partition("VmHWM:")[2].split()[0]) / 2**10
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def proved(seed: int) -> Iterator[_Row]:
+    """Whether random networks are proved where the sweep says so, and only there."""
+    for row in proofs(seed):
+        yield asdict(row) | {"required": finite(row.required), "holds": row.holds}
+
+
+def told(seed: int) -> Iterator[_Row]:
+    """What traces of random scenarios tell of their stability."""
+    for row in traces(seed):
+        yield asdict(row)
 
 
 def uneven(seed: int) -> Iterator[_Row]:
@@ -369,6 +365,38 @@ def _fault_table(report: dict[str, Any]) -> list[_Part]:
     return [_Part("", columns, tuple(rows), f"{good} of {len(rows)} faults end as they must")]
 
 
+def _proof_table(report: dict[str, Any]) -> list[_Part]:
+    """Of proofs of random networks: by what the sweep says."""
+    rows, good = [], sum(row["holds"] for row in report["rows"])
+    for says, enough in (("there is enough damping", True), ("there is too little", False)):
+        some = [row for row in report["rows"] if (row["required"] is not None and row["required"] < 1) == enough]
+        rows.append((says, str(len(some)), str(sum(row["proved"] for row in some))))
+    columns = ("the sweep says that", "networks", "proved")
+    return [_Part("", columns, tuple(rows), f"proof and sweep agree about {good} of {len(report['rows'])} networks")]
+
+
+def _told_table(report: dict[str, Any]) -> list[_Part]:
+    """Of traces of random scenarios: by what their eigenvalues say."""
+    rows, good = [], sum(row["holds"] for row in report["rows"])
+    for says, grows in (("stable", False), ("unstable", True)):
+        some = [row for row in report["rows"] if bool(unstable(row["exact_per_s"])) == grows]
+        read = [row for row in some if row["trace_per_s"] is not None]
+        same = sum(bool(unstable(row["trace_per_s"])) == grows for row in read)
+        quiet = sum(row["not_excited"] for row in some)
+        rows.append((says, *map(str, (len(some), same, len(read) - same, quiet, len(some) - len(read) - quiet))))
+    columns = (
+        "by the eigenvalues",
+        "runs",
+        "the trace agrees",
+        "says the opposite",
+        "not excited",
+        "no rate, for another reason",
+    )
+    return [
+        _Part("", columns, tuple(rows), f"{good} of {len(report['rows'])} traces tell no other than the eigenvalues")
+    ]
+
+
 def memory_table(report: dict[str, Any]) -> list[_Part]:
     """Of work that goes on for long."""
     rows = [
@@ -464,6 +492,8 @@ CHECKS = (
     Check("map", "Which springs and dampers may a device render against a wall?", _MAP, _gain_map),
     Check("accuracy", "Is MuJoCo right, and at what cost?", "sim.accuracy --duration 6", accuracy),
     Check("hard", "Numerically hard loops", hard_loops, hard),
+    Check("proofs", "Are random networks proved where the sweep says so?", proved, _proof_table),
+    Check("traces", "Does a trace ever say the opposite of the eigenvalues?", told, _told_table),
     Check("uneven", "Do uneven periods and late forces keep the guarantee?", uneven, _uneven_table),
     Check("guarantees", "Do limits, budgets, walls and friction hold at what they ask?", edges, guarantees),
     Check("faults", "Does every fault of a link end as it must?", faults, _fault_table),
@@ -473,20 +503,18 @@ CHECKS = (
 
 @dataclass(frozen=True)
 class _Answer:
-    """What a check found. Its files are in the folder of its name."""
+    """What a check found, as the report has it. Its files are in the folder of its name."""
 
-    check: Check
+    name: str
+    asks: str
     command: str
-    code: int | None  # the command's exit code; None where it broke off with `trouble`
+    exit_code: int | None  # the command's; None where it broke off with `trouble`
+    holds: bool
+    trouble: str | None
     wall_s: float
-    parts: tuple[_Part, ...] = ()
-    pictures: tuple[str, ...] = ()  # paths from the report's folder
-    trouble: str | None = None
-    report: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def holds(self) -> bool:
-        return self.code == options.DONE
+    parts: tuple[_Part, ...]
+    pictures: tuple[str, ...]  # paths from the report's folder
+    report: dict[str, Any]
 
 
 def ask(check: Check, out: Path, humans: int, seed: int) -> _Answer:
@@ -504,7 +532,8 @@ def ask(check: Check, out: Path, humans: int, seed: int) -> _Answer:
     report = json.loads(written.read_text()) if written.exists() else {}
     parts = tuple(check.figures(report)) if report else ()
     pictures = tuple(path.relative_to(out).as_posix() for path in sorted(place.glob("*.png")))
-    return _Answer(check, f"python -m {command}", code, wall, parts, pictures, trouble, report)
+    holds = code == options.DONE
+    return _Answer(check.name, check.asks, f"python -m {command}", code, holds, trouble, wall, parts, pictures, report)
 
 
 def _called(command: str, place: Path) -> int:
@@ -553,22 +582,22 @@ def main(argv: list[str]) -> int:
             interrupted = True
             break
         screen.print(f"{_verdict(answers[-1])} ({answers[-1].wall_s:.1f} s)")
-        if interrupted := answers[-1].code == options.INTERRUPTED:
+        if interrupted := answers[-1].exit_code == options.INTERRUPTED:
             break
     outcome = {
         "holds": len(answers) == len(checks) and all(answer.holds for answer in answers),
-        "checks": [_part(answer) for answer in answers],
+        "checks": [asdict(answer) for answer in answers],
         "left_out": [check.name for check in checks[len(answers) :]],
         "humans": args.humans,
         "seed": args.seed,
         "interrupted": interrupted,
         "wall_s": time.perf_counter() - begin,
-        "machine": machine(),
+        "machine": suite_report.machine(),
     }
-    screen.print(_headline(outcome))
+    screen.print(suite_report.headline(outcome))
     if len(checks) == 1 and answers:
         _show(answers[0], screen)
-    render.publish(args, outcome, (), (), out, [write(out / "report.md", _markdown(outcome))])
+    render.publish(args, outcome, (), (), out, [write(out / "report.md", suite_report.markdown(outcome))])
     if interrupted:
         return options.INTERRUPTED
     return options.DONE if outcome["holds"] else options.DOES_NOT_HOLD
@@ -603,7 +632,7 @@ def _chosen(args: argparse.Namespace) -> list[Check]:
 
 
 def _verdict(answer: _Answer) -> str:
-    if answer.code == options.INTERRUPTED:
+    if answer.exit_code == options.INTERRUPTED:
         return "[yellow]interrupted[/]"
     return "[green]holds[/]" if answer.holds else f"[red]{answer.trouble or 'does not hold'}[/]"
 
@@ -612,95 +641,3 @@ def _show(answer: _Answer, screen: render.Screen) -> None:
     """The figures of a check that was asked for alone."""
     for part in answer.parts:
         screen.print(render.grid(part.title, part.columns, part.rows, left=range(len(part.columns))))
-
-
-def _part(answer: _Answer) -> _Row:
-    return {
-        "name": answer.check.name,
-        "asks": answer.check.asks,
-        "command": answer.command,
-        "exit_code": answer.code,
-        "holds": answer.holds,
-        "trouble": answer.trouble,
-        "wall_s": answer.wall_s,
-        "parts": [asdict(part) for part in answer.parts],
-        "pictures": list(answer.pictures),
-        "report": answer.report,
-    }
-
-
-# ----------------------------------------------------------------------------------------------------
-# The report for a stranger.
-
-
-def _headline(outcome: dict[str, Any]) -> str:
-    """One sentence."""
-    checks = outcome["checks"]
-    good = sum(check["holds"] for check in checks)
-    if outcome["holds"]:
-        text = f"All {good} checks hold."
-    else:
-        failed = ", ".join(check["name"] for check in checks if not check["holds"])
-        text = f"{good} of {len(checks) + len(outcome['left_out'])} checks hold"
-        text += f"; not: {failed}." if failed else "."
-    return text + (" Interrupted." if outcome["interrupted"] else "")
-
-
-def _markdown(outcome: dict[str, Any]) -> str:
-    """The whole report."""
-    machine = outcome["machine"]
-    lines = ["# Validation report", "", f"**{_headline(outcome)}** {outcome['wall_s']:.0f} s, seed {outcome['seed']}."]
-    lines += ["", "## Verdicts", "", *_verdict_table(outcome), "", _INTRODUCTION]
-    for check in outcome["checks"]:
-        lines += _section(check)
-    lines += ["## Where this was run", "", ", ".join(f"{name} {value}" for name, value in machine.items()) + ".", ""]
-    return "\n".join(lines)
-
-
-def machine() -> dict[str, str]:
-    """What figures of speed, and the last digits of all others, depend on."""
-    packages = {name: version(name) for name in ("mujoco", "numpy", "scipy", "cvxpy", "clarabel")}
-    return {
-        "Python": platform.python_version(),
-        **packages,
-        "on": f"{platform.platform()}, {os.cpu_count()} processors",
-    }
-
-
-def _verdict_table(outcome: dict[str, Any]) -> list[str]:
-    rows = [
-        (
-            "holds" if check["holds"] else "**does not hold**",
-            f"[{check['asks']}](#{_anchor(check['asks'])})",
-            check["trouble"] or next((part["answer"] for part in check["parts"]), ""),
-            f"`{check['command']}`",
-        )
-        for check in outcome["checks"]
-    ]
-    rows += [("not run", name, "", "") for name in outcome["left_out"]]
-    return _table(("verdict", "check", "answer", "reproduce with"), rows)
-
-
-def _section(check: dict[str, Any]) -> list[str]:
-    lines = [f"## {check['asks']}", "", "```sh", check["command"], "```", ""]
-    verdict = "Holds" if check["holds"] else "Does not hold"
-    lines += [
-        f"{verdict} (exit code {check['exit_code']}, {check['wall_s']:.1f} s). {check['trouble'] or ''}".rstrip(),
-        "",
-    ]
-    for part in check["parts"]:
-        lines += [f"### {part['title']}", ""] if part["title"] else []
-        lines += [*_table(part["columns"], part["rows"]), ""]
-    for picture in check["pictures"]:
-        lines += [f"![{check['asks']}]({picture})", ""]
-    return lines
-
-
-def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    rule = "|" + "---|" * len(columns)
-    return [f"| {' | '.join(columns)} |", rule, *(f"| {' | '.join(cells)} |" for cells in rows)]
-
-
-def _anchor(title: str) -> str:
-    """As GitHub makes it from a heading."""
-    return "".join(c for c in title.lower() if c.isalnum() or c in " -").replace(" ", "-")

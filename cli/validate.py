@@ -11,9 +11,9 @@ import numpy as np
 
 from cli import options, render
 from controller.environment import Member
-from design.certificate import SetCheck, assess, check_set
+from design.certificate import RangesCheck, assess, check_ranges
 from design.conditions import this_environment
-from design.coverage import set_part
+from design.coverage import ranges_part
 from design.guarantees import ANY, guarantee_of
 from models.human import Human, Population
 from sim import report
@@ -36,15 +36,15 @@ def main(argv: list[str]) -> int:
     with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
         chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
     loop = scenario.loop(args.case)
-    with render.progress("searching the ranges" if loop.box else "judging the coupling") as move:
-        whole = check_set(loop, chosen.coupling, args.seed, progress=move)
+    with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
+        whole = check_ranges(loop, chosen.coupling, args.seed, progress=move)
         requirements = assess(loop, chosen.coupling, chosen.phi)
     environments = _environments(args, whole)
     proved = bool(whole and whole.proved)
     guarantee = guarantee_of(requirements, loop, proved)
     certified = guarantee is not None and (not environments or guarantee == ANY or proved)
 
-    limits = limits_of(scenario, chosen.coupling, requirements, args.limiter)
+    limits = limits_of(scenario, chosen, requirements, args.limiter)
     question = _question(args, scenario, chosen, environments, limits.rho)
     findings, wall = _findings(args, question, Table(question, out, args.resume))
     outcome = {
@@ -55,12 +55,12 @@ def main(argv: list[str]) -> int:
         "certificates": report.certificates_part(requirements),
         **report.validation_part(question, findings, certified, wall),
         "promise": guarantee,
-        "set": whole and set_part(whole),
+        "ranges": whole and ranges_part(whole),
         "limiter": limits.part([device.force_limit for device in scenario.device]),
         "remarks": list(chosen.notes),
     }
-    if scenario.jitter:
-        covered = report.delay_range_part(scenario.jitter) | certified_part(scenario, chosen, certified)
+    if scenario.varying_delay:
+        covered = report.delay_range_part(scenario.varying_delay) | certified_part(scenario, chosen, certified)
         _add(outcome, "switching", report.varying_delays_part(findings, covered))
     if scenario.uneven:
         met = report.timing_part(scenario.timing(args.seed, max(1, question.ticks)), scenario) or {}
@@ -70,7 +70,7 @@ def main(argv: list[str]) -> int:
         attacked, ratio = scenario, requirements["this-environment"].ratio
         if environments and whole:
             member, requirement = whole.worst_found
-            attacked, ratio = scenario.replace(environment=member.network, box=None), requirement.ratio
+            attacked, ratio = scenario.replace(environment=member.network, ranges=None), requirement.ratio
         worst = _attack(args, attacked, chosen, outcome)
         if worst:
             _add(outcome, "adversary", report.adversary_part(worst, ratio, certified))
@@ -134,7 +134,7 @@ def _scenario(args: argparse.Namespace) -> Scenario:
     return scenario
 
 
-def _environments(args: argparse.Namespace, whole: SetCheck | None) -> tuple[Member, ...]:
+def _environments(args: argparse.Namespace, whole: RangesCheck | None) -> tuple[Member, ...]:
     """Vertices and as many others of the ranges, the worst that was found first; none where all meet the nominal one.
 
     Raises InputError.
@@ -142,7 +142,7 @@ def _environments(args: argparse.Namespace, whole: SetCheck | None) -> tuple[Mem
     if args.environments == "nominal":
         return ()
     if whole is None:
-        raise InputError(f"--environments {args.environments}: the scenario has no ranges (docs/scenario.md, [box])")
+        raise InputError(f"--environments {args.environments}: the scenario has no ranges (docs/scenario.md, [ranges])")
     others = (whole.searched.worst[0].member, *whole.samples)
     return (*whole.members, *others[: len(whole.members)])
 

@@ -9,6 +9,7 @@ import argparse
 import csv
 import io
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,13 @@ from cli import options, render
 from controller.environment import RIGID_WALL
 from controller.loop import Loop
 from controller.lti import Array
-from design.certificate import CONDITIONS, assess, check_set
-from design.coverage import set_part
+from design.certificate import CONDITIONS, assess, check_ranges
+from design.coverage import ranges_part
 from design.files import write
 from design.guarantees import CAVEATS, guarantee_of
 from design.result import certificate_part, finite
 from sim import report
-from sim.couplings import NAMES, Chosen, choose
+from sim.couplings import NAMES, Chosen, choose, limits_of
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
 from sim.scenario import InputError, Scenario, require_constant_delay
 from sim.stability import MARGINAL
@@ -74,7 +75,7 @@ def _table(outcome: dict[str, Any]) -> Table:
 
 def _designed_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
     """The fixed coupling in the environment that it was designed for."""
-    designed = outcome["designed_for"]
+    designed, limited = outcome["designed_for"], outcome["simulation"]["effects"]["force_limit_n"]
     each = (f"{' - '.join(s['between'])} {s['K']:g} N/m, {s['B']:g} N s/m" for s in designed["contact_springs"])
     needs = "; ".join(
         f"{name} needs {100 / designed['certificates'][name]['margin']:.4g} % of the damping "
@@ -86,6 +87,7 @@ def _designed_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
         ("coupling", f"{outcome['coupling']['kind']}, fixed"),
         ("designed for", ", ".join(each)),
         ("there", f"guarantee: {designed['promise'] or 'none'}; {needs or 'no damping is enough'}"),
+        *([("force limits there", outcome["limiter"]["words"])] if limited else []),
     ]
 
 
@@ -334,7 +336,13 @@ def main(argv: list[str]) -> int:
         raise InputError("period: a map simulates even periods; give T_max alone, which its certificates are for")
     _check_case(args)
     chosen = _chosen(args, scenario)
-    sweep: Sweep = _environment_sweep(scenario, chosen) if chosen else _coupling_sweep(args, scenario)
+    designed: dict[str, Any] = {"axes": "coupling", "coupling": None}
+    if chosen:
+        fixed = _environment_sweep(scenario, chosen)
+        designed = _coupling(args, scenario, chosen)
+        sweep: Sweep = replace(fixed, lag=designed["limiter"]["rho"])
+    else:
+        sweep = _coupling_sweep(args, scenario)
     marks = _marks(args)
     grid, plan, out = _grid(args, sweep, marks), _plan(args, sweep), options.out_folder(args, "zwidth")
 
@@ -345,7 +353,7 @@ def main(argv: list[str]) -> int:
         drawn = draw_map(sweep, grid, crowd, plan, lambda stage, k, of: move(k, of, stage))
     outcome = _summary(sweep, drawn, plan, {"humans": args.humans, "seed": args.seed})
     outcome |= {"scenario": None if args.rigid else scenario.name, "scenario_digest": scenario.digest}
-    outcome |= _coupling(args, scenario, chosen) if chosen else {"axes": "coupling", "coupling": None}
+    outcome |= designed
     if not drawn.interrupted:
         _add_errors(outcome, {name: map_error(sweep, drawn, name) for name in drawn.ratio})
         _add_marks(outcome, [evaluate_point(sweep, crowd, *mark, grid.K) for mark in marks])
@@ -395,6 +403,7 @@ def _add_points(points: argparse._ActionsContainer) -> None:
     add("threshold", options.number(1e-9, 1, "m"), "METRES", swing)
     add("quantisation", options.number(0, 1e-2, "m"), "METRES", "encoder step of every device")
     points.add_argument("--saturation", action="store_true", help="motors have their force limits")
+    options.add_limiter_option(points, "with --saturation clip forces at these limits")
     add("friction", options.number(0, 1e3, "N"), "NEWTONS", "Coulomb friction of every device")
     points.add_argument("--wall", action="store_true", help="contacts push and never pull")
     cutoff = "first-order cut-off of the damped velocity; in all maps"
@@ -403,6 +412,8 @@ def _add_points(points: argparse._ActionsContainer) -> None:
 
 def _check_case(args: argparse.Namespace) -> None:
     """Whether the options ask for a map of one kind. Raises InputError."""
+    if args.limiter is False and not args.saturation:
+        raise InputError("--no-limiter without --saturation: motors without limits clip nothing")
     if args.case == "none":
         instead = "use --case I, or --coupling none for a map over environments"
         raise InputError(f"--case none is the loop without coupling, and the map is of couplings: {instead}")
@@ -422,7 +433,7 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
     if args.coupling == "optimal" and scenario.environment.walls:
         raise InputError("environment.walls: an optimal coupling holds a linear model, so it cannot face walls")
     with render.designing() as heard:
-        return choose(scenario, args.case, args.coupling, args.condition, progress=heard)
+        return choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
 
 
 def _environment_sweep(scenario: Scenario, chosen: Chosen) -> EnvironmentSweep:
@@ -437,9 +448,10 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
     """The fixed coupling and what is guaranteed of it where it was designed, in the scenario's own environment."""
     loop = scenario.loop(args.case)
     with render.progress("searching the ranges") as move:
-        whole = check_set(loop, chosen.coupling, args.seed, progress=move)
+        whole = check_ranges(loop, chosen.coupling, args.seed, progress=move)
     requirements = assess(loop, chosen.coupling, chosen.phi)
-    springs = contact_springs(loop.network)
+    limits = limits_of(scenario, chosen, requirements, args.limiter)
+    springs, ranges = contact_springs(loop.network), whole and ranges_part(whole)
     return {
         "axes": "environment",
         "coupling": report.coupling_part(chosen.kind, chosen.coupling, scenario.T),
@@ -447,8 +459,10 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
             "contact_springs": [{"between": s.between, "K": s.stiffness, "B": s.damping} for s in springs],
             "certificates": report.certificates_part(requirements),
             "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
-            "set": whole and set_part(whole),
+            "ranges": ranges,
+            "set": ranges,  # its older name
         },
+        "limiter": limits.part([device.force_limit for device in scenario.device]),
         "remarks": list(chosen.notes),
     }
 
@@ -461,14 +475,15 @@ def _coupling_sweep(args: argparse.Namespace, scenario: Scenario) -> CouplingSwe
             loop, devices = _nominal(options.rigid_loop(args, scenario)), devices[:1]
         elif args.wall:
             loop = loop.at(one_sided(scenario.environment))
-        return CouplingSweep(devices, scenario.population, loop, args.velocity_filter, args.rigid and args.wall)
+        wall, clip = args.rigid and args.wall, args.limiter is False
+        return CouplingSweep(devices, scenario.population, loop, args.velocity_filter, wall, clip)
     except ValueError as error:
         raise error if isinstance(error, InputError) else InputError(str(error)) from None
 
 
 def _nominal(loop: Loop) -> Loop:
     """With the environment itself and constant delays: what a map is about."""
-    return msgspec.structs.replace(loop, box=None, jitter=None)
+    return msgspec.structs.replace(loop, ranges=None, varying_delay=None)
 
 
 def _marks(args: argparse.Namespace) -> tuple[Range, ...]:
@@ -497,7 +512,7 @@ def _save(args: argparse.Namespace, drawn: Map, outcome: dict[str, Any], out: Pa
     """The table and the picture."""
     files = [_save_csv(drawn, out / "map.csv")]
     if not args.no_plot:
-        from sim.plots import plot_zwidth
+        from sim.map_plot import plot_zwidth
 
         files.append(plot_zwidth(drawn, outcome, out / "zwidth.png"))
     return files

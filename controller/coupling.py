@@ -7,10 +7,11 @@ floats, a stack, Fractions, or sampled responses (controller.lti). Its form is w
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -24,38 +25,58 @@ _LARGEST_WEIGHT = 1e9  # of a force filter: beyond it arithmetic would overflow 
 _Rows = tuple[tuple[float, ...], ...]
 
 
-class Coupling(Protocol):
-    """Anything that can be closed around the (delayed) environment."""
+class Coupling(ABC):
+    """Anything that can be closed around the (delayed) environment. `around` is all that a new one must have."""
 
+    kind: ClassVar[str] = "own"  # how reports name it
+    holds_model: ClassVar[bool] = False  # a linear model of the environment: it cannot face walls
+    one_period: ClassVar[bool] = False  # its coefficients are for the T that it was designed for
+
+    @abstractmethod
     def around(self, environment: Block, further: int = 0) -> Block:
         """(I + Psi E V)^-1 Psi E, given Psi E, whose last `further` ports lie behind no coupling."""
-        ...
 
     def compliance(self, T: Number) -> Lti | None:
         """V(z) in the arithmetic of T, or None where the coupling is no V in feedback around any environment."""
-        ...
+        return Lti.diag(*channels) if (channels := self.channels(T)) else None
+
+    def channels(self, T: Number) -> list[Lti] | None:
+        """V_i(z) where V is diagonal by its making."""
+        return None
+
+    def with_model(self, model: Lti) -> Compliance | None:
+        """The V that it is where its model stays `model` while the environment changes, None for a coupling without."""
+        return None
+
+    def at_period(self, T: float) -> Coupling:
+        """The same gains, or coefficients, with another period T [s]."""
+        return self
+
+    def figures(self, T: float) -> dict[str, Any]:
+        """What a report says of it: order of V, Q or R, and gains where it has some."""
+        V = self.compliance(T)
+        return {"order": V.order if V else 0}
 
     def form(self) -> Form:
         """What a file holds of it."""
-        ...
+        raise ValueError(f"a coupling of class {type(self).__name__} has no form in a file")
 
 
 @dataclass(frozen=True)
-class NoCoupling:
+class NoCoupling(Coupling):
     """V = 0: the devices touch the environment directly."""
+
+    kind = "none"
 
     def around(self, environment: Block, further: int = 0) -> Block:
         return environment
-
-    def compliance(self, T: Number) -> None:
-        return None
 
     def form(self) -> _NoForm:
         return _NoForm()
 
 
 @dataclass(frozen=True, eq=False)
-class SpringDamper(ReadOnly):
+class SpringDamper(ReadOnly, Coupling):
     """V = [K + B (z-1)/(Tz)]^-1, one spring and damper per channel (26); many of them at once with leading axes.
 
     The damper may act on a filtered velocity: backward Euler of B s / (tau s + 1), a damper in series with a spring of
@@ -65,6 +86,8 @@ class SpringDamper(ReadOnly):
     K: Array  # (..., m) [N/m]
     B: Array  # (..., m) [N s/m]
     cutoff: float | None = None  # [Hz] of the velocity filter, 1/(2 pi tau); None for none
+
+    kind = "spring-damper"
 
     if TYPE_CHECKING:  # what __post_init__ accepts is more than what the fields then hold
 
@@ -99,6 +122,9 @@ class SpringDamper(ReadOnly):
     def compliance(self, T: Number) -> Lti:
         """V(z), diagonal."""
         return Lti.diag(*self.channels(T))
+
+    def figures(self, T: float) -> dict[str, Any]:
+        return {"K": self.K.tolist(), "B": self.B.tolist()} | super().figures(T)
 
     def sampled(self, z: Complex, T: float) -> Sampled:
         """V at z (n, k) or (1, k), for gains (n, m) or (m,)."""
@@ -137,7 +163,7 @@ def _scalar(value: Any) -> Any:
 
 
 @dataclass(frozen=True, eq=False)
-class MovingAverage(ReadOnly):
+class MovingAverage(ReadOnly, Coupling):
     """V_i = weight_i (1 + 1/z + ... + z^-(terms_i - 1)) + constant_i: the sum of the last forces, and a plain spring.
 
     With weight T/(2 delta), as many terms as a force takes ticks to act and a constant however small it is the
@@ -147,6 +173,8 @@ class MovingAverage(ReadOnly):
     weight: Array  # (m,) [m/N]
     terms: tuple[int, ...]  # (m,)
     constant: Array  # (m,) [m/N]
+
+    kind, one_period = "moving-average", True
 
     if TYPE_CHECKING:
 
@@ -179,6 +207,9 @@ class MovingAverage(ReadOnly):
         """V(z), diagonal."""
         return Lti.diag(*self.channels(T))
 
+    def figures(self, T: float) -> dict[str, Any]:
+        return {"stiffness": self.stiffness.tolist()} | super().figures(T)
+
     def around(self, environment: Block, further: int = 0) -> Block:
         return Compliance(self.compliance(environment.T)).around(environment, further)
 
@@ -187,13 +218,18 @@ class MovingAverage(ReadOnly):
 
 
 @dataclass(frozen=True, eq=False)
-class Compliance:
+class Compliance(Coupling):
     """A general V(z), given as a state-space block."""
 
     V: Lti
 
+    kind, one_period = "compliance", True
+
     def compliance(self, T: Number) -> Lti:
         return Lti(self.V.A, self.V.B, self.V.C, self.V.D, T)
+
+    def at_period(self, T: float) -> Compliance:
+        return Compliance(replace(self.V, T=T))
 
     def around(self, environment: Block, further: int = 0) -> Block:
         if isinstance(environment, Sampled):
@@ -209,7 +245,7 @@ class Compliance:
 
 
 @dataclass(frozen=True, eq=False)
-class InternalModel(ReadOnly):
+class InternalModel(ReadOnly, Coupling):
     """The pair of a parameter Q(z) and the environment itself: u = x - Q y, where y = Psi E x is the model's answer.
 
     G = Psi E - Psi E Q Psi E: the same as V = Q (I - Psi E Q)^-1 in feedback, but affine in Q, and stable whenever Q
@@ -219,6 +255,8 @@ class InternalModel(ReadOnly):
 
     poles: Array  # (n,) in (-1, 1); all zero: an FIR filter of n + 1 taps
     Q: Array  # (n + 1, m, m) [m/N]
+
+    kind, holds_model, one_period = "internal-model", True, True
 
     if TYPE_CHECKING:
 
@@ -239,8 +277,11 @@ class InternalModel(ReadOnly):
         """Q(z), one chain of sections per input."""
         return _realised(self.poles, NO_PAIRS, self.Q, T)
 
-    def compliance(self, T: Number) -> None:
-        return None
+    def with_model(self, model: Lti) -> Compliance:
+        return Compliance(self.parameter(model.T).feedback(-model))
+
+    def figures(self, T: float) -> dict[str, Any]:
+        return {"order": self.parameter(T).order}
 
     def around(self, environment: Block, further: int = 0) -> Block:
         m = self.Q.shape[1]
@@ -259,7 +300,7 @@ class InternalModel(ReadOnly):
 
 
 @dataclass(frozen=True, eq=False)
-class ForceFilter(ReadOnly):
+class ForceFilter(ReadOnly, Coupling):
     """R in F = Theta R Psi E: one copy of the environment, moved by the devices, then a filter R(z) of its forces.
 
     Nothing is fed back, so R and the environment are stable or not by themselves, and F is affine in R. R = I - Psi E Q
@@ -273,6 +314,8 @@ class ForceFilter(ReadOnly):
     poles: Array  # (n,) in (-1, 1); at zero they make delays
     pairs: Array  # (p, 2): b1, b2 of z^2 + b1 z + b2
     R: Array  # (1 + n + 2 p, m, m) or (1 + n + 2 p, m, m + 1), without unit
+
+    kind, holds_model, one_period = "force-filter", True, True
 
     if TYPE_CHECKING:
 
@@ -306,10 +349,6 @@ class ForceFilter(ReadOnly):
             raise ValueError(f"the coefficients of R sum to {shown}, expected g times the identity with g >= 0")
 
     @property
-    def channels(self) -> int:
-        return self.R.shape[1]
-
-    @property
     def g(self) -> float:
         """The rendered share of the static stiffness: F(1) = g E(1)."""
         return float(self._static()[0, 0])
@@ -322,12 +361,12 @@ class ForceFilter(ReadOnly):
         """R(z), in the arithmetic of T."""
         return _realised(self.poles, self.pairs, self.R, T)
 
-    def compliance(self, T: Number) -> None:
-        return None
+    def figures(self, T: float) -> dict[str, Any]:
+        return {"order": self.filter(T).order}
 
     def around(self, environment: Block, further: int = 0) -> Block:
         """R Psi E, given Psi E."""
-        m = self.channels
+        m = self.R.shape[1]
         if isinstance(environment, Sampled):
             values = basis(self.poles, environment.z, self.pairs)
             return (

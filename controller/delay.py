@@ -124,7 +124,7 @@ _Pattern = Literal["constant", "random", "bursty", "adversarial", "recorded"]
 _LONGEST = 1000  # [samples]
 
 
-class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class VaryingDelay(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Delays of the forces, lo to hi [samples] per channel, drawn anew for every packet."""
 
     lo: tuple[int, ...]  # (m,) [samples]
@@ -138,29 +138,31 @@ class Jitter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if len(self.lo) != len(self.hi):
-            raise ValueError(f"jitter.lo has {len(self.lo)} entries and jitter.hi {len(self.hi)}: one each per channel")
+            given = f"varying_delay.lo has {len(self.lo)} entries and varying_delay.hi {len(self.hi)}"
+            raise ValueError(f"{given}: one each per channel")
         for i, (lo, hi) in enumerate(zip(self.lo, self.hi, strict=True)):
             if not 0 <= lo <= hi <= _LONGEST:
                 raise ValueError(
-                    f"jitter on channel {i + 1} is {lo} to {hi}, expected 0 <= lo <= hi <= {_LONGEST} samples"
+                    f"varying_delay on channel {i + 1} is {lo} to {hi}, expected 0 <= lo <= hi <= {_LONGEST} samples"
                 )
         if not 0 <= self.loss <= 1:
-            raise ValueError(f"jitter.loss is {self.loss:g}, allowed are probabilities 0 to 1")
+            raise ValueError(f"varying_delay.loss is {self.loss:g}, allowed are probabilities 0 to 1")
         for name in ("calm", "burst"):
             if not 1 <= getattr(self, name) <= 1e6:
-                raise ValueError(f"jitter.{name} is {getattr(self, name):g}, allowed are mean lengths 1 to 1e6 packets")
+                value = f"{getattr(self, name):g}"
+                raise ValueError(f"varying_delay.{name} is {value}, allowed are mean lengths 1 to 1e6 packets")
         if (self.pattern == "recorded") != bool(self.recorded):
-            raise ValueError("jitter.recorded and jitter.pattern = 'recorded' go together: give both or neither")
+            raise ValueError("varying_delay: recorded and pattern = 'recorded' go together: give both or neither")
         for k, row in enumerate(self.recorded):
             self._check_packet(k, row)
 
     def _check_packet(self, k: int, row: tuple[int, ...]) -> None:
         if len(row) != len(self.lo):
-            raise ValueError(f"jitter.recorded, packet {k}: {len(row)} delays for {len(self.lo)} channels")
+            raise ValueError(f"varying_delay.recorded, packet {k}: {len(row)} delays for {len(self.lo)} channels")
         for i, n in enumerate(row):
             if n != LOST and not self.lo[i] <= n <= self.hi[i]:
                 allowed = f"{self.lo[i]} to {self.hi[i]} samples, or {LOST} for a lost packet"
-                raise ValueError(f"jitter.recorded, packet {k}, channel {i + 1}: delay {n}, allowed are {allowed}")
+                raise ValueError(f"varying_delay.recorded, packet {k}, channel {i + 1}: delay {n}, allowed {allowed}")
 
     @property
     def channels(self) -> int:

@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.lti import Array, Complex, Lti, Number, Sampled, inverse, rational
+from controller.lti import Array, Complex, Lti, Number, Sampled, inverse, numbers, rational
 
 # ----------------------------------------------------------------------------------------------------
-# Environments that are not known exactly: a box around a network's parameters, its vertices, and points inside.
+# Environments that are not known exactly: ranges of a network's parameters, their vertices, and points inside.
 #
 # The vertices are the environments in which every uncertain parameter is at an end of its range, and every contact
 # that may be absent is there or not. An absent spring stays in its network with neither stiffness nor damping.
@@ -49,7 +49,7 @@ class UncertainSpring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             _check_range(f"{name} between {' and '.join(self.between)}", getattr(self, name), unit)
 
 
-class Box(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Ranges(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Ranges of a network's parameters, each independent of the others."""
 
     springs: tuple[UncertainSpring, ...] = ()
@@ -62,7 +62,7 @@ class Box(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Member:
-    """One environment of a set."""
+    """One environment within ranges."""
 
     name: str
     network: Any
@@ -96,24 +96,24 @@ class _Part:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A part of a box in which nothing but numbers varies: which contacts are there and which absent is decided."""
+    """A part of the ranges in which nothing but numbers varies: which contacts are there is decided."""
 
     low: Array  # (n,) the ends of the ranges
     high: Array  # (n,)
     at: Callable[[str, Array], Member]  # a name, and a point between low and high
 
 
-def members(network: Network, box: Box) -> tuple[Member, ...]:
-    """The environment itself, then the vertices of its box that differ from it.
+def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
+    """The environment itself, then the vertices of the ranges that differ from it.
 
-    Raises ValueError naming the field where the box does not fit the network, or has more than MOST_VERTICES vertices.
+    Raises ValueError naming the field where the ranges do not fit the network, or have more than 64 vertices.
     """
     nominal = Member("the nominal environment", network)
-    parts = _parts(network, box)
+    parts = _parts(network, ranges)
     count = prod(len(part.corners) for part in parts)
     if count > _MOST_VERTICES:
         raise ValueError(
-            f"box has {count} vertices, allowed are {_MOST_VERTICES}: leave out the ranges that matter least, "
+            f"ranges have {count} vertices, allowed are {_MOST_VERTICES}: leave out the ranges that matter least, "
             "each halves the number"
         )
     corners = (c for c in product(*(part.corners for part in parts)) if c != tuple(part.own for part in parts))
@@ -121,54 +121,54 @@ def members(network: Network, box: Box) -> tuple[Member, ...]:
     return (nominal, *vertices)
 
 
-def regions(network: Network, box: Box) -> tuple[Region, ...]:
-    """The box as one region for every way in which its contacts can be there or absent."""
-    parts = _parts(network, box)
+def regions(network: Network, ranges: Ranges) -> tuple[Region, ...]:
+    """The ranges as one region for every way in which its contacts can be there or absent."""
+    parts = _parts(network, ranges)
     return tuple(_region(network, parts, states) for states in product(*(part.states for part in parts)))
 
 
-def inside(network: Network, box: Box, count: int, seed: int) -> tuple[Member, ...]:
-    """`count` environments drawn from the box: every range evenly, a contact that may be absent as often as not.
+def inside(network: Network, ranges: Ranges, count: int, seed: int) -> tuple[Member, ...]:
+    """`count` environments drawn from the ranges: every parameter evenly, a contact that may be absent as often as not.
 
     The first are the same whatever the count.
     """
-    parts, rng = _parts(network, box), np.random.default_rng(seed)
+    parts, rng = _parts(network, ranges), np.random.default_rng(seed)
     return tuple(_member(f"sample {i}", network, parts, [p.draw(rng) for p in parts]) for i in range(1, count + 1))
 
 
-def _shrunk(network: Network, box: Box, factor: float) -> Box:
-    """The box with every range drawn in towards the environment's own value; what may be absent still may."""
+def _shrunk(network: Network, ranges: Ranges, factor: float) -> Ranges:
+    """The ranges with every one drawn in towards the environment's own value; what may be absent still may."""
 
     def closer(limits: _Range, own: float) -> _Range:
         return own + factor * (limits[0] - own), own + factor * (limits[1] - own)
 
     springs = []
-    for one in box.springs:
+    for one in ranges.springs:
         own = next((s for s in network.springs if set(s.between) == set(one.between)), None)
         stiffness, damping = one.stiffness, one.damping
         if own:
             stiffness = stiffness and closer(stiffness, own.stiffness)
             damping = damping and closer(damping, own.damping)
         springs.append(UncertainSpring(one.between, stiffness, damping, one.absent))
-    return Box(tuple(springs), {n: closer(r, network.masses.get(n, 0.0)) for n, r in box.masses.items()})
+    return Ranges(tuple(springs), {n: closer(r, network.masses.get(n, 0.0)) for n, r in ranges.masses.items()})
 
 
-def _parts(network: Network, box: Box) -> list[_Part]:
-    if not (box.springs or box.masses):
-        raise ValueError("box is empty: give springs or masses whose parameters have ranges")
-    named = [frozenset(one.between) for one in box.springs]
-    for one, ends in zip(box.springs, named, strict=True):
+def _parts(network: Network, ranges: Ranges) -> list[_Part]:
+    if not (ranges.springs or ranges.masses):
+        raise ValueError("ranges are empty: give springs or masses whose parameters have ranges")
+    named = [frozenset(one.between) for one in ranges.springs]
+    for one, ends in zip(ranges.springs, named, strict=True):
         if named.count(ends) > 1:
-            raise ValueError(f"box.springs names {' and '.join(one.between)} twice")
+            raise ValueError(f"ranges.springs names {' and '.join(one.between)} twice")
     return [
-        *(_spring_part(network, one) for one in box.springs),
-        *(_mass_part(network, *m) for m in box.masses.items()),
+        *(_spring_part(network, one) for one in ranges.springs),
+        *(_mass_part(network, *m) for m in ranges.masses.items()),
     ]
 
 
 def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
     a, b = uncertain.between
-    field = f"box.springs between {a} and {b}"
+    field = f"ranges.springs between {a} and {b}"
     for node in (a, b):
         if node not in (*network.nodes(), "ground"):
             raise ValueError(f"{field}: there is no node {node!r}; nodes: {', '.join(network.nodes())}, ground")
@@ -217,11 +217,11 @@ def _spring_state(between: tuple[str, str], stiffness: _Range, damping: _Range) 
 
 def _mass_part(network: Network, node: str, limits: _Range) -> _Part:
     if node not in network.nodes():
-        raise ValueError(f"box.masses names {node!r}, which no spring reaches; nodes: {', '.join(network.nodes())}")
+        raise ValueError(f"ranges.masses names {node!r}, which no spring reaches; nodes: {', '.join(network.nodes())}")
     own = network.masses.get(node, 0.0)
-    _require_inside(f"box.masses.{node}", limits, own, "kg")
+    _require_inside(f"ranges.masses.{node}", limits, own, "kg")
     if limits[0] == limits[1]:
-        raise ValueError(f"box.masses.{node} is {limits[0]:g} to {limits[1]:g} kg: nothing is uncertain")
+        raise ValueError(f"ranges.masses.{node} is {limits[0]:g} to {limits[1]:g} kg: nothing is uncertain")
     state = _State((limits,), lambda point: float(point[0]))
     return _Part(node, limits, own, lambda rng: rng.uniform(limits[0], limits[1]), (state,))
 
@@ -319,6 +319,10 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"gap of the wall between {ends} is {self.gap}, expected a finite length in m")
         if self.between[0] == self.between[1]:
             raise ValueError(f"between joins {self.between[0]!r} to itself; name two different nodes")
+
+    def slope(self, T: Number) -> Number:
+        """K + 2 B/T [N/m], in the arithmetic of T: no motion that alternates between ticks is met more stiffly."""
+        return numbers(self.stiffness, T) + 2 * numbers(self.damping, T) / T
 
 
 class Environment:
@@ -431,10 +435,11 @@ class Network(msgspec.Struct, Environment, frozen=True, forbid_unknown_fields=Tr
         index = {name: i for i, name in enumerate(self.nodes())}
         M = np.diag([number(self.masses.get(name, 0.0)) for name in index])
         D, K = np.zeros_like(M), np.zeros_like(M)
-        for spring, across in zip(self.springs, self.across(self.springs), strict=True):
-            pattern = np.outer(across, across)
-            mass, damping, stiffness = spring.amounts(number)
-            M, D, K = M + mass * pattern, D + damping * pattern, K + stiffness * pattern
+        for spring in self.springs:
+            ends = [(index[node], sign) for node, sign in zip(spring.between, (1, -1), strict=True) if node != GROUND]
+            for whole, amount in zip((M, D, K), spring.amounts(number), strict=True):
+                for (i, one), (j, other) in itertools.product(ends, ends):
+                    whole[i, j] += one * other * amount
         return M, D, K
 
     def across(self, parts: Sequence[Spring | Wall]) -> NDArray[np.int64]:

@@ -1,23 +1,23 @@
-"""What is to be made safe: all that a design, a check, a map or a bridge knows of a haptic loop.
+"""Loop, the specification: all that a design, a check, a map or a bridge knows of what is to be made safe.
 
                  x  sampled                                     Delta_D  damping that the devices guarantee
     devices ---------------> (+) ---> Psi E ---+---> Theta ---> f  held for T
                               ^-               |
                               +----- V <-------+                F = Theta (I + Psi E V)^-1 Psi E     (6)
 
-No device is known but by its damping, and no human at all.
+No device is known but by its damping, and no human at all. It computes nothing in time: the tick is controller.process.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import msgspec
 
 from controller.coupling import Coupling, Strict
 from controller.delay import delay
-from controller.environment import Box, Environment, Member, Network, RigidWall, members, walled_force_map
+from controller.environment import Environment, Member, Network, Ranges, RigidWall, members, walled_force_map
 from controller.lti import Complex, Lti, Number, Sampled, rational
 
 Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=100)], ...]
@@ -45,7 +45,25 @@ class DelayRange(Strict, frozen=True):
         return all(a <= b for a, b in below) and all(a >= b for a, b in above)
 
 
-class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without box and jitter keeps the digest it had
+#: fields of loops and scenarios -> their names in the first files, which are still read and which digests are made of
+FIRST_NAMES = {"ranges": "box", "varying_delay": "jitter"}
+
+
+def named_today(fields: dict[str, Any]) -> dict[str, Any]:
+    """Fields of a file by their names of today. Raises ValueError where one has both names."""
+    for name, first in FIRST_NAMES.items():
+        if name in fields and first in fields:
+            raise ValueError(f"{name} and {first}, its older name: give one of them")
+    today = {first: name for name, first in FIRST_NAMES.items()}
+    return {today.get(name, name): value for name, value in fields.items()}
+
+
+def named_first(fields: dict[str, Any]) -> dict[str, Any]:
+    """Fields by their names in the first files."""
+    return {FIRST_NAMES.get(name, name): value for name, value in fields.items()}
+
+
+class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without the newer fields keeps the digest it had
     """All that enters a condition beside the coupling."""
 
     T: Positive  # [s]
@@ -54,8 +72,8 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
     lam: Steps  # (m,) delays of the reference [samples]; they matter to transparency only
     delta: tuple[Positive, ...]  # (m,) damping that the devices guarantee [N s/m]
     environment: Network | RigidWall  # or a class of one's own, which cannot be stored
-    box: Box | None = None  # what else the environment may be
-    jitter: DelayRange | None = None  # what else the delays of the forces may be, switching at every tick
+    ranges: Ranges | None = None  # what else the environment may be
+    varying_delay: DelayRange | None = None  # what else the delays of the forces may be, switching at every tick
     T_max: Positive | None = None  # [s] the longest period there is, where it varies from tick to tick; T if None
     latency: tuple[tuple[float, float], ...] | None = None  # (m,) [s] least and most by which forces latch after kT
 
@@ -74,9 +92,9 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
             try:
                 member.network.check(self.psi, self.T)  # raises ValueError if nothing holds an internal node
             except ValueError as error:
-                raise ValueError(f"{member.name}: {error}" if self.box else str(error)) from None
-        if self.jitter:
-            self._check_jitter(self.jitter)
+                raise ValueError(f"{member.name}: {error}" if self.ranges else str(error)) from None
+        if self.varying_delay:
+            self._check_varying_delay(self.varying_delay)
         if self.T_max is not None and not self.T <= self.T_max < float("inf"):
             raise ValueError(f"T_max is {self.T_max:g} s, expected at least T = {self.T:g} s")
         if self.latency is not None:
@@ -90,18 +108,18 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
                 raise ValueError(
                     f"latency[{i}] is {least:g} to {most:g} s, expected 0 <= least <= most < T = {self.T:g} s"
                 )
-        if self.jitter or self.environment.walls:
-            other = "jitter" if self.jitter else "environment.walls"
+        if self.varying_delay or self.environment.walls:
+            other = "varying_delay" if self.varying_delay else "environment.walls"
             raise ValueError(f"latency and {other}: a latency is judged with constant delays in linear environments")
 
-    def _check_jitter(self, jitter: DelayRange) -> None:
-        if self.box or self.environment.walls:
-            other = "box" if self.box else "environment.walls"
-            raise ValueError(f"jitter and {other}: switching delays are judged in one linear environment")
-        if len(jitter.lo) != len(self.theta):
-            raise ValueError(f"jitter has {len(jitter.lo)} ranges for {len(self.theta)} channels")
-        if not jitter.contains(DelayRange(self.theta, self.theta)):
-            raise ValueError(f"theta is {list(self.theta)}, outside of its jitter, {jitter}")
+    def _check_varying_delay(self, span: DelayRange) -> None:
+        if self.ranges or self.environment.walls:
+            other = "ranges" if self.ranges else "environment.walls"
+            raise ValueError(f"varying_delay and {other}: switching delays are judged in one linear environment")
+        if len(span.lo) != len(self.theta):
+            raise ValueError(f"varying_delay has {len(span.lo)} ranges for {len(self.theta)} channels")
+        if not span.contains(DelayRange(self.theta, self.theta)):
+            raise ValueError(f"theta is {list(self.theta)}, outside of its varying_delay, {span}")
 
     @property
     def channels(self) -> int:
@@ -117,7 +135,14 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
 
     def sent(self, coupling: Coupling, exact: bool = False) -> Lti:
         """G = (I + Psi E V)^-1 Psi E: the forces as they leave for the devices. Raises SingularLoop."""
-        return self.environment.sent(coupling, self.psi, self.period(exact))
+        if not exact:
+            return self.environment.sent(coupling, self.psi, self.T)
+        asked = (self.environment, coupling, self.psi, self.T)
+        known, found = _exactly
+        if found is None or not all(one is other for one, other in zip(asked, known, strict=True)):
+            found = self.environment.sent(coupling, self.psi, self.period(exact))
+            _exactly[:] = asked, found
+        return found
 
     def sent_at(self, coupling: Coupling, z: Complex) -> Sampled:
         """The same at points z of the circle, (n, k) or (1, k)."""
@@ -135,8 +160,10 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
         return walled_force_map(self.network, coupling, self.theta, self.psi, self.period(exact))
 
     def members(self) -> tuple[Member, ...]:
-        """The environment, and the vertices of its box where it has one."""
-        return members(self.network, self.box) if self.box else (Member("the nominal environment", self.environment),)
+        """The environment, and the vertices of its ranges where it has some."""
+        if self.ranges:
+            return members(self.network, self.ranges)
+        return (Member("the nominal environment", self.environment),)
 
     @property
     def network(self) -> Network:
@@ -151,16 +178,20 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without b
 
     def at(self, network: Environment) -> Loop:
         """The loop around this environment, known exactly."""
-        return msgspec.structs.replace(self, environment=network, box=None)
+        return msgspec.structs.replace(self, environment=network, ranges=None)
 
-    def switching(self, jitter: DelayRange | None) -> Loop:
+    def switching(self, span: DelayRange | None) -> Loop:
         """The loop whose delays may switch within this range, or are the constant theta."""
-        return msgspec.structs.replace(self, jitter=jitter)
+        return msgspec.structs.replace(self, varying_delay=span)
 
     @property
     def delays(self) -> DelayRange:
         """What the delays of the forces may be; of no width where they are constant."""
-        return self.jitter or DelayRange(self.theta, self.theta)
+        return self.varying_delay or DelayRange(self.theta, self.theta)
+
+
+#: What was built last over Fractions, and of what: a proof asks for it three times, and it is most of its work.
+_exactly: list[Any] = [(None,) * 4, None]
 
 
 def force_map(E: Lti, coupling: Coupling, theta: Sequence[int], psi: Sequence[int]) -> Lti:

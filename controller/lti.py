@@ -12,15 +12,18 @@ and a stored float stands for its shortest decimal, the one that a person wrote:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg import schur
 
 Array = NDArray[np.floating[Any]]
 Complex = NDArray[np.complex128]
@@ -29,6 +32,33 @@ Number = float | Fraction
 
 class SingularLoop(ValueError):
     """A feedback interconnection whose algebraic loop has no solution, or an exact system with a pole at z = 1."""
+
+
+class TooLong(ValueError):
+    """Exact arithmetic that has used up the time it was given."""
+
+
+_until: ContextVar[tuple[float, float]] = ContextVar("until", default=(float("inf"), 0.0))
+
+
+@contextmanager
+def within(seconds: float) -> Iterator[None]:
+    """Exact arithmetic here may take so many seconds of this thread's processor, or what is left of a time around it.
+
+    Else it raises TooLong, at the next row of a product or of an elimination.
+    """
+    token = _until.set(min(_until.get(), (time.thread_time() + seconds, seconds)))
+    try:
+        yield
+    finally:
+        _until.reset(token)
+
+
+def on_time() -> None:
+    """Raises TooLong where the time of `within` is over."""
+    until, seconds = _until.get()
+    if time.thread_time() > until:
+        raise TooLong(f"exact arithmetic was given up after {seconds:g} s: these are too many digits over many states")
 
 
 def rational(value: Any) -> Fraction:
@@ -70,6 +100,9 @@ class ReadOnly:
             if isinstance(value, np.ndarray):
                 value.setflags(write=False)
         self.__dict__.update(state)
+
+
+_ROWS, _POINTS = 32, 1024  # of a response at once: what stays in the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,21 +200,27 @@ class Lti(ReadOnly):
             A, B, C, D = (getattr(self, name)[..., None, :, :] for name in "ABCD")
             return C @ np.linalg.solve(z[..., None, None] * one - A, B + 0j) + D
         points = z.ravel()
-        S, U = self._schur
-        rhs = U.conj().T @ self.B
-        X = np.empty((self.order, self.inputs * points.size), dtype=np.complex128)
-        for i in reversed(range(self.order)):
-            later = (S[i, i + 1 :] @ X[i + 1 :]).reshape(self.inputs, points.size)
-            X[i] = ((rhs[i][:, None] + later) / (points - S[i, i])).ravel()
-        G = (self.C @ U @ X).reshape(self.outputs, self.inputs, points.size) + self.D[:, :, None]
+        parts = [self._resolved(points[i : i + _POINTS]) for i in range(0, max(points.size, 1), _POINTS)]
+        G = np.concatenate(parts, axis=2) + self.D[:, :, None]
         return np.moveaxis(G, -1, 0).reshape(*z.shape, self.outputs, self.inputs)
+
+    def _resolved(self, points: Complex) -> Complex:
+        """C (z I - A)^-1 B, shape (p, m, points): row by row from the last one up, _ROWS of them into those above."""
+        S, U = self._schur
+        at, X = np.tile(points, self.inputs), np.repeat(U.conj().T @ self.B, points.size, axis=1)
+        for end in range(self.order, 0, -_ROWS):
+            first = max(end - _ROWS, 0)
+            for i in reversed(range(first, end)):
+                X[i] = (X[i] + S[i, i + 1 : end] @ X[i + 1 : end]) / (at - S[i, i])
+            X[:first] += S[:first, first:end] @ X[first:end]
+        return (self.C @ U @ X).reshape(self.outputs, self.inputs, points.size)
 
     @cached_property
     def _schur(self) -> tuple[Complex, Complex]:
         """S, U with A = U S U* and S upper triangular: once per block, however often it is evaluated."""
         if not self.order:
             return np.zeros((0, 0), dtype=np.complex128), np.zeros((0, 0), dtype=np.complex128)
-        S, U, *_ = schur(self.A, output="complex")
+        S, U, *_ = scipy.linalg.schur(self.A, output="complex")
         return S, U
 
     def dc(self) -> Array:
@@ -486,6 +525,7 @@ def _solve_exactly(M: Any, right: Any) -> Any:
     columns: list[set[int]] = [{i for i in range(n) if j in rows[i]} for j in range(n)]
     active, order = set(range(n)), []
     while active:
+        on_time()
         i = min(active, key=lambda r: len(rows[r]))
         if not rows[i]:
             raise SingularLoop(f"a {n} x {n} matrix is singular: a pole at z = 1 or an algebraic loop without solution")
@@ -501,6 +541,7 @@ def _solve_exactly(M: Any, right: Any) -> Any:
         columns[j].clear()
     solution: list[dict[int, Fraction]] = [{} for _ in range(n)]
     for i, j in reversed(order):
+        on_time()
         total = values[i]
         for c, v in rows[i].items():
             if c != j:

@@ -409,18 +409,10 @@ class Limiter(ReadOnly):
         m, w, F, step, whole = self.channels, len(self.walls), self.open, self._step, self._whole
         linear, kick, sent = np.block([[F.C, F.D], [F.A, F.B]]).dot, self.kick, self.sent_rows
         limit, solve = self.limit[:, None], self.problem.solve
-        finite = [(i, most) for i, most in zip(sent.tolist(), self.limit.tolist(), strict=True) if most < np.inf]
         if not w:
 
             def tick(before: Array, after: Array) -> None:
                 linear(before, after)
-                if after.shape[1] == 1:  # a single simulation spends its time in calls: look without numpy
-                    item = after.item
-                    for place, most in finite:
-                        if not -most <= item(place) <= most:
-                            break
-                    else:
-                        return
                 free = after.take(sent, axis=0)
                 touched = np.abs(free) > limit
                 if not touched.any():
@@ -573,11 +565,14 @@ class Process(ReadOnly):
         """The linear force maps that the process switches between, by the walls that touch: F alone without walls."""
         return self.contact.frozen() if self.contact else {(): self.F}
 
+    @property
+    def linear(self) -> Callable[[Array, Array], object]:
+        """Writes [f; z+] of a tick while no wall touches and no force is limited."""
+        return np.block([[self.F.C, self.F.D], [self.F.A, self.F.B]]).dot
+
     def transition(self) -> Callable[[Array, Array], object]:
         """Writes [f; z+] of a tick, (m + order, nsim), given its [z; x], (order + m, nsim)."""
-        if self.contact:
-            return self.contact.transition()
-        return np.block([[self.F.C, self.F.D], [self.F.A, self.F.B]]).dot
+        return self.contact.transition() if self.contact else self.linear
 
 
 class StepBuffer:
@@ -595,24 +590,17 @@ class StepBuffer:
             raise ValueError(f"plant_states is {plant_states}, but the first {m} entries must be the positions")
         self.ticks = ticks
         self.process = process
-        width = nz + plant_states + outside + m
+        self._width = width = nz + plant_states + outside + m
         self._memory = np.zeros(((ticks + 1) * width, nsim))
-        rows = self._memory.reshape(ticks + 1, width, nsim)
         #: (ticks + 1, entries, nsim): the last row holds only what the last tick left behind
+        self.rows = rows = self._memory.reshape(ticks + 1, width, nsim)
         self.z, self.s, self.w, self.f = np.split(rows, np.cumsum([nz, plant_states, outside]), axis=1)
         self.x = self.s[:, :m]
-
         # views are made once: making one costs as much as a small product
-        def slabs(first: int, size: int) -> list[Array]:
-            starts = range(first, first + ticks * width, width)
-            return [self._memory[start : start + size] for start in starts]
-
-        self.plant_state = [*slabs(nz, plant_states), self._memory[ticks * width + nz :][:plant_states]]
-        self.plant_input = slabs(nz + plant_states, outside + m)
-        self.force = slabs(width - m, m)
-        self.plant_row = slabs(nz, plant_states + outside + m)
-        self._input = slabs(0, nz + m)
-        self._output = slabs(width - m, m + nz)
+        self.plant_state, self.plant_input = list(self.s), list(rows[:, nz + plant_states :])
+        self.force, self.plant_row, self._input = list(self.f), list(rows[:, nz:]), list(rows[:, : nz + m])
+        shifted = self._memory[width - m :][: ticks * width].reshape(ticks, width, nsim)
+        self._output = list(shifted[:, : m + nz])
         self._transition = process.transition()
         self._quantised = bool((process.encoder_step > 0).any())
         self._line = None if process.delays is None else HeldLine(process.delays, nsim)
@@ -635,7 +623,23 @@ class StepBuffer:
         if self._quantised or self._line is not None or self.net is not None:
             return self.tick
         transition, seen, after = self._transition, self._input, self._output
-        return lambda k: transition(seen[k], after[k])
+        limiter = self.process.limiter
+        if limiter is None or limiter.walls or self._memory.shape[1] > 1:
+            return lambda k: transition(seen[k], after[k])
+        # a single simulation spends its time in calls: its forces are looked at without numpy
+        linear, number, width = self.process.linear, self._memory[:, 0].data, self._width
+        first = width - self.process.channels
+        sent = [(first + i, most) for i, most in zip(limiter.sent_rows.tolist(), limiter.limit.tolist(), strict=True)]
+
+        def tick(k: int) -> None:
+            linear(seen[k], after[k])
+            row = width * k
+            for place, most in sent:
+                if not -most <= number[row + place] <= most:
+                    transition(seen[k], after[k])
+                    return
+
+        return tick
 
     def seen(self, k: int) -> Array:
         """[z; x] of row k with x as the encoders give it, (order + m, nsim); the plant's own positions stay."""

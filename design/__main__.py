@@ -1,4 +1,4 @@
-"""python -m design: design a coupling, prove it, store it."""
+"""python -m design: design a coupling, prove it, store it; the command is cli/design.py."""
 
 if __name__ == "__main__":
     from cli.main import door

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypedDict, Unpack
 
 from controller.coupling import Coupling
 from controller.loop import Loop
-from design.certificate import assess, check_set, switching_requirement
+from design.certificate import assess, check_ranges, switching_requirement
 from design.designs import KINDS, NO_LONGER, OPTIONS, RETIRED, design_by_kind, usual_condition
 from design.guarantees import guarantee_of
 from design.result import Condition, Design, Requirement, bare, known, of_kind, one_of
@@ -49,7 +49,7 @@ def design_coupling(
     `kind` is "spring-damper", "moving-average" (the stiffest for any environment), "ccl" or "optimal"; `condition` is
     "any-environment" or "this-environment", None for what the commands design: a spring-damper for this environment,
     also while forces are limited; for any environment before walls, ranges or delays that vary. `options` are those of
-    the kind, see Options; switching is not taken from loop.jitter.
+    the kind, see Options; switching is not taken from loop.varying_delay.
 
     Returns a Design: `coupling` (for a spring-damper with K (m,) [N/m] and B (m,) [N s/m]), `requirement` (the damping
     that it needs, from a sweep of the coupling alone), `figure` and `objective` (what was minimised, and its value).
@@ -82,7 +82,7 @@ def instead(loop: Loop, kind: str, condition: str | None = None) -> str:
     """
     failed, found = (kind, condition or usual_condition(loop, kind)), []
     for other, target, options in _QUICK:
-        if (other, target) == failed or loop.jitter:
+        if (other, target) == failed or loop.varying_delay:
             continue
         try:
             made = design_coupling(loop, other, target, **options)
@@ -101,7 +101,7 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[st
     With ranges around the loop's environment this-environment is about the environment and every vertex: the figure is
     that of the one that asks the most, proved only if all are. Between the vertices nothing is proved, but searched: a
     violation found there (design.environments) is the figure then, and not certified. With a range of delays,
-    loop.jitter, there is a third, "jitter-proof": what any switching within the range asks.
+    loop.varying_delay, there is a third, "switching": what any switching within the range asks.
 
     Each Requirement has `required` and `available` (m,) [N s/m], `certified` (required < available), the frequency [Hz]
     where it binds, and `proof`: "rational" where exact arithmetic confirms it, "sampled" where a refined sweep says so.
@@ -114,18 +114,18 @@ def certify(loop: Loop, coupling: Coupling | Design) -> dict[str, Requirement[st
     phi = coupling.phi if isinstance(coupling, Design) else None
     alone = _fitting(loop, coupling)
     requirements: dict[str, Requirement[str]] = dict(assess(loop, alone, phi))
-    if whole := check_set(loop, alone, samples=0):
+    if whole := check_ranges(loop, alone, samples=0):
         _, worst = whole.worst if whole.proved else whole.worst_found
         requirements["this-environment"] = replace(worst, proof="rational" if whole.proved else "sampled")
-    if loop.jitter:
-        requirements["jitter-proof"] = switching_requirement(loop, alone).requirement
+    if loop.varying_delay:
+        requirements["switching"] = switching_requirement(loop, alone).requirement
     return requirements
 
 
 def guarantee(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str | None:
     """For which environments `certify(loop, coupling)` says that a coupling is safe, in words; None where for none.
 
-    "any passive environment", "a set" (the loop's environment and its box), "this environment", or each contact state
+    "any passive environment", "these ranges" (of the loop's environment), "this environment", or each contact state
     of an environment with walls. Raises TypeError for an argument of another type, ValueError for other requirements.
     """
     of_kind("loop", loop, Loop, _LOOP)
@@ -133,8 +133,8 @@ def guarantee(loop: Loop, requirements: Mapping[str, Requirement[str]]) -> str |
     if "this-environment" not in requirements:
         raise ValueError(f"requirements has {', '.join(requirements) or 'nothing'}, expected what certify returned")
     held = requirements["this-environment"]
-    whole_set = loop.box is not None and held.certified and held.proof == "rational"
-    return guarantee_of(requirements, loop, whole_set)
+    whole_ranges = loop.ranges is not None and held.certified and held.proof == "rational"
+    return guarantee_of(requirements, loop, whole_ranges)
 
 
 def transparency_of(loop: Loop, coupling: Coupling | Design, band_hz: tuple[float, float] = BAND_HZ) -> Transparency:

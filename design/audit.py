@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from typing import Any, cast, get_args
@@ -13,19 +13,14 @@ import msgspec
 import numpy as np
 
 from controller.coupling import (
-    Compliance,
     Coupling,
-    ForceFilter,
-    InternalModel,
-    MovingAverage,
-    NoCoupling,
     SpringDamper,
 )
 from controller.environment import RIGID_WALL
 from controller.loop import DelayRange, Loop
-from design.certificate import SetCheck, any_environment_of, switching_requirement, this_environment_of
+from design.certificate import RangesCheck, any_environment_of, switching_requirement, this_environment_of
 from design.conditions import any_environment
-from design.coverage import set_part, switching_part
+from design.coverage import ranges_part, switching_part
 from design.guarantees import ANY, CAVEATS, LATE, guarantee_of
 from design.result import Condition, Requirement, certificate_part, listed, refusal
 
@@ -56,10 +51,8 @@ def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any
 
 def _at_period(loop: Loop, coupling: Coupling, condition: Condition, T: float) -> Requirement:
     """The same with the gains, or coefficients, and the delays in samples at another T [s]."""
-    if isinstance(coupling, Compliance):
-        coupling = Compliance(replace(coupling.V, T=T))
     longest = loop.T_max and loop.T_max * (T / loop.T)  # periods vary in proportion
-    return _varied(loop, coupling, condition, T=T, T_max=longest)
+    return _varied(loop, coupling.at_period(T), condition, T=T, T_max=longest)
 
 
 def check_loop(loop: Loop) -> None:
@@ -274,26 +267,16 @@ def _smaller(vary: Callable[[float], Requirement], describe: Callable[[float], s
     return _Remedy(describe(best), needs(best))
 
 
-_KINDS = {
-    NoCoupling: "none",
-    SpringDamper: "spring-damper",
-    MovingAverage: "moving-average",
-    Compliance: "compliance",
-    InternalModel: "internal-model",
-    ForceFilter: "force-filter",
-}
-
-
 def report(
     loop: Loop,
     coupling: Coupling,
     switching: DelayRange | None = None,
-    whole: SetCheck | None = None,
+    whole: RangesCheck | None = None,
 ) -> dict[str, Any]:
     """Both conditions with what surrounds them; SI units, null with a "reason" where a figure does not exist.
 
     They are about the loop's own environment and constant delays. With a range of delays also the damping that any
-    switching within it asks; `whole` is the same coupling over the box around the environment, if there is one.
+    switching within it asks; `whole` is the same coupling over the ranges around the environment, if there is one.
     Raises ValueError naming the field of the loop that is wrong.
     """
     loop = loop.at(loop.environment).switching(None)
@@ -302,12 +285,12 @@ def report(
     here = requirements["this-environment"].certified
     proved = bool(whole and whole.proved)
     guaranteed = guarantee_of(requirements, loop, proved)
-    gains = coupling if isinstance(coupling, SpringDamper) else None
+    figures = coupling.figures(loop.T)
     return {
         "coupling": {
-            "kind": _KINDS[type(coupling)],
-            "K": gains.K.tolist() if gains else None,
-            "B": gains.B.tolist() if gains else None,
+            "kind": coupling.kind,
+            "K": figures.get("K"),
+            "B": figures.get("B"),
         },
         "loop": {
             "T_s": loop.T,
@@ -319,8 +302,8 @@ def report(
             "rigid": loop.environment is RIGID_WALL,
         },
         **{name: _condition_part(loop, coupling, needs) for name, needs in requirements.items()},
-        "jitter-proof": _switching_part(loop, coupling, switching) if switching else None,
-        "set": whole and set_part(whole),
+        "switching": _switching_part(loop, coupling, switching) if switching else None,
+        "ranges": whole and ranges_part(whole),
         "certified": here and (whole is None or proved or guaranteed == ANY),
         "promise": guaranteed,
         "helps": _helps(loop, coupling, requirements["any-environment" if here else "this-environment"]),

@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, qr, solve_triangular
+import scipy  # its parts load when they are used
 
 from controller.lti import Array, Complex
 
@@ -46,7 +46,7 @@ class Block:
 
     def changed(self, U: Array) -> Block:
         """The same of y where x = U^-1 y."""
-        slope = solve_triangular(U, self.slope.reshape(-1, len(U)).T, trans=1).T
+        slope = scipy.linalg.solve_triangular(U, self.slope.reshape(-1, len(U)).T, trans=1).T
         return Block(self.constant, np.ascontiguousarray(slope).reshape(self.slope.shape))
 
 
@@ -82,10 +82,10 @@ class Program:
         scale = np.linalg.norm(np.vstack([self.A, *rows]), axis=0)
         scale = np.where(scale > 0, scale, 1.0)
         stacked = np.vstack([self.A, *rows, _RIDGE * np.diag(scale)])
-        U = np.asarray(qr(stacked, mode="r")[0])[: x.size]
-        A = solve_triangular(U, self.A.T, trans=1).T
+        U = np.asarray(scipy.linalg.qr(stacked, mode="r")[0])[: x.size]
+        A = scipy.linalg.solve_triangular(U, self.A.T, trans=1).T
         blocks = tuple(block.changed(U) for block in self.blocks)
-        return Program(A, self.b, solve_triangular(U, self.c, trans=1), blocks), U
+        return Program(A, self.b, scipy.linalg.solve_triangular(U, self.c, trans=1), blocks), U
 
 
 def centre(program: Program, x: Array, t: float) -> Array:
@@ -122,8 +122,10 @@ def _solved(hessian: Array, right: Array) -> Array:
     ridge = 0.0
     while True:
         try:
-            return scale * cho_solve(cho_factor(unit + ridge * np.eye(len(unit))), scale * right)
-        except LinAlgError:
+            return scale * scipy.linalg.cho_solve(
+                scipy.linalg.cho_factor(unit + ridge * np.eye(len(unit))), scale * right
+            )
+        except np.linalg.LinAlgError:
             ridge = max(10 * ridge, 1e-14)
 
 

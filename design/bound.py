@@ -20,9 +20,8 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.interpolate import BSpline
-from scipy.linalg import null_space, solve_triangular
 
 from controller.delay import delay
 from controller.loop import Loop
@@ -98,7 +97,7 @@ class _Dual:
         def hats(w: Array) -> Array:
             """(inner, k): B-splines in log w."""
             x = np.clip(np.log(w), spline[0], spline[-1])
-            return BSpline.design_matrix(x, spline, _DEGREE).toarray()[:, 1:-1].T
+            return scipy.interpolate.BSpline.design_matrix(x, spline, _DEGREE).toarray()[:, 1:-1].T
 
         # objective, by Gauss's rule between the points of a grid that has the knots
         grid = np.union1d(knots, frequencies(E, low=low, high=high, points=200))
@@ -218,7 +217,7 @@ class _Dual:
                 if program.degree / t <= (_GAP if sweep else 5 * _GAP) * left:
                     break
                 t *= _STEEPER
-            x = solve_triangular(U, y)
+            x = scipy.linalg.solve_triangular(U, y)
             lacking = self.lacking(x)
             charge = self.m * max(0.0, -float(lacking.min()))
             value = 1 - rest - program.value(y) - charge
@@ -255,7 +254,7 @@ def _forbidden(loop: Loop, E: Lti) -> tuple[tuple[int, Array], ...]:
     for step in range(span):
         for k in range(step, span):
             reach[step * m : (step + 1) * m, k * m : (k + 1) * m] = impulse[k - step]
-    for v in null_space(reach, rcond=1e-9).T:
+    for v in scipy.linalg.null_space(reach, rcond=1e-9).T:
         for i, theta in enumerate(loop.theta):
             weights = np.zeros((theta + span + 1, m))
             for k, row in enumerate(v.reshape(span, m)):  # F_k = 2 (s_{k+1} - s_k)/T, and s_k is zero up to theta

@@ -1,13 +1,14 @@
-"""What conditions ask of a coupling in its loop, proved over the rationals, and proved again from a file."""
+"""A coupling judged (`assess`), proved over the rationals (`prove`), and its stored proof checked again (`verify`)."""
 
 from __future__ import annotations
 
 import math
 import platform
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -15,13 +16,11 @@ import scipy
 
 from controller.coupling import (
     Coupling,
-    MovingAverage,
-    SpringDamper,
 )
 from controller.delay import delay
 from controller.environment import Member, inside
 from controller.loop import Loop
-from controller.lti import Array, Lti, SingularLoop, rational
+from controller.lti import Array, Lti, SingularLoop, TooLong, rational, within
 from design.conditions import (
     any_environment,
     any_environment_delayed,
@@ -32,15 +31,15 @@ from design.conditions import (
     this_environment,
     this_environment_demand,
 )
-from design.environments import Progress, Searched, in_each, search_box, worst
+from design.environments import Progress, Searched, in_each, search_ranges, worst
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
 from design.frequency import frequencies, on_circle, rounding
-from design.guarantees import LATE, making_covered, no_compliance, switching_guarantee
+from design.guarantees import LATE, no_compliance, switching_guarantee
 from design.multipliers import (
     BETA,
     WALL_MULTIPLIER,
-    JitterProof,
     Lags,
+    SwitchingSweep,
     limiter_demand,
     limiter_lag,
     limiter_refusal,
@@ -51,7 +50,7 @@ from design.multipliers import (
     walls_of,
 )
 from design.result import Condition, NotProved, Requirement, refusal
-from design.stored import Certificate, LimiterCertificate, Stored, SwitchingProof, digest, sealed
+from design.stored import Certificate, Guarantee, LimiterCertificate, Stored, SwitchingProof, digest, sealed
 
 # ----------------------------------------------------------------------------------------------------
 # An exact proof that no switching of the delays within a loop's range is dangerous: made, stored, proved again.
@@ -66,13 +65,25 @@ from design.stored import Certificate, LimiterCertificate, Stored, SwitchingProo
 _CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
 
 
+_LONGEST = 60.0  # [s] of exact arithmetic for one certificate: what fits into the limits on states takes less
+
+
+@contextmanager
+def _in_time() -> Iterator[None]:
+    """Raises NotProved where exact arithmetic takes too long, however few states and digits there seem to be."""
+    try:
+        with within(_LONGEST):
+            yield
+    except TooLong as error:
+        raise NotProved(str(error)) from None
+
+
 def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
     """An exact proof of any switching within the loop's range, or why there is none."""
     found = swept(loop, coupling)
     requirement = found.requirement
     if not requirement.certified:
-        needed, have = (", ".join(f"{d:.6g}" for d in side) for side in (requirement.required, requirement.available))
-        return requirement.reason or f"needs {needed} N s/m of damping, has {have}"
+        return requirement.shortfall
     P = storage(loop, coupling, found.alpha)
     if isinstance(P, str):
         return P
@@ -82,19 +93,19 @@ def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
 def storage(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Matrix | str:
     """The matrix that proves the condition for these alpha [N/m] at the loop's damping, or why there is none."""
     try:
-        condition = condition_block(loop, coupling, alpha)
+        with within(_LONGEST):
+            P, reason = find_storage(condition_block(loop, coupling, alpha))
     except (SingularLoop, ValueError) as error:
         return str(error)
-    P, reason = find_storage(condition)
     return str(reason) if P is None else P
 
 
 def refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof | msgspec.UnsetType) -> str | None:
     """Why what is on file does not prove that the delays may switch within the loop's range, or None if it does."""
-    if loop.jitter is None:
+    if loop.varying_delay is None:
         return None if proof is msgspec.UNSET else "a proof for switching delays, but the loop's delays are constant"
     reason = "no proof is on file" if proof is msgspec.UNSET else _refuted(loop, coupling, proof)
-    return reason and f"{switching_guarantee(loop.jitter)}: {reason}"
+    return reason and f"{switching_guarantee(loop.varying_delay)}: {reason}"
 
 
 def _refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof) -> str | None:
@@ -102,13 +113,18 @@ def _refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof) -> str | Non
         condition = condition_block(loop, coupling, proof.alpha)
     except (SingularLoop, ValueError) as error:
         return str(error)
-    found = swept(loop, coupling, proof.alpha)
-    required = found.requirement.required
-    if len(proof.required) != len(required) or not np.allclose(proof.required, required, rtol=_CLAIM_TOLERANCE):
-        return f"required is {list(proof.required)}, the sweep finds {list(required)}"
-    if not np.isclose(proof.margin, _margin(found.requirement), rtol=_CLAIM_TOLERANCE):
-        return f"margin is {proof.margin:.9g}, the sweep finds {_margin(found.requirement):.9g}"
-    return refuted_rows("P", condition, proof.P)
+    other = _other_figures(proof, swept(loop, coupling, proof.alpha).requirement)
+    return other or refuted_rows("P", condition, proof.P)
+
+
+def _other_figures(claim: Certificate | SwitchingProof | LimiterCertificate, found: Requirement) -> str | None:
+    """Where the figures on file are not those of the sweep, or None."""
+    required = found.required
+    if len(claim.required) != len(required) or not np.allclose(claim.required, required, rtol=_CLAIM_TOLERANCE):
+        return f"required is {list(claim.required)}, the sweep finds {list(required)}"
+    if not np.isclose(claim.margin, _margin(found), rtol=_CLAIM_TOLERANCE):
+        return f"margin is {claim.margin:.9g}, the sweep finds {_margin(found):.9g}"
+    return None
 
 
 def condition_block(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> Lti:
@@ -141,22 +157,21 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
         return None
     if certificate.limiter is not msgspec.UNSET:
         return certificate.limiter.rho
-    covered = certificate.condition == "any-environment" and not any(loop.psi) and loop.jitter is None
+    covered = certificate.condition == "any-environment" and not any(loop.psi) and loop.varying_delay is None
     return (0.0,) * loop.channels if covered else None
 
 
+@_in_time()
 def prove_limiter(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | None = None) -> LimiterCertificate:
     """An exact proof with the multiplier `c` or the best one. Raises NotProved with the reason."""
     found = limiter_requirement(loop, coupling, beta, c)
     requirement = found.requirement
     if not requirement.certified:
-        needed, have = (", ".join(f"{d:.6g}" for d in side) for side in (requirement.required, requirement.available))
-        reason = requirement.reason or f"limiter: needs {needed} N s/m of damping, has {have}"
-        raise NotProved(reason, requirement)
+        raise NotProved(requirement.reason or f"limiter: {requirement.shortfall}", requirement)
     P, refused = find_storage(_limiter_block(loop, coupling, found.rho, found.c))
     if P is None:
         raise NotProved(f"limiter: {refused}; the sweep asks {requirement.ratio:.9f} of the damping", requirement)
-    return LimiterCertificate(beta, found.rho, found.c, requirement.required, _margin(found.requirement), rows_of(P))
+    return LimiterCertificate(beta, found.rho, found.c, requirement.required, _margin(requirement), rows_of(P))
 
 
 def _limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: Lags) -> Lti:
@@ -171,31 +186,24 @@ def _limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: Lags
     return demand.gain + demand.free
 
 
-def _refuted_limiter(loop: Loop, coupling: Coupling, certificate: Certificate) -> str | None:
-    """Why what is on file does not prove the limited loop, or None if it does or claims nothing."""
-    proof = certificate.limiter
-    if proof is msgspec.UNSET:
-        return None
-    if certificate.condition != "this-environment":
-        return "limiter: any-environment needs no proof of its own, and one is on file"
+def check_limiter(loop: Loop, coupling: Coupling, proof: LimiterCertificate) -> Requirement:
+    """What the limiter on file asks of the devices, proved again. Raises NotProved where the file does not prove it."""
     if reason := limiter_refusal(loop):
-        return reason
+        raise NotProved(reason)
     if any(not (0 <= v < math.inf) for v in (*proof.rho, *(v for row in proof.c for v in row))):
-        return "limiter: rho and c must be numbers >= 0"
+        raise NotProved("limiter: rho and c must be numbers >= 0")
     if proof.rho != limiter_lag(loop.delta, loop.T, proof.beta) or len(proof.c) != loop.channels:
-        return f"limiter: rho is {list(proof.rho)}, expected beta delta/T with beta = {proof.beta:g}, one row of c each"
-    found = limiter_requirement(loop, coupling, proof.beta, proof.c)
-    required = found.requirement.required
-    if len(proof.required) != len(required) or not np.allclose(proof.required, required, rtol=_CLAIM_TOLERANCE):
-        return f"limiter: required is {list(proof.required)}, the sweep finds {list(required)}"
-    if not np.isclose(proof.margin, _margin(found.requirement), rtol=_CLAIM_TOLERANCE):
-        return f"limiter: margin is {proof.margin:.9g}, the sweep finds {_margin(found.requirement):.9g}"
-    reason = refuted_rows("P", _limiter_block(loop, coupling, proof.rho, proof.c), proof.P)
-    return reason and f"limiter: {reason}"
+        expected = f"expected beta delta/T with beta = {proof.beta:g}, one row of c each"
+        raise NotProved(f"limiter: rho is {list(proof.rho)}, {expected}")
+    found = limiter_requirement(loop, coupling, proof.beta, proof.c).requirement
+    reason = _other_figures(proof, found)
+    if reason := reason or refuted_rows("P", _limiter_block(loop, coupling, proof.rho, proof.c), proof.P):
+        raise NotProved(f"limiter: {reason}")
+    return replace(found, proof="rational")
 
 
-def switching_requirement(loop: Loop, coupling: Coupling) -> JitterProof:
-    """The damping that switching within loop.jitter asks; `proof` is "rational" where exact arithmetic confirms it."""
+def switching_requirement(loop: Loop, coupling: Coupling) -> SwitchingSweep:
+    """The damping that switching in loop.varying_delay asks; `proof` is "rational" where it is proved exactly."""
     found = swept(loop, coupling)
     if not found.requirement.certified or not isinstance(storage(loop, coupling, found.alpha), Matrix):
         return found
@@ -210,7 +218,7 @@ def switching_requirement(loop: Loop, coupling: Coupling) -> JitterProof:
 # is strictly positive real (design.exact). On |z| = 1 the Hermitian part of F(1)/(z - 1) is -F(1)/2, so
 # He[F/(z-1)] > -Delta_D/T there; the same certificate shows that F is stable.
 #
-# this-environment, forces that latch late, or walls without dampers: the blocks of latency_demand and walls_demand, the
+# this-environment, forces that latch late, or walls: the blocks of latency_demand and walls_demand, the
 # latter with the multipliers g of its walls, stored too.
 #
 # any-environment, psi = 0: with H = V - Theta-hat (11), (12), V-hat = (1 - 1/z) H/T, H(1) is exactly symmetric, and
@@ -221,7 +229,7 @@ def switching_requirement(loop: Loop, coupling: Coupling) -> JitterProof:
 # passive because every parameter of the network is non-negative (the Network type refuses others), so
 # Phi = 0 satisfies Lemma 4, whatever the environment.
 #
-# With a box around the environment the same is proved for the environment (P) and for every vertex (P1, P2, ..);
+# With ranges around the environment the same is proved for the environment (P) and for every vertex (P1, P2, ..);
 # nothing is proved of the environments in between, or of one that changes.
 #
 # A loop whose delays may switch within a range carries a second proof, of any switching.
@@ -237,6 +245,7 @@ class Verdict:
     reason: str | None = None
 
 
+@_in_time()
 def prove(
     loop: Loop,
     coupling: Coupling,
@@ -257,11 +266,8 @@ def prove(
     multiplier = None if phi is None else [rational(float(p)) for p in phi]
     requirement = swept or required_damping(loop, coupling, condition, multiplier)
     if not requirement.certified:
-        needed = ", ".join(f"{d:.6g}" for d in requirement.required)
-        have = ", ".join(f"{d:.6g}" for d in requirement.available)
-        reason = requirement.reason or f"needs {needed} N s/m of damping, has {have}"
-        place = f"P{worst(in_each(loop, coupling, loop.members()))}" if loop.box else "P"
-        raise NotProved(f"{_place_certificate(loop, condition, place)}{reason}", requirement)
+        place = f"P{worst(in_each(loop, coupling, loop.members()))}" if loop.ranges else "P"
+        raise NotProved(f"{_place_certificate(loop, condition, place)}{requirement.shortfall}", requirement)
     if reason := _another_system(loop, coupling):
         raise NotProved(reason, requirement)
     proof: dict[str, Matrix] = {}
@@ -279,7 +285,7 @@ def prove(
             condition=condition,
             required=requirement.required,
             available=loop.delta,
-            margin=1 / max(requirement.ratio, 1e-12),
+            margin=_margin(requirement),
             guarantee=_guarantee(loop, condition),
             proof="rational",
             matrices={name: rows_of(M) for name, M in proof.items()},
@@ -293,7 +299,7 @@ def prove(
 
 #: More delays, states or digits than these are not looked at: a proof would take minutes.
 _MOST_BITS = 400  # of the denominator of a coefficient: a decimal of 120 places
-_MOST_COST = 8  # environments of a set, each as many as LARGEST states are
+_MOST_COST = 8  # environments of ranges, each as many as LARGEST states are
 
 
 def _require_limits(loop: Loop, coupling: Coupling, condition: Condition) -> None:
@@ -350,11 +356,11 @@ def _another_system(loop: Loop, coupling: Coupling) -> str | None:
 
 def _switching(loop: Loop, coupling: Coupling, requirement: Requirement) -> SwitchingProof | msgspec.UnsetType:
     """The proof that the delays may switch, of a loop with a range of them. Raises NotProved."""
-    if loop.jitter is None:
+    if loop.varying_delay is None:
         return msgspec.UNSET
     proof = prove_switching(loop, coupling)
     if isinstance(proof, str):
-        raise NotProved(f"{switching_guarantee(loop.jitter)}: {proof}", requirement)
+        raise NotProved(f"{switching_guarantee(loop.varying_delay)}: {proof}", requirement)
     return proof
 
 
@@ -369,7 +375,8 @@ def verify(stored: Stored) -> Verdict:
         return Verdict(False, "seal differs: the certificate was changed after it was made")
     coupling = stored.built()
     try:
-        reason = _refuted_claims(loop, coupling, certificate) or _refuted_proof(loop, coupling, certificate)
+        with _in_time():
+            reason = _refuted_claims(loop, coupling, certificate) or _refuted_proof(loop, coupling, certificate)
     except NotProved as refusal:
         reason = str(refusal)
     return Verdict(reason is None, reason)
@@ -410,8 +417,8 @@ def _walls_block(loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Lti:
     try:
         G = loop.walled(coupling, exact=True)
         _require_size(G.order)
-        stiffness = [wall.stiffness for wall in loop.environment.walls]
-        demand = walls_demand(G, loop.delta, stiffness, g, None, loop.T_max)
+        slopes = [wall.slope(G.T) for wall in loop.environment.walls]
+        demand = walls_demand(G, loop.delta, slopes, g, None, loop.T_max)
     except SingularLoop as error:
         raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
     for name, value in demand.static.items():
@@ -421,16 +428,16 @@ def _walls_block(loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Lti:
     return demand.gain + demand.free
 
 
-def _guarantee(loop: Loop, condition: Condition) -> Literal["any passive environment", "a set", "this environment"]:
+def _guarantee(loop: Loop, condition: Condition) -> Guarantee:
     if condition == "any-environment":
         return "this environment" if any(loop.psi) else "any passive environment"
-    # proved at every vertex; whether it is kept between them is searched by check_set and design.check
-    return "a set" if loop.box else "this environment"
+    # proved at every vertex; whether it is kept between them is searched by check_ranges and design.check
+    return "these ranges" if loop.ranges else "this environment"
 
 
 def _place_certificate(loop: Loop, condition: Condition, matrix: str) -> str:
-    """Which member of a set the matrix P, P1, P2, .. is about, as the beginning of a message."""
-    if loop.box is None or condition == "any-environment":
+    """Which member of the ranges the matrix P, P1, P2, .. is about, as the beginning of a message."""
+    if loop.ranges is None or condition == "any-environment":
         return ""
     return f"{loop.members()[int(matrix[1:] or 0)].name}: "
 
@@ -501,12 +508,8 @@ def _refuted_claims(loop: Loop, coupling: Coupling, certificate: Certificate) ->
         return f"available is {list(certificate.available)}, the loop has delta = {list(loop.delta)}"
     _require_limits(loop, coupling, certificate.condition)
     requirement = required_damping(loop, coupling, certificate.condition, _multiplier(loop, certificate))
-    if len(certificate.required) != len(loop.delta) or not np.allclose(
-        certificate.required, requirement.required, rtol=_CLAIM_TOLERANCE
-    ):
-        return f"required is {list(certificate.required)}, the sweep finds {list(requirement.required)}"
-    if not np.isclose(certificate.margin, 1 / max(requirement.ratio, 1e-12), rtol=_CLAIM_TOLERANCE):
-        return f"margin is {certificate.margin:.9g}, the sweep finds {1 / max(requirement.ratio, 1e-12):.9g}"
+    if reason := _other_figures(certificate, requirement):
+        return reason
     if not requirement.certified:
         return f"the sweep asks {requirement.ratio:.6g} times the available damping, whatever the matrices prove"
     return _another_system(loop, coupling)
@@ -525,7 +528,11 @@ def _refuted_proof(loop: Loop, coupling: Coupling, certificate: Certificate) -> 
     for name, real in blocks.items():
         if reason := refuted_rows(name, real, certificate.matrices[name]):
             return f"{_place_certificate(loop, certificate.condition, name)}{reason}"
-    return refuted(loop, coupling, certificate.switching) or _refuted_limiter(loop, coupling, certificate)
+    if certificate.limiter is not msgspec.UNSET:
+        if certificate.condition != "this-environment":
+            return "limiter: any-environment needs no proof of its own, and one is on file"
+        check_limiter(loop, coupling, certificate.limiter)
+    return refuted(loop, coupling, certificate.switching)
 
 
 def _multiplier_name(loop: Loop, condition: Condition) -> str:
@@ -553,9 +560,9 @@ def assess(
 ) -> dict[str, Requirement]:
     """Required damping by each condition; `phi` is the multiplier that the coupling was designed with, if any.
 
-    this-environment is about the nominal environment alone (ranges.check asks for the rest of its ranges) and the
-    constant theta (sim.switching.certified_part asks for the rest of its range); where there are walls it is about the
-    frozen contact state that asks for most. What `known`, a certificate just made, proves is not proved again.
+    this-environment is about the nominal environment alone (design.coverage.ranges_part asks for the rest of its
+    ranges) and the constant theta (sim.switching.certified_part asks for the rest of its range). What `known`, a
+    certificate just made, proves is not proved again.
     """
     loop = loop.at(loop.environment).switching(None)
     here = this_environment_of(loop, coupling)
@@ -567,15 +574,13 @@ def assess(
 
 
 def this_environment_of(loop: Loop, coupling: Coupling) -> Requirement:
-    """What this-environment asks; with walls that have dampers, in their most demanding frozen contact state."""
-    if making_covered(loop):
+    """What this-environment asks of the environment itself, its walls making and breaking contact."""
+    if loop.environment.walls:
         try:
             return walls_of(loop, coupling).requirement
         except NotProved as error:
             return refusal("this-environment", loop.delta, str(error))
-    maps = (state.F(coupling) for state in loop.frozen())
-    requirements = [this_environment(F, loop.delta, loop.T_max, loop.latency) for F in maps]
-    return max(requirements, key=lambda requirement: requirement.ratio)
+    return this_environment(loop.F(coupling), loop.delta, loop.T_max, loop.latency)
 
 
 def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Requirement:
@@ -585,8 +590,8 @@ def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None)
     if loop.environment.walls and any(loop.psi):
         reason = "with delay in the environment its multiplier is of a linear one: no walls"
         return refusal("any-environment", loop.delta, reason)
-    if isinstance(coupling, SpringDamper | MovingAverage) and not any(loop.psi):
-        return any_environment_per_channel(coupling.channels(loop.T), loop.theta, loop.delta, loop.T_max)
+    if (channels := coupling.channels(loop.T)) and not any(loop.psi):
+        return any_environment_per_channel(channels, loop.theta, loop.delta, loop.T_max)
     V = coupling.compliance(loop.T)
     if V is None:
         return refusal("any-environment", loop.delta, no_compliance(coupling))
@@ -614,12 +619,12 @@ def _proved(loop: Loop, coupling: Coupling, requirement: Requirement, phi: Array
     return replace(requirement, proof="rational")
 
 
-SAMPLES = 64  # environments drawn evenly from inside the box, beside what the search looks at
+SAMPLES = 64  # environments drawn evenly from inside the ranges, beside what the search looks at
 
 
 @dataclass(frozen=True, eq=False)
-class SetCheck:
-    """The this-environment condition over a box. `members` and `at_members` are the environment and the vertices."""
+class RangesCheck:
+    """The this-environment condition over ranges. `members` and `at_members` are the environment and the vertices."""
 
     members: tuple[Member, ...]
     at_members: tuple[Requirement, ...]
@@ -628,8 +633,8 @@ class SetCheck:
     searched: Searched
     at_found: Requirement  # at the worst environment that the search has found
     seed: int
-    certificate: Certificate | None  # of the whole set, with the guarantee "a set"
-    reason: str | None  # why the set is not guaranteed
+    certificate: Certificate | None  # of all members, with the guarantee "these ranges"
+    reason: str | None  # why the ranges are not guaranteed
 
     @property
     def proved(self) -> bool:
@@ -651,7 +656,7 @@ class SetCheck:
         return places[i], requirements[i]
 
 
-def check_set(
+def check_ranges(
     loop: Loop,
     coupling: Coupling,
     seed: int = 0,
@@ -659,23 +664,23 @@ def check_set(
     progress: Progress = lambda done, total: None,
     searched: Searched | None = None,
     certificate: Certificate | None = None,
-) -> SetCheck | None:
-    """The coupling over the box of its loop, None where it has none.
+) -> RangesCheck | None:
+    """The coupling over the ranges of its loop, None where it has none.
 
     The search is the same every time; `samples` more points are drawn from inside, from the seed. `searched` and
     `certificate` are those of a design that has made them.
     """
-    if loop.box is None:
+    if loop.ranges is None:
         return None
-    searched = searched or search_box(loop, coupling, progress)
-    members, drawn = loop.members(), inside(loop.network, loop.box, samples, seed)
+    searched = searched or search_ranges(loop, coupling, progress)
+    members, drawn = loop.members(), inside(loop.network, loop.ranges, samples, seed)
     try:
         certificate, reason = certificate or prove(loop, coupling, "this-environment"), None
     except NotProved as error:
         certificate, reason = None, str(error)
     at_members, at_samples = in_each(loop, coupling, members), in_each(loop, coupling, drawn)
     (at_found,) = in_each(loop, coupling, [searched.worst[0].member])
-    check = SetCheck(
+    check = RangesCheck(
         members, tuple(at_members), drawn, tuple(at_samples), searched, at_found, seed, certificate, reason
     )
     if certificate and not check.proved:
@@ -685,6 +690,6 @@ def check_set(
 
 
 def violated_between(place: Member, ratio: float) -> str:
-    """Why a coupling that is proved at every vertex has no guarantee for the set."""
+    """Why a coupling that is proved at every vertex has no guarantee for the ranges."""
     needs = f"{ratio:.4f} of the damping is needed" if np.isfinite(ratio) else "no damping is enough"
     return f"proved at the vertices, but violated between them: {needs} at {place.name}"

@@ -1,4 +1,4 @@
-"""python -m design.check: prove a stored coupling again."""
+"""python -m design.check: prove a stored coupling again (design.certificate.verify); the command is cli/check.py."""
 
 if __name__ == "__main__":
     from cli.main import door

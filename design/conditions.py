@@ -25,7 +25,7 @@ from fractions import Fraction
 from typing import Any, Generic
 
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
+import scipy  # its parts load when they are used
 
 from controller.delay import delay, moving_sum
 from controller.lti import (
@@ -123,7 +123,9 @@ def latency_demand(F: Block, delta: Sequence[Any], latency: Latency, T_max: floa
 def any_environment_demand(
     V: Block, theta: Sequence[int], delta: Sequence[Any], T_max: float | None = None
 ) -> Demand[Block]:
-    """He[(1 - 1/z) V/T] >= diag(|1 - z^-n_i|^2 / (4 s delta_i)), n = theta + 1, divided by |1 - 1/z|^2 and times s.
+    """Theorem 4 without psi.
+
+    He[(1 - 1/z) V/T] >= diag(|1 - z^-n_i|^2 / (4 s delta_i)), n = theta + 1, divided by |1 - 1/z|^2 and times s.
 
     With Theta-hat = diag(T/(2 delta_i) (1 + 1/z + ... + z^-theta_i)) (12) and H = V - Theta-hat/s, which (11) makes
     V-hat of, the block is H(1)/2 - (H - H(1))/(z - 1) for either part.
@@ -361,7 +363,7 @@ def l1_gain(F: Lti) -> Array:
     if not F.order:
         return total
     r = (1 + radius) / 2
-    P = solve_discrete_lyapunov(A.T / r, np.eye(F.order))
+    P = scipy.linalg.solve_discrete_lyapunov(A.T / r, np.eye(F.order))
     P = (P + P.T) / 2
     reach = np.sqrt(np.einsum("in,ni->i", F.C, np.linalg.solve(P, F.C.T)))
     powers = [F.C]

@@ -11,13 +11,15 @@ from controller.delay import delay
 from controller.environment import Member, environment
 from controller.loop import DelayRange, Loop, force_map
 from controller.lti import Lti
-from design.certificate import SetCheck, prove_limiter
+from design.certificate import RangesCheck, check_limiter, prove_limiter
 from design.conditions import this_environment
 from design.environments import SEARCH, Searched, worst
-from design.multipliers import JitterProof, limiter_refusal, limiter_requirement
+from design.multipliers import BETA, SwitchingSweep, limiter_refusal, limiter_requirement
 from design.result import NotProved, Requirement, certificate_part, finite
 from design.stored import LimiterCertificate
 from design.transparency import decibels, transparency
+
+_OWN_PROOF = "by a proof of its own, for this environment"
 
 
 @dataclass(frozen=True)
@@ -57,43 +59,50 @@ class Limits:
         }
 
 
-def covered_limits(loop: Loop, coupling: Coupling, requirements: Mapping[str, Requirement]) -> Limits:
-    """The limiter that a coupling may have: of no lag under any-environment, else that of its own condition."""
-    if loop.jitter:
+def covered_limits(
+    loop: Loop, coupling: Coupling, requirements: Mapping[str, Requirement], proof: LimiterCertificate | None = None
+) -> Limits:
+    """The limiter that a coupling may have: of no lag under any-environment, else that of its own condition.
+
+    With `proof`, which the coupling comes with, it is the limiter of that proof; in a loop for which it is none, the
+    one of the same beta.
+    """
+    if loop.varying_delay:
         return Limits(None, str(limiter_refusal(loop)))
     if requirements["any-environment"].certified and not any(loop.psi):
         return Limits((0.0,) * loop.channels, "any-environment covers limited forces")
     if not requirements["this-environment"].certified:
         return Limits(None, "no guarantee that it could extend")
-    found = limiter_requirement(loop, coupling)
+    if proof:
+        try:
+            requirement = check_limiter(loop, coupling, proof)
+            return Limits(proof.rho, _OWN_PROOF, requirement, proof.c, proof)
+        except NotProved:  # made for another loop
+            pass
+    beta = proof.beta if proof and 0 < proof.beta <= 1 else BETA
+    found = limiter_requirement(loop, coupling, beta)
     requirement = found.requirement
     if not requirement.certified:
         needs = f"limiter: needs {', '.join(f'{d:.5g}' for d in requirement.required)} N s/m of damping"
         return Limits(None, requirement.reason or needs, requirement, found.c)
     try:
-        proved = prove_limiter(loop, coupling, c=found.c)
+        proved = prove_limiter(loop, coupling, beta, found.c)
     except NotProved as refused:
         return Limits(found.rho, f"swept, not proved: {refused}", requirement, found.c)
-    return Limits(
-        found.rho,
-        "by a proof of its own, for this environment",
-        replace(requirement, proof="rational"),
-        found.c,
-        proved,
-    )
+    return Limits(found.rho, _OWN_PROOF, replace(requirement, proof="rational"), found.c, proved)
 
 
 # ----------------------------------------------------------------------------------------------------
-# What a report says of delays that vary: the jitter-proof requirement beside that of the playout buffer.
+# What a report says of delays that vary: what switching asks beside that of the playout buffer.
 
 
 _NOT_COVERED = (
-    "Covered: any ages of the forces within the range, at every tick and on every channel. Not covered: jitter on the "
-    "measured positions, periods longer than T_max, or forces older than the range, which lost packets make."
+    "Covered: any ages of the forces within the range, at every tick and on every channel. Not covered: varying delays "
+    "of the measured positions, periods longer than T_max, or forces older than the range, which lost packets make."
 )
 
 
-def switching_part(found: JitterProof, G: Lti, span: DelayRange, T_max: float | None = None) -> dict[str, Any]:
+def switching_part(found: SwitchingSweep, G: Lti, span: DelayRange, T_max: float | None = None) -> dict[str, Any]:
     """The requirement with its multiplier, and what a playout buffer to the constant delay hi would need.
 
     G is the force map without Theta.
@@ -113,12 +122,12 @@ def switching_part(found: JitterProof, G: Lti, span: DelayRange, T_max: float | 
 
 
 # ----------------------------------------------------------------------------------------------------
-# What a guarantee for a set of environments costs: the robust coupling beside the one made for the nominal one.
+# What a guarantee for ranges of parameters costs: the robust coupling beside the one made for the nominal one.
 
 
 @dataclass(frozen=True)
 class _Cost:
-    """One coupling over the members of a set, in which it runs on the current environment."""
+    """One coupling over the members of the ranges, where it runs on the current environment."""
 
     name: str
     ratio: tuple[float, float]  # required over available damping: in the nominal environment, and the most
@@ -150,7 +159,7 @@ def cost(name: str, loop: Loop, coupling: Coupling, members: Sequence[Member]) -
 
 
 def price(loop: Loop, couplings: Mapping[str, Coupling]) -> tuple[_Cost, ...]:
-    """The cost of each coupling over the box of the loop."""
+    """The cost of each coupling over the ranges of the loop."""
     members = loop.members()
     return tuple(cost(name, loop, coupling, members) for name, coupling in couplings.items())
 
@@ -168,7 +177,7 @@ _WHAT_IS_PROVED = (
 )
 
 
-def set_part(check: SetCheck) -> dict[str, Any]:
+def ranges_part(check: RangesCheck) -> dict[str, Any]:
     """The check as plain data; SI units, null where no damping is enough."""
     member, requirement = check.worst
     part: dict[str, Any] = {
@@ -205,7 +214,7 @@ def search_words(part: dict[str, Any]) -> str:
     return f"searched, not proved: {found}, {ratio} in {part['environments']} points, at {part['worst']}"
 
 
-def _inside_part(check: SetCheck) -> dict[str, Any]:
+def _inside_part(check: RangesCheck) -> dict[str, Any]:
     """What was found in the environments drawn from inside: evidence, no proof."""
     if not check.samples:
         return {"samples": 0, "certified": 0, "seed": check.seed, "worst_ratio": None, "worst": None}
@@ -219,7 +228,7 @@ def _inside_part(check: SetCheck) -> dict[str, Any]:
     }
 
 
-def set_rows(part: dict[str, Any]) -> list[tuple[str, str]]:
+def ranges_rows(part: dict[str, Any]) -> list[tuple[str, str]]:
     """The part of a report as rows of a table."""
     ratios = [d / a for d, a in zip(part["required_damping"], part["available_damping"], strict=True) if d is not None]
     most = f"{max(ratios):.4f} of the damping" if ratios else "no damping is enough"
@@ -227,14 +236,14 @@ def set_rows(part: dict[str, Any]) -> list[tuple[str, str]]:
     proof = "[green]proved exactly[/] at all" if exact else f"[red]not proved[/]: {part['reason']}"
     found, count = part["inside"], part["vertices"]
     rows = [
-        ("set, vertices", f"{part['vertices_certified']} of {count} certified, {proof}"),
-        ("set, worst vertex", f"{most}, at {part['worst']}"),
-        ("set, between", search_words(part["search"])),
+        ("ranges, vertices", f"{part['vertices_certified']} of {count} certified, {proof}"),
+        ("ranges, worst vertex", f"{most}, at {part['worst']}"),
+        ("ranges, between", search_words(part["search"])),
     ]
     if found["samples"]:
         ratio = "no damping is enough" if found["worst_ratio"] is None else f"at most {found['worst_ratio']:.4f}"
         inside = f"{found['certified']} of {found['samples']} random samples certified, {ratio} of the damping"
-        rows.append(("set, inside", inside))
+        rows.append(("ranges, inside", inside))
     if exact and not part["certified"]:
-        rows.append(("set", f"[red]not guaranteed[/]: {part['reason']}"))
+        rows.append(("ranges", f"[red]not guaranteed[/]: {part['reason']}"))
     return rows

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from controller.loop import Loop
-from design.conditions import this_environment
+from design.certificate import this_environment_of
 from design.guarantees import LATE
 from design.result import Design, DesignFailed
 
@@ -37,10 +37,10 @@ _HOMES: dict[str, tuple[str, str, tuple[str, ...]]] = {
 def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     """What a coupling is designed for where nobody says it: a spring-damper for this environment, which feels best.
 
-    For any environment where this-environment covers less than the loop: walls that make and break contact, ranges,
-    delays that vary. Other kinds for their own condition.
+    For any environment where this-environment covers less than the loop: limited forces before walls, ranges, delays
+    that vary. Other kinds for their own condition.
     """
-    less = loop.environment.walls or loop.box or loop.jitter
+    less = loop.environment.walls or loop.ranges or loop.varying_delay
     return "any-environment" if less and "any-environment" in KINDS[kind] else KINDS[kind][0]
 
 
@@ -92,24 +92,27 @@ def design_by_kind(
     further = {name: value for name, value in (("condition", condition), ("progress", progress)) if name in takes}
     made = partial(getattr(import_module(module), function), **further, **options)
 
-    if loop.latency is None or kind == "optimal":
-        return made(loop)
-    if condition == "any-environment":
+    if condition == "any-environment" and loop.latency and kind != "optimal":
         raise ValueError(f"latency: {LATE}, or design for this-environment")
-    return _with_latency(loop, made)
+    if kind == "optimal" or condition == "any-environment" or not (loop.latency or loop.environment.walls):
+        return made(loop)
+    return _with_less_damping(loop, made)
 
 
-#: A design for forces that latch late leaves at most this share of the damping, and is sought so often.
+#: A design for forces that latch late, or for walls, leaves at most this share of the damping, and is sought so often.
 _UNUSED, _MOST_ROUNDS = 0.005, 6
 
 
-def _with_latency(loop: Loop, made: Callable[[Loop], Design]) -> Design:
-    """The design for forces that latch at the tick and so much less damping that the late ones need what there is."""
+def _with_less_damping(loop: Loop, made: Callable[[Loop], Design]) -> Design:
+    """The design for so much less damping that late forces, or walls that make and break contact, need what there is.
+
+    It is made for forces that latch at the tick, and walls that all touch.
+    """
     share, best = 1.0, None
     for _ in range(_MOST_ROUNDS):
         part = msgspec.structs.replace(loop, latency=None, delta=tuple(share * d for d in loop.delta))
         found = made(part)
-        needs = this_environment(loop.F(found.coupling), loop.delta, loop.T_max, loop.latency)
+        needs = this_environment_of(loop, found.coupling)
         if needs.certified:
             best = replace(found, requirement=needs)
             if needs.ratio > 1 - _UNUSED:
@@ -118,5 +121,6 @@ def _with_latency(loop: Loop, made: Callable[[Loop], Design]) -> Design:
         if best and share == 1.0:
             return best
     if best is None:
-        raise DesignFailed(None, (), f"no coupling was found for a latency of {loop.latency} s")
+        what = f"a latency of {loop.latency} s" if loop.latency else "walls that make and break contact"
+        raise DesignFailed(None, (), f"no coupling was found for {what}")
     return best

@@ -1,4 +1,4 @@
-"""What a coupling asks in each environment of a set, and the one of a box that asks the most: a search, no proof."""
+"""What a coupling asks in each environment of ranges, and the one that asks the most: a search, no proof."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def _required(loop: Loop, coupling: Coupling, member: Member) -> Requirement:
 
 
 # ----------------------------------------------------------------------------------------------------
-# The environment of a box in which a coupling needs the most damping: a search, the same every time, and no proof.
+# The environment within ranges in which a coupling needs the most damping: a search, the same every time, and no proof.
 #
 # Between the vertices the need is no convex function of stiffness and mass, and what asks the most often lies on an
-# edge or a face, where points drawn evenly from the box never fall: the resonance moves from one vertex to the next.
+# edge or a face, where points drawn evenly from the ranges never fall: the resonance moves from one vertex to the next.
 # So every way in which the contacts may be there or absent is searched along all its edges, on its faces and inside,
 # and from the worst points that were found a compass search goes on within the ranges until its steps are small.
 
@@ -66,7 +66,7 @@ SEARCH = "along all edges, on faces and inside, then uphill from the worst point
 
 @dataclass(frozen=True)
 class _Found:
-    """An environment of the box, and the share of the damping that is needed there."""
+    """An environment of the ranges, and the share of the damping that is needed there."""
 
     member: Member
     ratio: float
@@ -81,7 +81,7 @@ class Searched:
 
 
 def search(regions: Sequence[Region], ratio: _Ratio, progress: Progress = lambda done, total: None) -> Searched:
-    """Where the coupling behind `ratio` needs the most in the box that consists of these regions."""
+    """Where the coupling behind `ratio` needs the most in the ranges that consist of these regions."""
     points = [list(_points(region)) for region in regions]
     refinements = [min(_STARTS, len(some)) * 8 * region.low.size for region, some in zip(regions, points, strict=True)]
     tried, total = 0, sum(map(len, points)) + sum(refinements)
@@ -154,8 +154,8 @@ def _climbed(need: Callable[[Array], float], point: Array, value: float) -> tupl
     return point, value
 
 
-def search_box(loop: Loop, coupling: Coupling, progress: Progress = lambda done, total: None) -> Searched:
-    """The worst environments of the loop's box that the search of design.environments finds."""
-    assert loop.box
-    parts = regions(loop.network, loop.box)
+def search_ranges(loop: Loop, coupling: Coupling, progress: Progress = lambda done, total: None) -> Searched:
+    """The worst environments of the loop's ranges that the search of design.environments finds."""
+    assert loop.ranges
+    parts = regions(loop.network, loop.ranges)
     return search(parts, lambda member: in_each(loop, coupling, [member])[0].ratio, progress)

@@ -1,4 +1,4 @@
-"""The matrix of a proof as a file holds it: rows of rationals "p/q"."""
+"""Exact arithmetic: definiteness and positive realness over the rationals, and a proof's matrix as a file holds it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.linalg import LinAlgError, cholesky, solve_discrete_are, solve_triangular
 
-from controller.lti import Array, Lti, rational
+from controller.lti import Array, Lti, on_time, rational
 from design.frequency import frequencies, hermitian, on_circle, supremum
 
 # ----------------------------------------------------------------------------------------------------
@@ -70,7 +70,11 @@ class Matrix:
         return self if common == 1 else Matrix(self.num // common, self.den // common)
 
     def __matmul__(self, other: Matrix) -> Matrix:
-        return Matrix(self.num @ other.num, self.den * other.den).reduced()
+        num = np.empty((self.shape[0], other.shape[1]), dtype=object)
+        for i, row in enumerate(self.num):
+            on_time()
+            num[i] = row @ other.num
+        return Matrix(num, self.den * other.den).reduced()
 
     def __add__(self, other: Matrix) -> Matrix:
         den = math.lcm(self.den, other.den)
@@ -227,10 +231,10 @@ def _whitening(W: Floats) -> _Integers | None:
         return None
     for added in (0.0, GROWTH):
         try:
-            L = cholesky(unit + added * np.eye(W.shape[0]), lower=True)
-        except LinAlgError:
+            L = scipy.linalg.cholesky(unit + added * np.eye(W.shape[0]), lower=True)
+        except np.linalg.LinAlgError:
             continue
-        inverse = scale[:, None] * solve_triangular(L, np.eye(W.shape[0]), lower=True).T
+        inverse = scale[:, None] * scipy.linalg.solve_triangular(L, np.eye(W.shape[0]), lower=True).T
         size = _FACTOR_BITS - np.ceil(np.log2(np.abs(inverse).max()))
         return np.vectorize(int, otypes=[object])(np.round(np.ldexp(inverse, int(size))))
     return None
@@ -294,9 +298,9 @@ def _refuted_in_floating_point(G: Lti, P: Matrix) -> bool:
     F, p = G.floats(), P.floats()
     A, B, C, D = F.A, F.B, F.C, F.D
     J = np.hstack([A, B])
-    direct = np.block([[p, C.T], [C, D + D.T]])
     with np.errstate(all="ignore"):
-        M = direct.copy() - J.T @ p @ J
+        direct = np.block([[p, C.T], [C, D + D.T]])
+        M = direct - J.T @ p @ J
     if not np.isfinite(M).all():
         return False
     k = (2 * G.order + 8) * _UNIT
@@ -345,7 +349,7 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     for share, again in ((0.5, False), (0.5, True), (0.9, True), (0.1, True)):
         try:
             P = _riccati(block, margin, share, again)
-        except (LinAlgError, ValueError) as error:
+        except (np.linalg.LinAlgError, ValueError) as error:
             reason = f"the Riccati equation has no solution: {error}"
             continue
         stored = _rounded_positive_real(back[:, None] * P * back)
@@ -389,13 +393,13 @@ def _riccati(G: Lti, margin: float, share: float, again: bool) -> Array:
     gain = np.linalg.norm(_states(G), 2, axis=(1, 2)).max() ** 2
     drive = (1 - share) * margin / max(gain, 1.0)  # the gain is at least one unless no input reaches any state
     R = G.D + G.D.T - 2 * share * margin * np.eye(m)
-    P = -solve_discrete_are(G.A, G.B, -drive * np.eye(n), R, s=G.C.T)
+    P = -scipy.linalg.solve_discrete_are(G.A, G.B, -drive * np.eye(n), R, s=G.C.T)
     if not again:
         return P
     size, V = np.linalg.eigh(P)
     root = np.sqrt(np.maximum(size, size[-1] * 1e-16))
     into, out = V / root, (V * root).T
-    better = -solve_discrete_are(out @ G.A @ into, out @ G.B, -drive * into.T @ into, R, s=(G.C @ into).T)
+    better = -scipy.linalg.solve_discrete_are(out @ G.A @ into, out @ G.B, -drive * into.T @ into, R, s=(G.C @ into).T)
     return out.T @ better @ out
 
 

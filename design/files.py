@@ -52,9 +52,16 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c in "\n\t" else c.encode("unicode_escape").decode() for c in text)
 
 
+_QUOTED = re.compile(r"(?<!\w)'[^']*'|(?<!\S)[^\s/']{81,}(?!\S*/)")  # a text in quotes, or a long word that is no path
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= 80 else f"{text[:38]}[..]{text[-38:]}"
+
+
 def one_line(text: object) -> str:
-    """A message in one line of at most MOST_WORDS characters."""
-    words = printable(" ".join(str(text).split()))
+    """A message in one line of at most MOST_WORDS characters; of what a user gave it quotes 80, of a path the whole."""
+    words = _QUOTED.sub(lambda found: _cut(found[0]), printable(" ".join(str(text).split())))
     half = _MOST_WORDS // 2 - 3
     return words if len(words) <= _MOST_WORDS else f"{words[:half]} [..] {words[-half:]}"
 

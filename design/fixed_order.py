@@ -22,26 +22,8 @@ from scipy.optimize import minimize
 from controller.coupling import Compliance, SpringDamper
 from controller.loop import Loop
 from controller.lti import Array, Lti
-from design import spring_damper
+from design import lmi, spring_damper
 from design.frequency import on_circle
-from design.lmi import (
-    Ports,
-    Shaping,
-    affine,
-    affine_lmis,
-    gain_lmi,
-    least_phi,
-    lemma1,
-    lemma2,
-    lemma3,
-    packed,
-    reachability_scaled,
-    solve,
-    solved,
-    symmetric,
-    symmetric_from,
-    theta_hat,
-)
 from design.result import METHODS, Design, DesignFailed, Requirement, Row, of_kind, one_of, whole
 
 # ----------------------------------------------------------------------------------------------------
@@ -64,7 +46,7 @@ class FixedOrder:
     Everything is in units T = 1 and usable damping = I. `sigma` (N,) is Delta_V^-1 there, inf where psi = 0.
     """
 
-    def __init__(self, shaping: Shaping, sigma: Array, order: int = 1, diagonal: bool = True) -> None:
+    def __init__(self, shaping: lmi.Shaping, sigma: Array, order: int = 1, diagonal: bool = True) -> None:
         if order < 1:
             raise ValueError(f"order is {order}, expected one state per channel or more")
         self.loop, self.usable, self.sigma, self.order = shaping.loop, shaping.usable, sigma, order
@@ -76,7 +58,7 @@ class FixedOrder:
         masks = masks if diagonal else [np.ones_like(mask) for mask in masks]
         self._free = [np.nonzero(mask) for mask in (*masks[:2], np.triu(masks[2]))]
         self.plant = _plant(shaping)
-        self.window = theta_hat(self.loop.theta)
+        self.window = lmi.theta_hat(self.loop.theta)
 
     @property
     def unknowns(self) -> int:
@@ -114,7 +96,7 @@ class FixedOrder:
         parts = (A, B, np.diag(1 / k))
         return np.concatenate([M[free] for M, free in zip(parts, self._free, strict=True)])
 
-    def ports(self, p: Array) -> Ports:
+    def ports(self, p: Array) -> lmi.Ports:
         """The remedied V-hat: supply y2'u - y1'y1, y1 = Sigma^-1/2 H u, with no y1 rows where Sigma is infinite."""
         A, B, V1 = self.matrices(p)
         V, G = self.unit_coupling(p), self.window
@@ -123,7 +105,7 @@ class FixedOrder:
         weight = 1 / np.sqrt(self.sigma[paid])[:, None]
         C1, D1 = np.hstack([V.C, -G.C])[paid] * weight, (V.D - G.D)[paid] * weight
         C2, D2 = np.hstack([self.F, -quotient]), (V1 - G.dc()) / 2
-        return Ports(block_diag(A, G.A), np.vstack([B, G.B]), C2, D2, C1, D1)
+        return lmi.Ports(block_diag(A, G.A), np.vstack([B, G.B]), C2, D2, C1, D1)
 
     def weighted_loop(self, p: Array) -> tuple[Array, Array, Array, Array]:
         """A, B, C, D of W1 L W2: the plant with V closed between its output u and its input v."""
@@ -137,7 +119,7 @@ class FixedOrder:
         return A, B, np.hstack([Cy + Dyv @ V.D @ Cu, Dyv @ V.C]), Dyr + Dyv @ V.D @ Dur
 
 
-def _plant(shaping: Shaping) -> Lti:
+def _plant(shaping: lmi.Shaping) -> Lti:
     """[y; u] from [r; v]: y = W1 ((I - Psi Lambda^-1 Theta) W2 r + Psi E v), u = W2 r, with v and u in unit scale."""
     N, T = shaping.loop.channels, shaping.loop.T
     root, one, zero = 1 / np.sqrt(shaping.usable), np.eye(N), np.zeros((N, N))
@@ -160,30 +142,30 @@ def _passivity_storage(family: FixedOrder, p: Array) -> Array:
     """P > 0 of the remedied (2) for the coupling p, with the most room; the coupling must satisfy it strictly."""
     G = family.ports(p)
     m, paid = G.D2.shape[0], G.D1.shape[0]
-    return _roomiest(lambda P: lemma1(G, P, np.eye(paid), np.zeros((m, m))), G.A.shape[0], "the storage of V-hat")
+    return _roomiest(lambda P: lmi.lemma1(G, P, np.eye(paid), np.zeros((m, m))), G.A.shape[0], "the storage of V-hat")
 
 
 def _gain_storage(family: FixedOrder, p: Array, mu: float) -> Array:
     """U = X^-1 > 0 of Lemma 3, ||W1 L W2||_inf < mu, with the most room in coordinates of unit reachability."""
     A, B, C, D = family.weighted_loop(p)
-    S = reachability_scaled(Lti(A, B, C, D, 1.0))
+    S = lmi.reachability_scaled(Lti(A, B, C, D, 1.0))
     A, B, C, D = np.linalg.solve(S, A @ S), np.linalg.solve(S, B), C @ S / mu, D / mu
     m = B.shape[1]
-    bounded = Ports(A, B, np.zeros((m, A.shape[0])), np.eye(m), C, D)
+    bounded = lmi.Ports(A, B, np.zeros((m, A.shape[0])), np.eye(m), C, D)
     zero = np.zeros((m, m))
-    X = _roomiest(lambda X: lemma1(bounded, X, np.eye(C.shape[0]), zero), A.shape[0], "the storage of L")
+    X = _roomiest(lambda X: lmi.lemma1(bounded, X, np.eye(C.shape[0]), zero), A.shape[0], "the storage of L")
     return S @ np.linalg.inv(X) @ S.T
 
 
 def _roomiest(inequality: Callable[[Array], Array], n: int, what: str) -> Array:
     """The P that maximises s <= 1 with inequality(P) >= s I and P >= s I."""
     size = inequality(np.zeros((n, n))).shape[0]
-    x, s = cp.Variable(packed(n)), cp.Variable()
-    matrix = affine(lambda v: inequality(symmetric_from(v, n)), x)
-    P = affine(lambda v: symmetric_from(v, n), x)
+    x, s = cp.Variable(lmi.packed(n)), cp.Variable()
+    matrix = lmi.affine(lambda v: inequality(lmi.symmetric_from(v, n)), x)
+    P = lmi.affine(lambda v: lmi.symmetric_from(v, n), x)
     constraints = [matrix >> s * np.eye(size), P >> s * np.eye(n), s <= 1]
-    solve(cp.Problem(cp.Maximize(s), constraints), what)
-    return symmetric_from(np.asarray(x.value), n)
+    lmi.solve(cp.Problem(cp.Maximize(s), constraints), what)
+    return lmi.symmetric_from(np.asarray(x.value), n)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -217,37 +199,37 @@ def _step(family: FixedOrder, at: Array, Q0: Array, U0: Array, norm: float) -> t
     """One SDP in x = (p - at, Q, U, mu^2/norm^2), Q and U in coordinates where Q0 = U0 = I."""
     LQ, LU = np.linalg.cholesky(Q0), np.linalg.cholesky(U0)
     nq, nu = Q0.shape[0], U0.shape[0]
-    ends = np.cumsum([family.unknowns, packed(nq), packed(nu)])
+    ends = np.cumsum([family.unknowns, lmi.packed(nq), lmi.packed(nu)])
     x = cp.Variable(int(ends[-1]) + 1)
 
     def split(v: Array) -> tuple[Array, Array, Array, float]:
         p, q, u, t = np.split(v, ends)
-        return at + p, symmetric_from(q, nq), symmetric_from(u, nu), t[0]
+        return at + p, lmi.symmetric_from(q, nq), lmi.symmetric_from(u, nu), t[0]
 
     def passivity(v: Array) -> Array:
         p, Q, _, _ = split(v)
         G = _in_coordinates(family.ports(p), LQ)
         sigma = np.eye(G.C1.shape[0]) if G.C1.size else None
-        return lemma2(G, Q, 2 * np.eye(nq) - Q, sigma, np.zeros_like(G.D2))
+        return lmi.lemma2(G, Q, 2 * np.eye(nq) - Q, sigma, np.zeros_like(G.D2))
 
     def gain(v: Array) -> Array:
         p, _, U, t = split(v)
         A, B, C, D = family.weighted_loop(p)
         A, B, C = np.linalg.solve(LU, A @ LU), np.linalg.solve(LU, B), C @ LU / norm
-        return lemma3(A, B, C, D / norm, 2 * np.eye(nu) - U, U, t)
+        return lmi.lemma3(A, B, C, D / norm, 2 * np.eye(nu) - U, U, t)
 
-    storages = [affine(lambda v: split(v)[1], x), affine(lambda v: split(v)[2], x)]
+    storages = [lmi.affine(lambda v: split(v)[1], x), lmi.affine(lambda v: split(v)[2], x)]
     least = [Z >> _LEAST * np.eye(Z.shape[0]) for Z in storages]
     most = [Z << _MOST * np.eye(Z.shape[0]) for Z in storages]
-    cuts: list[cp.Constraint] = [affine(passivity, x) >> 0, affine(gain, x) >> 0, *least, *most]
-    solve(cp.Problem(cp.Minimize(x[-1]), cuts), "a step of the inner convex approximation")
-    p, Q, U, _ = split(solved(x))
+    cuts: list[cp.Constraint] = [lmi.affine(passivity, x) >> 0, lmi.affine(gain, x) >> 0, *least, *most]
+    lmi.solve(cp.Problem(cp.Minimize(x[-1]), cuts), "a step of the inner convex approximation")
+    p, Q, U, _ = split(lmi.solved(x))
     return p, LQ @ Q @ LQ.T, LU @ U @ LU.T
 
 
-def _in_coordinates(G: Ports, L: Array) -> Ports:
+def _in_coordinates(G: lmi.Ports, L: Array) -> lmi.Ports:
     """G with the states L^-1 x."""
-    return Ports(np.linalg.solve(L, G.A @ L), np.linalg.solve(L, G.B), G.C2 @ L, G.D2, G.C1 @ L, G.D1)
+    return lmi.Ports(np.linalg.solve(L, G.A @ L), np.linalg.solve(L, G.B), G.C2 @ L, G.D2, G.C1 @ L, G.D1)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -288,23 +270,23 @@ class _Relaxed:
         self.LQ = np.linalg.cholesky(np.linalg.inv(_passivity_storage(family, p)))
         self.LU = np.linalg.cholesky(_gain_storage(family, p, norm * (1 + _FIRST_ROOM)))
         self.sizes = (self.LQ.shape[0],) * 2 + (self.LU.shape[0],) * 2
-        self.ends = np.cumsum([family.unknowns, *map(packed, self.sizes)])[:-1]
+        self.ends = np.cumsum([family.unknowns, *map(lmi.packed, self.sizes)])[:-1]
 
     def split(self, v: Array) -> tuple[Array, list[Array]]:
         """p and [Q, Y, U, X] from the vector of unknowns."""
         p, *vectors = np.split(v, self.ends)
-        return self.at + p, [symmetric_from(u, n) for u, n in zip(vectors, self.sizes, strict=True)]
+        return self.at + p, [lmi.symmetric_from(u, n) for u, n in zip(vectors, self.sizes, strict=True)]
 
     def search(self, mu: float, holds: Callable[[Array, float], bool], patience: int) -> tuple[Array | None, int]:
         """(a coupling that holds for mu or None, SDPs spent)."""
-        x = cp.Variable(self.family.unknowns + sum(map(packed, self.sizes)))
+        x = cp.Variable(self.family.unknowns + sum(map(lmi.packed, self.sizes)))
         constraints = self._constraints(x, mu)
         matrices = [np.eye(n) for n in self.sizes]
         for spent in range(1, patience + 1):
             Q0, Y0, U0, X0 = matrices
-            trace = affine(lambda v, at=(Y0, Q0, X0, U0): self._inner(v, at), x)
+            trace = lmi.affine(lambda v, at=(Y0, Q0, X0, U0): self._inner(v, at), x)
             try:
-                solve(cp.Problem(cp.Minimize(cp.sum(trace)), constraints), "a step of cone complementarity")
+                lmi.solve(cp.Problem(cp.Minimize(cp.sum(trace)), constraints), "a step of cone complementarity")
             except DesignFailed:
                 return None, spent
             p, matrices = self.split(np.asarray(x.value))
@@ -321,19 +303,19 @@ class _Relaxed:
             p, (Q, Y, _, _) = self.split(v)
             G = _in_coordinates(self.family.ports(p), self.LQ)
             sigma = np.eye(G.C1.shape[0]) if G.C1.size else None
-            return lemma2(G, Q, Y, sigma, np.zeros_like(G.D2))
+            return lmi.lemma2(G, Q, Y, sigma, np.zeros_like(G.D2))
 
         def gain(v: Array) -> Array:
             p, (_, _, U, X) = self.split(v)
             A, B, C, D = self.family.weighted_loop(p)
             A, B, C = np.linalg.solve(self.LU, A @ self.LU), np.linalg.solve(self.LU, B), C @ self.LU / self.norm
-            return lemma3(A, B, C, D / self.norm, X, U, (mu / self.norm) ** 2)
+            return lmi.lemma3(A, B, C, D / self.norm, X, U, (mu / self.norm) ** 2)
 
         def pair(first: int) -> Callable[[Array], Array]:
             one = np.eye(self.sizes[first])
-            return lambda v: symmetric([[self.split(v)[1][first + 1], one], [one, self.split(v)[1][first]]])
+            return lambda v: lmi.symmetric([[self.split(v)[1][first + 1], one], [one, self.split(v)[1][first]]])
 
-        return [affine(f, x) >> 0 for f in (passivity, gain, pair(0), pair(2))]
+        return [lmi.affine(f, x) >> 0 for f in (passivity, gain, pair(0), pair(2))]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -351,7 +333,7 @@ _MOST_CUTS = 20
 class FixedPoles:
     """The problem for one loop; frequencies that were binding are kept from one set of poles to the next."""
 
-    def __init__(self, shaping: Shaping, sigma: Array) -> None:
+    def __init__(self, shaping: lmi.Shaping, sigma: Array) -> None:
         self.loop, self.sigma, self.shaping = shaping.loop, sigma, shaping
         self.frequencies = [0.0]
         self.sdps = 0
@@ -389,19 +371,19 @@ class FixedPoles:
     def _solve(self, poles: Sequence[Sequence[float]]) -> tuple[Lti, float]:
         N = self.loop.channels
         states = sum(map(len, poles)) + sum(self.loop.theta)
-        gains, storage, t = cp.Variable(N + sum(map(len, poles))), cp.Variable(packed(states)), cp.Variable()
+        gains, storage, t = cp.Variable(N + sum(map(len, poles))), cp.Variable(lmi.packed(states)), cp.Variable()
         x = cp.hstack([gains, storage])
 
         def passive(v: Array) -> Array:
             g, p = np.split(v, [gains.size])
-            return self._passivity(poles, g, symmetric_from(p, states))
+            return self._passivity(poles, g, lmi.symmetric_from(p, states))
 
-        P = affine(lambda v: symmetric_from(v, states), storage)
+        P = lmi.affine(lambda v: lmi.symmetric_from(v, states), storage)
         cuts = self._cuts(poles, gains, t)
-        problem = cp.Problem(cp.Minimize(t), [affine(passive, x) >> 0, P >> 0, *cuts])
-        solve(problem, "the coupling with fixed poles")
+        problem = cp.Problem(cp.Minimize(t), [lmi.affine(passive, x) >> 0, P >> 0, *cuts])
+        lmi.solve(problem, "the coupling with fixed poles")
         self.sdps += 1
-        return self._coupling(poles, solved(gains)), float(np.sqrt(solved(t)))
+        return self._coupling(poles, lmi.solved(gains)), float(np.sqrt(lmi.solved(t)))
 
     def _unit(self, poles: Sequence[Sequence[float]], gains: Array) -> tuple[Lti, Array, Array]:
         """V in units T = 1 and usable damping = I, with F and V1 of design.fixed_order.realisation's realisation."""
@@ -419,15 +401,15 @@ class FixedPoles:
     def _passivity(self, poles: Sequence[Sequence[float]], gains: Array, P: Array) -> Array:
         """The remedied (2) with the excess term by a Schur complement, so that it is linear in (gains, P)."""
         V, F, V1 = self._unit(poles, gains)
-        G = theta_hat(self.loop.theta)
+        G = lmi.theta_hat(self.loop.theta)
         C2 = np.hstack([F, G.quotient_at_one().C])
         C1, D1 = np.hstack([V.C, -G.C]), V.D - G.D
-        ports = Ports(block_diag(V.A, G.A), np.vstack([V.B, G.B]), C2, (V1 - G.dc()) / 2, C1, D1)
+        ports = lmi.Ports(block_diag(V.A, G.A), np.vstack([V.B, G.B]), C2, (V1 - G.dc()) / 2, C1, D1)
         zero = np.zeros_like(D1)
-        plain = lemma1(ports, P, zero, zero)
+        plain = lmi.lemma1(ports, P, zero, zero)
         paid = np.isfinite(self.sigma)
         excess = np.hstack([C1, D1])[paid] / np.sqrt(self.sigma[paid])[:, None]
-        return symmetric([[plain, excess.T], [excess, np.eye(excess.shape[0])]])
+        return lmi.symmetric([[plain, excess.T], [excess, np.eye(excess.shape[0])]])
 
     def _cuts(self, poles: Sequence[Sequence[float]], gains: cp.Variable, t: cp.Variable) -> list[cp.Constraint]:
         """[[I, L*], [L, t I]] >= 0 for W1 L W2 at the binding frequencies."""
@@ -438,8 +420,8 @@ class FixedPoles:
         slopes = np.stack([left @ self._coupling(poles, e).at(on_circle(w)) @ right for e in units])
         m = right.shape[-1]
         base = np.broadcast_to(np.eye(m), (w.size, m, m)).astype(np.complex128)
-        constant, slopes = gain_lmi(at_zero, slopes, base, np.zeros((gains.size, w.size, m, m)))
-        return affine_lmis(constant, slopes, cp.hstack([gains, t]))
+        constant, slopes = lmi.gain_lmi(at_zero, slopes, base, np.zeros((gains.size, w.size, m, m)))
+        return lmi.affine_lmis(constant, slopes, cp.hstack([gains, t]))
 
 
 #: The start is designed for this much less damping, so that it is strictly feasible.
@@ -498,8 +480,8 @@ class _Search:
     """One run: the family of couplings, the judge, and the count of problems solved."""
 
     def __init__(self, loop: Loop, order: int, diagonal: bool, start: SpringDamper | None) -> None:
-        self.loop, self.shaping, self.sdps = loop, Shaping(loop), 0
-        self.phi = least_phi(loop)
+        self.loop, self.shaping, self.sdps = loop, lmi.Shaping(loop), 0
+        self.phi = lmi.least_phi(loop)
         self.sigma = spring_damper.excess_limits(loop, self.phi)
         self.family = FixedOrder(self.shaping, self.sigma, order, diagonal)
         self.gains = start or self._structured()

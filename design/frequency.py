@@ -6,7 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import schur, solve_triangular
 
 from controller.lti import Array, Lti
 
@@ -149,19 +148,11 @@ def rounding(G: Lti, z: NDArray[np.complex128]) -> float:
     |C R| (|A| |R B| + |B|) + |C| |R B| + |D|: large where big terms cancel.
     """
     part = (2 * G.order + 8) * 2.0**-53
-    worst = np.abs(G.D).max(initial=0.0)
-    if not G.order:
-        return part * float(worst)
-    triangle, Q = schur(G.A, output="complex")[:2]  # one for all frequencies, each of which is solved by substitution
-    B, C, diagonal = Q.conj().T @ G.B, (G.C @ Q).T, np.diag_indices(G.order)
-    for value in z:
-        shifted = -triangle
-        shifted[diagonal] += value
-        states = np.abs(Q @ solve_triangular(shifted, B))
-        outputs = np.abs(Q.conj() @ solve_triangular(shifted, C, trans=1)).T
-        terms = outputs @ (np.abs(G.A) @ states + np.abs(G.B)) + np.abs(G.C) @ states + np.abs(G.D)
-        worst = max(worst, float(terms.max()))
-    return part * worst
+    one, zero = np.eye(G.order), np.zeros
+    states = np.abs(Lti(G.A, G.B, one, zero(G.B.shape), G.T).at(z))
+    outputs = np.abs(Lti(G.A.T, G.C.T, one, zero(G.C.T.shape), G.T).at(z)).swapaxes(1, 2)
+    terms = outputs @ (np.abs(G.A) @ states + np.abs(G.B)) + np.abs(G.C) @ states + np.abs(G.D)
+    return part * float(terms.max(initial=0.0))
 
 
 def _distinct(poles: NDArray[np.complex128]) -> NDArray[np.complex128]:

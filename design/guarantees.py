@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from controller.coupling import Coupling, ForceFilter, InternalModel
+from controller.coupling import Coupling
 from controller.loop import DelayRange, Loop
 from design.conditions import encoder_friction
 from design.result import Requirement, finite
@@ -16,21 +16,20 @@ from design.result import Requirement, finite
 # What may be said of a coupling: required against available damping, for which environments, and what is left out.
 
 
-ANY, SET, HERE = "any passive environment", "a set", "this environment"
+ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment"
 
 
-FROZEN = "each frozen contact state of this environment (contact that makes and breaks is not covered)"
+FROZEN = "each frozen contact state of this environment (with ranges, contact that makes and breaks is not covered)"
 
 
-MAKING = "this environment, with walls up to their stiffness that make and break contact"
+MAKING = "this environment, with walls up to their stiffness and damping that make and break contact"
 
 
 #: What no certificate covers.
 CAVEATS = (
     "The proofs are for the linear loop: they hold while forces stay below their limits (clipped ticks are counted) "
     "or leave through the limiter that a report names, "
-    "not for walls with dampers that make and break contact (except under any-environment without delay in the "
-    "environment), periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb "
+    "not for periods longer than the loop's T_max (T where it has none), encoder steps beyond what Coulomb "
     "friction pays for, velocity filters or friction compensation."
 )
 
@@ -40,16 +39,16 @@ def switching_guarantee(span: DelayRange) -> str:
     return f"delays switching within {span}"
 
 
-def guarantee_of(requirements: Mapping[str, Requirement], loop: Loop, whole_set: bool = False) -> str | None:
+def guarantee_of(requirements: Mapping[str, Requirement], loop: Loop, whole_ranges: bool = False) -> str | None:
     """For which environments a coupling is certified, by its requirements; None for none.
 
-    The multiplier that any-environment takes for psi >= 1 is of one environment. `whole_set`: this-environment is
-    proved at every vertex of the loop's box, and a search has found no violation between them.
+    The multiplier that any-environment takes for psi >= 1 is of one environment. `whole_ranges`: this-environment is
+    proved at every vertex of the loop's ranges, and a search has found no violation between them.
     """
     if requirements["any-environment"].certified and not any(loop.psi):
         return ANY
-    if whole_set:
-        return SET
+    if whole_ranges:
+        return RANGES
     if not any(requirement.certified for requirement in requirements.values()):
         return None
     if loop.environment.walls:
@@ -74,18 +73,18 @@ def encoder_part(
     enough = (
         f"friction of {', '.join(f'{f:.4g}' for f in needed)} N is enough for {widths} um, the devices declare {has} N"
     )
-    words = f"encoder steps {'are covered' if covered else 'are not covered'}: {enough}"
+    verdict = "are covered while forces stay below the limits" if covered else "are not covered"
+    words = f"encoder steps {verdict}: {enough}"
     return part | {"friction_needed": [finite(f) for f in needed], "covered": covered, "words": words}
 
 
 # ----------------------------------------------------------------------------------------------------
-# A coupling in every environment of a set: what the this-environment condition asks at each vertex of a box.
+# A coupling in every environment of ranges: what the this-environment condition asks at each vertex of ranges.
 
 
 def making_covered(loop: Loop) -> bool:
-    """Whether this-environment covers walls that make and break contact: those without dampers."""
-    walls = loop.environment.walls
-    return bool(walls) and not loop.box and not any(wall.damping for wall in walls)
+    """Whether this-environment covers walls that make and break contact: in one environment, not over ranges."""
+    return bool(loop.environment.walls) and not loop.ranges
 
 
 #: Why any-environment says nothing of forces that latch between ticks.
@@ -94,6 +93,6 @@ LATE = "a latency of a fraction of a sample is derived for this environment only
 
 def no_compliance(coupling: Coupling) -> str:
     """Why Theorem 4 has nothing to say of a coupling that is no V of its own."""
-    if isinstance(coupling, InternalModel | ForceFilter):
+    if coupling.holds_model:
         return "the coupling contains a model of the environment: Theorem 4 is about one that knows none"
     return "without a coupling there is nothing that Theorem 4 could use"

@@ -1,7 +1,7 @@
 """The paper's matrix inequalities, one function per equation, with a remedy where the printed strict form is empty.
 
-Units: T = 1 and Delta_D = I (design.semidefinite.coordinates). Every function returns a symmetric matrix that must be
-positive (semi)definite; its arguments are numbers or cvxpy expressions.
+Units: T = 1 and Delta_D = I (the scaling at the end of this file). Every function returns a symmetric matrix that must
+be positive (semi)definite; its arguments are numbers or cvxpy expressions.
 
 Two transfer matrices of the paper can never satisfy the strict inequalities printed for them:
   E-hat = z/(z-1) Psi E has a pole at z = 1 wherever E has static stiffness, and A'PA - P < 0 excludes it (15), (17).
@@ -17,12 +17,11 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
-import cvxpy as cp
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, solve_discrete_lyapunov, svd
 
 from controller.delay import delay
 from controller.loop import Loop
@@ -30,6 +29,9 @@ from controller.lti import Array, Lti
 from design.conditions import even_damping, regular_part, uncovered
 from design.frequency import frequencies, hermitian, on_circle, supremum
 from design.result import Attempt, DesignFailed, Infeasible
+
+if TYPE_CHECKING:  # most of a second: loaded where it is used
+    import cvxpy as cp
 
 #: Designs ask for (1 - RESERVE) of the damping that there is, so that they are certified as stored.
 RESERVE = 1e-4
@@ -107,12 +109,12 @@ _TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
 _LOOSE = {"tol_gap_abs": 1e-6, "tol_gap_rel": 1e-6, "tol_feas": 1e-6}
 
 LADDER = (
-    _Settings("default", cp.CLARABEL),
-    _Settings("tight", cp.CLARABEL, {**_TIGHT, "max_step_fraction": 0.95}),
-    _Settings("as given", cp.CLARABEL, {"equilibrate_enable": False, "chordal_decomposition_enable": False}),
-    _Settings("loose", cp.CLARABEL, {**_LOOSE, "static_regularization_constant": 1e-7}),
+    _Settings("default", "CLARABEL"),
+    _Settings("tight", "CLARABEL", {**_TIGHT, "max_step_fraction": 0.95}),
+    _Settings("as given", "CLARABEL", {"equilibrate_enable": False, "chordal_decomposition_enable": False}),
+    _Settings("loose", "CLARABEL", {**_LOOSE, "static_regularization_constant": 1e-7}),
 )
-CROSS_CHECK = _Settings("splitting", cp.SCS, {"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 200_000})
+CROSS_CHECK = _Settings("splitting", "SCS", {"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 200_000})
 
 
 def solve(
@@ -126,6 +128,8 @@ def solve(
     `what` names the problem in the message of an error. Raises Infeasible when two settings agree that there is no
     solution and none found one, DesignFailed otherwise. After either, no variable holds a value.
     """
+    import cvxpy as cp
+
     attempts: list[Attempt] = []
     for settings in ladder:
         attempts.append(_attempt(problem, settings, accept))
@@ -158,6 +162,8 @@ def _attempt(problem: cp.Problem, settings: _Settings, accept: Callable[[], bool
 
 def _call(problem: cp.Problem, settings: _Settings) -> tuple[str, str | None]:
     """(status, reason for refusing it or None). A cached solver would keep the options of the rung before."""
+    import cvxpy as cp
+
     _forget(problem)
     try:
         with warnings.catch_warnings():
@@ -244,6 +250,8 @@ def affine(function: Callable[[Array], Array], x: cp.Expression) -> cp.Expressio
 
     Compiling a block matrix of expressions costs cvxpy far more than these p + 1 evaluations.
     """
+    import cvxpy as cp
+
     constant = function(np.zeros(x.size))
     slopes = np.stack([(function(e) - constant).ravel() for e in np.eye(x.size)], axis=1)
     return cp.reshape(slopes @ x + constant.ravel(), constant.shape, order="C")
@@ -286,7 +294,7 @@ def balanced(G: Lti, negligible: float = 1e-11) -> Lti:
     if G.order == 0:
         return G
     reach, show = _root(G.A, G.B), _root(G.A.T, G.C.T)
-    U, hankel, Vt = svd(show.T @ reach)
+    U, hankel, Vt = scipy.linalg.svd(show.T @ reach)
     keep = hankel > negligible * max(hankel[0], 1e-300)
     scale = 1 / np.sqrt(hankel[keep])
     left = (show @ U[:, keep] * scale).T
@@ -296,14 +304,14 @@ def balanced(G: Lti, negligible: float = 1e-11) -> Lti:
 
 def reachability_scaled(G: Lti) -> Array:
     """S (n, n) such that the states S^-1 x of G have the identity as reachability Gramian (regularised)."""
-    W = solve_discrete_lyapunov(G.A, G.B @ G.B.T)
+    W = scipy.linalg.solve_discrete_lyapunov(G.A, G.B @ G.B.T)
     size = max(np.trace(W) / max(G.order, 1), 1e-300)
-    return cholesky((W + W.T) / 2 + 1e-9 * size * np.eye(G.order), lower=True)
+    return scipy.linalg.cholesky((W + W.T) / 2 + 1e-9 * size * np.eye(G.order), lower=True)
 
 
 def _root(A: Array, B: Array) -> Array:
     """R with R R' = the Gramian of (A, B), defined for singular ones too."""
-    W = solve_discrete_lyapunov(A, B @ B.T)
+    W = scipy.linalg.solve_discrete_lyapunov(A, B @ B.T)
     values, basis = np.linalg.eigh((W + W.T) / 2)
     return basis * np.sqrt(np.maximum(values, 0.0))
 
@@ -336,6 +344,8 @@ def affine_lmis(constant: Complex, slopes: Complex, x: cp.Expression) -> list[cp
     constant (k, n, n) and slopes (p, k, n, n) are Hermitian in their last two axes, x is (p,). One product
     with a constant matrix each: cvxpy compiles this much faster than block matrices of complex expressions.
     """
+    import cvxpy as cp
+
     fixed, by_x = _real_form(constant), _real_form(slopes)
     size = fixed.shape[-1]
     return [
@@ -387,6 +397,8 @@ def least_multiplier(loop: Loop) -> Array:
 
     Raises Infeasible, with the damping that would be needed, where even a full Phi is not below Delta_D.
     """
+    import cvxpy as cp
+
     delta, N = even_damping(loop.delta, loop.T, loop.T_max), loop.channels
     regular = balanced(e_hat_regular(unit_environment(loop.E(), delta), loop.psi))
     full, s = cp.Variable((N, N), symmetric=True), cp.Variable()
@@ -405,6 +417,8 @@ def least_multiplier(loop: Loop) -> Array:
 
 
 def _minimise(objective: cp.Expression, Phi: cp.Expression, regular, constraints: list[cp.Constraint]) -> None:
+    import cvxpy as cp
+
     P = cp.Variable((regular.order,) * 2, symmetric=True)
     passive = lemma1(Ports.same(regular), P, np.zeros(Phi.shape), -Phi)
     problem = cp.Problem(cp.Minimize(objective), [passive >> 0, P >> 0, *constraints])
@@ -514,6 +528,8 @@ def _shifted_ports(H: Lti) -> Ports:
 
 def symmetric(rows: list[list[_Matrix]]) -> _Matrix:
     """The block matrix, made exactly symmetric; an array if every block is one. Empty blocks are left out."""
+    import cvxpy as cp
+
     kept = [[block for block in row if 0 not in block.shape] for row in rows]
     kept = [row for row in kept if row]
     numbers = all(isinstance(block, np.ndarray) for row in kept for block in row)

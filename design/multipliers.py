@@ -50,27 +50,27 @@ Lags = Sequence[Sequence[Any]]
 def walls_demand(
     G: Block,
     delta: Sequence[Any],
-    stiffness: Sequence[Any],
+    slopes: Sequence[Any],
     g: Any,
     lam: Sequence[Any] | None = None,
     T_max: float | None = None,
 ) -> Demand[Block]:
-    """this-environment for walls p = k max(0, y - gap) of any slope k up to `stiffness` (w,) [N/m] and any gap.
+    """this-environment for walls of any stiffness and damping with k + 2 b/T up to `slopes` (w,) [N/m], and any gap.
 
     G takes [x; p] to [f; y], displacements (m,) and wall forces to the forces of the devices and the ways into the
     walls, [[F, J], [H, Y]]. With a multiplier g >= 0 and a weight lam > 0 for each wall (1 if not given) and
     M = g (z-1) - 1 the block is, on (dx, dp),
-        [[F, J], [-lam M H, -lam M Y]]/(z-1) + diag(s Delta_D/T, lam g/stiffness),
+        [[F, J], [-lam M H, -lam M Y]]/(z-1) + diag(s Delta_D/T, lam g/slopes),
     whose static part must be symmetric, J(1) = H(1)' lam and lam Y(1) = Y(1)' lam, with F(1) >= 0 >= lam Y(1).
     """
-    T, m, w = G.T, len(delta), len(stiffness)
+    T, m, w = G.T, len(delta), len(slopes)
     gains, one = numbers(g, T), numbers(np.eye(m + w), T)
     weights = numbers([1] * w if lam is None else lam, T)
     weigh = np.diag(np.concatenate([numbers([1] * m, T), weights]))
     S1, R = (weigh @ G).split_at_one()
-    slopes = np.diag(np.concatenate([numbers([0] * m, T), weights * gains]))
-    limits = np.concatenate([numbers([0] * m, T), weights * gains / numbers(stiffness, T)])
-    free = np.hstack([one, -slopes]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
+    steep = np.diag(np.concatenate([numbers([0] * m, T), weights * gains]))
+    limits = np.concatenate([numbers([0] * m, T), weights * gains / numbers(slopes, T)])
+    free = np.hstack([one, -steep]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
     damping = np.concatenate([even_damping(delta, T, T_max) / T, numbers([0] * w, T)])
     F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]
     static = {"F(1)": F1, "-Y(1)": -Y1, "the static map of devices and walls": S1}
@@ -168,7 +168,7 @@ class _WallsProof:
 def walls_proof(
     G: Lti,
     delta: Sequence[float],
-    stiffness: Sequence[float],
+    slopes: Sequence[float],
     g: Sequence[float] | None = None,
     T_max: float | None = None,
 ) -> _WallsProof:
@@ -176,7 +176,7 @@ def walls_proof(
 
     G takes [x; p] to [f; y] while no wall touches.
     """
-    m, w = len(delta), len(stiffness)
+    m, w = len(delta), len(slopes)
     available = dampings(delta, m)
 
     def refused(reason: str) -> _WallsProof:
@@ -200,11 +200,11 @@ def walls_proof(
     sampled = Sampled(z[None], G.at(z)[None], G.T)
 
     def needed(values: Array) -> float:
-        demand = walls_demand(sampled, available, stiffness, values, None, T_max)
+        demand = walls_demand(sampled, available, slopes, values, None, T_max)
         return float(least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G)).max())
 
     found = _best_g(needed, w) if g is None else np.asarray(g, dtype=float)
-    demand = walls_demand(G, available, stiffness, found, None, T_max)
+    demand = walls_demand(G, available, slopes, found, None, T_max)
     ratio, at = supremum(lambda w: least_scale(demand, w), grid)
     if np.isinf(ratio):
         return refused("no multiplier was found with which the walls are covered, whatever the damping")
@@ -260,22 +260,22 @@ _NEAR, _MOST_PEAKS = 0.3, 8  # of the peaks within 30 % of the highest, so many 
 
 
 @dataclass(frozen=True)
-class JitterProof:
+class SwitchingSweep:
     """What switching within a range asks of the devices."""
 
-    requirement: Requirement  # condition "jitter-proof"
+    requirement: Requirement  # condition "switching"
     alpha: tuple[float, ...]  # (m,) [N/m] the multiplier that shows it, at the available damping; 0 where lo = hi
     bound: float  # no multiplier shows less than this times the available damping (on the frequencies looked at)
 
 
-def jitter_proof(
+def switching_sweep(
     G: Lti,
     lo: Sequence[int],
     hi: Sequence[int],
     delta: Sequence[float],
     alpha: Sequence[float] | None = None,
     T_max: float | None = None,
-) -> JitterProof:
+) -> SwitchingSweep:
     """The least common factor on `delta` [N s/m] with which some multiplier satisfies the condition, and which does.
 
     G is the force map without Theta. The factor is that of the refined sweep (design.frequency.sweep) at the multiplier
@@ -286,20 +286,20 @@ def jitter_proof(
         raise ValueError(f"delays are given for {len(h)} channels, expected {G.inputs}")
     constant = this_environment(nominal(lo, hi, G.T) @ G, delta, T_max)
     if not np.isfinite(constant.ratio):
-        return _jitter_refusal(available, constant.reason or "no constant delay is safe")
+        return _refused(available, constant.reason or "no constant delay is safe")
     damping = even_damping(available, G.T, T_max)
     search, unit = _Search(G, lo, hi, damping), damping / G.T
     given = None if alpha is None else (np.asarray(alpha) / unit)[search.active]
     a, ratio, w, bound = search.least() if given is None else search.only(given)
     multiplier = np.zeros(h.size)
     multiplier[search.active] = a
-    requirement = from_ratio("jitter-proof", max(ratio, 0.0), available, w / (2 * np.pi * G.T))
-    return JitterProof(requirement, tuple((multiplier * unit).tolist()), bound)
+    requirement = from_ratio("switching", max(ratio, 0.0), available, w / (2 * np.pi * G.T))
+    return SwitchingSweep(requirement, tuple((multiplier * unit).tolist()), bound)
 
 
-def _jitter_refusal(available: tuple[float, ...], reason: str) -> JitterProof:
+def _refused(available: tuple[float, ...], reason: str) -> SwitchingSweep:
     """That no damping is enough, and why."""
-    return JitterProof(refusal("jitter-proof", available, reason), (np.inf,) * len(available), np.inf)
+    return SwitchingSweep(refusal("switching", available, reason), (np.inf,) * len(available), np.inf)
 
 
 _Found = tuple[Array, float, float, float]  # a, s(a), where it binds [rad/sample], a lower bound on s over all a
@@ -578,30 +578,30 @@ def nominal(lo: Sequence[int], hi: Sequence[int], T: float) -> Lti:
     return Lti.diag(*(taps(_halves(p, q), T) for p, q in zip(lo, hi, strict=True)))
 
 
-def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) -> JitterProof:
+def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) -> SwitchingSweep:
     """What switching within the loop's range asks, by a sweep; with the multiplier `alpha` [N/m] where it is given."""
     span = loop.delays
     try:
         G = loop.sent(coupling)
     except SingularLoop as error:
-        return _jitter_refusal(loop.delta, str(error))
-    return jitter_proof(G, span.lo, span.hi, loop.delta, alpha, loop.T_max)
+        return _refused(loop.delta, str(error))
+    return switching_sweep(G, span.lo, span.hi, loop.delta, alpha, loop.T_max)
 
 
 # ----------------------------------------------------------------------------------------------------
 # An exact proof that a coupling is safe in this environment also while its forces are limited: made, stored, proved
-# again. F(1) is exactly symmetric and positive semidefinite, and design.conditions.limiter_demand is strictly
+# again. F(1) is exactly symmetric and positive semidefinite, and design.multipliers.limiter_demand is strictly
 # positive real. any-environment without delay in the environment needs no proof of its own: with rho = 0 the limiter
 # and the environment together are a passive environment.
 
 
 def limiter_refusal(loop: Loop) -> str | None:
     """Why the limiter's own condition has nothing to say of a loop, or None."""
-    if loop.jitter:
+    if loop.varying_delay:
         return "limiter: forces that are limited are proved for constant delays, not for delays that switch"
     if loop.environment.walls:
         return "limiter: with walls only any-environment covers limited forces (no delay in the environment)"
-    if loop.box:
+    if loop.ranges:
         return "limiter: limited forces are proved for one environment, not for ranges"
     if loop.latency:
         return "limiter: limited forces are proved for forces that latch at ticks, not for a latency"
@@ -633,18 +633,14 @@ def walls_of(loop: Loop, coupling: Coupling, g: Sequence[Fraction] | None = None
     Raises NotProved for walls that nothing is proved of.
     """
     walls = loop.environment.walls
-    if any(wall.damping for wall in walls):
-        raise NotProved(
-            "of walls with dampers only each frozen contact state is judged, and any-environment proves all"
-        )
-    if loop.box:
-        raise NotProved("walls and a box: walls are proved in one environment")
+    if loop.ranges:
+        raise NotProved("walls and ranges: walls are proved in one environment")
     try:
         G = loop.walled(coupling)
     except (SingularLoop, ValueError) as error:
         raise NotProved(str(error)) from None
-    stiffness = [wall.stiffness for wall in walls]
+    slopes = [float(wall.slope(loop.T)) for wall in walls]
     values = None if g is None else [float(value) for value in g]
     if values is not None and (len(values) != len(walls) or min(values) < 0):
         raise NotProved(f"{WALL_MULTIPLIER} is {values}, expected a number >= 0 for each of {len(walls)} walls")
-    return walls_proof(G, loop.delta, stiffness, values, loop.T_max)
+    return walls_proof(G, loop.delta, slopes, values, loop.T_max)

@@ -20,7 +20,7 @@ from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design.certificate import prove, prove_limiter
 from design.conditions import this_environment as requirement_of
-from design.environments import Searched, in_each, search_box, worst
+from design.environments import Searched, in_each, search_ranges, worst
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.program import (
     DEFAULT,
@@ -146,7 +146,7 @@ def design(
             best = found
         if (gained < _SETTLED_DB and len(rungs) >= _FEWEST_RUNGS) or climb.elapsed > options.seconds:
             break
-    if best and loop.box:
+    if best and loop.ranges:
         best = climb.between(best)
     if best is None or climb.mismatch(best) > _HOPELESS:
         rivals = [one for one in (best, climb.scaled(), climb.spring_damper()) if one is not None]
@@ -186,7 +186,7 @@ class _Climb:
         cases: list[Case] = []
         for member in loop.members():
             there = at(loop, member.network)
-            asked = [this_environment(there), *([switching(there, loop.jitter)] if loop.jitter else [])]
+            asked = [this_environment(there), *([switching(there, loop.varying_delay)] if loop.varying_delay else [])]
             if options.high_gain is not None and 2 * HIGH_HZ * loop.T < 1 and there.E().D.any():
                 asked.append(most_gain(there, options.high_gain))
             if options.objective == "sup" and not cases:
@@ -290,18 +290,18 @@ class _Climb:
             scale = min(1.0, (1 - MARGIN) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))
             found = self._assessed(scaled, scaled.g)
-            if not proved or self.loop.box or (found := self._proved(found, slip)).proved:
+            if not proved or self.loop.ranges or (found := self._proved(found, slip)).proved:
                 break
         return found
 
     def between(self, found: Optimal) -> Optimal:
-        """The coupling for a box after the search between the vertices, and proved at each of them.
+        """The coupling for ranges after the search between the vertices, and proved at each of them.
 
         Where the worst environment that was found asks for more damping than there is, the forces are scaled down.
         """
         whole = found.coupling
         assert isinstance(whole, ForceFilter)
-        searched = search_box(self.loop, whole)
+        searched = search_ranges(self.loop, whole)
         ratio, last = searched.worst[0].ratio, found
         for limit in (1 - MARGIN / 2, 1 - 2.5 * MARGIN):
             share = min(1.0, limit / ratio)

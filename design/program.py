@@ -13,8 +13,8 @@ from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 from controller.coupling import ForceFilter, basis
 from controller.delay import delay
@@ -113,7 +113,7 @@ def _demand(loop: Loop, F: Any) -> Demand[Any]:
 
 
 def switching(loop: Loop, span: DelayRange) -> Constraint:
-    """design.conditions.switching_block for delays that switch within the span; alpha T/Delta are its unknowns."""
+    """design.multipliers.switching_block for delays that switch within the span; alpha T/Delta are its unknowns."""
     scale = even_damping(loop.delta, loop.T, loop.T_max) / loop.T
     moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))
 
@@ -140,7 +140,7 @@ class Slip:
 
 
 def limiter(loop: Loop, slip: Slip) -> Constraint:
-    """design.conditions.limiter_demand: forces that are limited. A little of rho stays unused, as of the damping."""
+    """design.multipliers.limiter_demand: forces that are limited. A little of rho stays unused, as of the damping."""
     rho = limiter_lag(loop.delta, loop.T, slip.beta)
     spare = np.diag([*rho, *rho]) * SPARE
 
@@ -481,14 +481,14 @@ class Problem:
             y = U @ x
             t = program.degree / max(program.value(y), 1e-12) if t is None else t / back
             y = centre(program, y, t)
-            inner = solve_triangular(U, y)
+            inner = scipy.linalg.solve_triangular(U, y)
             while True:
                 value = program.value(y)
                 if program.degree / t <= gaps[0] * max(min(value, nothing - value), 1e-9):
                     break
                 t *= _STEEPER
                 y = centre(program, y, t)
-            x = solve_triangular(U, y)
+            x = scipy.linalg.solve_triangular(U, y)
             more, worst = self.missed(x)
             if worst < _FORGIVEN and len(gaps) == 1:
                 break

@@ -6,7 +6,7 @@ import difflib
 import math
 import operator
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
@@ -17,7 +17,7 @@ from controller.lti import Array, Lti
 Condition = Literal["this-environment", "any-environment"]
 
 
-C = TypeVar("C", bound=str)  # a Condition, "jitter-proof" or "limiter"
+C = TypeVar("C", bound=str)  # a Condition, "switching" or "limiter"
 
 
 # How much damping a condition asks: sweeps, without a solver.
@@ -43,6 +43,12 @@ class Requirement(Generic[C]):
     @property
     def certified(self) -> bool:
         return self.ratio < 1
+
+    @property
+    def shortfall(self) -> str:
+        """Why it is not certified."""
+        have = listed(self.available)
+        return self.reason or f"needs {listed(self.required)} N s/m of damping, has {have}"
 
 
 def from_ratio(condition: C, ratio: float, available: tuple[float, ...], frequency_hz: float) -> Requirement[C]:
@@ -154,6 +160,7 @@ class Design:
     sdps: int  # convex problems solved (local searches count their runs)
     wall_s: float
     phi: Array | None = None  # (N,) multiplier Phi_E [N s/m] of Theorem 4, None where the environment has none
+    certificate: Any = field(kw_only=True, default=None)  # design.stored.Certificate, where the design has proved it
 
 
 @dataclass(frozen=True)

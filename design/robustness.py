@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 
 from controller.coupling import Coupling, ForceFilter
-from controller.environment import Box, Network, UncertainSpring
+from controller.environment import Network, Ranges, UncertainSpring
 from controller.loop import Loop
 from design.conditions import this_environment
 from design.environments import in_each
@@ -105,7 +105,7 @@ def robustness_parts(loop: Loop, coupling: Coupling, options: Options = DEFAULT)
     """
     if loop.environment.walls:
         return {"robustness": None, "designed_for_it": None}
-    price = spread(loop, options) if isinstance(coupling, ForceFilter) and not loop.box else None
+    price = spread(loop, options) if isinstance(coupling, ForceFilter) and not loop.ranges else None
     parts = price and {name: finite(value) for name, value in asdict(price).items()}
     return {"robustness": robustness(loop, coupling).part(), "designed_for_it": parts}
 
@@ -113,21 +113,21 @@ def robustness_parts(loop: Loop, coupling: Coupling, options: Options = DEFAULT)
 _MOST_RANGES = 6  # whose 64 vertices can all be proved
 
 
-def ranges(loop: Loop, percent: float) -> tuple[Box, str | None]:
+def widest_ranges(loop: Loop, percent: float) -> tuple[Ranges, str | None]:
     """Every stiffness and every mass this much more or less, and a note.
 
     Of more than MOST_RANGES those stay for which a small nominal design needs the most damping at their ends: the note
     names the others, which are taken as known.
     """
-    whole = box_around(loop.network, percent)
-    single = [Box(springs=(spring,)) for spring in whole.springs]
-    single += [Box(masses={node: span}) for node, span in whole.masses.items()]
+    whole = ranges_around(loop.network, percent)
+    single = [Ranges(springs=(spring,)) for spring in whole.springs]
+    single += [Ranges(masses={node: span}) for node, span in whole.masses.items()]
     if len(single) <= _MOST_RANGES:
         return whole, None
     small = design(loop.at(loop.network), replace(DEFAULT, ladder=DEFAULT.ladder[:1])).coupling
 
-    def need(box: Box) -> float:
-        there = msgspec.structs.replace(loop, box=box)
+    def need(box: Ranges) -> float:
+        there = msgspec.structs.replace(loop, ranges=box)
         return max(found.ratio for found in in_each(there, small, there.members()))
 
     ranked = sorted(single, key=need, reverse=True)
@@ -139,14 +139,14 @@ def ranges(loop: Loop, percent: float) -> tuple[Box, str | None]:
         f"most are kept, taken as known: {', '.join(names)}"
     )
     springs = tuple(spring for box in kept for spring in box.springs)
-    return Box(springs, {node: span for box in kept for node, span in box.masses.items()}), note
+    return Ranges(springs, {node: span for box in kept for node, span in box.masses.items()}), note
 
 
-def box_around(network: Network, percent: float) -> Box:
+def ranges_around(network: Network, percent: float) -> Ranges:
     """Every stiffness and every mass this much more or less, each independent of the others."""
 
     def near(value: float) -> tuple[float, float]:
         return tuple(float(f"{value * (1 + sign * percent / 100):.12g}") for sign in (-1, 1))  # type: ignore[return-value]
 
     springs = tuple(UncertainSpring(s.between, near(s.stiffness)) for s in network.springs if s.stiffness > 0)
-    return Box(springs, {node: near(mass) for node, mass in network.masses.items() if mass > 0})
+    return Ranges(springs, {node: near(mass) for node, mass in network.masses.items() if mass > 0})

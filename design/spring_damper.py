@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
-import cvxpy as cp
 import numpy as np
 
 from controller.coupling import MovingAverage, SpringDamper
@@ -25,17 +24,18 @@ from design.multipliers import (
     Lags,
     LimiterProof,
     half_widths,
-    jitter_proof,
     limiter_demand,
     limiter_lag,
     limiter_refusal,
     switching_block,
+    switching_sweep,
 )
 from design.multipliers import limiter as limiter_proof
 from design.result import Design, DesignFailed, Infeasible, Requirement
 from design.transparency import BAND_HZ, transparency
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # slow to load
+    import cvxpy as cp
     from scipy.optimize import OptimizeResult
 
 # ----------------------------------------------------------------------------------------------------
@@ -68,6 +68,8 @@ def gain_set(k: cp.Expression, b: cp.Expression, theta: int, sigma: float) -> li
     Gram form: a trigonometric polynomial r - |c(z)|^2 is non-negative iff c c' <= Q for some Q >= 0 whose
     diagonals sum to r on the main one and to zero on the others.
     """
+    import cvxpy as cp
+
     n = theta + 1
     y = cp.hstack([k + b, *[k] * (n - 1), -b])  # coefficients of 1, 1/z, ..., z^-n
     columns = [y / 2]
@@ -95,6 +97,8 @@ def solve_within(
 
     Raises as `solve`, and DesignFailed where an inequality still fails after all rounds.
     """
+    import cvxpy as cp
+
     N = len(theta)
     cones = {i: _first_frequencies(theta[i]) for i in range(N) if theta[i] > largest_gram}
     for _ in range(_MOST_ROUNDS):
@@ -124,6 +128,8 @@ def _constraints(
 
 def _gain_cones(k: cp.Expression, b: cp.Expression, theta: int, sigma: float, w: Array) -> list[cp.Constraint]:
     """The inequality at the frequencies w [rad/sample]: |(2c, r - 1)| <= r + 1 says |c|^2 <= r."""
+    import cvxpy as cp
+
     of_k, of_b = _polynomials(theta, w)
     rows = [part * k + other * b for part, other in zip(_parts(of_k), _parts(of_b), strict=True)]
     if np.isfinite(sigma):
@@ -172,6 +178,8 @@ def _parts(values: Array) -> tuple[Array, Array]:
 
 def step(shaping: Shaping, sigma: Array, at: Array, norm: float, w: Array) -> tuple[Array, float]:
     """(gains, bound on the norm at the frequencies w) of one convex-concave step from the gains `at`."""
+    import cvxpy as cp
+
     loop = shaping.loop
     gains, t = cp.Variable(2 * loop.channels), cp.Variable()
     constant, slopes = _tangent(shaping, at, norm, w)
@@ -233,6 +241,7 @@ class _SampledLoop:
         self.target = delay(loop.lam, loop.T).at(on_circle(self.band)) @ E
         self.delta = even_damping(loop.delta, loop.T, loop.T_max)
         self.root = np.sqrt(loop.T / self.delta)
+        self._last: tuple[_Responses, Array, Array, Complex] | None = None
         self._known: dict[int, tuple[_Responses, Array, tuple[Complex, Array, Complex, Complex]]] = {}
 
     def coupling(self, x: Array) -> SpringDamper:
@@ -297,26 +306,38 @@ class _SampledLoop:
         Delay in the environment can make the loop unstable where the sampled condition still holds, so there the
         distance of its poles from the circle is the last entry.
         """
-        room = 1 - _SAMPLED_RESERVE - np.linalg.eigvalsh(self._needed(x))[:, -1]
+        room = 1 - _SAMPLED_RESERVE + self._least(x)[0]
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
     def room_slope(self, x: Array) -> Array:
         """The gradient of `room`, (k, 2N) or (k + 1, 2N); poles are differenced."""
         _, E, theta = self.loop_at_conditions
         by, _, S, right = self._solved(x, self.loop_at_conditions)
-        v = np.linalg.eigh(self._needed(x))[1][:, :, -1:] * self.root[:, None]
+        v = self._least(x)[1][:, :, None]
         into = (v.conj().swapaxes(1, 2) @ theta @ E @ S)[:, 0]
         turned = into * (right @ v)[:, :, 0] / (on_circle(self.conditions) - 1)[:, None]
         slope = np.concatenate([*(turned * by).real], axis=1)
         if not any(self.loop.psi):
             return slope
-        at, steps = self.stability(x), _DIFFERENCE * np.eye(x.size)
-        return np.vstack([slope, [(self.stability(x + step) - at) / _DIFFERENCE for step in steps]])
+        return np.vstack([slope, self._stability_slope(x)])
 
-    def _needed(self, x: Array) -> Complex:
-        """Whose largest eigenvalue is the damping ratio that each sampled frequency asks for."""
-        ratio = self.force(x, self.loop_at_conditions) / (on_circle(self.conditions) - 1)[:, None, None]
-        return -hermitian(self.root[:, None] * ratio * self.root)
+    def _stability_slope(self, x: Array) -> Array:
+        at, steps = self.stability(x), _DIFFERENCE * np.eye(x.size)
+        return np.array([(self.stability(x + step) - at) / _DIFFERENCE for step in steps])
+
+    def _least(self, x: Array) -> tuple[Array, Complex]:
+        """Least eigenvalue (k,) of `_block` in units of Delta_D/T, and v whose v* block v it is; of the last x."""
+        at = self.loop_at_conditions
+        if self._last is None or self._last[0] is not at or not np.array_equal(self._last[1], x):
+            block = self._block(x)
+            root = np.tile(self.root, block.shape[1] // self.loop.channels)
+            values, vectors = np.linalg.eigh(root[:, None] * block * root)
+            self._last = (at, x.copy(), values[:, 0].astype(float), vectors[:, :, 0] * root)
+        return self._last[2], self._last[3]
+
+    def _block(self, x: Array) -> Complex:
+        """What must be positive definite with the damping, at each sampled frequency, Hermitian."""
+        return hermitian(self.force(x, self.loop_at_conditions) / (on_circle(self.conditions) - 1)[:, None, None])
 
     def stability(self, x: Array) -> float:
         """By how much more than CLOSEST_POLE the poles keep away from the circle."""
@@ -324,15 +345,17 @@ class _SampledLoop:
         return float(1 - _CLOSEST_POLE - np.abs(F.poles()).max(initial=0.0))
 
     def search(self, x: Array) -> OptimizeResult:
-        return self.minimised(x, [])
+        return self.minimised(x, [], self.room_slope)
 
-    def minimised(self, x: Array, more: list[tuple[float, float]]) -> OptimizeResult:
-        """The local optimum from x; `more` bounds the unknowns behind the gains."""
+    def minimised(
+        self, x: Array, more: list[tuple[float, float]], slope: Callable[[Array], Array] | None = None
+    ) -> OptimizeResult:
+        """The local optimum from x; `more` bounds what is behind the gains; without `slope` room is differenced."""
         N = self.loop.channels
         from scipy.optimize import minimize  # slow to load
 
         bounds = [(np.log(_SOFTEST), np.log(STIFFEST))] * N + [(0.0, 20.0)] * N + more
-        condition = {"type": "ineq", "fun": self.room, "jac": None if more else self.room_slope}  # None: differenced
+        condition = {"type": "ineq", "fun": self.room, "jac": slope}
         options = {"maxiter": 100, "ftol": 1e-7}
         problem = {"bounds": bounds, "constraints": condition, "options": options}
         return minimize(self.square_mismatch, x, jac=self.square_mismatch_slope, method="SLSQP", **problem)
@@ -385,10 +408,10 @@ def _certified_optimum(
 
 
 # ----------------------------------------------------------------------------------------------------
-# Spring-damper gains that are safe under any switching of their delays: a local search as in frozen_environment.py.
+# Spring-damper gains that are safe under any switching of their delays: a local search like the one above.
 #
 # Its sampled condition is `switching_block`: the multiplier is searched together with the gains. What is returned
-# passes the sweep of `jitter_proof`, which knows nothing of the multiplier found here.
+# passes the sweep of `switching_sweep`, which knows nothing of the multiplier found here.
 
 
 _FIRST = 0.5  # the multiplier alpha T/delta that a search begins with where the start has none
@@ -409,7 +432,7 @@ class _SwitchingLoop(_SampledLoop):
     def point(self, coupling: SpringDamper) -> Array:
         """The gains with their best multiplier."""
         loop = self.loop
-        found = jitter_proof(loop.sent(coupling), *self.range, loop.delta, T_max=loop.T_max)
+        found = switching_sweep(loop.sent(coupling), *self.range, loop.delta, T_max=loop.T_max)
         a = np.array(found.alpha)[self.active] * loop.T / self.delta[self.active]
         a = np.clip(np.where(np.isfinite(a), a, _FIRST), *_MULTIPLIERS)
         return np.concatenate([super().point(coupling), np.log(a)])
@@ -450,7 +473,7 @@ def _safe_optimum(sampled: _SwitchingLoop, start: SpringDamper) -> tuple[SpringD
     for searches in range(1, _MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
         coupling = sampled.coupling(x)
-        requirement = jitter_proof(loop.sent(coupling), *sampled.range, loop.delta, T_max=loop.T_max).requirement
+        requirement = switching_sweep(loop.sent(coupling), *sampled.range, loop.delta, T_max=loop.T_max).requirement
         if requirement.ratio <= 1 - RESERVE:
             return coupling, searches
         if sampled.room(x).min() < -_STUCK or requirement.frequency_hz is None:
@@ -461,7 +484,7 @@ def _safe_optimum(sampled: _SwitchingLoop, start: SpringDamper) -> tuple[SpringD
 
 # ----------------------------------------------------------------------------------------------------
 # Spring-damper gains that are safe also while forces are limited: the same search with the limiter's block
-# (design.conditions.limiter_demand) in the place of the linear one, and its multiplier among the unknowns.
+# (design.multipliers.limiter_demand) in the place of the linear one, and its multiplier among the unknowns.
 
 
 class _LimiterLoop(_SampledLoop):
@@ -469,6 +492,7 @@ class _LimiterLoop(_SampledLoop):
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.rho = limiter_lag(loop.delta, loop.T, BETA)
+        self._undelayed: tuple[_Responses, _Responses] | None = None
         super().__init__(loop, band_hz)
 
     def coupling(self, x: Array) -> SpringDamper:
@@ -489,21 +513,42 @@ class _LimiterLoop(_SampledLoop):
 
     def room(self, x: Array) -> Array:
         """The least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency."""
-        loop, (D, E, _) = self.loop, self.loop_at_conditions
-        now = np.broadcast_to(np.eye(loop.channels, dtype=complex), E.shape)
-        G = Sampled(on_circle(self.conditions)[None], self.force(x, (D, E, now))[None], loop.T)
-        demand = limiter_demand(G, loop.theta, loop.delta, self.rho, self.weights(x), loop.T_max)
-        block = hermitian(demand.free.G[0] + (1 - _SAMPLED_RESERVE) * demand.gain.G[0])
-        root = np.tile(self.root, 2)
-        room = np.linalg.eigvalsh(root[:, None] * block * root)[:, 0].astype(float)
-        return np.append(room, self.stability(x)) if any(loop.psi) else room
+        room = self._least(x)[0]
+        return np.append(room, self.stability(x)) if any(self.loop.psi) else room
+
+    def room_slope(self, x: Array) -> Array:
+        """Its gradient: the block's first columns hold G, and c_i takes itself from N_i."""
+        loop, (_, E, theta), v = self.loop, self.loop_at_conditions, self._least(x)[1]
+        (by, _, S, right), z = self._solved(self._gains(x), self._now()), on_circle(self.conditions)[:, None]
+        first, second = np.split(v, 2, axis=1)
+        N = -np.stack([_polynomials(n, self.conditions)[0] for n in loop.theta], axis=1) - self.weights(x).T
+        late = np.diagonal(theta, axis1=1, axis2=2) / (z - 1)
+        into = np.einsum("ki,kij->kj", first.conj() * late + second.conj() * N, E @ S)
+        turned = into * np.einsum("kij,kj->ki", right, first)
+        steps = np.einsum("kij,kj->ki", self.force(x, self._now()), first) - (1 - 1 / z) * np.array(self.rho) * second
+        slope = np.concatenate([*(turned * by).real, -(second.conj() * steps).real], axis=1)
+        return np.vstack([slope, self._stability_slope(x)]) if any(loop.psi) else slope
+
+    def _now(self) -> _Responses:
+        """Of the forces as they leave, before Theta."""
+        D, E, _ = at = self.loop_at_conditions
+        if self._undelayed is None or self._undelayed[0] is not at:
+            now = np.broadcast_to(np.eye(self.loop.channels, dtype=complex), E.shape)
+            self._undelayed = (at, (D, E, now))
+        return self._undelayed[1]
+
+    def _block(self, x: Array) -> Complex:
+        loop = self.loop
+        G = Sampled(on_circle(self.conditions)[None], self.force(x, self._now())[None], loop.T)
+        demand = limiter_demand(G, loop.theta, loop.delta, self.rho, self.weights(x).tolist(), loop.T_max)
+        return hermitian(demand.free.G[0] + (1 - _SAMPLED_RESERVE) * demand.gain.G[0])
 
     def search(self, x: Array) -> OptimizeResult:
-        return self.minimised(x, [(0.0, _MOST_WEIGHT)] * self.loop.channels)
+        return self.minimised(x, [(0.0, _MOST_WEIGHT)] * self.loop.channels, self.room_slope)
 
-    def weights(self, x: Array) -> list[list[float]]:
+    def weights(self, x: Array) -> Array:
         """c, a row of one lag per channel."""
-        return np.maximum(x[2 * self.loop.channels :, None], 0.0).tolist()
+        return np.maximum(x[2 * self.loop.channels :, None], 0.0)
 
     def _gains(self, x: Array) -> Array:
         return x[: 2 * self.loop.channels]
@@ -516,7 +561,7 @@ def _limited_optimum(loop: Loop, band_hz: tuple[float, float], start: SpringDamp
     for searches in range(1, _MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
         coupling = sampled.coupling(x)
-        requirement = sampled.proof(coupling, sampled.weights(x)).requirement
+        requirement = sampled.proof(coupling, sampled.weights(x).tolist()).requirement
         if requirement.ratio <= 1 - RESERVE:
             return coupling, searches
         if sampled.room(x).min() < -_STUCK or requirement.frequency_hz is None:
@@ -563,9 +608,28 @@ def design(
     raise ValueError(f"condition is {condition!r}, expected 'any-environment' or 'this-environment'")
 
 
+#: Devices whose search ends within half a minute: matrix inequalities cost their sixth power, eigenvalues their third.
+_MOST_ANY, _MOST_LIMITED = 16, 12
+
+
+def _require_few(loop: Loop, most: int, what: str) -> None:
+    if loop.channels > most:
+        raise DesignFailed(None, (), f"{loop.channels} devices, allowed are {most} for a spring-damper by {what}")
+
+
 def design_with(loop: Loop, condition: str, limiter: bool | None = None, **options: Any) -> Design:
-    """A spring-damper, with the limiter's block in the place of the linear one where that is asked for or usual."""
-    if limiter is False or condition == "any-environment":  # with rho = 0 any-environment covers limited forces anyway
+    """A spring-damper, with the limiter's block in the place of the linear one where that is asked for or usual.
+
+    Raises DesignFailed at once for so many devices that the search would take minutes.
+    """
+    if condition == "any-environment":  # with rho = 0 it covers limited forces anyway
+        _require_few(
+            loop, _MOST_ANY, "any-environment: use a moving average, which needs no search, or this-environment"
+        )
+        return design(loop, condition, **options)
+    if limiter:
+        _require_few(loop, _MOST_LIMITED, "the limiter's block: leave the limiter out")
+    if limiter is False or loop.channels > _MOST_LIMITED:
         return design(loop, condition, **options)
     refusal = limiter_refusal(loop)
     if limiter and refusal:
@@ -711,6 +775,8 @@ def _coupling(loop: Loop, gains: Array) -> SpringDamper:
 
 def _start(loop: Loop, sigma: Array, start: SpringDamper | None) -> tuple[Array, int]:
     """The gains of the set nearest to `start`, or the stiffest of the set; and the number of SDPs, one."""
+    import cvxpy as cp
+
     N = loop.channels
     gains = cp.Variable(2 * N)
     objective = cp.Maximize(cp.sum(gains[:N]))

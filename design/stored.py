@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 
 from controller.coupling import Coupling, Form, Strict, require_channels
-from controller.loop import Loop
+from controller.loop import Loop, named_first, named_today
 from design.files import InputError, read, write
 from design.result import OLDER_NAMES, Condition
 
@@ -30,6 +30,11 @@ _Rows = tuple[tuple[float, ...], ...]
 
 
 _Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_length=1000)]
+
+
+#: for which environments a certificate holds
+Guarantee = Literal["any passive environment", "these ranges", "this environment"]
+_OLDER_GUARANTEES = {"a set": "these ranges"}
 
 
 _Part = TypeVar("_Part", bound=msgspec.Struct)
@@ -62,13 +67,13 @@ class Certificate(Strict, frozen=True):
     required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep
     available: tuple[float, ...]  # (m,) [N s/m], the damping for which it is proved
     margin: float  # available / required
-    guarantee: Literal["any passive environment", "a set", "this environment"] = msgspec.field(name="promise")
+    guarantee: Guarantee = msgspec.field(name="promise")
     proof: Literal["sampled", "kyp", "rational"]
     matrices: dict[str, tuple[tuple[_Rational, ...], ...]]  # rationals "p/q"
     scenario: str  # digest of the loop and the coupling
     versions: dict[str, str]
     seal: str = ""  # digest of all other fields
-    switching: SwitchingProof | msgspec.UnsetType = msgspec.UNSET  # of a loop with jitter; left out of other files
+    switching: SwitchingProof | msgspec.UnsetType = msgspec.UNSET  # where delays vary; left out of other files
     limiter: LimiterCertificate | msgspec.UnsetType = msgspec.UNSET  # where it was proved; left out of other files
 
 
@@ -95,23 +100,25 @@ class Stored(Strict, frozen=True):
 
 def digest(*parts: msgspec.Struct) -> str:
     """sha256 over the canonical JSON (sorted keys, shortest decimals, 7 as 7.0 where it is a float) of the parts."""
-    return _sha256([_read_back(part) for part in parts])
+    plain = [msgspec.json.decode(_canonical(_read_back(part))) for part in parts]
+    return hashlib.sha256(msgspec.json.encode([named_first(fields) for fields in plain])).hexdigest()
 
 
 def _read_back(part: _Part) -> _Part:
     return msgspec.json.decode(msgspec.json.encode(part), type=type(part))
 
 
-def _sha256(parts: list[Any]) -> str:
-    return hashlib.sha256(msgspec.json.encode(parts, order="deterministic")).hexdigest()
+def _canonical(part: Any) -> bytes:
+    return msgspec.json.encode(part, order="deterministic")
 
 
 def sealed(certificate: Certificate) -> Certificate:
-    """The certificate with the digest of all its other fields, its condition by the name of the first files."""
-    older = {name: before for before, name in OLDER_NAMES.items()}
+    """The certificate with the digest of all its other fields, named as in the first files."""
+    older: dict[str, Any] = {name: before for before, name in (OLDER_NAMES | _OLDER_GUARANTEES).items()}
     plain = _read_back(msgspec.structs.replace(certificate, seal=""))
-    first: Any = older[certificate.condition]
-    return msgspec.structs.replace(certificate, seal=_sha256([msgspec.structs.replace(plain, condition=first)]))
+    guarantee = older.get(plain.guarantee, plain.guarantee)
+    first = msgspec.structs.replace(plain, condition=older[plain.condition], guarantee=guarantee)
+    return msgspec.structs.replace(certificate, seal=hashlib.sha256(_canonical([first])).hexdigest())
 
 
 def load(path: str | Path) -> Stored:
@@ -127,20 +134,24 @@ def load(path: str | Path) -> Stored:
         raise InputError(f"{path}: names {str(error)!r} twice in one object") from None
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: is no stored coupling: {' '.join(str(error).split())}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: {_place(content, str(error))}{' '.join(str(error).split())}") from None
 
 
 def _renamed(content: bytes) -> bytes:
-    """The content with the condition by its name of today; as it is where it has that, or is no certificate."""
+    """The content by the names of today; as it is where it has those, or is no stored coupling."""
     try:
         whole = msgspec.json.decode(content)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return content
+    older = OLDER_NAMES | _OLDER_GUARANTEES
     match whole:
-        case {"certificate": {"condition": str(name)} as claim} if name in OLDER_NAMES:
-            return msgspec.json.encode(whole | {"certificate": claim | {"condition": OLDER_NAMES[name]}})
-    return content
+        case {"certificate": dict() as claim}:
+            claim |= {key: older[word] for key, word in claim.items() if isinstance(word, str) and word in older}
+    match whole:
+        case {"loop": dict() as loop}:
+            whole["loop"] = named_today(loop)
+    return msgspec.json.encode(whole)
 
 
 class _Twice(Exception):

@@ -1,5 +1,8 @@
 """python docs/regenerate.py: run what README and docs command, and write the real output where a block asks for it.
 
+`--check` runs the slow commands alone (`make validate` does) and compares what they print with what the pages show, but
+for times: exit code 1 where that is something else.
+
     <!-- output: certified|binds -->      lines with one of these words (a regular expression); all without ": .."
     ```console
     $ python -m design.audit ..
@@ -17,6 +20,8 @@ tests/project/test_docs.py runs the same steps and compares, but for what is mea
 from __future__ import annotations
 
 import ast
+import itertools
+import math
 import os
 import re
 import shlex
@@ -91,8 +96,58 @@ def renewed(text: str, printed: dict[str, str]) -> str:
     return text
 
 
+_NUMBER = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?:e[-+]\d+)?(?![\w])")
+#: what a machine decides: seconds, speeds, what costs what, and the last column of a table, of times or of rounding
+_TIMES = re.compile(
+    r"[\d.]+(?= s\b| x real time| simulated seconds per)|(?<=raw steps )[\d.]+|(?<=clipped )[\d.]+|[^│]*│$"
+)
+_ROUNDING = 1e-6  # an error smaller than this may be rounding, which is another one on another machine
+
+
+def same_line(shown: str, line: str, measured: bool = False) -> bool:
+    """The same words, and numbers that differ by two units in the last place shown, or two thousandths, at most.
+
+    Where it is measured, times do not count, and errors (`1.2e-05`) are the same within a factor of two.
+    """
+    if measured:
+        shown, line = _TIMES.sub("", shown), _TIMES.sub("", line)
+    shown, line = " ".join(shown.split()), " ".join(line.split())  # a column is as wide as its widest number
+    if _NUMBER.sub("#", shown) != _NUMBER.sub("#", line):
+        return False
+    pairs = zip(_NUMBER.findall(shown), _NUMBER.findall(line), strict=True)
+    return all(_close(a, b, measured) for a, b in pairs)
+
+
+def _close(shown: str, number: str, measured: bool) -> bool:
+    a, b = float(shown), float(number)
+    if measured and "e" in shown:
+        return max(abs(a), abs(b)) < _ROUNDING or 0.5 <= a / b <= 2 if b else abs(a) < _ROUNDING
+    mantissa, _, exponent = shown.partition("e")
+    last_place = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
+    return math.isclose(a, b, rel_tol=2e-3, abs_tol=2 * last_place)
+
+
+def check() -> int:
+    """Run what is measured and say which lines of which pages are something else now."""
+    found, printed = 0, {}
+    with TemporaryDirectory() as place:
+        for page in PAGES:
+            for _, pattern, command, shown in MEASURED.findall(page.read_text(encoding="utf-8")):
+                if command not in printed:
+                    print(f"{page.name}: {command}", flush=True)
+                    printed[command] = run(command, Path(place)).stdout
+                fresh = kept(printed[command], pattern).splitlines()
+                for was, now in itertools.zip_longest(shown.splitlines(), fresh, fillvalue=""):
+                    if not same_line(was, now, measured=True):
+                        found += 1
+                        print(f"  the page shows  {was}\n  and there is    {now}")
+    return 1 if found else 0
+
+
 def main() -> int:
     """Run every page that shows output, and rewrite those whose output is another."""
+    if sys.argv[1:] == ["--check"]:
+        return check()
     printed: dict[str, str] = {}
     with TemporaryDirectory() as place:
         folder = Path(place)

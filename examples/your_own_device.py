@@ -7,6 +7,9 @@ import sys
 
 import numpy as np
 
+from controller.coupling import SpringDamper
+from controller.environment import RIGID_WALL
+from design import Loop, certify
 from hw import rehearse
 from models.device import RigidDevice
 from sim import InputError, load
@@ -14,6 +17,13 @@ from sim import InputError, load
 # put your numbers here: [kg], [N s/m], [N], [m]
 MINE = {"mass": 0.18, "damping": 0.9, "force_limit": 6.0, "encoder_step": 2e-6}
 SECONDS = 2.0
+
+
+def _wall(delay: float | None) -> float:
+    """Damping [N s/m] that a rigid wall behind a spring asks, its force late by this [s], or by a sample."""
+    theta, latency = ((1,), None) if delay is None else ((0,), ((delay, delay),))
+    wall = Loop(1.2e-3, theta, (0,), theta, (MINE["damping"],), RIGID_WALL, latency=latency)
+    return certify(wall, SpringDamper([1000.0], [0.0]))["this-environment"].required[0]
 
 
 def main() -> None:
@@ -26,6 +36,7 @@ def main() -> None:
     delay, late = 1e6 * (session.delay or 0.0), [1e6 * tau for tau in session.latency or ()]
     print(f"measured: {delay:.0f} us from sample to force; spring-damper for {late[0]:.0f} to {late[1]:.0f} us")
     print(f"needs {max(found.required):.4f} of {min(found.available):.2f} N s/m: certified = {found.certified}")
+    print(f"a wall of 1000 N/m at 1.2 ms needs {_wall(session.delay):.4f} N s/m, a whole sample late {_wall(None):.4f}")
     moved = np.abs(session.result.x).max()
     print(f"{len(session.result.t)} ticks, ended {session.stage}; handles moved up to {1e3 * moved:.1f} mm")
     print(f"zero force {1e3 * session.zero_after:.1f} ms after the stop was asked for")

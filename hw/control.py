@@ -26,11 +26,11 @@ from controller.process import Limiter, limited
 from design.certificate import assess
 from design.coverage import Limits as ForceLimits
 from design.guarantees import guarantee_of
-from design.result import DesignFailed, Requirement, certificate_part
+from design.result import Design, DesignFailed, Requirement, certificate_part
 from hw.limits import Fault, Gain, Heat, Limits, Units, check_jolt, check_jump, check_range, check_speed, shape
 from hw.monitor import Ages, ClockMonitor, CommandMonitor, Counters, EncoderMonitor, EncoderTest, LinkSettings
 from hw.protocol import MAX_THETA, Config, State
-from sim.couplings import Chosen, choose, limits_of
+from sim.couplings import Chosen, choose, given, limits_of
 from sim.report import coupling_part
 from sim.scenario import InputError, Scenario
 
@@ -427,10 +427,10 @@ def certified_coupling(
     name: str | None,
     condition: str | None,
     link: int,
-    given: Coupling | None = None,
+    own: Coupling | Design | None = None,
     limiter: bool | None = None,
 ) -> CertifiedCoupling:
-    """The coupling `name`, or the one that is `given`, for a link of `link` ticks (0: the host is the clock).
+    """The coupling `name`, or one's `own`, for a link of `link` ticks (0: the host is the clock).
 
     Forces leave through the limiter that these cover, unless `limiter` is False.
 
@@ -443,11 +443,11 @@ def certified_coupling(
     try:
         # a latency is derived for this environment only
         wanted = condition or ("this-environment" if slower.latency else None)
-        chosen = Chosen("given", given, "this-environment") if given else choose(slower, case, name, wanted, limiter)
+        chosen = choose(slower, case, name, wanted, limiter) if own is None else given(own)
     except DesignFailed as error:
         raise Fault(f"no coupling for a link of {link} ticks: {error}") from None
     requirements = assess(slower.loop(case), chosen.coupling, chosen.phi)
-    limits = limits_of(slower, chosen.coupling, requirements, limiter)
+    limits = limits_of(slower, chosen, requirements, limiter)
     made = CertifiedCoupling(min(slower.theta) if link else 0, slower, case, chosen, requirements, limits)
     if not made.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"

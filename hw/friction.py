@@ -25,26 +25,27 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
-from scipy.signal import fftconvolve
-from scipy.special import erf
 
 from controller.lti import Array
 
-_WINDOW = 0.012  # [s] standard deviation of h: half the amplitude at 16 Hz
+_WINDOW = 0.012  # [s] least standard deviation of h: half the amplitude at 16 Hz
+_ACCELERATION_NOISE = 1.5e-3  # [m/s2] that rounding of the encoder may leave: a coarse one has a longer window
 _SPEED_NOISE = 3e-4  # [m/s] of the speed that friction is told by: makes its window as short as the encoder allows
+_SPACING = 0.4  # standard deviations of the window between two rows: what it lets pass has nothing finer
+_NEARBY = 3.5  # standard deviations that a row keeps from where the balance does not hold
 _REACH = 6  # standard deviations that a window is cut at
 _STILL = 0.02  # [s] within one count of which an encoder stands still
-_SLIPS = (5e-4, 1e-3, 2e-3, 5e-3, 1e-2, 2e-2)  # [m/s] speed at which dry friction is at 3/4
-_BRISTLES = (1e-5, 3e-5, 1e-4)  # [m] over which friction reverses, where it is position that turns it (Dahl 1968)
+_SLIPS = (5e-4, 1e-3, 2e-3, 3.5e-3, 6e-3, 1e-2, 1.4e-2, 2e-2, 3e-2)  # [m/s] speed at which dry friction is at 3/4
+_BRISTLES = (1e-5, 1.7e-5, 3e-5, 5.5e-5, 1e-4, 1.7e-4)  # [m] over which friction reverses by position (Dahl 1968)
 _STRIBECK = 0.02  # [m/s] above which the rest of static friction is gone
 _SLOW, _WEAK = 0.2, 0.05  # part of a force that the window has to pass, unless it is so small a part of the strongest
 _BLOCKS = 10  # of the record, that are left out in turn
 _HIDDEN = 0.03  # of what is left unexplained, that may be damping in disguise
+_SCALE = 5e-3  # of the encoder, that nobody can tell: 20 um of eccentricity over a part of a turn of 40 mm are 3e-3
 _QUANTILE = 1.833  # of Student's t with 9 degrees of freedom, 95 % to one side
 _FEW = 200  # rows
 _ALMOST = 4.0  # by which a log likelihood ratio may be worse than the best law's
@@ -52,7 +53,7 @@ _ROUNDS = 3  # in which the transmission's part of friction is found
 _PERIODS = np.geomspace(5e-4, 0.08, 60)  # [m] where a periodic disturbance is looked for
 _NEAR = np.geomspace(0.92, 1.09, 24)  # times the best one of these, once more
 _PERIODIC = 4  # at most so many
-_GAIN = 0.05  # of the sum of squares, that a periodic one has to explain
+_CHANCE = 2.0  # by which the log likelihood of a periodic one exceeds what the best of so many explains of noise
 _MASS, _VISCOUS, _CONSTANT, _SLOPE, _SPRING, _TAU, _MODE, _LOSS, _STIFF, _DRAG, _DRY, _STATIC = range(12)
 _NOT_NEGATIVE = (_VISCOUS, _MODE, _DRAG, _DRY, _STATIC)
 
@@ -81,33 +82,29 @@ def _window(order: int, sigma: float, T: float) -> Array:
 
 
 def _filtered(signal: Array, order: int, sigma: float, T: float) -> Array:
-    return fftconvolve(signal, _window(order, sigma, T), mode="same")
+    return scipy.signal.fftconvolve(signal, _window(order, sigma, T), mode="same")
 
 
 def _held(force: Array, sigma: float, T: float) -> tuple[Array, Array, Array]:
     """A force held for each tick, filtered, and its two derivatives."""
     n = round(_REACH * sigma / T)
     t = np.arange(-n, n + 1) * T
-    step = (erf(t / (np.sqrt(2) * sigma)) - erf((t - T) / (np.sqrt(2) * sigma))) / 2
+    step = (scipy.special.erf(t / (np.sqrt(2) * sigma)) - scipy.special.erf((t - T) / (np.sqrt(2) * sigma))) / 2
     bells = [np.exp(-((s / sigma) ** 2) / 2) / (np.sqrt(2 * np.pi) * sigma) for s in (t, t - T)]
     slope = (bells[1] * (t - T) - bells[0] * t) / sigma**2
-    first, second, third = (fftconvolve(force, kernel, mode="same") for kernel in (step, bells[0] - bells[1], slope))
+    kernels = (step, bells[0] - bells[1], slope)
+    first, second, third = (scipy.signal.fftconvolve(force, kernel, mode="same") for kernel in kernels)
     return first, second, third
 
 
-def _moving(x: Array, step: float, T: float, sigma: float) -> NDArray[np.bool_]:
-    """Where the encoder does not stand still, nor within a window's width: what holds a body at rest is not in g."""
+def _moving(x: Array, step: float, T: float) -> NDArray[np.bool_]:
+    """Where the encoder does not stand still."""
     counts, n = np.round(x / step), max(2, round(_STILL / T))
-    still = np.zeros(len(x))
+    moves = np.ones(len(x), dtype=bool)
     view = np.lib.stride_tricks.sliding_window_view(counts, n)
-    starts = np.flatnonzero(np.ptp(view, axis=1) <= 1)
-    for k in starts:
-        still[k : k + n] = 1.0
-    width = np.ones(2 * round(2 * sigma / T) + 1)
-    near = fftconvolve(still, width, mode="same") > 0.5
-    edge = round(_REACH * sigma / T)
-    near[:edge] = near[-edge:] = True
-    return ~near
+    for k in np.flatnonzero(np.ptp(view, axis=1) <= 1):
+        moves[k : k + n] = False
+    return moves
 
 
 def _bristle(x: Array, reach: float) -> Array:
@@ -121,8 +118,7 @@ def _bristle(x: Array, reach: float) -> Array:
 
 def _slow(force: Array, sigma: float, T: float) -> NDArray[np.bool_]:
     """Where the force is not mostly faster than the window: there friction is turned by motion that is not seen."""
-    width = 3 * sigma
-    strong, left = (_filtered(f**2, 0, width, T) for f in (force, _filtered(force, 0, sigma, T)))
+    strong, left = (_filtered(f**2, 0, sigma, T) for f in (force, _filtered(force, 0, sigma, T)))
     return (left > _SLOW**2 * strong) | (strong < _WEAK**2 * strong.max())
 
 
@@ -130,53 +126,68 @@ class _Balance:
     """The rows of the balance where the axis moves."""
 
     def __init__(self, x: Array, force: Array, T: float, step: float) -> None:
-        self.T, self.sigma, self.force = T, max(_WINDOW, 3 * T), force
+        noise = 3 * step**2 * T / (96 * np.sqrt(np.pi) * _ACCELERATION_NOISE**2)  # sigma^5, of white rounding
+        self.T, self.sigma, self.force = T, max(_WINDOW, 3 * T, noise**0.2), force
         self.x = x - x[0]
-        self.rows = np.flatnonzero(_moving(x, step, T, self.sigma) & _slow(force, self.sigma, T))
-        if len(self.rows) < _FEW:
-            raise ValueError(f"the axis moves in {len(self.rows)} samples only, at least {_FEW} are needed")
+        self._reach = round(_REACH * self.sigma / T)
+        # what holds a body at rest, or dithers it, is not in g
+        clear = _moving(x, step, T) & _slow(force, self.sigma, T)
+        spoilt = scipy.ndimage.binary_dilation(~clear, iterations=round(_NEARBY * self.sigma / T)).astype(bool)
+        rows = np.flatnonzero(~spoilt[self._reach : -self._reach]) + self._reach
+        if len(rows) < _FEW:
+            raise ValueError(f"the axis moves in {len(rows)} samples only, at least {_FEW} are needed")
+        self.independent = len(rows) * T / (2 * np.sqrt(np.pi) * self.sigma)  # samples behind so long a window
+        self.rows = rows[:: max(1, int(_SPACING * self.sigma / T))]
+        self._length = scipy.fft.next_fast_len(len(x) + 2 * self._reach)
+        self._filters = {n: np.fft.fft(_window(n, self.sigma, T), self._length) for n in range(5)}
         short = (step**2 / 12 * T / (4 * np.sqrt(np.pi) * _SPEED_NOISE**2)) ** (1 / 3)
         self.speed = _filtered(self.x, 1, float(np.clip(short, T, self.sigma / 2)), T)
         applied, rate, bend = _held(force, self.sigma, T)
         self.applied = applied[self.rows]
         t = np.arange(len(x)) * T
         zero = np.zeros(len(self.rows))
-        self.common = [
-            self._of(self.x, 2),
-            self._of(self.x, 1),
-            zero + 1.0,
-            t[self.rows] - t[self.rows].mean(),
-            self._of(self.x, 0),
-            rate[self.rows],
-            -bend[self.rows],
-            self._of(self.x, 3),
-            self._of(self.x, 4),
-        ]
+        place, velocity, acceleration, jerk, snap = self._of(self.x, 0, 1, 2, 3, 4)
+        drift = t[self.rows] - t[self.rows].mean()
+        lag = [rate[self.rows], -bend[self.rows]]
+        self.common = [acceleration, velocity, zero + 1.0, drift, place, *lag, jerk, snap]
         self.drag = self.speed * np.abs(self.speed)
 
-    def _of(self, signal: Array, order: int) -> Array:
-        return _filtered(signal, order, self.sigma, self.T)[self.rows]
+    def _complex(self, signal: NDArray[np.complex128] | Array, *orders: int) -> list[NDArray[np.complex128]]:
+        """Derivatives (rows,) of the filtered signal (N,)."""
+        spectrum = np.fft.fft(signal, self._length)
+        return [np.fft.ifft(spectrum * self._filters[order])[self.rows + self._reach] for order in orders]
+
+    def _of(self, signal: Array, *orders: int) -> list[Array]:
+        return [one.real for one in self._complex(signal, *orders)]
 
     def laws(self, step: float) -> list[tuple[float, Array]]:
         """Dry friction (N,) within +-1 by every law, and the speed [m/s] at which it is at 3/4 (0: by position)."""
         bristles = [(0.0, _bristle(self.x, reach)) for reach in _BRISTLES if reach > step]
         return [(slip, np.tanh(self.speed / slip)) for slip in _SLIPS] + bristles
 
-    def matrix(self, dry: Array, periodic: list[Array]) -> Callable[[float], Array]:
+    def matrix(self, dry: Array, periodic: list[_Pair]) -> Callable[[float], Array]:
         """Columns (rows, p) of the balance, by how much of friction's second derivative is in it."""
         laws = [self.drag, dry, dry * np.exp(-((self.speed / _STRIBECK) ** 2))]
-        plain, bent = [self._of(law, 0) for law in laws], [self._of(law, 2) for law in laws]
+        plain, bent = zip(*(self._of(law, 0, 2) for law in laws), strict=True)
 
         def columns(mode: float) -> Array:
             friction = [one + mode * two for one, two in zip(plain, bent, strict=True)]
-            return np.stack([*self.common, *friction, *periodic], axis=1)
+            return np.hstack([np.stack([*self.common, *friction], axis=1), *(pair.columns for pair in periodic)])
 
         return columns
 
-    def waves(self, period: float) -> tuple[list[Array], list[Array]]:
-        """A force that repeats with position, and an encoder's error that does."""
-        wave = np.exp(2j * np.pi * self.x / period)
-        return [self._of(wave.real, 0), self._of(wave.imag, 0)], [self._of(wave.real, 2), self._of(wave.imag, 2)]
+    def waves(self, periods: Array) -> list[_Pair]:
+        """For every period [m] a force that repeats with position, and an encoder's error that does."""
+        waves = [(p, wave) for p in periods.tolist() for wave in self._complex(np.exp(2j * np.pi * self.x / p), 0, 2)]
+        return [_Pair(period, np.stack([wave.real, wave.imag], axis=1)) for period, wave in waves]
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """What repeats with position: columns (rows, 2) of its cosine and sine."""
+
+    period: float  # [m]
+    columns: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +200,11 @@ class _Fit:
     def squares(self) -> float:
         return float(self.residual @ self.residual)
 
+    @property
+    def price(self) -> float:
+        """Of friction beside the viscous one, as Akaike's criterion has it: of laws alike, the simplest is told."""
+        return 2.0 * int(np.count_nonzero(self.p[[_DRAG, _DRY, _STATIC]]))
+
 
 def _solve(columns: Array, force: Array) -> Array:
     """Least squares where some parameters are not negative."""
@@ -196,10 +212,10 @@ def _solve(columns: Array, force: Array) -> Array:
     q, r = np.linalg.qr(columns / scale)
     low = np.full(columns.shape[1], -np.inf)
     low[list(_NOT_NEGATIVE)] = 0.0
-    return lsq_linear(r, q.T @ force, (low, np.inf), method="bvls").x / scale
+    return scipy.optimize.lsq_linear(r, q.T @ force, (low, np.inf), method="bvls").x / scale
 
 
-def _fitted(balance: _Balance, dry: Array, periodic: list[Array]) -> _Fit:
+def _fitted(balance: _Balance, dry: Array, periodic: list[_Pair]) -> _Fit:
     columns = balance.matrix(dry, periodic)
     at = columns(0.0)
     p = _solve(at, balance.applied)
@@ -209,36 +225,43 @@ def _fitted(balance: _Balance, dry: Array, periodic: list[Array]) -> _Fit:
     return _Fit(p, at, balance.applied - at @ p)
 
 
-def _disturbances(balance: _Balance, fit: _Fit) -> tuple[list[Array], tuple[float, ...]]:
-    """Periodic disturbances that explain what the fit leaves, strongest first, and their periods [m]."""
-    found: list[Array] = []
-    periods: list[float] = []
-    for _ in range(_PERIODIC):
-        q, _r = np.linalg.qr(np.stack([*fit.columns.T, *found], axis=1))
-        left = fit.residual - q @ (q.T @ fit.residual)
-        best = (0.0, 0.0, list[Array]())
-        for fine in (False, True):  # between two of the grid a long record loses count of the periods
-            periods_near = best[1] * _NEAR if fine else _PERIODS[np.ptp(balance.x) > _PERIODS]
-            for period in periods_near if best[1] or not fine else ():
-                for pair in balance.waves(float(period)):
-                    own = np.stack(pair, axis=1)
-                    own = np.linalg.qr(own - q @ (q.T @ own))[0]
-                    gain = float(np.sum((own.T @ left) ** 2) / (left @ left))
-                    if gain > best[0]:
-                        best = (gain, float(period), pair)
-        if best[0] < _GAIN:
+def _strongest(pairs: list[_Pair], columns: Array, residual: Array) -> tuple[float, _Pair]:
+    """The pair that explains most of what `columns` (rows, p) leave of `residual` (rows,), and which part of it."""
+    q = np.linalg.qr(columns)[0]
+    left, most, found = residual - q @ (q.T @ residual), 0.0, pairs[0]
+    for pair in pairs:
+        own = np.linalg.qr(pair.columns - q @ (q.T @ pair.columns))[0]
+        gain = float(np.sum((own.T @ left) ** 2) / (left @ left))
+        if gain > most:
+            most, found = gain, pair
+    return most, found
+
+
+def _disturbances(balance: _Balance, fit: _Fit) -> list[_Pair]:
+    """Periodic disturbances that explain what the fit leaves, strongest first.
+
+    Among noise the best of n pairs explains about 2 log n of `independent` parts: one that counts has _CHANCE more.
+    """
+    found: list[_Pair] = []
+    grid = balance.waves(_PERIODS[np.ptp(balance.x) > _PERIODS])
+    needed = -np.expm1(-2 * (np.log(len(grid) * len(_NEAR) + 1) + _CHANCE) / balance.independent)
+    while grid and len(found) < _PERIODIC:
+        columns = np.hstack([fit.columns, *(pair.columns for pair in found)])
+        _, near = _strongest(grid, columns, fit.residual)
+        # between two of the grid a long record loses count of the periods
+        gain, pair = _strongest(balance.waves(near.period * _NEAR), columns, fit.residual)
+        if gain < needed:
             break
-        found += best[2]
-        periods.append(best[1])
-    return found, tuple(periods)
+        found.append(pair)
+    return found
 
 
 def _scatter(fit: _Fit, force: Array) -> Array:
     """Covariance (p, p) of the free parameters by leaving out each of _BLOCKS parts of the record in turn."""
-    edges = np.linspace(0, len(force), _BLOCKS + 1).astype(int)
+    group = np.arange(len(force)) * _BLOCKS // len(force)
     others = []
-    for a, b in pairwise(edges):
-        keep = np.r_[0:a, b : len(force)]
+    for g in range(_BLOCKS):
+        keep = group != g
         others.append(_solve(fit.columns[keep], force[keep]))
     apart = np.array(others) - np.mean(others, axis=0)
     return (_BLOCKS - 1) / _BLOCKS * apart.T @ apart
@@ -255,13 +278,13 @@ def friction(x: Array, force: Array, T: float, step: float) -> Friction:
     balance = _Balance(x, force, T, step)
     laws = balance.laws(step)
     plain = min((_fitted(balance, dry, []) for _, dry in laws), key=lambda fit: fit.squares)
-    periodic, periods = _disturbances(balance, plain)
+    periodic = _disturbances(balance, plain)
     fits = [(slip, _fitted(balance, dry, periodic)) for slip, dry in laws]
-    slip, best = min(fits, key=lambda entry: entry[1].squares)
-    independent = len(balance.rows) * T / (2 * np.sqrt(np.pi) * balance.sigma)
+    least = min(fit.squares for _, fit in fits)
+    slip, best = min(fits, key=lambda entry: balance.independent * np.log(entry[1].squares / least) + entry[1].price)
     delta, covariance = np.inf, np.zeros(0)
     for _, fit in fits:
-        if independent * np.log(fit.squares / best.squares) > _ALMOST:
+        if balance.independent * np.log(fit.squares / least) > _ALMOST:
             continue
         spread = _scatter(fit, fit.residual + fit.columns @ fit.p)
         hid = np.sqrt(fit.squares) / np.linalg.norm(_apart(fit.columns, _VISCOUS))
@@ -277,8 +300,8 @@ def friction(x: Array, force: Array, T: float, step: float) -> Friction:
         stiffness=float(p[_SPRING]),
         constant=float(p[_CONSTANT]),
         slip=slip,
-        periods=periods,
+        periods=tuple(pair.period for pair in periodic),
         errors={name: float(np.sqrt(covariance[i, i])) for name, i in names.items()},
-        delta=max(0.0, float(delta)),
+        delta=max(0.0, (1 - _SCALE) * float(delta)),
         rms=float(np.sqrt(best.squares / len(best.residual))),
     )

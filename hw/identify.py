@@ -15,9 +15,8 @@ from math import tanh
 from typing import Any
 
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.linalg import expm
-from scipy.optimize import OptimizeResult, least_squares
 
 from controller.lti import Array, frozen
 from hw.control import Controller
@@ -35,9 +34,10 @@ _SHIFT = 1e-5  # of log parameters, and of Coulomb friction in newtons, for deri
 _UNEXPLAINED = 0.7, 1.5e-3  # encoder steps rms (rounding alone leaves 0.29), or this part of the motion's rms
 _SLIP = 0.002  # [m/s] speed at which Coulomb friction is at 3/4
 _COARSE, _FINE = 3, 8  # substeps of a tick for which it is held: in a search, and at its end
-_SLOWER, _SLOW_SPAN = 1.2, 5.0  # where the second sweep begins and ends, by the first one's lowest frequency
+_SLOW_SPAN = 4.0  # of the slow sweeps' frequencies
 _LEAD = 0.3  # [s] of zero force, in which the gain comes up
 _MODES_HZ = np.geomspace(25.0, 300.0, 60)  # where a mode is looked for first
+_FAST, _A_WHILE = 0.1, 0.02  # part of the largest mean square change of a force, and [s] of that mean
 _PARTS = (0.15, 0.25, 0.35, 0.5, 0.65)  # of the mass, that the motor may have
 _STARTS = 2  # of the search in time
 _SPECTRUM = 250  # frequencies that are compared first
@@ -100,21 +100,24 @@ class _Player:
 def chirp(
     channels: int, T: float, link: int, amplitude: float, band: tuple[float, float], seconds: float
 ) -> Excitation:
-    """A cosine [N] whose frequency rises exponentially through `band` [Hz], slow motion at half the force, silence.
+    """Cosines [N] whose frequency rises exponentially: through `band` [Hz], slowly, slowly at half the force; silence.
 
-    The second one is as long, the silence half as long: friction that is not viscous is told by the two levels. They
-    begin with a cosine so that a free mass does not drift away.
+    Each takes `seconds`, the silence half of that: friction that is not viscous is told by the two levels of slow
+    motion, which are as wide. They begin with a cosine, and end at whole cycles, so that a free mass does not drift
+    away; the last ends a quarter later, with a speed for the release.
     """
-    t = np.arange(round(seconds / T)) * T
+    t = np.arange(round(seconds / T)) / round(seconds / T)
 
-    def sweep(low: float, high: float) -> Array:
-        rate = np.log(high / low) / seconds
-        return amplitude * np.cos(2 * np.pi * low * np.expm1(rate * t) / rate)
+    def sweep(low: float, high: float, further: float = 0.0) -> Array:
+        ratio = high / low
+        cycles = max(1, round(seconds * (high - low) / np.log(ratio))) + further
+        return amplitude * np.cos(2 * np.pi * cycles * (ratio**t - 1) / (ratio - 1))
 
     low, high = band
-    slow = sweep(low / _SLOWER, min(high, _SLOW_SPAN * low)) / 2
+    slower, span = low / np.sqrt(2.0), min(_SLOW_SPAN, high / low)
+    parts = sweep(low, high), sweep(low, span * low), sweep(slower, span * slower, 0.25) / 2
     lead, tail = np.zeros(round(_LEAD / T)), np.zeros(round(seconds / 2 / T))
-    return Excitation(np.tile(np.concatenate([lead, sweep(low, high), slow, tail])[:, None], channels), T, link)
+    return Excitation(np.tile(np.concatenate([lead, *parts, tail])[:, None], channels), T, link)
 
 
 # How much a sample of an encoder is worth to a fit: all samples of one standstill together as much as a few.
@@ -171,7 +174,7 @@ class _Model:
             a[0, 2] = a[1, 3] = 1.0
             a[2] = [-k / m1, k / m1, -b / m1, 0.0, 1 / m1]
             a[3, :2] = [k / m2, -k / m2]
-        step = np.asarray(expm(a * T), dtype=np.float64)
+        step = np.asarray(scipy.linalg.expm(a * T), dtype=np.float64)
         return step[:-1, :-1], step[:-1, -1]
 
     def simulate(self, p: Array) -> Array:
@@ -271,7 +274,8 @@ class _Spectrum:
         def apart(p: Array) -> Array:
             return self.apart(np.insert(p, _COULOMB, point[_COULOMB]))
 
-        fit = least_squares(apart, np.delete(point, _COULOMB), loss="soft_l1", f_scale=_OUTLIER, max_nfev=40)
+        start, robust = np.delete(point, _COULOMB), {"loss": "soft_l1", "f_scale": _OUTLIER}
+        fit = scipy.optimize.least_squares(apart, start, max_nfev=40, **robust)
         return float(fit.cost), np.insert(fit.x, _COULOMB, point[_COULOMB])
 
 
@@ -341,8 +345,16 @@ def identify(x: Array, force: Array, used: _Flags, T: float, step: float, rigid:
             f"the record does not tell viscous from dry friction: {found.viscous:.3g} N s/m viscous, "
             f"{found.coulomb:.3g} N dry, {1e3 * found.rms:.2g} mN unexplained; take one with more force or a longer one"
         )
-    transmission = None if rigid else _transmission(_Model(x, force, used, T, step, rigid=False), found)
+    end = _end_of_chirp(force, T)
+    model = _Model(x[:end], force[:end], used[:end], T, step, rigid)
+    transmission = None if rigid else _transmission(model, found)
     return Estimate(friction=found, transmission=transmission)
+
+
+def _end_of_chirp(force: Array, T: float) -> int:
+    """Where forces (N,) [N] that excite a transmission end: slow motion tells nothing of it."""
+    changes = np.convolve(np.diff(force) ** 2, np.ones(max(2, round(_A_WHILE / T))))[: len(force)]
+    return int(np.flatnonzero(changes > _FAST * changes.max())[-1])
 
 
 def _transmission(model: _Model, found: Friction) -> _Transmission | None:
@@ -362,7 +374,7 @@ def _transmission(model: _Model, found: Friction) -> _Transmission | None:
     return _Transmission(float(m1), float(m2), float(k), float(mode))
 
 
-def _search(model: _Model, start: Array) -> OptimizeResult:
+def _search(model: _Model, start: Array) -> scipy.optimize.OptimizeResult:
     strongest = np.ptp(model.force)
     start = start.copy()
     start[_COULOMB] = np.clip(start[_COULOMB], _LEAST_FRICTION * strongest, strongest / 2)
@@ -371,7 +383,7 @@ def _search(model: _Model, start: Array) -> OptimizeResult:
     # the tolerance is of a sum of squares with a kink; what is left unexplained is looked at afterwards
     options: dict[str, Any] = {"x_scale": "jac", "max_nfev": _EVALUATIONS, "ftol": 1e-4}
     slopes: Any = lambda p: -model.slopes(p)  # noqa: E731 - SciPy's stub takes names only
-    return least_squares(model.residual, start, slopes, bounds=bounds, **options)
+    return scipy.optimize.least_squares(model.residual, start, slopes, bounds=bounds, **options)
 
 
 def _polished(model: _Model, p: Array) -> Array:

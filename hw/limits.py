@@ -321,7 +321,7 @@ def configuration(info: Info, limits: Limits, theta: int) -> Config:
     ramp = max(1, min(0xFF, math.ceil(1000 * _RAMP_US / T_ns)))
     steps = [1e-6 * step for step in info.force_step]
     most = [int(cap / step + 1e-9) for cap, step in zip(limits.cap, steps, strict=True)]
-    slew = [min(0xFFFF, math.ceil(limits.slew * 1e-9 * T_ns / step)) for step in steps]
+    slew = [min(0xFFFF, math.ceil(limits.slew * 1e-9 * T_ns / step - 1e-6)) for step in steps]
     return Config(
         theta=theta,
         hold=max(0, min(_HOLD, MAX_RELEASE_NS // T_ns - ramp)),

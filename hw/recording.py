@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.coupling import Form
+from controller.loop import named_today
 from controller.lti import Array
 from design.files import read_arrays, write, write_json
 from hw.control import BudgetPlan, CertifiedCoupling, Controller, Program, SentBudget, TraceRow, host_controller
@@ -257,7 +258,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
 
 def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
     measured = session.measurement
-    counters = asdict(session.counters) | {"host_errors": session.decoder.rejected, "host_dropped_bytes": dropped}
+    counters = asdict(session.counters) | {"host_dropped_bytes": dropped}
     part: dict[str, Any] = {
         "measured_age_us": _percentiles(np.array(measured.ages)),
         "measured_missing": measured.missing,
@@ -379,8 +380,12 @@ class Comparison:
 def recipes_of(result: Trace) -> list[_Recipe]:
     """The recipes in a trace, one for each arming. Raises InputError where there is none."""
     try:
-        _require_limits(result.meta.get("replay"))
-        return msgspec.convert(result.meta.get("replay"), Annotated[list[_Recipe], msgspec.Meta(min_length=1)])
+        raw = result.meta.get("replay")
+        _require_limits(raw)
+        for recipe in raw if isinstance(raw, list) else []:
+            if isinstance(recipe, dict) and isinstance(scenario := recipe.get("scenario"), dict):
+                recipe["scenario"] = named_today(scenario)
+        return msgspec.convert(raw, Annotated[list[_Recipe], msgspec.Meta(min_length=1)])
     except (msgspec.ValidationError, ValueError) as error:
         raise InputError(f"the trace cannot be replayed: {error}") from None
 

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any
+from typing import Any, ClassVar
 
 import msgspec
 
@@ -45,6 +45,18 @@ class CompliantDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, t
     credible_speed: float = 2.0  # [m/s] likewise; assumed: three times the 0.7 m/s that teleoperation masters exceed
     # in a fifth of the fast part of a tapping task (the abstract of such a study says so; not a figure of this device)
 
+    file: ClassVar[str] = "compliant"  # .xml, its MJCF
+
+    @property
+    def bodies(self) -> dict[str, float]:
+        """Its masses by name [kg]; the last one is what a hand holds."""
+        return {"motor": self.motor_mass, "handle": self.handle_mass}
+
+    @property
+    def transmission(self) -> tuple[float, float] | None:
+        """Damping [N s/m] and stiffness [N/m] between motor and handle."""
+        return self.transmission_damping, self.transmission_stiffness
+
     def __post_init__(self) -> None:
         _check_common(self, ("motor_mass", "handle_mass"))
         require("transmission_stiffness", self.transmission_stiffness, 1.0, 1e9, "N/m")
@@ -63,6 +75,14 @@ class RigidDevice(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
     friction: float = 0.0  # [N] Coulomb friction, assumed 0; only MuJoCo models it
     delta: float | None = None  # [N s/m] guaranteed damping
     credible_speed: float = 2.0  # [m/s] as of a compliant device
+
+    file: ClassVar[str] = "rigid"
+    transmission: ClassVar[None] = None
+
+    @property
+    def bodies(self) -> dict[str, float]:
+        """Its mass by name [kg]; a hand holds the motor."""
+        return {"motor": self.mass}
 
     def __post_init__(self) -> None:
         _check_common(self, ("mass",))

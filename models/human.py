@@ -14,8 +14,8 @@ from typing import Annotated, Any, Protocol, Self
 
 import msgspec
 import numpy as np
+import scipy  # its parts load when they are used
 from numpy.typing import NDArray
-from scipy.linalg import eig
 
 from models.device import require
 
@@ -66,7 +66,7 @@ def _check_positive_real(A: _Array, B: _Array, C: _Array, D: _Array) -> None:
     n = A.shape[0]
     if n and not np.linalg.eigvals(A).real.max() < 0:
         raise ValueError("impedance: A has an eigenvalue on or right of the imaginary axis, expected what decays")
-    zeros = eig(-np.block([[A @ A, B], [C @ A, D]]), np.diag([*[1.0] * n, 0.0]), right=False)
+    zeros = scipy.linalg.eig(-np.block([[A @ A, B], [C @ A, D]]), np.diag([*[1.0] * n, 0.0]), right=False)
     zeros = np.sort(zeros[np.isfinite(zeros)])
     real = np.real(zeros[(np.real(zeros) > 0) & (np.abs(np.imag(zeros)) <= 1e-6 * np.abs(zeros))])
     between = [(a + b) / 2 for a, b in pairwise([0.0, *real])] + [2 * real.max() if real.size else 1.0]
@@ -240,7 +240,7 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         w = 2 * np.pi * self.frequency
         wave = self.amplitude * np.sin(w * t + self.phase)
         wave_rate = self.amplitude * w * np.cos(w * t + self.phase)
-        if self.ease == 0:
+        if self.ease == 0 or t.min(initial=self.ease) >= self.ease:
             return wave, wave_rate
         rising = t < self.ease
         gain = np.where(rising, (1 - np.cos(np.pi * t / self.ease)) / 2, 1.0)

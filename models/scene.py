@@ -8,14 +8,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from models.device import CompliantDevice, Device
+from models.device import Device
 from models.human import Cross, Hand, Human, Impedance, Link, Person, Port, body_port, chain_port, check_holds
+
+if TYPE_CHECKING:  # a third of a second: loaded where it is used
+    import mujoco
 
 # ----------------------------------------------------------------------------------------------------
 # Devices and humans as one MuJoCo model, and the same plant as matrices, read from that model.
@@ -47,8 +49,7 @@ _STICK, _HARD = [3e-3, 1.0], [0.9999, 0.9999, 0.001, 0.5, 2.0]
 FILES = Path(__file__).parent  # of the devices
 APART, STEP, _HEIGHT = 0.11, 0.09, 0.03  # [m] between devices, between the bodies of one, and above the rail
 DRAWN = "drawn transmission"
-_GREY = {"rgb1": [0.93] * 3, "rgb2": [0.93] * 3, "builtin": mujoco.mjtBuiltin.mjBUILTIN_FLAT}
-_SKY: dict[str, Any] = {"name": "sky", "type": mujoco.mjtTexture.mjTEXTURE_SKYBOX, "width": 32, "height": 192, **_GREY}
+_SKY: dict[str, Any] = {"name": "sky", "width": 32, "height": 192, "rgb1": [0.93] * 3, "rgb2": [0.93] * 3}
 _EMPTY_CLASSES = re.compile(r" *<default>\s*(<default class=\"[^\"]*\"/>\s*)*</default>\s*\n")  # of attached files
 _IMPEDANCE = "impedance_"  # custom numbers: joint of the handle, joint of the base or -1, then A, B, C, D row by row
 
@@ -100,6 +101,8 @@ def plant(model: mujoco.MjModel) -> Plant:
 
     With the humans' impedances, which MuJoCo does not simulate.
     """
+    import mujoco
+
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     mass = np.zeros((model.nv, model.nv))
@@ -170,6 +173,8 @@ def from_mjcf(xml: str, handle: str = "handle", pull: str | None = None) -> Port
     contracts the joint or tendon named `pull` (default: the last spring-damper). Gravity and shapes are left out.
     Raises ValueError for what is no network of masses, springs and dampers.
     """
+    import mujoco
+
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -200,6 +205,8 @@ def from_mjcf(xml: str, handle: str = "handle", pull: str | None = None) -> Port
 
 def _check_linear(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     """Raise ValueError unless the model is a network of masses, springs and dampers along x, at rest."""
+    import mujoco
+
     slide, fixed = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtWrap.mjWRAP_JOINT
     rubbing = ("dof_frictionloss", "tendon_frictionloss", "dof_armature", "tendon_armature")
     curved = ("jnt_stiffnesspoly", "tendon_stiffnesspoly", "dof_dampingpoly", "tendon_dampingpoly")
@@ -221,6 +228,8 @@ def _check_linear(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 def tendon_jacobian(model: mujoco.MjModel) -> _Array:
     """How each tendon lengthens when a joint moves, shape (tendons, n)."""
+    import mujoco
+
     rows = np.zeros((model.ntendon, model.nv))
     for t in range(model.ntendon):
         first, count = int(model.tendon_adr[t]), int(model.tendon_num[t])
@@ -232,6 +241,8 @@ def tendon_jacobian(model: mujoco.MjModel) -> _Array:
 
 def actuation(model: mujoco.MjModel) -> _Array:
     """Force on each joint per unit of each input, shape (n, outside + m)."""
+    import mujoco
+
     columns, across = np.zeros((model.nv, model.nu)), tendon_jacobian(model)
     for a in range(model.nu):
         target, gain = model.actuator_trnid[a, 0], model.actuator_gear[a, 0] * model.actuator_gainprm[a, 0]
@@ -243,6 +254,8 @@ def actuation(model: mujoco.MjModel) -> _Array:
 
 
 def _only_what_the_loop_needs(spec: mujoco.MjSpec, friction: bool) -> None:
+    import mujoco
+
     off = mujoco.mjtDisableBit
     disabled = [off.mjDSBL_CONTACT, off.mjDSBL_AUTORESET, off.mjDSBL_SENSOR]
     if not friction:  # MuJoCo's Coulomb friction is a constraint
@@ -252,7 +265,7 @@ def _only_what_the_loop_needs(spec: mujoco.MjSpec, friction: bool) -> None:
 
 
 def _handle(i: int, device: Device) -> str:
-    return f"device_{i}/handle" if isinstance(device, CompliantDevice) else f"device_{i}/motor"
+    return f"device_{i}/{list(device.bodies)[-1]}"
 
 
 class _Placed(NamedTuple):
@@ -315,15 +328,13 @@ def _amounts(devices: Sequence[Device], placed: Sequence[_Placed]) -> _Amounts:
     damping: dict[str, Any] = {}
     stiffness: dict[str, Any] = {}
     for i, device in enumerate(devices, start=1):
-        compliant = isinstance(device, CompliantDevice)
         motor = f"device_{i}/motor"
-        mass[motor] = device.motor_mass if compliant else device.mass
-        damping[motor], stiffness[motor] = device.damping, 0.0
+        mass[motor], damping[motor], stiffness[motor] = device.bodies["motor"], device.damping, 0.0
     for i, device in enumerate(devices, start=1):
-        if isinstance(device, CompliantDevice):
-            mass[f"device_{i}/handle"] = device.handle_mass
-            damping[f"device_{i}/transmission"] = device.transmission_damping
-            stiffness[f"device_{i}/transmission"] = device.transmission_stiffness
+        mass |= {f"device_{i}/{name}": amount for name, amount in device.bodies.items()}
+        if device.transmission:
+            between = f"device_{i}/transmission"
+            damping[between], stiffness[between] = device.transmission
     for port, joints, _, springs in placed:
         for k, joint in enumerate(joints):
             mass[joint] = mass.get(joint, 0.0) + port.mass[..., k]
@@ -335,9 +346,11 @@ def _amounts(devices: Sequence[Device], placed: Sequence[_Placed]) -> _Amounts:
 
 
 def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
+    import mujoco
+
     spec = mujoco.MjSpec()
     spec.modelname = "haptic loop"
-    spec.add_texture(**_SKY)
+    spec.add_texture(type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT, **_SKY)
     spec.visual.headlight.ambient = [0.5, 0.5, 0.5]
     _only_what_the_loop_needs(spec, friction=any(device.friction for device in devices))
     mass, damping, stiffness = _amounts(devices, placed)
@@ -358,9 +371,9 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
             joint = spec.joint(f"device_{i}/motor")
             joint.frictionloss = device.friction
             joint.solref_friction, joint.solimp_friction = _STICK, _HARD
-        if isinstance(device, CompliantDevice):
+        if device.transmission:
             tendon = spec.tendon(f"device_{i}/transmission")
-            tendon.stiffness[0], tendon.damping[0] = device.transmission_stiffness, device.transmission_damping
+            tendon.damping[0], tendon.stiffness[0] = device.transmission
         _add_springs(spec, placed[i - 1], damping, stiffness)
     for part in placed[len(devices) :]:
         _add_springs(spec, part, damping, stiffness)
@@ -397,7 +410,7 @@ def _compiled(devices: Sequence[Device], placed: Sequence[_Placed]) -> Scene:
 
 def _attach_devices(spec: mujoco.MjSpec, devices: Sequence[Device]) -> None:
     """Motors and handles of the devices' own files, side by side: first all motors, then all handles."""
-    parts = [_file("compliant" if isinstance(device, CompliantDevice) else "rigid").copy() for device in devices]
+    parts = [_file(device.file).copy() for device in devices]
     for name in ("motor", "handle"):
         for i, part in enumerate(parts, start=1):
             if part.body(name):
@@ -408,6 +421,8 @@ def _attach_devices(spec: mujoco.MjSpec, devices: Sequence[Device]) -> None:
 @cache
 def _file(name: str) -> mujoco.MjSpec:
     """A device's file as the scene takes it: without actuators, which have an order there."""
+    import mujoco
+
     spec = mujoco.MjSpec.from_file(str(FILES / f"{name}.xml"))
     for actuator in list(spec.actuators):
         spec.delete(actuator)
@@ -444,6 +459,8 @@ def _add_spring(spec: mujoco.MjSpec, name: str, ends: Mapping[str, float], stiff
 def _add_motor(
     spec: mujoco.MjSpec, name: str, target: str, gear: float, limit: float | None = None, joint: bool = True
 ) -> None:
+    import mujoco
+
     kind = mujoco.mjtTrn.mjTRN_JOINT if joint else mujoco.mjtTrn.mjTRN_TENDON
     motor = spec.add_actuator(name=name, target=target, trntype=kind)
     motor.set_to_motor()

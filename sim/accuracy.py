@@ -14,7 +14,7 @@ import numpy as np
 
 from controller.delay import delay
 from controller.lti import Array, Lti
-from models.device import RigidDevice, credible_force
+from models.device import credible_force
 from sim.engines import EXPONENTIAL
 from sim.run import Simulation, make_engine, run
 from sim.stability import close, dominant_mode, exact_growth, unstable, worst_mode
@@ -179,18 +179,19 @@ def credible_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
         motor, speed = trace.s[:, i], np.abs(trace.s[:, n + i])
         outside |= speed > device.credible_speed
         speeds.append(float(speed.max(initial=0.0)))
-        if isinstance(device, RigidDevice):
+        if device.transmission is None:
             forces.append(None)
             continue
         stretched, stretching = motor - trace.s[:, handle], trace.s[:, n + i] - trace.s[:, n + handle]
-        force = np.abs(device.transmission_stiffness * stretched + device.transmission_damping * stretching)
+        damping, stiffness = device.transmission
+        force = np.abs(stiffness * stretched + damping * stretching)
         outside |= force > credible_force(device)
         forces.append(float(force.max(initial=0.0)))
     part: dict[str, Any] = {
         "until_s": float(trace.t[np.argmax(outside)]) if outside.any() else None,
         "transmission_force_n": forces,
         "motor_speed_m_per_s": speeds,
-        "credible_force_n": [None if isinstance(d, RigidDevice) else credible_force(d) for d in devices],
+        "credible_force_n": [None if d.transmission is None else credible_force(d) for d in devices],
         "credible_speed_m_per_s": [device.credible_speed for device in devices],
     }
     if part["until_s"] is not None:
@@ -250,12 +251,13 @@ def force_error(simulation: Simulation, trace: Trace, lam: Sequence[int]) -> For
 
 def response(G: Lti, x: Array) -> Array:
     """y = G x from rest; x (N, inputs), y (N, outputs)."""
-    states = np.zeros((x.shape[0] + 1, G.order))
-    driven = x @ G.B.T
+    rows = np.zeros((x.shape[0] + 1, G.order + x.shape[1]))  # [state, x] of every tick
+    rows[:-1, G.order :] = x
+    step = np.hstack([G.A, G.B]).dot
     with np.errstate(over="ignore", invalid="ignore"):  # an unstable run may leave the range of numbers
-        for k in range(x.shape[0]):
-            states[k + 1] = G.A @ states[k] + driven[k]
-        return states[:-1] @ G.C.T + x @ G.D.T
+        for row, state in zip(rows, rows[1:, : G.order], strict=False):
+            step(row, state)
+        return rows[:-1] @ np.hstack([G.C, G.D]).T
 
 
 def _rms(values: Array) -> float:

@@ -93,7 +93,7 @@ def alternatives(
 ) -> list[Alternative]:
     """Every coupling that can stand in the place of the run's own; none where the delays switch.
 
-    Walls and ranges are covered by any-environment alone: the couplings for one linear environment are left out there.
+    Of ranges only couplings for any environment are shown, and the optimal one holds a linear model: none before walls.
     """
     if scenario.switches:
         return []
@@ -109,10 +109,9 @@ def alternatives(
 def _possible(scenario: Scenario, case: str, kind: str, condition: str | None) -> bool:
     if kind == "published":
         return scenario.loop(case) == load().loop(case)
-    one_environment = scenario.environment.walls or scenario.box
-    if condition == "this-environment" and one_environment:
+    if condition == "this-environment" and scenario.ranges:
         return False
-    return kind != "optimal" or scenario.channels <= _QUICK
+    return kind != "optimal" or (scenario.channels <= _QUICK and not scenario.environment.walls)
 
 
 def _alternative(scenario: Scenario, case: str, kind: str, condition: str | None) -> Alternative:
@@ -122,7 +121,7 @@ def _alternative(scenario: Scenario, case: str, kind: str, condition: str | None
         return Alternative(kind, condition, reason=str(error))
     loop = scenario.loop(case)
     requirements = assess(loop, chosen.coupling, chosen.phi)
-    simulation = assemble(scenario, chosen.coupling, limits_of(scenario, chosen.coupling, requirements).rho)
+    simulation = assemble(scenario, chosen.coupling, limits_of(scenario, chosen, requirements).rho)
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)
     made = Alternative(

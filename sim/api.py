@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from controller.coupling import Coupling, NoCoupling
+from controller.coupling import Coupling
 from controller.lti import Array
-from design.result import COUPLING, Design, bare, number, of_kind, one_of, whole
+from design.result import Design, number, of_kind, one_of, whole
 from sim import crowds
-from sim.couplings import limits_of
+from sim.couplings import given, limits_of
 from sim.engines import INTEGRATORS
 from sim.nets import EnergyNet, Plugged, netted
 from sim.run import ENGINES, Progress, assemble, make_engine, run
@@ -56,13 +56,13 @@ def simulate(
     coupling has no solution.
     """
     of_kind("scenario", scenario, Scenario, _SCENARIO)
-    alone, seed = _bare(coupling), whole("seed", seed, 0)
+    chosen, seed = given(coupling), whole("seed", seed, 0)
     one_of("engine", engine, ENGINES)
     if integrator is not None:
         one_of("integrator", integrator, tuple(INTEGRATORS))
     if substeps is not None:
         substeps = whole("substeps", substeps, 1, MOST)
-    limits = limits_of(scenario, alone, limiter=limiter and environment is None)
+    alone, limits = chosen.coupling, limits_of(scenario, chosen, limiter=limiter and environment is None)
     simulation = assemble(scenario, alone, limits.rho)
     if scenario.switches:
         simulation, _ = switching(simulation, alone, seed, scenario.samples)
@@ -115,7 +115,7 @@ def validate(
     TypeError for an argument of another type.
     """
     of_kind("scenario", scenario, Scenario, _SCENARIO)
-    alone = _bare(coupling)
+    chosen = given(coupling)
     require_linear(scenario, "validate", walls=True)
     humans, seed = whole("humans", humans, 1, _MOST_HUMANS), whole("seed", seed, 0)
     shards = whole("shards", shards, 1)
@@ -124,10 +124,6 @@ def validate(
     if not (duration == 0 or duration >= 4 * scenario.T):
         raise InputError(f"duration is {duration:g}, allowed are 0 and {4 * scenario.T:g} s or more")
     links = getattr(scenario.population, "links", 1)  # of a user's own population there are none
-    lag = limits_of(scenario, alone, limiter=limiter).rho
-    question = crowds.Validation(scenario, alone, seed, humans, links, engine, duration, lag=lag)
+    lag = limits_of(scenario, chosen, limiter=limiter).rho
+    question = crowds.Validation(scenario, chosen.coupling, seed, humans, links, engine, duration, lag=lag)
     return validate_all(question, shards, progress)
-
-
-def _bare(coupling: Coupling | Design | None) -> Coupling:
-    return NoCoupling() if coupling is None else bare(coupling, f"{COUPLING}, or None for the loop without one")

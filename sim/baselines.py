@@ -13,14 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from controller.coupling import Coupling, NoCoupling
+from controller.coupling import NoCoupling
 from controller.lti import Array
 from controller.process import StepBuffer
-from design.designs import design_by_kind
 from design.result import DesignFailed
 from models.scene import Crowd, variants
 from sim.accuracy import force_error
-from sim.couplings import limits_of
+from sim.couplings import Chosen, choose, limits_of
 from sim.engines import ExactBatchEngine, hold
 from sim.nets import BASELINES, Classic, EnergyNet, netted
 from sim.run import Simulation, assemble, run, run_blocks
@@ -56,9 +55,14 @@ class Rival:
 
 
 def rivals(
-    scenario: Scenario, case: str, progress: Callable[[int, int], None] = lambda done, total: None
+    scenario: Scenario,
+    case: str,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    limiter: bool | None = None,
 ) -> Iterator[Rival]:
     """No coupling but its limits, every baseline, the budget, and our designs where there are such.
+
+    With `limiter` False forces of the designs are clipped, too, and they are designed for that.
 
     Raises ValueError for Coulomb friction, which the exact plant has not.
     """
@@ -66,24 +70,25 @@ def rivals(
     total = len(nets) + len(_DESIGNS)
     for done, net in enumerate(nets):
         progress(done, total)
-        yield _judged(scenario, case, NoCoupling(), net, None)
+        yield _judged(scenario, case, None, net)
     for done, (kind, condition) in enumerate(_DESIGNS, start=len(nets)):
         progress(done, total)
         try:
-            coupling = design_by_kind(scenario.loop(case), kind, condition).coupling
+            chosen = choose(scenario, case, kind, condition, limiter)
         except DesignFailed:
             continue
-        yield _judged(scenario, case, coupling, None, (kind, condition))
+        yield _judged(scenario, case, chosen, None, limiter)
 
 
 def _judged(
     scenario: Scenario,
     case: str,
-    coupling: Coupling,
+    design: Chosen | None,
     net: Classic | EnergyNet | None,
-    design: tuple[str, str] | None,
+    limiter: bool | None = None,
 ) -> Rival:
-    simulation = assemble(scenario, coupling, limits_of(scenario, coupling).rho if design else None)
+    coupling = design.coupling if design else NoCoupling()
+    simulation = assemble(scenario, coupling, limits_of(scenario, design, limiter=limiter).rho if design else None)
     most = max(scenario.samples, round(SECONDS / scenario.T))
     with_net = netted(simulation, coupling, net, most) if net else simulation
     trace = run(with_net, "exact")
@@ -95,7 +100,8 @@ def _judged(
     name = net.name if isinstance(net, Classic) else "energy budget" if net else "none, clipped"
     guarantee = net.guarantee if isinstance(net, EnergyNet) else None
     if design:
-        name, guarantee = f"{design[0]}, {_GUARANTEES[design[1]]}", _GUARANTEES[design[1]]
+        guarantee = _GUARANTEES[design.condition]
+        name = f"{design.kind}, {guarantee}"
     return Rival(
         name,
         isinstance(net, Classic),

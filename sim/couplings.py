@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, MovingAverage, NoCoupling
+from controller.coupling import Coupling, NoCoupling
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design.certificate import assess, verify
 from design.coverage import Limits, covered_limits
 from design.designs import KINDS, design_by_kind
 from design.guarantees import switching_guarantee
-from design.result import PUBLISHED, DesignFailed, Requirement
-from design.stored import Stored, load
+from design.result import COUPLING, PUBLISHED, Design, DesignFailed, Requirement, bare
+from design.stored import LimiterCertificate, Stored, load
 from sim.scenario import InputError, Scenario
 
 NAMES = ("none", "published", *KINDS)
@@ -31,6 +31,7 @@ class Chosen:
     phi: Array | None = None  # (m,) multiplier of Theorem 4 that the design found, if it needed one
     notes: tuple[str, ...] = ()  # what a reader should know of its origin
     switching: DelayRange | None = None  # its file proves that any switching of the delays within it is safe here
+    limiter: LimiterCertificate | None = None  # what it comes with for limited forces
 
 
 def choose(
@@ -66,29 +67,40 @@ def choose(
             raise
         except ValueError as error:
             raise InputError(str(error)) from None
-        return Chosen(name, design.coupling, design.condition, design.phi)
+        return given(design, name)
     if Path(name).suffix != ".json":
         raise InputError(f"--coupling is {name!r}, allowed are {', '.join(NAMES)} or a FILE.json")
     stored = read_coupling(name)
     coupling = fitted(stored, name, scenario.channels, scenario.T)
     made_for = stored.certificate.condition if stored.certificate else "this-environment"
     checked = check_stored(stored, scenario.loop(case))
-    return Chosen(Path(name).name, coupling, condition or made_for, notes=checked.notes, switching=checked.switching)
+    proof = (stored.certificate and stored.certificate.limiter) or None
+    return Chosen(Path(name).name, coupling, condition or made_for, None, checked.notes, checked.switching, proof)
+
+
+def given(coupling: Coupling | Design | None, kind: str = "given") -> Chosen:
+    """A coupling, or that of a design with its proofs; None is the loop without one."""
+    if isinstance(coupling, Design):
+        proof = (coupling.certificate and coupling.certificate.limiter) or None
+        return Chosen(kind, coupling.coupling, coupling.condition, coupling.phi, limiter=proof)
+    alone = NoCoupling() if coupling is None else bare(coupling, f"{COUPLING}, or None for the loop without one")
+    return Chosen(kind, alone, "this-environment")
 
 
 def limits_of(
     scenario: Scenario,
-    coupling: Coupling,
+    chosen: Chosen,
     requirements: Mapping[str, Requirement] | None = None,
     limiter: bool | None = None,
 ) -> Limits:
     """How forces are limited in a loop: by the limiter that a guarantee covers, unless `limiter` is False."""
     if limiter is False:
         return Limits(None, "forces are clipped, as asked")
-    if scenario.jitter:
+    if scenario.varying_delay:
         return Limits(None, "limiter: limited forces are proved for constant delays")
     loop = scenario.loop("I")  # the reference does not matter
-    return covered_limits(loop, coupling, assess(loop, coupling) if requirements is None else requirements)
+    coupling, proof = chosen.coupling, chosen.limiter
+    return covered_limits(loop, coupling, requirements or assess(loop, coupling, chosen.phi), proof)
 
 
 def read_coupling(path: str | Path) -> Stored:
@@ -106,7 +118,7 @@ def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
     if len(stored.loop.delta) != channels:
         raise InputError(f"{path} couples {len(stored.loop.delta)} channels, the loop has {channels}")
     coupling = stored.coupling.build(T)
-    if isinstance(coupling, Compliance | MovingAverage | InternalModel | ForceFilter) and stored.loop.T != T:
+    if coupling.one_period and stored.loop.T != T:
         raise InputError(f"{path}: its coefficients are for T = {stored.loop.T:g} s, the loop has {T:g} s")
     return coupling
 
@@ -126,19 +138,20 @@ def check_stored(stored: Stored, loop: Loop) -> _FileCheck:
     except (ValueError, ArithmeticError) as error:
         reason = str(error)
     notes = [f"the certificate in the coupling's file does not hold: {reason}"] if reason else []
-    delays = ("theta", "jitter", "lam")  # lam matters to transparency only
+    delays = ("theta", "varying_delay", "lam")  # lam matters to transparency only
     differ = [n for n in loop.__struct_fields__ if n not in delays and getattr(loop, n) != getattr(stored.loop, n)]
     proved = stored.certificate is not None and not reason and not differ
-    switching = stored.loop.jitter if proved else None
-    if switching and switching.contains(loop.jitter or DelayRange(loop.theta, loop.theta)):
-        if loop.theta != stored.loop.theta or loop.jitter not in (None, switching):
-            here = switching_guarantee(loop.jitter) if loop.jitter else f"the constant theta = {list(loop.theta)}"
+    switching = stored.loop.varying_delay if proved else None
+    if switching and switching.contains(loop.varying_delay or DelayRange(loop.theta, loop.theta)):
+        if loop.theta != stored.loop.theta or loop.varying_delay not in (None, switching):
+            constant = f"the constant theta = {list(loop.theta)}"
+            here = switching_guarantee(loop.varying_delay) if loop.varying_delay else constant
             notes.append(f"the file proves {switching_guarantee(switching)}, which covers {here}")
         return _FileCheck(tuple(notes), switching)
     differ += ["theta"] if loop.theta != stored.loop.theta else []
-    if loop.jitter and proved:
+    if loop.varying_delay and proved:
         made_for = switching_guarantee(switching) if switching else "constant delays"
-        notes.append(f"the file proves {made_for}: {switching_guarantee(loop.jitter)} are judged anew here")
+        notes.append(f"the file proves {made_for}: {switching_guarantee(loop.varying_delay)} are judged anew here")
     if differ:
         notes.append(
             f"the coupling was stored for another loop (different {', '.join(differ)}), and is judged anew here"

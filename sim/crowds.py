@@ -31,6 +31,7 @@ from sim.scenario import Scenario
 from sim.stability import (
     ClosedLoop,
     ImpulseTest,
+    Latch,
     Mode,
     disagree,
     dominant_mode,
@@ -219,7 +220,7 @@ def examine(
     """
     scenario, member = validation.scenario, validation.environment(indices[0])
     if member:
-        scenario = scenario.replace(environment=member.network, box=None)
+        scenario = scenario.replace(environment=member.network, ranges=None)
     simulation = assemble(scenario, validation.coupling, validation.lag)
     return _merge([_group(validation, simulation, *group, ticked) for group in validation.crowds(indices)])
 
@@ -286,10 +287,12 @@ def _tests(
     process, T = simulation.process, validation.scenario.T
     settings = held_by.scene, loops, np.array(validation.scenario.delta), validation.ticks
     late = validation.scenario.usual_latency
-    exact = impulse_test(process, ExactBatchEngine(hold(held_by.plants(), T, late), process.force_limit), *settings)
+    latch = Latch.of(held_by, validation.scenario.loop("I"), late) if late else None
+    engine = ExactBatchEngine(hold(held_by.plants(), T, late), process.force_limit)
+    exact = impulse_test(process, engine, *settings, latch=latch)
     if validation.engine == "exact":
         return exact, exact
     threads, n = validation.threads, len(held_by)
     timing = Timing(np.array([T]), np.array([late])) if late else None
     engine = MujocoBatchEngine(held_by.scene, T, EXPONENTIAL, 1, n, threads, held_by.fields, timing)
-    return exact, impulse_test(process, engine, *settings, ticked)
+    return exact, impulse_test(process, engine, *settings, ticked, latch)

@@ -23,14 +23,12 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
 from itertools import pairwise
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
-import mujoco
 import numpy as np
-from mujoco.batch import Batch
+import scipy  # its parts load when they are used
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
-from scipy.linalg import expm
-from scipy.sparse.csgraph import connected_components
 
 from controller.lti import Array
 from controller.process import StepBuffer
@@ -38,17 +36,20 @@ from controller.timing import Timing
 from design.files import InputError
 from models.scene import Plant, Scene, Variants, impeded, plant
 
+if TYPE_CHECKING:
+    import mujoco
+
 #: the integrator of ours, which reads MuJoCo's accelerations
 EXPONENTIAL = "exponential"
 
 #: name -> what MuJoCo's model is set to, for the exponential one, where it decides nothing, to RK4
 INTEGRATORS = {
-    EXPONENTIAL: mujoco.mjtIntegrator.mjINT_RK4,
-    "RK4": mujoco.mjtIntegrator.mjINT_RK4,
-    "Euler": mujoco.mjtIntegrator.mjINT_EULER,
-    "implicit": mujoco.mjtIntegrator.mjINT_IMPLICIT,
-    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-    "discrete": mujoco.mjtIntegrator.mjINT_DISCRETE,
+    EXPONENTIAL: "mjINT_RK4",
+    "RK4": "mjINT_RK4",
+    "Euler": "mjINT_EULER",
+    "implicit": "mjINT_IMPLICIT",
+    "implicitfast": "mjINT_IMPLICITFAST",
+    "discrete": "mjINT_DISCRETE",
 }
 
 _MOST_MAPS = 256  # of ticks that differ, kept by an engine
@@ -109,7 +110,7 @@ def hold(plant: Plant, T: float, late: Sequence[float] | None = None) -> HeldPla
     if many:
         step = _expm_in_units(generator * T, np.concatenate([_units(plant.A, T), np.ones((*many, inputs))], axis=1))
     else:
-        step = expm(generator * T)
+        step = scipy.linalg.expm(generator * T)
     return HeldPlant(step[..., :n, :n], step[..., :n, n:], plant.C, T)
 
 
@@ -121,9 +122,24 @@ def _latched(held: Callable[[float], HeldPlant], T: float, late: Sequence[float]
     A, B = np.zeros((*many, n + m, n + m)), np.zeros((*many, n + m, inputs))
     A[..., :n, :n], B[..., :n, :w], B[..., n:, w:] = whole.A, whole.B[..., :w], np.eye(m)
     for i, tau in enumerate(late):
-        B[..., :n, w + i] = held(T - tau).B[..., w + i]
+        if tau < T:
+            B[..., :n, w + i] = held(T - tau).B[..., w + i]
     A[..., :n, n:] = whole.B[..., w:] - B[..., :n, w:]
     return HeldPlant(A, B, np.pad(whole.C, ((0, 0), (0, m))), T)
+
+
+def at_the_latch(plant: Plant, late: Sequence[float]) -> Array:
+    """[s; forces held; w; f] of a tick to where each device is when its own force latches, (..., m, entries)."""
+    *many, n, inputs = plant.B.shape
+    m = len(late)
+    rows = np.zeros((*many, m, n + m + inputs))
+    for i, tau in enumerate(late):
+        if tau == 0:
+            rows[..., i, :n] = plant.C[i]
+            continue
+        held = hold(plant, tau, [min(other, tau) for other in late])  # the forces that latch before act by then
+        rows[..., i, :] = held.C[i] @ np.concatenate([held.A, held.B], axis=-1)
+    return rows
 
 
 class ExactEngine:
@@ -132,16 +148,28 @@ class ExactEngine:
     def __init__(self, plant: HeldPlant, force_limit: Array) -> None:
         self._product = np.ascontiguousarray(np.hstack([plant.A, plant.B])).dot
         self._high = force_limit[:, None]
-        self._low = -self._high
+        self.advance: Callable[[int], None]  # from `start` on
 
     def start(self, buffer: StepBuffer) -> None:
-        self._rows, self._states, self._forces = buffer.plant_row, buffer.plant_state, buffer.force
+        product, rows, states = self._product, buffer.plant_row, buffer.plant_state
 
-    def advance(self, k: int, /) -> None:
-        force = self._forces[k]
-        np.minimum(force, self._high, out=force)
-        np.maximum(force, self._low, out=force)
-        self._product(self._rows[k], self._states[k + 1])
+        def free(k: int) -> None:
+            product(rows[k], states[k + 1])
+
+        self.advance = free
+        limiter = buffer.process.limiter
+        if limiter and not buffer.process.net and (limiter.limit[:, None] <= self._high).all():
+            return  # forces have left within the limits
+        forces, low, high = buffer.force, -self._high, self._high
+
+        def limited(k: int) -> None:
+            force = forces[k]
+            np.minimum(force, high, out=force)
+            np.maximum(force, low, out=force)
+            product(rows[k], states[k + 1])
+
+        if np.isfinite(high).any():
+            self.advance = limited
 
     def troubled(self) -> bool:
         return False
@@ -277,7 +305,7 @@ def _blocks(pattern: NDArray[np.bool_]) -> tuple[_Which, _Which]:
     n, width = pattern.shape
     graph = np.zeros((width, width), dtype=bool)
     graph[:n] = pattern
-    count, label = connected_components(graph, directed=False)
+    count, label = scipy.sparse.csgraph.connected_components(graph, directed=False)
     rows = [np.flatnonzero(label[:n] == c) for c in range(count)]
     columns = [np.flatnonzero(label == c) for c in range(count)]
     # an input that moves nothing is a block without rows
@@ -305,32 +333,99 @@ def _segments(late: tuple[float, ...] | None, T: float) -> list[tuple[float, NDA
     return [(float(b - a), taus > a) for a, b in pairwise(ends)]
 
 
-class _TimedTicks:
-    """What MuJoCo's engines share where ticks have a timing: from latch to latch, and the forces that are held."""
+@dataclass(frozen=True, eq=False)
+class _Access:
+    """What is written to MuJoCo and read from it: of one simulation arrays (n,), of many (n, nsim).
 
-    def __init__(self, timing: Timing, move: Callable[[float], None], ctrl: Array) -> None:
-        """`move` advances the plant by so many seconds, `ctrl` (inputs, ..) is what it holds meanwhile."""
-        kinds = [_segments(late, T) for T, late in timing.kinds]
-        self._segments, self._which = kinds, timing.which
-        self._move, self._ctrl = move, ctrl
-        self._late = 0 if timing.late is None else timing.late.shape[1]
+    Its ticks are closures: looking things up would take longer than moving them, and a bound method would be a cycle
+    that keeps a batch's memory.
+    """
 
-    def start(self, buffer: StepBuffer) -> None:
-        self._buffer = buffer
-        self._limit = buffer.process.force_limit[:, None]
+    T: float  # [s]
+    substeps: int
+    ctrl: Array
+    state: Array  # [q; v], (2, n) of one simulation
+    qacc: Array
+    forward: Callable[[], object]
+    step: Callable[[int], object]  # so many steps
+    pace: Callable[[float], object]  # sets their length [s]
+    move: Callable[[float], _Product] | None  # seconds -> [q; v; qacc] to [q; v] then, where steps are exponential
 
-    def advance(self, k: int, states: int) -> None:
-        """Tick k from the row of the buffer; of the next row the forces that are held, behind so many states."""
-        buffer, which, m = self._buffer, self._which, self._late
-        inputs = buffer.plant_input[k].reshape(-1, *self._ctrl.shape[1:])
-        held, force = buffer.plant_state[k][states:].reshape(m, *self._ctrl.shape[1:]), inputs[len(inputs) - m :]
-        self._ctrl[...] = inputs
-        for seconds, waiting in self._segments[which[(buffer.first + k) % len(which)]]:
-            self._ctrl[len(inputs) - m :] = force
-            self._ctrl[len(inputs) - m :][waiting] = held[waiting]
-            self._move(seconds)
-        if m:
-            np.clip(buffer.force[k], -self._limit, self._limit, out=buffer.plant_state[k + 1][states:])
+    def ticks(self, buffer: StepBuffer, timing: Timing | None) -> Callable[[int], None]:
+        """What moves tick k of the buffer; the plant is put into the state of its first row."""
+        one = (..., 0) if self.ctrl.ndim == 1 else ...
+        states = 2 * len(self.qacc)
+        rows, inputs = list(buffer.s[:, :states][one]), [row[one] for row in buffer.plant_input]
+        self.state[...] = rows[0].reshape(self.state.shape)
+        if timing:
+            return self._timed(buffer, timing, rows, inputs)
+        return self._by_exponentials(rows, inputs) if self.move else self._by_steps(rows, inputs)
+
+    def _by_steps(self, rows: list[Array], inputs: list[Array]) -> Callable[[int], None]:
+        ctrl, state, step, count = self.ctrl, self.state, self.step, self.substeps
+        written = [row.reshape(state.shape) for row in rows]
+
+        def advance(k: int) -> None:
+            ctrl[...] = inputs[k]
+            step(count)
+            written[k + 1][...] = state
+
+        return advance
+
+    def _by_exponentials(self, rows: list[Array], inputs: list[Array]) -> Callable[[int], None]:
+        assert self.move
+        ctrl, state, qacc, forward, move = self.ctrl, self.state, self.qacc, self.forward, self.move
+        sight = np.concatenate([rows[0], np.zeros_like(qacc)])  # [q; v; qacc]
+        seen, qacc_seen = np.split(sight, [len(rows[0])])
+        shaped, each = [row.reshape(state.shape) for row in rows], range(self.substeps)
+        product = move(self.T / self.substeps)
+
+        def advance(k: int) -> None:
+            ctrl[...] = inputs[k]
+            after = rows[k + 1]
+            for _ in each:
+                forward()
+                qacc_seen[...] = qacc
+                product(sight, after)
+                seen[...] = after
+                state[...] = shaped[k + 1]
+
+        return advance
+
+    def _timed(
+        self, buffer: StepBuffer, timing: Timing, rows: list[Array], inputs: list[Array]
+    ) -> Callable[[int], None]:
+        """From latch to latch; of the next row also the forces that are held, behind the state."""
+        kinds, which = [_segments(late, T) for T, late in timing.kinds], timing.which
+        m, states = 0 if timing.late is None else timing.late.shape[1], len(rows[0])
+        forces = self.ctrl[len(self.ctrl) - m :]
+        limit = buffer.process.force_limit[:m].reshape(m, *[1] * (forces.ndim - 1))
+
+        def advance(k: int) -> None:
+            self.ctrl[...] = inputs[k]
+            asked, held = inputs[k][len(self.ctrl) - m :], buffer.plant_state[k][states:].reshape(forces.shape)
+            for seconds, waiting in kinds[which[(buffer.first + k) % len(which)]]:
+                forces[...] = asked
+                forces[waiting] = held[waiting]
+                self._move_by(seconds)
+            rows[k + 1][...] = self.state.reshape(rows[k + 1].shape)
+            if m:
+                buffer.plant_state[k + 1][states:] = np.clip(asked, -limit, limit).reshape(m, -1)
+
+        return advance
+
+    def _move_by(self, seconds: float) -> None:
+        if self.move is None:
+            count = math.ceil(self.substeps * seconds / self.T - _WHOLE)
+            self.pace(seconds / count)
+            self.step(count)
+            return
+        seen = np.empty((2 * len(self.qacc), *self.qacc.shape[1:]))
+        for _ in range(self.substeps):
+            self.forward()
+            sight = np.concatenate([self.state.reshape(seen.shape), self.qacc])
+            self.move(seconds / self.substeps)(sight, seen)
+            self.state[...] = seen.reshape(self.state.shape)
 
 
 class MujocoEngine:
@@ -339,73 +434,30 @@ class MujocoEngine:
     def __init__(
         self, scene: Scene, T: float, integrator: str = "RK4", substeps: int = 4, timing: Timing | None = None
     ) -> None:
+        import mujoco
+
         self.model = discretised(scene, T, integrator, substeps)
         self.data = mujoco.MjData(self.model)
-        self.substeps = substeps
-        self._forward = partial(mujoco.mj_forward, self.model, self.data)
-        self._step = partial(mujoco.mj_step, self.model, self.data, substeps)
-        self._sight = np.zeros(self.model.nq + 2 * self.model.nv)  # [q; v; qacc]
-        self._start_ticks: Callable[[StepBuffer], None] = lambda buffer: None
-        self.advance: Callable[[int], None] = self._by_steps
-        if integrator == EXPONENTIAL:
-            (move,) = _rosenbrock(_rates(scene, None), T / substeps)
-            self._move, self.advance = move.dot, self._by_exponentials
-        if timing:
-            rates = _rates(scene, None)
-            self._moves = cache(lambda h: _rosenbrock(rates, h)[0].dot)
-            by = self._exponentials_for if integrator == EXPONENTIAL else partial(self._steps_for, T)
-            self._timed = _TimedTicks(timing, by, self.data.ctrl)
-            self.advance = self._by_ticks
-            self._start_ticks = self._timed.start
+        self.advance: Callable[[int], None]  # from `start` on
+        self._timing, both, q, v = timing, (self.model, self.data), self.data.qpos, self.data.qvel
+        self._access = _Access(
+            T,
+            substeps,
+            self.data.ctrl,
+            # one view of both, wherever MuJoCo has put them: one copy reads them
+            as_strided(q, (2, q.size), (v.ctypes.data - q.ctypes.data, q.itemsize)),
+            self.data.qacc,
+            partial(mujoco.mj_forward, *both),
+            partial(mujoco.mj_step, *both),
+            partial(setattr, self.model.opt, "timestep"),
+            cache(lambda h: _rosenbrock(_rates(scene, None), h)[0].dot) if integrator == EXPONENTIAL else None,
+        )
 
     def start(self, buffer: StepBuffer) -> None:
-        n, nv = self.model.nq, self.model.nq + self.model.nv
-        self._s = [row[:, 0] for row in buffer.plant_state]
-        self._q, self._v = ([row[part] for row in self._s] for part in (slice(n), slice(n, nv)))
-        self._inputs = [row[:, 0] for row in buffer.plant_input]
-        self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
-        self._qpos[...], self._qvel[...] = self._q[0], self._v[0]
-        self._qacc, self._qacc_seen, self._seen = self.data.qacc, self._sight[nv:], self._sight[:nv]
-        self._seen[...] = self._s[0][:nv]
-        self._start_ticks(buffer)
-
-    def _by_ticks(self, k: int, /) -> None:
-        states = self._seen.size
-        self._timed.advance(k, states)
-        after = self._s[k + 1][:states]
-        after[: self._qpos.size], after[self._qpos.size :] = self._qpos, self._qvel
-
-    def _steps_for(self, T: float, seconds: float) -> None:
-        count = math.ceil(self.substeps * seconds / T - _WHOLE)
-        self.model.opt.timestep = seconds / count
-        mujoco.mj_step(self.model, self.data, count)
-
-    def _exponentials_for(self, seconds: float) -> None:
-        move, n = self._moves(seconds / self.substeps), self._qpos.size
-        for _ in range(self.substeps):
-            self._forward()
-            self._qacc_seen[...] = self._qacc
-            self._seen[...] = move(self._sight)
-            self._qpos[...], self._qvel[...] = self._seen[:n], self._seen[n:]
-
-    def _by_steps(self, k: int, /) -> None:
-        self._ctrl[...] = self._inputs[k]
-        self._step()
-        self._q[k + 1][...] = self._qpos
-        self._v[k + 1][...] = self._qvel
-
-    def _by_exponentials(self, k: int, /) -> None:
-        self._ctrl[...] = self._inputs[k]
-        after = self._s[k + 1]
-        for _ in range(self.substeps):
-            self._forward()
-            self._qacc_seen[...] = self._qacc
-            self._move(self._sight, after)
-            self._seen[...] = after
-            self._qpos[...], self._qvel[...] = self._q[k + 1], self._v[k + 1]
+        self.advance = self._access.ticks(buffer, self._timing)
 
     def troubled(self) -> bool:
-        return any(warning.number for warning in self.data.warning)
+        return bool(self.data.warning.number.any())
 
 
 class MujocoBatchEngine:
@@ -427,75 +479,39 @@ class MujocoBatchEngine:
         timing: Timing | None = None,
     ) -> None:
         """`fields` gives fields of the model a row per simulation, such as masses: (nsim, ...)."""
+        import mujoco
+        from mujoco.batch import Batch
+
         model = discretised(scene, T, integrator, substeps)
-        self.batch = Batch(model, nsim, nthread)
+        self.batch = batch = Batch(model, nsim, nthread)
         for name, rows in (fields or {}).items():
-            self.batch.expand(name)[...] = rows
+            batch.expand(name)[...] = rows
         if fields:
-            self.batch.set_const()
-        self.substeps = substeps
-        time, motion = (mujoco.mj_stateSize(model, part) for part in (_TIME, _TIME | _MOTION))
-        # position and velocity lie side by side in a state row, so one copy reads both
-        self._state = self.batch.state[:, time:motion].T
-        self._ctrl = self.batch.bind("ctrl").T
-        self._sight = np.zeros((len(self._state) + model.nv, nsim))  # [q; v; qacc]
-        self._seen, self._qacc_seen = self._sight[: len(self._state)], self._sight[len(self._state) :]
-        self._way = MujocoBatchEngine._by_steps  # not bound: a cycle would keep the batch's memory for long
-        if integrator == EXPONENTIAL:
-            moves = _rosenbrock(_rates(scene, fields), T / substeps)
-            self._move: _Product = _each_by_its_own(moves) if fields else moves[0].dot
-            self._qacc, self._way = self.batch.bind("qacc").T, MujocoBatchEngine._by_exponentials
-        self._start_ticks: Callable[[StepBuffer], None] = lambda buffer: None
-        if timing:
-            rates = _rates(scene, fields)
-            self._next, self._timestep = np.zeros_like(self._seen), self.batch.expand("opt.timestep")
-            self._moves: Callable[[float], _Product] = cache(
-                lambda h: _each_by_its_own(_rosenbrock(rates, h)) if fields else _rosenbrock(rates, h)[0].dot
-            )
-            by = self._exponentials_for if integrator == EXPONENTIAL else partial(self._steps_for, T)
-            self._timed = _TimedTicks(timing, by, self._ctrl)
-            self._way, self._start_ticks = MujocoBatchEngine._by_ticks, self._timed.start
+            batch.set_const()
+        parts, before = mujoco.mjtState, int(mujoco.mjtState.mjSTATE_TIME)
+        moved = before | int(parts.mjSTATE_QPOS) | int(parts.mjSTATE_QVEL)
+        time, motion = (mujoco.mj_stateSize(model, part) for part in (before, moved))
+
+        def move(h: float) -> _Product:
+            moves = _rosenbrock(_rates(scene, fields), h)
+            return _each_by_its_own(moves) if fields else moves[0].dot
+
+        self.advance: Callable[[int], None]  # from `start` on
+        self._timing = timing
+        self._access = _Access(
+            T,
+            substeps,
+            batch.bind("ctrl").T,
+            batch.state[:, time:motion].T,  # position and velocity lie side by side in a state row
+            batch.bind("qacc").T,
+            batch.forward,
+            lambda count: batch.step(nstep=count),
+            batch.expand("opt.timestep").fill if timing else float,
+            cache(move) if integrator == EXPONENTIAL else None,
+        )
 
     def start(self, buffer: StepBuffer) -> None:
-        self._state[...] = self._seen[...] = buffer.s[0][: len(self._seen)]
-        self._inputs, self._states = buffer.plant_input, buffer.plant_state
-        self._start_ticks(buffer)
-
-    def _by_ticks(self, k: int, /) -> None:
-        states = len(self._seen)
-        self._timed.advance(k, states)
-        self._states[k + 1][:states] = self._state
-
-    def _steps_for(self, T: float, seconds: float) -> None:
-        count = math.ceil(self.substeps * seconds / T - _WHOLE)
-        self._timestep[...] = seconds / count
-        self.batch.step(nstep=count)
-
-    def _exponentials_for(self, seconds: float) -> None:
-        move = self._moves(seconds / self.substeps)
-        for _ in range(self.substeps):
-            self.batch.forward()
-            self._qacc_seen[...] = self._qacc
-            move(self._sight, self._next)
-            self._seen[...] = self._state[...] = self._next
-
-    def advance(self, k: int, /) -> None:
-        self._way(self, k)
-
-    def _by_steps(self, k: int, /) -> None:
-        self._ctrl[...] = self._inputs[k]
-        self.batch.step(nstep=self.substeps)
-        self._states[k + 1][...] = self._state
-
-    def _by_exponentials(self, k: int, /) -> None:
-        self._ctrl[...] = self._inputs[k]
-        after = self._states[k + 1]
-        for _ in range(self.substeps):
-            self.batch.forward()
-            self._qacc_seen[...] = self._qacc
-            self._move(self._sight, after)
-            self._seen[...] = after
-            self._state[...] = after
+        self.advance = self._access.ticks(buffer, self._timing)
 
     def troubled(self) -> bool:
         return bool(np.any(self.batch.warning))
@@ -525,6 +541,8 @@ def _rosenbrock(J: Array, h: float) -> Array:
 
 def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoco.MjModel:
     """A copy of the scene's model that makes `substeps` steps of `integrator` in a period T."""
+    import mujoco
+
     if integrator not in INTEGRATORS:
         raise ValueError(f"integrator is {integrator!r}, allowed are {', '.join(INTEGRATORS)}")
     if substeps < 1:
@@ -533,12 +551,8 @@ def discretised(scene: Scene, T: float, integrator: str, substeps: int) -> mujoc
         raise InputError("a human has an impedance (A, B, C, D), which MuJoCo does not simulate: use the exact engine")
     model = copy(scene.model)
     model.opt.timestep = T / substeps
-    model.opt.integrator = INTEGRATORS[integrator]
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, INTEGRATORS[integrator])
     return model
-
-
-_TIME = int(mujoco.mjtState.mjSTATE_TIME)
-_MOTION = int(mujoco.mjtState.mjSTATE_QPOS) | int(mujoco.mjtState.mjSTATE_QVEL)
 
 
 @contextmanager
@@ -563,6 +577,8 @@ def profiler_off() -> Iterator[bool]:
 @contextmanager
 def quiet_warnings() -> Iterator[None]:
     """Keep MuJoCo from printing and logging its warnings: the engine counts and reports them."""
+    import mujoco
+
     previous = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda message: None)
     try:
@@ -572,6 +588,8 @@ def quiet_warnings() -> Iterator[None]:
 
 
 def _profiler_clock() -> ctypes.c_void_p | None:
+    import mujoco
+
     folder = os.path.dirname(mujoco.__file__)
     for library in glob.glob(os.path.join(folder, "libmujoco*")):
         try:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.lti import Array, Lti
-from controller.process import Contact, Process, StepBuffer
+from controller.process import Contact, Limiter, Process, StepBuffer
 from controller.timing import Timing
 from design.conditions import Latency
 from models.device import Device
@@ -343,15 +343,33 @@ class _ManyProcesses(StepBuffer):
 
     def __init__(self, processes: Sequence[Process], ticks: int, plant_states: int, outside: int) -> None:
         super().__init__(processes[0], ticks, plant_states, outside, len(processes))
-        made = _linear if processes[0].contact is None else _each
-        if isinstance(processes[0].contact, Contact) and len(processes[0].contact.walls) == 1:
+        made, contact = _linear if processes[0].contact is None else _each, processes[0].contact
+        if isinstance(contact, Contact) and len(contact.walls) == 1:
             made = _one_wall
+        elif contact and not contact.walls:
+            made = _limited
         self._transition = made(processes)
 
 
 def _linear(processes: Sequence[Process]) -> _Transition:
     blocks = _last_axis([np.block([[p.F.C, p.F.D], [p.F.A, p.F.B]]) for p in processes])
     return lambda before, after: np.einsum("oin,in->on", blocks, before, out=after)
+
+
+def _limited(processes: Sequence[Process]) -> _Transition:
+    """Limiter.transition for one simulation each: only those with a force beyond its limit solve their problem."""
+    limiters = [p.contact for p in processes if isinstance(p.contact, Limiter)]
+    linear, sent, limit = _linear(processes), limiters[0].sent_rows, _last_axis([each.limit for each in limiters])
+
+    def together(before: Array, after: Array) -> None:
+        linear(before, after)
+        free = after[sent]
+        for i in np.flatnonzero((np.abs(free) > limit).any(axis=0)):
+            slip, force = limiters[i].problem.solve(free[:, i : i + 1])
+            after[:, i : i + 1] += limiters[i].kick @ slip
+            after[sent, i] = force[:, 0]
+
+    return together
 
 
 def _one_wall(processes: Sequence[Process]) -> _Transition:

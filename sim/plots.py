@@ -1,4 +1,4 @@
-"""Every picture that a command writes, in one style: readable in black and white and by the colour-blind.
+"""Pictures that commands write, in one style: readable in black and white and by the colour-blind.
 
 Each function takes what its command reports (a Trace, a Map, or the report as it stands in JSON), writes one PNG and
 returns its path.
@@ -15,10 +15,8 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
-from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.text import Text
 from matplotlib.ticker import NullFormatter
@@ -26,10 +24,7 @@ from numpy.typing import NDArray
 
 from controller.lti import Array
 from design.files import printable, write
-from sim.limit_cycles import UNDECIDED
-from sim.stability import MARGINAL
 from sim.trace import Trace
-from sim.zwidth import MODEL_KEPT, Map
 
 mpl.use("Agg")
 
@@ -37,7 +32,7 @@ mpl.use("Agg")
 # The style.
 
 #: Okabe and Ito's palette, with a line style each
-_STYLES: tuple[dict[str, Any], ...] = (
+STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#0072B2", "linestyle": "-"},
     {"color": "#D55E00", "linestyle": "--"},
     {"color": "#009E73", "linestyle": ":"},
@@ -47,9 +42,8 @@ _STYLES: tuple[dict[str, Any], ...] = (
 )
 #: what is ideal: broad, grey and behind the rest
 _IDEAL: dict[str, Any] = {"color": "0.45", "linestyle": "-", "linewidth": 3.0, "alpha": 0.55}
-_STABLE, _UNSTABLE = "#DDEBF4", "#F6D9C6"  # areas
 #: the two conditions, by the keys that reports have
-_CONDITIONS = {"this-environment": "this environment", "any-environment": "any passive environment"}
+CONDITIONS = {"this-environment": "this environment", "any-environment": "any passive environment"}
 
 
 def _panels(title: str, rows: int, columns: int, size: tuple[float, float], **shared: Any) -> tuple[Figure, Any]:
@@ -72,7 +66,7 @@ def _entries(axis: Axes) -> dict[str, Any]:
     return dict(zip(labels, handles, strict=True))
 
 
-def _save(figure: Figure, path: Path, dpi: int = 130) -> Path:
+def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
     _literal(figure)
     try:
         return write(path, lambda file: figure.savefig(file, format="png", dpi=dpi))
@@ -166,7 +160,7 @@ def plot_run(
     # a calm curve stays visible on an agitated one
     for axis, part, width in zip(axes[1], parts, (0.9, 1.4), strict=False):
         for i in _calmest_last(result.f):
-            style = _STYLES[i % len(_STYLES)]
+            style = STYLES[i % len(STYLES)]
             label = f"{around.name(i)}, force" if two or alike[i] else around.name(i)
             axis.plot(result.t[part], result.f[part, i], label=label + alike[i], linewidth=width, **style)
     axes[0, 0].set_ylabel("displacement [mm]")
@@ -185,16 +179,16 @@ def plot_run(
     for axis in axes[1]:
         axis.set_xlabel("time [s]")
         axis.margins(x=0.01)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def _ordered(entries: dict[str, Any], around: Surroundings) -> dict[str, Any]:
-    """Channel by channel, and then the rest."""
+    """Channel by channel, of each what the hand holds first, and then the rest."""
     names = around.names or [f"device {i}" for i in range(1, 100)]
 
-    def place(label: str) -> tuple[int, str]:
+    def place(label: str) -> tuple[int, bool, str]:
         mine = [i for i, name in enumerate(names) if label == name or label.startswith((f"{name},", f"{name} ("))]
-        return (mine[0] if mine else len(names), label)
+        return (mine[0] if mine else len(names), "handle" not in label, label)
 
     return dict(sorted(entries.items(), key=lambda entry: place(entry[0])))
 
@@ -235,7 +229,7 @@ def _stands_out(result: Trace, near: slice, ticks: int) -> bool:
 def _draw_walls(axes: Array, result: Trace, around: Surroundings) -> None:
     """Where walls stand, in the panel of displacements, and when they were touched, in both."""
     for i, place, name in around.walls:
-        colour = _STYLES[i % len(_STYLES)]["color"]
+        colour = STYLES[i % len(STYLES)]["color"]
         axes[0].axhline(1e3 * place, color=colour, linestyle=(0, (2, 2)), linewidth=1.0, label=name)
     if around.touching is None or not around.touching.any():
         return
@@ -252,7 +246,7 @@ def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...], ar
     two, alike = _two_points(result), _coinciding(result.x, around)
     for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
         for i in _calmest_last(result.x):
-            style = _STYLES[i % len(_STYLES)]
+            style = STYLES[i % len(STYLES)]
             label = f"{around.name(i)}, encoder (thin)" if two else around.name(i)
             if alike[i] and not two:
                 label += f", displacement{alike[i]}"
@@ -260,7 +254,7 @@ def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...], ar
             axis.plot(result.t[part], 1e3 * result.x[part, i], label=label, linewidth=thin, **style)
         if two:
             for i in _calmest_last(result.x_handle):
-                style = _STYLES[i % len(_STYLES)]
+                style = STYLES[i % len(STYLES)]
                 label, handle = f"{around.name(i)}, handle (thick)", 1e3 * result.x_handle[part, i]
                 axis.plot(result.t[part], handle, label=label, linewidth=2.2 * width, **style)
 
@@ -283,7 +277,7 @@ def _draw_onset(axis: Axes, result: Trace, hertz: float, onset: Onset, around: S
     if not t.size:
         return
     for i, column in enumerate(1e3 * sizes.T):
-        axis.plot(t, column, label=around.name(i), linewidth=1.6, **_STYLES[i % len(_STYLES)])
+        axis.plot(t, column, label=around.name(i), linewidth=1.6, **STYLES[i % len(STYLES)])
     loudest = int(np.argmax(sizes[-1]))
     # the last third: by then the slower modes have died away
     late = slice(2 * t.size // 3, None)
@@ -321,7 +315,7 @@ def _draw_ideal(axes: Array, result: Trace, ideal: tuple[Array, float | None], p
     for axis, part in zip(axes, parts, strict=True):
         most = 3 * max(map(abs, axis.get_ylim()))
         for i, force in enumerate(forces[part].T):
-            axis.plot(result.t[part], force, color=_STYLES[i % len(_STYLES)]["color"], alpha=0.3, linewidth=3, zorder=1)
+            axis.plot(result.t[part], force, color=STYLES[i % len(STYLES)]["color"], alpha=0.3, linewidth=3, zorder=1)
         axis.plot([], [], color="#BBBBBB", linewidth=3, label=label)
         low, high = axis.get_ylim()
         axis.set_ylim(max(low, -most), min(high, most))
@@ -365,15 +359,14 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
     """
     columns, around = 2 if len(panels) > 1 else 1, Surroundings(names)
     rows = -(-len(panels) // columns)
-    figure, axes = _panels(
-        "the same devices and hands", rows, columns, (11, 3.1 * rows + 0.6), sharex=True, sharey=True
-    )
+    title, size = "the same devices, hands and object, another coupling in each panel", (11, 3.1 * rows + 0.6)
+    figure, axes = _panels(title, rows, columns, size, sharex=True, sharey=True)
     calm = [panel.ideal for panel in panels if panel.until is None] or [panel.ideal for panel in panels]
     most = 1.5 * max(float(np.abs(force).max(initial=1e-9)) for force in calm)
     for axis, panel in zip(axes.flat, panels, strict=False):
         axis.set_ylim(-most, most)
         for i in _calmest_last(panel.trace.f):
-            style = _STYLES[i % len(_STYLES)]
+            style = STYLES[i % len(STYLES)]
             ideal = panel.ideal[:, i]
             axis.plot(panel.trace.t, ideal, color=style["color"], alpha=0.3, linewidth=5, zorder=1)
             axis.plot(panel.trace.t, panel.trace.f[:, i], label=around.name(i), linewidth=1.1, **style)
@@ -389,7 +382,7 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
         axis.set_xlabel("time [s]")
     axes[0, 0].plot([], [], color="#BBBBBB", linewidth=5, label="pale: the force that should be felt")
     _legend(figure, _ordered(_entries(axes[0, 0]), around), 6)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -402,7 +395,7 @@ def plot_accuracy(rows: list[dict[str, Any]], path: Path) -> Path:
     figure, axes = _panels("speed against error (crossed: wrong verdict)", 1, 2, (11, 4.5), sharex=True)
     names = list(dict.fromkeys(row["integrator"] for row in rows if row["integrator"]))
     for axis, (key, label) in zip(axes[0], errors.items(), strict=True):
-        for name, style in zip(names, _STYLES, strict=False):
+        for name, style in zip(names, STYLES, strict=False):
             mine = [row for row in rows if row["integrator"] == name and row[key]]
             points = [(row["wall_s_per_simulated_s"], abs(row[key])) for row in mine]
             axis.loglog(*zip(*points, strict=True) if points else ((), ()), marker="o", label=name, **style)
@@ -412,7 +405,7 @@ def plot_accuracy(rows: list[dict[str, Any]], path: Path) -> Path:
                     axis.plot(*point, "kx", markersize=11)
         axis.set(xlabel="seconds per simulated second", ylabel=label)
     axes[0, 0].legend()
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def plot_population(mass: Array, damping: Array, growth: Array, path: Path, title: str) -> Path:
@@ -421,7 +414,7 @@ def plot_population(mass: Array, damping: Array, growth: Array, path: Path, titl
     Where a loop has several humans, mass and damping are geometric means over them.
     """
     figure, axes = _panels(title, 1, 2, (10, 4.2), sharey=True)
-    kinds = (("stable", growth <= 0, "o", _STYLES[0]), ("unstable", growth > 0, "^", _STYLES[1]))
+    kinds = (("stable", growth <= 0, "o", STYLES[0]), ("unstable", growth > 0, "^", STYLES[1]))
     labels = "mass of the human [kg]", "least damping of the human [N s/m]"
     for axis, values, label in zip(axes[0], (mass, damping), labels, strict=True):
         for name, chosen, marker, style in kinds:
@@ -433,14 +426,14 @@ def plot_population(mass: Array, damping: Array, growth: Array, path: Path, titl
     axes[0, 0].set_ylabel("growth rate [1/s]")
     _plain_numbers(axes)
     _legend(figure, _entries(axes[0, 0]), 2)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def plot_tightness(rows: list[dict[str, Any]], path: Path) -> Path:
     """Growth rate with the first destabilising human found, over the share of the required damping that was missing."""
     figure, axes = _panels("", 1, 1, (7, 4.2))
     axis = axes[0, 0]
-    for name, style in zip(dict.fromkeys(row["loop"] for row in rows), _STYLES, strict=False):
+    for name, style in zip(dict.fromkeys(row["loop"] for row in rows), STYLES, strict=False):
         mine = [row for row in rows if row["loop"] == name]
         points = [(100 * row["short"], row["growth_rate_per_s"] if row["found"] else 0.0) for row in mine]
         axis.plot(*zip(*points, strict=True), label=name, **style)
@@ -453,7 +446,7 @@ def plot_tightness(rows: list[dict[str, Any]], path: Path) -> Path:
         ylabel="growth with the first human found [1/s]",
     )
     axis.legend()
-    return _save(figure, path)
+    return save(figure, path)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -462,8 +455,8 @@ def plot_tightness(rows: list[dict[str, Any]], path: Path) -> Path:
 #: E, F and M in every panel of singular values
 _PARTS: tuple[tuple[str, str, dict[str, Any]], ...] = (
     ("sigma_E", "E, the environment", _IDEAL),
-    ("sigma_F", "F, what the devices see", _STYLES[0]),
-    ("sigma_M", "M, the mismatch", _STYLES[1]),
+    ("sigma_F", "F, what the devices see", STYLES[0]),
+    ("sigma_M", "M, the mismatch", STYLES[1]),
 )
 _HIGHEST = 20.0  # of the available damping: what a picture of the required one still shows
 _FLOOR = 1e-4  # of the largest value: what a logarithmic axis still shows
@@ -482,13 +475,13 @@ def plot_singular_values(data: dict[str, Any], path: Path) -> Path:
                 width = (3.0 if style is _IDEAL else 1.6) / (1 + i)
                 axis.plot(hz, row, label=label if i == 0 else None, **(style | {"linewidth": width}))
         if not _array(coupling["sigma_M"]).any():
-            axis.annotate("M = 0", (0.05, 0.05), xycoords="axes fraction", color=_STYLES[1]["color"])
+            axis.annotate("M = 0", (0.05, 0.05), xycoords="axes fraction", color=STYLES[1]["color"])
         axis.set(xscale="log", yscale="log", title=coupling["name"], xlabel="frequency [Hz]")
         axis.set_ylim(_FLOOR * top, 2 * top)
     axes[0, 0].set_ylabel("singular values [N/m]")
     _plain_numbers(axes)
     _legend(figure, _entries(axes[0, 0]), 4)
-    return _save(figure, path, 90)
+    return save(figure, path, 90)
 
 
 def plot_required_damping(data: dict[str, Any], path: Path) -> Path:
@@ -498,12 +491,12 @@ def plot_required_damping(data: dict[str, Any], path: Path) -> Path:
     hz, available = _array(data["frequency_hz"]), data["available_damping"]
     alike = len(set(available)) == 1  # devices that are not are drawn as ratios
     scale, unit = (available[0], " [N s/m]") if alike else (1.0, " over available damping")
-    for axis, (condition, words) in zip(axes[0], _CONDITIONS.items(), strict=True):
+    for axis, (condition, words) in zip(axes[0], CONDITIONS.items(), strict=True):
         axis.axhline(scale, color="black", linewidth=1.2)
         axis.annotate("available", (hz[0], scale), (2, 3), textcoords="offset points", fontsize=8)
         parts = [coupling[condition] for coupling in data["couplings"]]
         top = scale * min(max([1.0, *(part["ratio"] or 0.0 for part in parts)]), _HIGHEST)
-        for coupling, part, style in zip(data["couplings"], parts, _STYLES, strict=False):
+        for coupling, part, style in zip(data["couplings"], parts, STYLES, strict=False):
             if part["demand"] is None:
                 axis.plot([], [], label=f"{coupling['name']} (no curve: see the notes)", **style)
                 continue
@@ -518,7 +511,7 @@ def plot_required_damping(data: dict[str, Any], path: Path) -> Path:
         axis.legend(fontsize=8)
     axes[0, 0].set_ylabel(f"required damping{unit}")
     _plain_numbers(axes)
-    return _save(figure, path, 90)
+    return save(figure, path, 90)
 
 
 def plot_perceived(data: dict[str, Any], path: Path) -> Path:
@@ -527,7 +520,7 @@ def plot_perceived(data: dict[str, Any], path: Path) -> Path:
     figure, axes = _over_frequency(title, 2, len(data["available_damping"]), (4.8, 3.2))
     hz = _array(data["frequency_hz"])
     curves = [("ideal: E itself", data["ideal"], _IDEAL)]
-    curves += [(c["name"], c["perceived"], s) for c, s in zip(data["couplings"], _STYLES, strict=False)]
+    curves += [(c["name"], c["perceived"], s) for c, s in zip(data["couplings"], STYLES, strict=False)]
     for row, (key, label) in zip(axes, (("stiffness", "stiffness [N/m]"), ("damping", "damping [N s/m]")), strict=True):
         for i, axis in enumerate(row):
             for name, values, style in curves:
@@ -544,7 +537,7 @@ def plot_perceived(data: dict[str, Any], path: Path) -> Path:
         lower.set_xlabel("frequency [Hz]")
     _plain_numbers(axes)
     _legend(figure, _entries(axes[0, 0]), 4)
-    return _save(figure, path, 90)
+    return save(figure, path, 90)
 
 
 def _over_frequency(title: str, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, Any]:
@@ -557,9 +550,9 @@ def _over_frequency(title: str, rows: int, columns: int, size: tuple[float, floa
 
 #: design -> what it is called, and how it is drawn
 _CURVES: dict[str, tuple[str, dict[str, Any]]] = {
-    "optimal": ("the optimal coupling", _STYLES[0] | {"marker": "o"}),
-    "this-environment": (f"spring-damper, {_CONDITIONS['this-environment']}", _STYLES[1] | {"marker": "s"}),
-    "any-environment": (f"spring-damper, {_CONDITIONS['any-environment']}", _STYLES[2] | {"marker": "^"}),
+    "optimal": ("the optimal coupling", STYLES[0] | {"marker": "o"}),
+    "this-environment": (f"spring-damper, {CONDITIONS['this-environment']}", STYLES[1] | {"marker": "s"}),
+    "any-environment": (f"spring-damper, {CONDITIONS['any-environment']}", STYLES[2] | {"marker": "^"}),
 }
 #: the floor of the picture [dB]: in case I a loop that needs no coupling has minus infinity
 _EXACT = -60.0
@@ -580,7 +573,7 @@ def plot_limits(outcome: dict[str, Any], path: Path) -> Path:
     for axis in axes[:, 0]:
         axis.set_ylabel(f"{outcome['objective']} mismatch [dB]")
     _legend(figure, entries, 3, fontsize=9)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def plot_baselines(outcome: dict[str, Any], path: Path) -> Path:
@@ -600,7 +593,7 @@ def plot_baselines(outcome: dict[str, Any], path: Path) -> Path:
     axes[0, 0].invert_yaxis()
     names = {"baseline": "tab:orange", "with a guarantee": "tab:blue", "without": "tab:grey"}
     _legend(figure, {name: Patch(color=colour) for name, colour in names.items()}, 3)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def _here(name: str, outcome: dict[str, Any]) -> float:
@@ -645,136 +638,3 @@ def _draw_sweep(axis: Axes, name: str, sweep: dict[str, Any], figure: str, here:
         axis.set_xticks([row["value"] for row in sweep["optimal"]])
     axis.set_xlabel(f"{sweep['label']}" + ("" if name == "order" else f" [{unit}]"))
     return entries
-
-
-# ----------------------------------------------------------------------------------------------------
-# The K-B plane: what is certified, what random humans allow, and what was simulated.
-
-#: in the order of drawing: the broken line lies on the other, so that both are seen where they are the same
-_LINES: dict[str, dict[str, Any]] = {
-    "this-environment": _STYLES[2] | {"linestyle": "-", "linewidth": 3.6},
-    "any-environment": _STYLES[0] | {"linestyle": "--", "linewidth": 1.8},
-    MODEL_KEPT: _STYLES[3] | {"linewidth": 1.8},
-}
-
-
-def plot_zwidth(drawn: Map, outcome: dict[str, Any], path: Path) -> Path:
-    """Stiffness over damping; cells are the population's verdict, lines the certificates' edges, symbols MuJoCo's."""
-    figure, axes = plt.subplots(figsize=(8, 5.6), layout="constrained")  # areas in place of a grid
-    about_environment = outcome["axes"] == "environment"
-    of = " of the environment's contacts" if about_environment else ""
-    axes.set(xscale=drawn.grid.scale, yscale=drawn.grid.scale, xlabel=f"B{of} [N s/m]", ylabel=f"K{of} [N/m]")
-    entries = [*_cells(axes, drawn, outcome), *_edges(axes, drawn, about_environment), *_points(axes, drawn, outcome)]
-    for mark in outcome.get("marks", ()):
-        axes.plot(mark["B"], mark["K"], "*", color="black", markersize=14, clip_on=False, zorder=5)
-        axes.annotate(
-            f"{mark['K']:g}, {mark['B']:g}", (mark["B"], mark["K"]), (9, 5), textcoords="offset points", zorder=5
-        )
-    if about_environment:
-        entries += _designed_for(axes, drawn, outcome)
-    figure.legend(handles=entries, loc="outside lower center", ncols=2, fontsize=8.5)
-    figure.suptitle(_title(outcome), fontsize=11)
-    return _save(figure, path, 110)
-
-
-def _cells(axes: Axes, drawn: Map, outcome: dict[str, Any]) -> list[Patch]:
-    growth = drawn.growth.reshape(drawn.grid.shape)
-    verdict = np.ma.masked_invalid(np.where(np.isnan(growth), np.nan, growth > MARGINAL))
-    colours = ListedColormap([_STABLE, _UNSTABLE])
-    edges = [_cell_edges(axis, drawn.grid.scale) for axis in (drawn.grid.B, drawn.grid.K)]
-    axes.pcolormesh(*edges, verdict, cmap=colours, vmin=0, vmax=1, rasterized=True)
-    humans = outcome["population"]["humans"]
-    return [
-        Patch(color=_STABLE, label=f"exact: stable with all of {humans} humans"),
-        Patch(color=_UNSTABLE, label="exact: unstable with some"),
-    ]
-
-
-def _cell_edges(axis: Array, scale: str) -> Array:
-    """Borders halfway between grid values, with the first and the last value on the border of the picture."""
-    values = np.log(axis) if scale == "log" else axis
-    borders = np.concatenate([values[:1], (values[1:] + values[:-1]) / 2, values[-1:]])
-    return np.exp(borders) if scale == "log" else borders
-
-
-def _edges(axes: Axes, drawn: Map, about_environment: bool) -> list[Line2D]:
-    entries = []
-    for name, style in _LINES.items():
-        if name not in drawn.ratio:
-            continue
-        ratio = drawn.ratio[name]
-        # the edge is where required damping is what is available; far from it the figure is only kept finite
-        height = np.ma.masked_invalid(np.clip(ratio, 0, 4).reshape(drawn.grid.shape))
-        safe, unsafe = bool((ratio < 1).any()), bool((ratio >= 1).any())
-        if safe and unsafe:
-            drawing = {"colors": style["color"], "linestyles": style["linestyle"], "linewidths": style["linewidth"]}
-            axes.contour(drawn.grid.B, drawn.grid.K, height, [1], **drawing)
-        side = "inside this edge" if about_environment else "below this edge"
-        where = side if safe and unsafe else "everywhere here" if safe else "nowhere here"
-        label = f"{_CONDITIONS.get(name, name)}: certified {where}"
-        entries.append(Line2D([], [], label=label, **style))
-    return entries
-
-
-def _designed_for(axes: Axes, drawn: Map, outcome: dict[str, Any]) -> list[Line2D]:
-    """The contact springs of the environment that the coupling was designed for, where they lie on the map."""
-    style: dict[str, Any] = {"marker": "P", "markersize": 9, "color": "black", "linestyle": "none"}
-    shown = [(s["B"], s["K"]) for s in outcome["designed_for"]["contact_springs"]]
-    for b, k in shown:
-        if drawn.grid.B[0] <= b <= drawn.grid.B[-1] and drawn.grid.K[0] <= k <= drawn.grid.K[-1]:
-            axes.plot(b, k, zorder=5, markeredgecolor="white", **style)
-    return [Line2D([], [], label="the springs that the coupling was designed for", **style)]
-
-
-def _points(axes: Axes, drawn: Map, outcome: dict[str, Any]) -> list[Line2D]:
-    points = outcome["simulation"]["points"]
-    if not points:
-        return []
-    entries, effects = [], "" if outcome["simulation"]["nonlinear"] else ", linear loop"
-    kinds = (("rests", "o", "white"), ("oscillates", "X", _STYLES[1]["color"]), (UNDECIDED, "D", "grey"))
-    for word, marker, face in kinds:
-        some = [p for p in points if p["verdict"] == word]
-        if not some:
-            continue
-        style = {"marker": marker, "markersize": 5.5, "markerfacecolor": face, "markeredgecolor": "black"}
-        style |= {"linestyle": "none", "markeredgewidth": 0.7}
-        axes.plot([p["B"] for p in some], [p["K"] for p in some], clip_on=False, zorder=4, **style)
-        entries.append(Line2D([], [], label=f"MuJoCo{effects}: {word} ({len(some)})", **style))
-    other = [p for p in points if p["differs_from_linear"]]
-    if other:
-        style = {"marker": "o", "markersize": 11, "markerfacecolor": "none", "markeredgecolor": _STYLES[3]["color"]}
-        style |= {"linestyle": "none", "markeredgewidth": 1.6}
-        axes.plot([p["B"] for p in other], [p["K"] for p in other], clip_on=False, zorder=4, **style)
-        entries.append(Line2D([], [], label=f"unlike the linear loop ({len(other)})", **style))
-    return entries
-
-
-def _title(outcome: dict[str, Any]) -> str:
-    what = "rigid wall" if outcome["rigid"] else outcome["scenario"]
-    if outcome["coupling"]:
-        what += f", {outcome['coupling']['kind']} coupling"
-    if outcome["one_sided"]:
-        what += ", one-sided"
-    parts = [
-        f"theta {_list(outcome['theta'])}",
-        f"T {1e3 * outcome['T']:g} ms",
-        f"delta {_list(outcome['delta'])} N s/m",
-    ]
-    if any(outcome["psi"]):
-        parts.append(f"psi {_list(outcome['psi'])}")
-    if outcome["velocity_filter_hz"]:
-        parts.append(f"velocity filter {outcome['velocity_filter_hz']:g} Hz")
-    effects = outcome["simulation"]["effects"]
-    if any(effects["encoder_step_m"]):
-        parts.append(f"encoder step {1e6 * max(effects['encoder_step_m']):g} um")
-    if any(effects["friction_n"]):
-        parts.append(f"friction {max(effects['friction_n']):g} N")
-    if effects["force_limit_n"]:
-        parts.append(f"limit {_list(effects['force_limit_n'])} N")
-    head = f"{what}: {', '.join(parts[:3])}"
-    return head if len(parts) == 3 else f"{head}\n{', '.join(parts[3:])}"
-
-
-def _list(values: list[float]) -> str:
-    """The numbers, or the one that all of them are."""
-    return ", ".join(f"{v:g}" for v in (values if len(set(values)) > 1 else values[:1]))

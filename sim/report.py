@@ -1,4 +1,7 @@
-"""What a run and a validation came to, as plain data: SI units, null with a "reason" where a figure does not exist."""
+"""What a run and a validation came to, as plain data in SI units: null with a "reason" where a figure does not exist.
+
+The rows on the screen are made of it in the commands: cli/run.py, cli/validate.py.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import Compliance, Coupling, ForceFilter, InternalModel, MovingAverage, SpringDamper
-from controller.delay import LOST, Jitter, Ticks, ages
+from controller.coupling import Coupling
+from controller.delay import LOST, Ticks, VaryingDelay, ages
 from controller.lti import Array
 from controller.timing import Timing
 from design.certificate import assess
@@ -40,19 +43,7 @@ def certificates_part(requirements: Mapping[str, Requirement]) -> dict[str, Any]
 
 def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
     """Kind, gains (None where it has none) and order of V, Q or R."""
-    part: dict[str, Any] = {"kind": kind, "K": None, "B": None, "order": 0}
-    match coupling:
-        case SpringDamper(K=K, B=B):
-            part |= {"K": K.tolist(), "B": B.tolist(), "order": coupling.compliance(T).order}
-        case MovingAverage():
-            part |= {"stiffness": coupling.stiffness.tolist(), "order": coupling.compliance(T).order}
-        case Compliance(V=V):
-            part["order"] = V.order
-        case InternalModel():
-            part["order"] = coupling.parameter(T).order
-        case ForceFilter():
-            part["order"] = coupling.filter(T).order
-    return part
+    return {"kind": kind, "K": None, "B": None} | coupling.figures(T)
 
 
 def transparency_part(figures: Transparency) -> dict[str, Any]:
@@ -98,16 +89,17 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
         lines.append(f"{what} {condition}: it needs {worst:.3g} times the damping that the devices guarantee.")
     if "contact" in outcome["stability"]:
         covered = {ANY: "any-environment", MAKING: "this-environment"}.get(outcome["promise"], "no certificate")
-        frozen = "this-environment is about frozen contact states where walls have dampers"
-        lines.append(f"Contact that makes and breaks: {covered} covers it in this loop; {frozen}.")
+        slopes = listed(outcome["stability"]["contact"]["slopes_n_per_m"])
+        softer = f", and any walls with K + 2 B/T up to {slopes} N/m" if outcome["promise"] == MAKING else ""
+        lines.append(f"Contact that makes and breaks: {covered} covers it in this loop{softer}.")
     for name in ("stability", "error", "transparency", "credible"):
         if "reason" in outcome[name]:
             lines.append(f"{name}: {outcome[name]['reason']}.")
     for name, part in certificates.items():
         if "reason" in part:
             lines.append(f"{name}: {part['reason']}.")
-    if outcome.get("jitter"):
-        lines.append(f"Delays that vary: {outcome['jitter']['covers']}.")
+    if outcome.get("varying_delay"):
+        lines.append(f"Delays that vary: {outcome['varying_delay']['covers']}.")
     if part := outcome.get("encoder"):
         lines.append(f"{part['words'][0].upper()}{part['words'][1:]}.")
     return [*lines, CAVEATS]
@@ -119,7 +111,7 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
 
 def beside_the_paper(scenario: Scenario, case: str, outcome: dict[str, Any]) -> list[dict[str, str]]:
     """Rows of {what, paper, here, why}; empty where the loop is not the paper's."""
-    if scenario.jitter or scenario.loop(case) != load().loop(case):
+    if scenario.varying_delay or scenario.loop(case) != load().loop(case):
         return []
     figure = _figure(case, outcome["stability"])
     return [figure] if case == "none" else [*_printed_gains(scenario, case, outcome), _tau(case), figure]
@@ -178,23 +170,23 @@ _JUDGED = 4.0  # [s] at most of the linear loop from which a growth is read: lat
 def delays_part(
     simulation: Simulation, chosen: Chosen, period: Period | None, ticks: int, certified: bool
 ) -> dict[str, Any] | None:
-    """All that a report says of delays that vary; None where the scenario has no jitter."""
+    """All that a report says of delays that vary; None where the scenario has none."""
     scenario = simulation.scenario
-    if scenario.jitter is None:
+    if scenario.varying_delay is None:
         return None
     met = _delays_met(simulation, period, ticks) if scenario.switches else {}
-    return delay_range_part(scenario.jitter) | met | certified_part(scenario, chosen, certified)
+    return delay_range_part(scenario.varying_delay) | met | certified_part(scenario, chosen, certified)
 
 
-def delay_range_part(jitter: Jitter) -> dict[str, Any]:
+def delay_range_part(varying: VaryingDelay) -> dict[str, Any]:
     """The range of delays and how they vary within it."""
     return {
-        "lo": list(jitter.lo),
-        "hi": list(jitter.hi),
-        "pattern": jitter.pattern,
-        "loss": jitter.loss,
-        "playout": jitter.playout,
-        "constant": jitter.steady,
+        "lo": list(varying.lo),
+        "hi": list(varying.hi),
+        "pattern": varying.pattern,
+        "loss": varying.loss,
+        "playout": varying.playout,
+        "constant": varying.steady,
     }
 
 
@@ -244,26 +236,26 @@ def timing_part(timing: Timing | None, scenario: Scenario) -> dict[str, Any] | N
     }
 
 
-def switched_stability_part(simulation: Simulation, trace: Trace, jitter: dict[str, Any]) -> dict[str, Any]:
+def switched_stability_part(simulation: Simulation, trace: Trace, delays: dict[str, Any]) -> dict[str, Any]:
     """As report.stability_part, for a loop that switches: it has no eigenvalue of its own but over a period."""
-    worst = jitter["period"] or jitter
+    worst = delays["period"] or delays
     constant = eigenvalue_part(dominant_mode(close(simulation.plant, simulation.F)))
-    verdict = "unstable" if trace.diverged or "unstable" in (worst["verdict"], jitter["verdict"]) else "stable"
+    verdict = "unstable" if trace.diverged or "unstable" in (worst["verdict"], delays["verdict"]) else "stable"
     return {
         "verdict": verdict,
         "clipped_ticks": int(trace.clipped(simulation.process.force_limit).sum()),
         "growth_rate_per_s": worst["growth_rate_per_s"],
         "frequency_hz": trace.dominant_frequency_hz(),
         **constant,
-        "reason": _how(jitter)
+        "reason": _how(delays)
         + f"; the eigenvalues are those of the constant delay theta = {listed(simulation.scenario.theta)}",
     }
 
 
-def _how(jitter: dict[str, Any]) -> str:
-    if jitter["period"]:
-        return f"growth by the eigenvalues of the product over the {jitter['period']['ticks']} ticks of a period"
-    return f"growth of the linear loop after an impulse, over {jitter['judged_s']:.3g} s under the run's delays"
+def _how(delays: dict[str, Any]) -> str:
+    if delays["period"]:
+        return f"growth by the eigenvalues of the product over the {delays['period']['ticks']} ticks of a period"
+    return f"growth of the linear loop after an impulse, over {delays['judged_s']:.3g} s under the run's delays"
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -301,7 +293,7 @@ def validation_part(question: Validation, findings: Findings, certified: bool, w
         "wall_s": wall,
         "simulated_s_per_s": findings.simulated / wall,
     }
-    if certified and question.ticks and question.scenario.latency is None:  # it knows positions at ticks only
+    if certified and question.ticks:
         part["energy_audit"] = _energy(question, findings)
         part["holds"] = part["holds"] and part["energy_audit"]["holds"]
     if not findings.index.size:
@@ -373,7 +365,7 @@ def _environments(question: Validation, findings: Findings, bad: NDArray[np.bool
         return {"of": "the nominal environment", "count": 1}
     unstable_in = sorted({int(i) % len(question.environments) for i in findings.index[bad]})
     return {
-        "of": "the box",
+        "of": "the ranges",
         "count": len(question.environments),
         "names": [member.name for member in question.environments],
         "unstable_in": [question.environments[i].name for i in unstable_in],

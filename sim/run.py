@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from controller.coupling import Compliance, Coupling, MovingAverage, NoCoupling, SpringDamper
+from controller.coupling import Coupling
 from controller.environment import environment, held
 from controller.loop import force_map
 from controller.lti import Array, Lti
@@ -45,7 +45,7 @@ Outside = Callable[[int, int], Array]  # (first tick, ticks) -> forces on the ha
 _Look = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, ticks in it) -> whether to stop
 Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 
-_COPIES = 5  # of a trace, at most, from the run to its report
+_COPIES = 4  # of a trace, at most, from the run to its report
 _BLOCK = 1024  # ticks between two looks at the clock, the keyboard and the numbers
 
 
@@ -96,7 +96,7 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
     no compliance V stands before.
     """
     network, delays = scenario.environment, (scenario.theta, scenario.psi)
-    if network.walls and not isinstance(coupling, NoCoupling | SpringDamper | MovingAverage | Compliance):
+    if network.walls and coupling.holds_model:
         raise InputError(f"environment.walls: {type(coupling).__name__} holds a linear model, so it cannot face walls")
     E = environment(held(network), scenario.T)
     limits, steps = (np.array([getattr(d, of) for d in scenario.device]) for of in ("force_limit", "encoder_step"))
@@ -131,19 +131,23 @@ def run(
     ticks = scenario.samples if ticks is None else ticks
     start = np.zeros((simulation.plant.A.shape[0], 1)) if start is None else start
     _require_memory(process.F.order + len(start) + simulation.scene.outside + process.channels, ticks, scenario.T)
-    blocks: list[tuple[Array, ...]] = []
+    widths = (process.F.order, len(start), simulation.scene.outside, process.channels)
+    record, done = np.empty((ticks, sum(widths))), 0
     net: Net | None = None
     diverged = interrupted = False
 
     def keep(buffer: StepBuffer, first: int, count: int) -> bool:
-        nonlocal diverged, net
-        net = buffer.net
-        finite = np.isfinite(buffer.s[:count]).all(axis=(1, 2)) & np.isfinite(buffer.f[:count]).all(axis=(1, 2))
-        diverged = engine.troubled() or not finite.all()
-        count = count if finite.all() else int(np.argmin(finite))
+        nonlocal diverged, net, done
+        net, rows = buffer.net, buffer.rows[:count]
+        diverged = engine.troubled()
+        if not np.isfinite(rows.sum()):  # rarely, and then looked at row by row
+            finite = np.isfinite(buffer.s[:count]).all(axis=(1, 2)) & np.isfinite(buffer.f[:count]).all(axis=(1, 2))
+            diverged |= not finite.all()
+            count = count if finite.all() else int(np.argmin(finite))
         buffer.saturate(count)
-        blocks.append(tuple(rows[:count, :, 0].copy() for rows in (buffer.z, buffer.s, buffer.w, buffer.f)))
-        progress(first + count, ticks)
+        done = first + count
+        record[first:done] = rows[:count, :, 0]
+        progress(done, ticks)
         return diverged
 
     try:
@@ -151,10 +155,10 @@ def run(
     except KeyboardInterrupt:  # what was finished is kept
         interrupted = True
     n, m, handles = simulation.scene.model.nq, process.channels, list(simulation.scene.handles)
-    nothing = [np.empty((0, width)) for width in (process.F.order, len(start), simulation.scene.outside, m)]
-    z, s, w, f = (np.concatenate(rows) for rows in zip(nothing, *blocks, strict=True))
+    record.setflags(write=False)
+    z, s, w, f = np.split(record[:done], np.cumsum(widths)[:3], axis=1)
     return Trace(
-        t=beginnings(scenario.T, simulation.timing, 0, len(s)),
+        t=beginnings(scenario.T, simulation.timing, 0, done),
         x=process.measured(s[:, :m]),
         f=f,
         x_handle=s[:, handles],

@@ -17,9 +17,9 @@ from typing import Any, Self, get_args
 import msgspec
 import numpy as np
 
-from controller.delay import Jitter
-from controller.environment import Box, Network, Spring, UncertainSpring, Wall, environment
-from controller.loop import DelayRange, Loop
+from controller.delay import VaryingDelay
+from controller.environment import Network, Ranges, Spring, UncertainSpring, Wall, environment
+from controller.loop import DelayRange, Loop, named_first, named_today
 from controller.timing import Periods, Timing, drawn
 from design.files import InputError, read_text, toml, write
 from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
@@ -28,6 +28,7 @@ from models.human import Cross, Human, Link, MeasuredHand, Person, Population, P
 CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
+OLDER_SCENARIOS = {"omega-pair-box": "omega-pair-ranges"}  # older name -> the name of today
 
 LONGEST_DELAY = 1000  # [samples]; every one is a state
 _MOST_DELAYS = 1000  # of all channels together: the eigenvalues of so many states take ten seconds, of 2000 a minute
@@ -60,13 +61,13 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     device: tuple[Device, ...]
     human: tuple[Human, ...]
     environment: Network
-    box: Box | None = None  # what else the environment may be
+    ranges: Ranges | None = None  # what else the environment may be
     lam: _Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
     person: tuple[Person, ...] = ()  # those who hold several devices
     tap: _Tap | None = None
     duration: float = 15.0  # [s]
     population: Population = Population()  # who `validate` draws
-    jitter: Jitter | None = None  # how the delays of the forces vary around theta; None where they do not
+    varying_delay: VaryingDelay | None = None  # of the forces, around theta; None where delays are constant
     T_max: float | None = None  # [s] the longest period, where it varies from tick to tick; certificates are for it
     period: Periods | None = None  # the periods that are simulated; T is what the computer's filters are made for
     latency: tuple[tuple[float, float], ...] | None = None  # [s] least and most by which a channel's force latches late
@@ -91,12 +92,12 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 total = self.theta[i] + self.psi[i]
                 raise ValueError(f"lam[{i}] is {lam}, allowed are 0 to theta + psi = {total} samples")
         check_holds([person.holds for person in self.person], self.channels)
-        if self.jitter:
-            self._check_jitter(self.jitter)
-        if self.box and self.environment.walls:
-            raise ValueError("box and environment.walls: a set is of linear environments; give one of them")
+        if self.varying_delay:
+            self._check_varying_delay(self.varying_delay)
+        if self.ranges and self.environment.walls:
+            raise ValueError("ranges and environment.walls: ranges are of linear environments; give one of them")
         self._check_timing()
-        self.loop("I")  # raises ValueError where the box does not fit the environment
+        self.loop("I")  # raises ValueError where the ranges do not fit the environment
         if self.tap and not 1 <= self.tap.channel <= self.channels:
             raise ValueError(f"tap.channel is {self.tap.channel}, allowed are 1 to {self.channels}")
 
@@ -108,18 +109,18 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if most >= shortest:
                 raise ValueError(f"latency[{i}] is up to {most:g} s, expected less than every period, {shortest:g} s")
 
-    def _check_jitter(self, jitter: Jitter) -> None:
-        if jitter.channels != self.channels:
-            raise ValueError(f"jitter has {jitter.channels} ranges for {self.channels} channels")
-        if self.box:
-            raise ValueError("jitter and box: switching delays are judged in one environment; give one of them")
+    def _check_varying_delay(self, varying: VaryingDelay) -> None:
+        if varying.channels != self.channels:
+            raise ValueError(f"varying_delay has {varying.channels} ranges for {self.channels} channels")
+        if self.ranges:
+            raise ValueError("varying_delay and ranges: switching delays are judged in one environment; give one")
         if self.environment.walls:
-            raise ValueError("jitter and environment.walls: what switching delays do is judged for linear loops only")
-        for i, (n, lo, hi) in enumerate(zip(self.theta, jitter.lo, jitter.hi, strict=True)):
-            if jitter.playout and n != hi:
-                raise ValueError(f"theta[{i}] is {n}, but jitter.playout makes it the largest delay, {hi}")
+            raise ValueError("varying_delay and environment.walls: switching delays are judged in linear loops only")
+        for i, (n, lo, hi) in enumerate(zip(self.theta, varying.lo, varying.hi, strict=True)):
+            if varying.playout and n != hi:
+                raise ValueError(f"theta[{i}] is {n}, but varying_delay.playout makes it the largest delay, {hi}")
             if not lo <= n <= hi:
-                raise ValueError(f"theta[{i}] is {n}, outside of its jitter, {lo} to {hi} samples")
+                raise ValueError(f"theta[{i}] is {n}, outside of its varying_delay, {lo} to {hi} samples")
 
     @property
     def channels(self) -> int:
@@ -128,12 +129,13 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def switches(self) -> bool:
         """Whether the delay of the forces is anything but the constant theta."""
-        return self.jitter is not None and not self.jitter.steady
+        return self.varying_delay is not None and not self.varying_delay.steady
 
     @property
     def delay_range(self) -> DelayRange:
         """What the delay of a force may be; of one that is lost nothing is said."""
-        return DelayRange(self.jitter.lo, self.jitter.hi) if self.jitter else DelayRange(self.theta, self.theta)
+        varying = self.varying_delay
+        return DelayRange(varying.lo, varying.hi) if varying else DelayRange(self.theta, self.theta)
 
     @property
     def delta(self) -> tuple[float, ...]:
@@ -171,7 +173,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """SHA-256 over the scenario's contents."""
         newer = {"T_max", "latency", "period"}  # left out where they are not given: scenarios keep their digest
         contents = {name: value for name, value in msgspec.structs.asdict(self).items() if name not in newer or value}
-        return hashlib.sha256(msgspec.json.encode(contents, order="sorted", enc_hook=_contents)).hexdigest()
+        content = msgspec.json.encode(named_first(contents), order="sorted", enc_hook=_contents)
+        return hashlib.sha256(content).hexdigest()
 
     def reference_delays(self, case: str) -> tuple[int, ...]:
         """Lambda of a case: what `lam` says, else 0 in case II and theta + psi otherwise. Raises InputError."""
@@ -185,7 +188,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def title(self, case: str) -> str:
         """What reports and pictures are headed with: the paper's cases have names for its own loop only."""
-        if (case == "none" or self.jitter is None) and self.loop(case) == load().loop(case):
+        if (case == "none" or self.varying_delay is None) and self.loop(case) == load().loop(case):
             return f"{self.name}, case {case}"
         return self.name + {"none": ", no coupling", "II": ", reference without delay"}.get(case, "")
 
@@ -195,9 +198,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Raises InputError for another case.
         """
         span = self.delay_range
-        jitter = span if self.switches and span.lo != span.hi else None
+        varying = span if self.switches and span.lo != span.hi else None
         delays = (self.theta, self.psi, self.reference_delays(case))
-        rest = (self.delta, self.environment, self.box, jitter)
+        rest = (self.delta, self.environment, self.ranges, varying)
         return Loop(self.T, *delays, *rest, T_max=self.longest_period, latency=self.latency)
 
     def replace(self, delta: Sequence[float] | None = None, **changes: Any) -> Self:
@@ -230,7 +233,8 @@ def load(source: str | Path = DEFAULT) -> Scenario:
     if not isinstance(source, str | Path):
         kind = type(source).__name__
         raise InputError(f"scenario is {source!r} ({kind}), expected a TOML file or one of: {', '.join(built_in())}")
-    path = SCENARIOS / f"{source}.toml" if str(source) in built_in() else Path(source)
+    name = OLDER_SCENARIOS.get(str(source), str(source))
+    path = SCENARIOS / f"{name}.toml" if name in built_in() else Path(source)
     text = read_text(path, f"scenario {source}", f"; give a TOML file or one of: {', '.join(built_in())}")
     return parse(text, str(source))
 
@@ -264,9 +268,9 @@ def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
 
 def require_constant_delay(scenario: Scenario, what: str) -> None:
     """Raises InputError where a scenario's delays vary, for what would not make them vary."""
-    if scenario.jitter is not None:
+    if scenario.varying_delay is not None:
         instead = "sim.run simulates it"
-        raise InputError(f"jitter: {what} takes the delays that its link has; take the table out, {instead}")
+        raise InputError(f"varying_delay: {what} takes the delays that its link has; take the table out, {instead}")
 
 
 def require_even_ticks(scenario: Scenario, what: str) -> None:
@@ -330,7 +334,13 @@ def _run_file(path: str | Path) -> _HumanFile:
     try:
         names = runpy.run_path(str(path))
         hands, persons = _kept(tuple(names.get("humans", ()))), tuple(names.get("persons", ()))
-        return _HumanFile(hands, persons, names.get("population"))
+        for i, person in enumerate(persons):
+            if not isinstance(person, Person):
+                raise ValueError(f"persons[{i}] is {person!r}, expected a models.human.Person")
+        population = names.get("population")
+        if population is not None and len(_kept(tuple(population.draw(np.random.default_rng(0), 2)))) != 2:
+            raise ValueError("population.draw(rng, 2) gives not two humans")
+        return _HumanFile(hands, persons, population)
     except (Exception, SystemExit) as error:
         raise InputError(f"--human {path}: {type(error).__name__}: {error}") from None
 
@@ -360,6 +370,7 @@ def _converted(text: str, kind: Any, source: str) -> Any:
     """TOML text as `kind`. Raises InputError with the path of the field and the value that came."""
     raw = toml(text, source)
     try:
+        raw = named_today(raw) if kind is Scenario else raw
         return msgspec.convert(_with_catalogue(raw), kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_located(str(error), raw)}") from None
@@ -420,6 +431,9 @@ def _plain(name: str, value: Any) -> Any:
 _NOBODY = Human((Link(0.0, 0.0, 0.0),))
 
 
+_TIMES = np.array([0.0, 0.1])  # [s] at which a hand's own force is tried
+
+
 def _is_own(name: str, value: Any) -> bool:
     """Whether some of these humans, or this population, are of a user's own class, which no file could have given."""
     if name == "population":
@@ -437,6 +451,10 @@ def _kept(value: Any) -> Any:
             raise ValueError(f"human[{i}] is {human!r}, expected a Human, or what has port() and voluntary_force(t)")
         if not isinstance(port := human.port(), Port):  # which raises ValueError where it is not passive
             raise ValueError(f"human[{i}].port() is {port!r}, expected a models.human.Port")
+        with np.errstate(all="ignore"):
+            force = np.asarray(human.voluntary_force(_TIMES))
+        if force.shape != _TIMES.shape or force.dtype.kind not in "fiu" or not np.isfinite(force).all():
+            raise ValueError(f"human[{i}].voluntary_force(t) is {force!r} for two times, expected as many forces in N")
     return tuple(value)
 
 
@@ -477,6 +495,6 @@ def _hint(what: str) -> str:
 
 
 _STRUCTS = (
-    Scenario, _Tap, Jitter, Human, Link, Voluntary, Person, Cross, Population, Network, Spring, Wall, Box,
+    Scenario, _Tap, VaryingDelay, Human, Link, Voluntary, Person, Cross, Population, Network, Spring, Wall, Ranges,
     UncertainSpring, *get_args(Device)
 )  # fmt: skip

@@ -144,7 +144,7 @@ def _pool(question: Validation, table: Table, missing: list[int], shards: int, p
     # a forked child would inherit locks of MuJoCo's threads and of the progress bar
     context = multiprocessing.get_context("spawn")
     strangers = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(shards, mp_context=context, initializer=_as_worker)
+    pool = ProcessPoolExecutor(shards, mp_context=context, initializer=as_worker)
     left, running = iter(missing), dict[Future[Findings], int]()
     try:
         while True:
@@ -178,7 +178,7 @@ def _finished(running: dict[Future[Findings], int], table: Table) -> int:
     return len(ready)
 
 
-def _as_worker() -> None:
+def as_worker() -> None:
     """Ctrl-C reaches every process of a terminal, and only the one that merges may act on it; a worker ends with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()

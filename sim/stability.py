@@ -13,12 +13,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from controller.loop import Loop
 from controller.lti import Array, Lti
 from controller.process import Limiter, Process, State, StepBuffer
 from controller.timing import Timing
 from design.result import finite
 from models.scene import Scene, Variants
-from sim.engines import Engine, HeldPlant, MujocoBatchEngine, hold, profiler_off, quiet_warnings
+from sim.engines import Engine, HeldPlant, MujocoBatchEngine, at_the_latch, hold, profiler_off, quiet_warnings
 from sim.run import Simulation, beginnings, make_engine, run_blocks
 from sim.trace import Trace
 
@@ -173,6 +174,7 @@ def exact_growth(simulation: Simulation) -> float:
 
 
 NOT_EXCITED = "not excited: nothing in this run moves the dominant mode; the verdict is that of the eigenvalues"
+_VECTOR_ROUNDING = 1e-12  # of the largest entry: what an eigenvector's entries may be off
 _UNLIKE = 0.05  # rms of what y does beside the mode, relative to it: above, it is no such mode but noise
 
 
@@ -195,7 +197,8 @@ def measured_growth(
     pushed = trace.w[:usable] @ (loop.B.T @ left)
     weight = float(np.vdot(y[:-1], y[:-1]).real)
     states = np.concatenate([trace.s[:usable], trace.z[:usable]], axis=1)
-    summed = np.abs(states) @ np.abs(left)  # what rounding is relative to, where large parts cancel in y
+    # what rounding is relative to: large parts that cancel in y, and the eigenvector's own zeros
+    summed = np.abs(states) @ (np.abs(left) + _VECTOR_ROUNDING / _NOISE_FLOOR * np.abs(left).max())
     eigenvalue = np.array(np.vdot(y[:-1], y[1:] - pushed) / weight if weight else 0.0, dtype=np.complex128)
     rest = y[1:] - pushed - eigenvalue * y[:-1]
     if weight <= _NOISE_FLOOR**2 * float(summed @ summed) or float(np.vdot(rest, rest).real) > _UNLIKE**2 * weight:
@@ -256,6 +259,7 @@ def _contact_part(simulation: Simulation, trace: Trace) -> dict[str, Any]:
     return {
         "made": int((touching[1:] & ~touching[:-1]).sum() + touching[:1].sum()),
         "ticks": int(touching.any(axis=1).sum()),
+        "slopes_n_per_m": [wall.slope(simulation.scenario.T) for wall in walls.walls],
         "frozen": states,
     }
 
@@ -283,6 +287,22 @@ class ImpulseTest:
     simulated: float  # [s] of all simulations together
 
 
+@dataclass(frozen=True, eq=False)
+class Latch:
+    """Forces that latch within a tick: where devices are then, and what pays for their steps before and after it."""
+
+    seen: Array  # (nsim, m, entries) of engines.at_the_latch
+    before: Array  # (m,) [N/m] delta/t2
+    after: Array  # (m,) [N/m] delta/(T - t1), T the longest period
+
+    @classmethod
+    def of(cls, variants: Variants, loop: Loop, late: Sequence[float]) -> Latch:
+        """Of devices in the hands of `variants`, with forces that latch `late` (m,) [s], within the loop's latency."""
+        delta, spans = np.array(loop.delta), np.array(loop.latency)
+        before = np.divide(delta, spans[:, 1], out=np.zeros_like(delta), where=spans[:, 1] > 0)  # 0: no step before
+        return cls(at_the_latch(variants.plants(), late), before, delta / ((loop.T_max or loop.T) - spans[:, 0]))
+
+
 def impulse_forces(scene: Scene, T: float, first: int, ticks: int, size: float = 1.0) -> Array:
     """Forces [N] of the impulse, (ticks, outside): `size` on handle 1, -1/2 of it on handle 2, 1/3 on handle 3, ..."""
     w = np.zeros((ticks, scene.outside))
@@ -300,13 +320,16 @@ def impulse_test(
     delta: Array,
     ticks: int,
     tick_done: Callable[[int], None] = lambda ticks: None,
+    latch: Latch | None = None,
 ) -> ImpulseTest:
     """Simulate `ticks` periods with every set of humans and measure them. `loops` are the exact ones.
+
+    Where forces latch within a tick, `latch` has the balance at that instant.
 
     Where there are walls the impulse is large enough to reach them, and no growth is read from the trace.
     """
     nsim, states = loops.A.shape[0], loops.A.shape[1] - process.F.order
-    audit = _Audit(process, scene, loops, delta, ticks)
+    audit = _Audit(process, scene, loops, delta, ticks, latch)
     push = partial(impulse_forces, scene, loops.T, size=_TO_THE_WALL if process.walls else 1.0)
 
     def look(buffer: StepBuffer, first: int, count: int) -> None:
@@ -383,8 +406,10 @@ class _Speeds:
 class _Audit:
     """What the impulse test measures, summed over the ticks seen so far."""
 
-    def __init__(self, process: Process, scene: Scene, loops: ClosedLoop, delta: Array, ticks: int) -> None:
-        nsim = loops.A.shape[0]
+    def __init__(
+        self, process: Process, scene: Scene, loops: ClosedLoop, delta: Array, ticks: int, latch: Latch | None
+    ) -> None:
+        nsim, self._latch = loops.A.shape[0], latch
         self._limit, self._limiter = process.force_limit[:, None], process.limiter
         self._contact = process.contact if process.walls else None
         self._made, self._touching = np.zeros(nsim, dtype=int), np.zeros((len(process.walls), nsim), dtype=bool)
@@ -410,10 +435,8 @@ class _Audit:
         self._usable += linear.sum(axis=0)
         self._linear = linear[-1]
 
-        moved = np.diff(buffer.x[: count + 1], axis=0)
         audited = np.ones_like(linear) if limiter else linear
-        work = np.where(audited[:, None], f[:count] * moved, 0.0).sum(axis=1)
-        spent = np.where(audited[:, None], self._damping * moved**2, 0.0).sum(axis=1)
+        work, spent = (np.where(audited[:, None], part, 0.0).sum(axis=1) for part in self._balance(buffer, count))
         energy = self._energy + np.cumsum(work + spent, axis=0)
         self._least = np.minimum(self._least, energy.min(axis=0))
         self._energy = energy[-1]
@@ -429,6 +452,18 @@ class _Audit:
         self._across += (y.conj() * after).sum(axis=0)
         self._weight += (np.abs(y) ** 2).sum(axis=0)
         self._whole += np.where(linear[:, None], xi[:-1] ** 2, 0.0).sum(axis=(0, 1))
+
+    def _balance(self, buffer: StepBuffer, count: int) -> tuple[Array, Array]:
+        """Work of the forces and the least that devices dissipate, of each tick and channel, (count, m, nsim)."""
+        x, f, latch = buffer.x[: count + 1], buffer.f[:count], self._latch
+        if latch is None:
+            moved = np.diff(x, axis=0)
+            return f * moved, self._damping * moved**2
+        s, m = buffer.s[:count], f.shape[1]
+        middle = np.einsum("nme,ken->kmn", latch.seen, np.concatenate([s, buffer.w[:count], f], axis=1), optimize=True)
+        first, then = middle - x[:-1], x[1:] - middle
+        spent = latch.before[:, None] * first**2 + latch.after[:, None] * then**2
+        return s[:, s.shape[1] - m :] * first + f * then, spent
 
     def result(self, simulated: float) -> ImpulseTest:
         above_noise = (self._usable >= _SHORTEST_TRACE) & (self._weight > _NOISE_FLOOR**2 * self._whole)

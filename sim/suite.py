@@ -1,4 +1,4 @@
-"""python -m sim.suite: every check that a verdict rests on."""
+"""python -m sim.suite: every check that a verdict rests on; the command is cli/suite.py."""
 
 if __name__ == "__main__":
     from cli.main import door

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.coupling import Coupling
-from controller.delay import LOST, Jitter, Ticks, realising
+from controller.delay import LOST, Ticks, VaryingDelay, realising
 from controller.loop import DelayRange, force_map
 from controller.lti import Array, Lti
 from controller.process import Process, StepBuffer
@@ -63,9 +63,9 @@ def switching(
     simulation: Simulation, coupling: Coupling, seed: int, ticks: int, index: int = 0
 ) -> tuple[Simulation, Period | None]:
     """The loop with the scenario's varying delays, and their period where they are adversarial."""
-    jitter = simulation.scenario.jitter
-    assert jitter is not None
-    period = worst_switching(simulation, coupling, jitter) if jitter.pattern == "adversarial" else None
+    varying = simulation.scenario.varying_delay
+    assert varying is not None
+    period = worst_switching(simulation, coupling, varying) if varying.pattern == "adversarial" else None
     given = period.delays if period else None
     delays = _draw_delays(simulation.scenario, seed, index, max(ticks, _SHORTEST), given)
     return with_delays(simulation, coupling, delays[:, :, None]), period
@@ -80,12 +80,12 @@ def with_delays(simulation: Simulation, coupling: Coupling, delays: Ticks) -> Si
     return replace(simulation, process=process)
 
 
-def worst_switching(simulation: Simulation, coupling: Coupling, jitter: Jitter) -> Period:
+def worst_switching(simulation: Simulation, coupling: Coupling, varying: VaryingDelay) -> Period:
     """The periodic switching within the range that was found to grow fastest in this loop."""
     G, plant = without_theta(simulation, coupling), simulation.plant
     one = HeldPlant(plant.A[None], plant.B[None], plant.C, plant.T)
-    ages = greedy_ages(replace(simulation.process, F=G), one, simulation.scene, jitter, _SEARCHED)
-    return _worst_period(ages[:, :, 0], plant, G, jitter)
+    ages = greedy_ages(replace(simulation.process, F=G), one, simulation.scene, varying, _SEARCHED)
+    return _worst_period(ages[:, :, 0], plant, G, varying)
 
 
 def without_theta(simulation: Simulation, coupling: Coupling) -> Lti:
@@ -95,10 +95,10 @@ def without_theta(simulation: Simulation, coupling: Coupling) -> Lti:
 
 def _draw_delays(scenario: Scenario, seed: int, index: int, ticks: int, given: Ticks | None = None) -> Ticks:
     """Delays (ticks, m) of run number `index`; they depend on (seed, index) and the scenario only."""
-    assert scenario.jitter is not None
-    rows = np.array([scenario.theta]) if scenario.jitter.pattern == "constant" else given
+    assert scenario.varying_delay is not None
+    rows = np.array([scenario.theta]) if scenario.varying_delay.pattern == "constant" else given
     rng = np.random.default_rng(np.random.SeedSequence((seed, index, _STREAM)))
-    return scenario.jitter.draw(rng, ticks, rows)
+    return scenario.varying_delay.draw(rng, ticks, rows)
 
 
 # ---- the worst delays
@@ -127,11 +127,11 @@ def mode_matrix(plant: HeldPlant, G: Lti, depth: Sequence[int], ages: Sequence[i
     return A
 
 
-def greedy_ages(process: Process, plants: HeldPlant, scene: Scene, jitter: Jitter, ticks: int) -> Ticks:
+def greedy_ages(process: Process, plants: HeldPlant, scene: Scene, varying: VaryingDelay, ticks: int) -> Ticks:
     """Ages (ticks, m, nsim) that feed the linear loop of every plant; `process` is that without Theta."""
     nsim, states, nv = plants.A.shape[0], plants.A.shape[1], scene.model.nv
     m, free = process.channels, np.full(process.channels, np.inf)
-    lo, hi = (np.array(side)[:, None] for side in (jitter.lo, jitter.hi))
+    lo, hi = (np.array(side)[:, None] for side in (varying.lo, varying.hi))
     depth = int(hi.max()) + 1
     buffer = StepBuffer(replace(process, force_limit=free, delays=None), 1, states, scene.outside, nsim)
     engine = ExactBatchEngine(plants, free)
@@ -158,13 +158,13 @@ def greedy_ages(process: Process, plants: HeldPlant, scene: Scene, jitter: Jitte
     return ages
 
 
-def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, jitter: Jitter) -> Period:
+def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, varying: VaryingDelay) -> Period:
     """The fastest growing repetition of a window of `ages` (ticks, m), or of one delay at an end of its range."""
     ticks = ages.shape[0]
-    matrix = cache(lambda *now: mode_matrix(plant, G, jitter.hi, now))
+    matrix = cache(lambda *now: mode_matrix(plant, G, varying.hi, now))
     best, chosen = -np.inf, ages[:1]
     starts = np.linspace(ticks // 3, max(ticks - _LONGEST_PERIOD, ticks // 3), _STARTS, dtype=int)
-    ends = [np.array([row]) for row in product(*zip(jitter.lo, jitter.hi, strict=True))][:_MOST_ENDS]
+    ends = [np.array([row]) for row in product(*zip(varying.lo, varying.hi, strict=True))][:_MOST_ENDS]
     for window in [*(ages[start : start + _LONGEST_PERIOD] for start in starts), *ends]:
         products, scale = _running_products([matrix(*row) for row in window.tolist()])
         radius = np.abs(np.linalg.eigvals(products)).max(axis=1)
@@ -175,7 +175,7 @@ def _worst_period(ages: Ticks, plant: HeldPlant, G: Lti, jitter: Jitter) -> Peri
         if growth[at] > best:
             best, chosen = float(growth[at]), window[: at + 1]
     period = len(chosen)
-    delays = realising(np.tile(chosen, (2 + -(-2 * max(jitter.hi) // period), 1)))
+    delays = realising(np.tile(chosen, (2 + -(-2 * max(varying.hi) // period), 1)))
     return Period(chosen, delays[:period], best, float(np.exp(best * period * G.T)))
 
 
@@ -261,10 +261,10 @@ def _crowd_delays(
     ticks: int,
 ) -> Ticks:
     """(ticks, m, nsim)"""
-    assert scenario.jitter is not None
+    assert scenario.varying_delay is not None
     given: list[Ticks | None] = [None] * len(index)
-    if scenario.jitter.pattern == "adversarial":
-        worst = realising(greedy_ages(process, plants, scene, scenario.jitter, ticks))
+    if scenario.varying_delay.pattern == "adversarial":
+        worst = realising(greedy_ages(process, plants, scene, scenario.varying_delay, ticks))
         given = [worst[:, :, j] for j in range(len(index))]
     numbered = zip(index.tolist(), given, strict=True)
     return np.stack([_draw_delays(scenario, seed, i, ticks, own) for i, own in numbered], axis=2)
@@ -274,21 +274,22 @@ def _crowd_delays(
 
 
 def certified_part(scenario: Scenario, chosen: Chosen, certified: bool) -> dict[str, Any]:
-    """The jitter-proof requirement, and what the certificates cover; `certified` is about the constant theta."""
-    assert scenario.jitter is not None
+    """What switching asks, and what the certificates cover; `certified` is about the constant theta."""
+    assert scenario.varying_delay is not None
     if not scenario.switches:
-        return {"jitter_proof": None, "on_file": None} | _coverage(scenario.jitter, certified, None)
+        nothing = {"switching": None, "jitter_proof": None, "on_file": None}
+        return nothing | _coverage(scenario.varying_delay, certified, None)
     span = scenario.delay_range
     loop = scenario.loop("I").switching(span)  # the case does not matter to stability
     found = switching_requirement(loop, chosen.coupling)
     on_file = chosen.switching if chosen.switching and chosen.switching.contains(span) else None
     figures = switching_part(found, loop.sent(chosen.coupling), span, loop.T_max)
     proof = _how_proved(found.requirement, on_file)
-    parts = {"jitter_proof": figures, "on_file": on_file and msgspec.to_builtins(on_file)}
-    return parts | _coverage(scenario.jitter, certified, proof, figures["playout"]["certified"])
+    parts = {"switching": figures, "jitter_proof": figures, "on_file": on_file and msgspec.to_builtins(on_file)}
+    return parts | _coverage(scenario.varying_delay, certified, proof, figures["playout"]["certified"])
 
 
-def _coverage(jitter: Jitter, certified: bool, proof: str | None, buffered: bool = False) -> dict[str, Any]:
+def _coverage(varying: VaryingDelay, certified: bool, proof: str | None, buffered: bool = False) -> dict[str, Any]:
     """Whether what is certified covers these delays: {"covered", "covers"}.
 
     `certified` is about the constant theta, `proof` says what shows that every switching within the range is safe
@@ -300,18 +301,18 @@ def _coverage(jitter: Jitter, certified: bool, proof: str | None, buffered: bool
     if proof is None:
         text = "the delay is constant after all (theta): the certificates cover it" if certified else constants
         return {"covered": certified, "covers": text}
-    lossy = jitter.loss > 0 or any(LOST in row for row in jitter.recorded)
+    lossy = varying.loss > 0 or any(LOST in row for row in varying.recorded)
     if proof:
         what = "any switching of the delays within their range is covered"
-        within = f"jitter-proof in this environment ({proof}): {what}"
+        within = f"certified for switching delays in this environment ({proof}): {what}"
         losses = ", but a lost packet makes a force older than hi, which is not"
         return {"covered": not lossy, "covers": within + (losses if lossy else "")}
     verdict = "for which it is certified" if buffered else "for which it is not certified either"
-    constant = f"the constant {list(jitter.hi)}" + (" but for lost packets" if lossy else "")
+    constant = f"the constant {list(varying.hi)}" + (" but for lost packets" if lossy else "")
     advice = f"a playout buffer (--playout) makes the delay {constant}, {verdict}"
     return {
         "covered": False,
-        "covers": f"{constants}; this coupling is not jitter-proof, so switching is not covered; {advice}",
+        "covers": f"{constants}; switching is not covered, as this coupling is not certified for it; {advice}",
     }
 
 

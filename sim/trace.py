@@ -40,6 +40,12 @@ def _real(name: str, values: NDArray[Any]) -> Array:
     return values
 
 
+def _is_frozen(value: Any, ndim: int) -> bool:
+    """Whether nobody can write to it, so that a long run needs no second copy."""
+    own = isinstance(value, np.ndarray) and value.dtype == np.float64 and value.ndim == ndim
+    return own and not value.flags.writeable and not (value.base is not None and value.base.flags.writeable)
+
+
 @dataclass(frozen=True, eq=False)
 class Trace(ReadOnly):
     """What every tick saw, and under which settings. Arrays are read-only.
@@ -63,10 +69,11 @@ class Trace(ReadOnly):
     def __post_init__(self) -> None:
         for name, ndim in (_MEASURED | _STATES).items():
             value = getattr(self, name)
-            value = frozen(value if name in _MEASURED or np.size(value) else np.empty((len(self.t), 0)), ndim, name)
-            object.__setattr__(self, name, value)
-            if value.shape[0] != self.t.shape[0]:
-                raise ValueError(f"{name} has {value.shape[0]} samples, t has {self.t.shape[0]}")
+            value = value if name in _MEASURED or np.size(value) else np.empty((len(self.t), 0))
+            if not _is_frozen(value, ndim):
+                object.__setattr__(self, name, frozen(value, ndim, name))
+            if len(value) != self.t.shape[0]:
+                raise ValueError(f"{name} has {len(value)} samples, t has {self.t.shape[0]}")
         if self.f.shape != self.x.shape:
             raise ValueError(f"f has {self.f.shape[1]} channels, x has {self.x.shape[1]}")
 

@@ -22,7 +22,7 @@ from controller.loop import Loop
 from controller.lti import Array, SingularLoop
 from design.certificate import this_environment_of
 from models.scene import Plant
-from sim.engines import hold
+from sim.engines import at_the_latch, hold
 from sim.stability import close
 
 T, _LONG = 1e-3, 1.6e-3  # [s]
@@ -106,7 +106,7 @@ def _run(
     periods = np.linspace(0.3 * _LONG, _LONG, 3) if loop.T_max else (T,)
     kinds = [(period, late) for period in periods for late in product(*(dict.fromkeys(span) for span in spans))]
     steps = np.stack([close(hold(plants, period, late), F).A for period, late in kinds])  # (kinds, n, order, order)
-    seen = np.stack([_at_the_latch(plants, late) for _, late in kinds])  # (kinds, n, m, 3 m): x at the latch
+    seen = np.stack([at_the_latch(plants, late) for _, late in kinds])  # (kinds, n, m, 4 m)
     output = np.hstack([F.D @ np.eye(m, 2 * m), np.zeros((m, m)), F.C])
     xi = np.zeros((n, steps.shape[-1]))
     xi[:, m : 2 * m] = rng.standard_normal((n, m))
@@ -125,7 +125,7 @@ def _run(
             which = (weight * each[:, :, : 2 * m] ** 2).sum(axis=2).argmax(axis=0)
             after = each[which, everyone]
         x, held, force = xi[:, :m], xi[:, 2 * m : 3 * m], xi @ output.T
-        middle = np.einsum("nij,nj->ni", seen[which, everyone], xi[:, : 3 * m])
+        middle = np.einsum("nij,nj->ni", seen[which, everyone], np.hstack([xi[:, : 3 * m], force]))
         a, b = middle - x, after[:, :m] - middle
         work, spent = (held * a + force * b).sum(axis=1), (first * a**2 + last * b**2).sum(axis=1)
         unit = np.exp(np.minimum(log, 600)) if k > 15 else 1 / before  # of the energy at the start
@@ -139,17 +139,3 @@ def _run(
             log += np.log(np.maximum(energy, 1e-290) / (before if k == 15 else 1.0))
             largest = np.maximum(largest, np.exp(np.minimum(log, 700)))
     return largest, np.exp(np.minimum(log, 700)), least
-
-
-def _at_the_latch(plants: Plant, late: tuple[float, ...]) -> Array:
-    """[s; held forces] to each device's position at its own latch, (n, m, 3 m)."""
-    n, m = len(plants.A), len(late)
-    rows = np.zeros((n, m, 3 * m))
-    for i, tau in enumerate(late):
-        if tau == 0:
-            rows[:, i, i] = 1
-            continue
-        # forces that latch before have no part in this device's position: the channels are separate plants
-        held = hold(plants, tau)
-        rows[:, i, : 2 * m], rows[:, i, 2 * m :] = held.A[:, i], held.B[:, i]
-    return rows

@@ -1,4 +1,4 @@
-"""python -m sim.validate: thousands of random hands on the loop."""
+"""python -m sim.validate: thousands of random hands on the loop (sim.crowds); the command is cli/validate.py."""
 
 if __name__ == "__main__":
     from cli.main import door

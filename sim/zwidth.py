@@ -20,7 +20,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import Compliance, Coupling, InternalModel, NoCoupling, SpringDamper
+from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.delay import delay
 from controller.environment import (
     GROUND,
@@ -32,7 +32,7 @@ from controller.environment import (
     environment_of,
     sampled_environment,
 )
-from controller.loop import Loop, force_map
+from controller.loop import Loop
 from controller.lti import Array, Complex, Lti, Sampled, SingularLoop, as_like
 from controller.process import Limiter, Process, contact, limited
 from design.audit import check_loop, edge
@@ -87,6 +87,7 @@ class CouplingSweep(_Sweep):
 
     cutoff: float | None = None  # [Hz] of a filter on the velocity that the coupling damps
     one_sided: bool = False  # whether a rigid wall only pushes; the walls of a network do in any case
+    clip: bool = False  # whether motors clip forces, in place of the limiter that a guarantee covers
 
     def __post_init__(self) -> None:
         check_loop(self.loop)
@@ -144,7 +145,7 @@ class CouplingSweep(_Sweep):
         Where motors have limits, forces leave through the limiter that a guarantee covers; the rest are clipped.
         """
         limits = self._limits(devices)
-        if (limits[0] < UNLIMITED).any():
+        if (limits[0] < UNLIMITED).any() and not self.clip:
             return [Process(limiter.open, *limits, limiter) for limiter in self._limiters(K, B, limits[0])]
         if self.walled is None:
             F = self.force_maps(K, B)[0]
@@ -226,6 +227,7 @@ class EnvironmentSweep(_Sweep):
     """
 
     coupling: Coupling
+    lag: tuple[float, ...] | None = None  # rho (m,) [N/m] of its limiter, in every environment; None: motors clip
 
     cutoff = walled = None  # a velocity filter and contact made and broken belong to the other sweep
     usual_scale = "log"
@@ -245,7 +247,7 @@ class EnvironmentSweep(_Sweep):
     @property
     def conditions(self) -> tuple[str, ...]:
         """What is asked of every cell."""
-        return (*CONDITIONS, MODEL_KEPT) if isinstance(self.coupling, InternalModel) else CONDITIONS
+        return (*CONDITIONS, MODEL_KEPT) if self._kept else CONDITIONS
 
     @property
     def refusals(self) -> dict[str, str]:
@@ -262,8 +264,13 @@ class EnvironmentSweep(_Sweep):
 
     def processes(self, K: Array, B: Array, devices: Sequence[Device]) -> list[Process]:
         """What the computer does every T in each environment; limits and encoder steps are those of `devices`."""
-        F, limits = self.force_maps(K, B)[0], self._limits(devices)
-        return [Process(F[i], *limits) for i in range(K.size)]
+        limits = self._limits(devices)
+        if self.lag is None or not (limits[0] < UNLIMITED).any():
+            F = self.force_maps(K, B)[0]
+            return [Process(F[i], *limits) for i in range(K.size)]
+        sent, lag = self._sent(self._matrices(K, B), self.coupling), np.array(self.lag)
+        limiters = [Limiter(sent[i], self.loop.theta, limits[0], lag) for i in range(K.size)]
+        return [Process(limiter.open, *limits, limiter) for limiter in limiters]
 
     def ratios(self, condition: str, K: Array, B: Array) -> Array:
         """Required over available damping, (n,); inf where no damping is enough."""
@@ -298,17 +305,18 @@ class EnvironmentSweep(_Sweep):
 
     def _facing(self, condition: str) -> Coupling:
         """The coupling; for MODEL_KEPT as the V whose model stays that of the scenario's environment."""
-        return self._kept if condition == MODEL_KEPT else self.coupling
+        return (self._kept if condition == MODEL_KEPT else None) or self.coupling
 
     @cached_property
-    def _kept(self) -> Coupling:
-        assert isinstance(self.coupling, InternalModel)
-        model = self.loop.sent(NoCoupling())
-        return Compliance(self.coupling.parameter(self.loop.T).feedback(-model))
+    def _kept(self) -> Coupling | None:
+        return self.coupling.with_model(self.loop.sent(NoCoupling()))
+
+    def _sent(self, matrices: Matrices, coupling: Coupling) -> Lti:
+        loop = self.loop
+        return coupling.around(delay(loop.psi, loop.T) @ environment_of(matrices, loop.channels, loop.T))
 
     def _force_map(self, matrices: Matrices, coupling: Coupling) -> Lti:
-        loop = self.loop
-        return force_map(environment_of(matrices, loop.channels, loop.T), coupling, loop.theta, loop.psi)
+        return delay(self.loop.theta, self.loop.T) @ self._sent(matrices, coupling)
 
     def _matrices(self, K: Array, B: Array) -> Matrices:
         """Mass, damping and stiffness of every network, (n, nodes, nodes)."""

@@ -22,7 +22,7 @@ SOFT_NETWORK = Network(
     (Spring(("contact 1", "mass"), 200.0, 0.25), Spring(("mass", "contact 2"), 175.0, 0.25)),
     {"mass": 1.0},
 )
-#: of version 0.1: eight functions of a diagonal Q, optimal at the vertices of omega-pair-box and at nothing else
+#: of version 0.1: eight functions of a diagonal Q, optimal at the vertices of omega-pair-ranges and at nothing else
 POLES = (0.0, 0.0, 0.5, 0.822172, 0.936754, 0.977506, 0.992)
 DIAGONAL = (
     (-3.6184269801e-05, -2.9144270496e-05),
@@ -57,3 +57,25 @@ def filter_by_hand(coupling: ForceFilter, z: np.ndarray) -> np.ndarray:
         R = R + (first * z[:, None, None] + second) * section
         through = through * (b2 * z * z + b1 * z + 1) / (z * z + b1 * z + b2)
     return R
+
+
+class FakePort:
+    """The host's end of a serial line: `coming` will be read, `sent` was written, `now` is its clock [us]."""
+
+    def __init__(self):
+        self.coming, self.sent, self.now = b"", b"", 0
+
+    def wait(self, seconds):
+        self.now += 0 if self.coming else round(1e6 * seconds)
+        return bool(self.coming)
+
+    def read(self):
+        data, self.coming = self.coming, b""
+        return data
+
+    def write(self, data):
+        self.sent += data
+        return len(data)
+
+    def discard(self):
+        self.coming = b""

@@ -188,6 +188,6 @@ def _choose(menu: Menu, scenario: Scenario, label: str) -> Chosen:
 def _prepare(menu: Menu, scenario: Scenario, label: str, chosen: Chosen) -> PreparedLoop:
     loop = scenario.loop(menu.case)
     requirements = assess(loop, chosen.coupling, chosen.phi)
-    limits = limits_of(scenario, chosen.coupling, requirements, menu.limiter)
+    limits = limits_of(scenario, chosen, requirements, menu.limiter)
     assembly, guarantee = assemble(scenario, chosen.coupling, limits.rho), guarantee_of(requirements, loop)
     return PreparedLoop(menu, label, chosen, assembly, worst_mode(assembly), requirements, guarantee, limits)

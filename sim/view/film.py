@@ -25,27 +25,8 @@ from design.files import check_file, write
 from models.scene import Scene
 from sim.graphics import asked
 from sim.scenario import InputError
+from sim.view import stage as drawn
 from sim.view.session import HISTORY, Frame
-from sim.view.stage import (
-    ALARM,
-    COLUMNS,
-    GREY,
-    LONGEST,
-    PALETTE,
-    PLOT,
-    SIZE,
-    STEP,
-    WORDS,
-    Colour,
-    Stage,
-    channels,
-    colour,
-    columns,
-    envelope,
-    overlay,
-    places,
-    scale,
-)
 
 Picture = NDArray[np.uint8]  # (height, width, 3)
 
@@ -71,7 +52,7 @@ def painter(draw: str, scene: Scene, force_limit: Array) -> tuple[Flat | Offscre
         if draw == "gl":
             raise InputError(f"--draw gl: {error}") from None
         return Flat(scene, force_limit), "flat", [f"{error}: the bodies are drawn flat"]
-    return Offscreen(Stage(scene, force_limit), name), name, []
+    return Offscreen(drawn.Stage(scene, force_limit), name), name, []
 
 
 class NoOffscreen(Exception):
@@ -96,10 +77,10 @@ def backend() -> str:
 class Offscreen:
     """Renders frames of a stage."""
 
-    def __init__(self, stage: Stage, name: str) -> None:
+    def __init__(self, stage: drawn.Stage, name: str) -> None:
         """`name` is what backend() gave."""
         self.stage = stage
-        width, height = SIZE
+        width, height = drawn.SIZE
         self._gl = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
         self._gl.make_current()
         self._context = mujoco.MjrContext(stage.model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
@@ -112,18 +93,18 @@ class Offscreen:
 
     def picture(self, frame: Frame) -> Picture:
         """(height, width, 3): what is said of the loop, the scene, the forces, from top to bottom."""
-        stage, (width, height) = self.stage, SIZE
+        stage, (width, height) = self.stage, drawn.SIZE
         stage.show(frame.q)
         seen = self._option, self._grip, self._camera, mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(stage.model, stage.data, *seen, self._scene)
         stage.draw(self._scene, frame)
-        below = round(PLOT * height)
-        top = round(WORDS * height)
+        below = round(drawn.PLOT * height)
+        top = round(drawn.WORDS * height)
         mujoco.mjr_render(mujoco.MjrRect(0, below, width, height - below - top), self._scene, self._context)
         above = mujoco.MjrRect(0, height - top, width, top)
         mujoco.mjr_rectangle(above, 0.93, 0.93, 0.93, 1.0)
         font, corner = mujoco.mjtFont.mjFONT_NORMAL, mujoco.mjtGridPos.mjGRID_TOPLEFT
-        mujoco.mjr_overlay(font, corner, above, *columns(overlay(frame, live=False)), self._context)
+        mujoco.mjr_overlay(font, corner, above, *drawn.columns(drawn.overlay(frame, live=False)), self._context)
         for place, figure in stage.figures(frame, mujoco.MjrRect(0, 0, width, height)):
             mujoco.mjr_figure(place, figure, self._context)
         pixels = np.empty((height, width, 3), dtype=np.uint8)
@@ -166,20 +147,20 @@ class Flat:
     def __init__(self, scene: Scene, force_limit: Array) -> None:
         self.scene, self.force_limit = scene, force_limit
         self._font = ImageFont.load_default(12)
-        self._places, self._channels = places(scene), channels(scene)
+        self._places, self._channels = drawn.places(scene), drawn.channels(scene)
 
     def picture(self, frame: Frame) -> Picture:
         """(height, width, 3): what is said of the loop, the bodies, the forces, from top to bottom."""
-        image = Image.new("RGB", SIZE, "white")
+        image = Image.new("RGB", drawn.SIZE, "white")
         pen = ImageDraw.Draw(image)
-        height = SIZE[1]
-        below = round((1 - PLOT) * height)
+        height = drawn.SIZE[1]
+        below = round((1 - drawn.PLOT) * height)
         top = 8
-        for label, value in overlay(frame, live=False):
+        for label, value in drawn.overlay(frame, live=False):
             pen.text((8, top), label, _BLACK, self._font)
             pen.text((130, top), value, _BLACK, self._font)
             top += 15
-        self._bodies(pen, frame, max(top, round(WORDS * height)), below)
+        self._bodies(pen, frame, max(top, round(drawn.WORDS * height)), below)
         self._forces(pen, frame, below + 18, height - 18)
         return np.asarray(image)
 
@@ -188,35 +169,36 @@ class Flat:
 
     def _bodies(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
         steps = max(self._places) + 2
-        per_metre = (SIZE[0] - 120) / (steps * STEP + 2 * LONGEST)
-        origin, row = 60 + (LONGEST + STEP) * per_metre, (bottom - top) / self.scene.channels
+        per_metre = (drawn.SIZE[0] - 120) / (steps * drawn.STEP + 2 * drawn.LONGEST)
+        origin, row = 60 + (drawn.LONGEST + drawn.STEP) * per_metre, (bottom - top) / self.scene.channels
         size = min(14.0, 0.3 * row)
         for i in range(self.scene.channels):
             y = top + (i + 0.5) * row
-            pen.line((30, y, SIZE[0] - 30, y), _LIGHT, 2)
+            pen.line((30, y, drawn.SIZE[0] - 30, y), _LIGHT, 2)
         for place, i, q in zip(self._places, self._channels, frame.q, strict=True):
-            x, y = origin + (place * STEP + q) * per_metre, top + (i + 0.5) * row
+            x, y = origin + (place * drawn.STEP + q) * per_metre, top + (i + 0.5) * row
             corners = (x - size, y - size, x + size, y + size)
             if place == 0:
-                pen.ellipse(corners, _rgb(colour(i)))
+                pen.ellipse(corners, _rgb(drawn.colour(i)))
                 self._force(pen, frame, i, x, y - 0.45 * row, per_metre)
             else:
-                pen.rectangle(corners, _rgb(GREY))
+                pen.rectangle(corners, _rgb(drawn.GREY))
 
     def _force(self, pen: ImageDraw.ImageDraw, frame: Frame, i: int, x: float, y: float, per_metre: float) -> None:
         """The range of the force since the last frame, and its mean; the device feels -f."""
-        reach = per_metre * LONGEST / self.force_limit[i]
+        reach = per_metre * drawn.LONGEST / self.force_limit[i]
         clipped = max(-frame.low[i], frame.high[i]) >= self.force_limit[i]
-        pen.line((x - frame.high[i] * reach, y, x - frame.low[i] * reach, y), _rgb(ALARM if clipped else colour(i)), 3)
-        pen.line((x, y + 4, x - frame.mean[i] * reach, y + 4), _rgb(colour(i)), 4)
+        shade = drawn.ALARM if clipped else drawn.colour(i)
+        pen.line((x - frame.high[i] * reach, y, x - frame.low[i] * reach, y), _rgb(shade), 3)
+        pen.line((x, y + 4, x - frame.mean[i] * reach, y + 4), _rgb(drawn.colour(i)), 4)
         if frame.push[i]:
             pen.line((x, y + 9, x + frame.push[i] * reach, y + 9), _BLACK, 4)
 
     def _forces(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
         """One plot per device, side by side."""
-        m, most, middle = self.scene.channels, scale(frame.history), (top + bottom) / 2
-        low, high = envelope(frame.history, COLUMNS, round(HISTORY / frame.prepared.scenario.T))
-        width = (SIZE[0] - 20) / m
+        m, most, middle = self.scene.channels, drawn.scale(frame.history), (top + bottom) / 2
+        low, high = drawn.envelope(frame.history, drawn.COLUMNS, round(HISTORY / frame.prepared.scenario.T))
+        width = (drawn.SIZE[0] - 20) / m
         for i in range(m):
             left, right = 50 + i * width, (i + 1) * width - 2
             for value in (-most, 0.0, most):
@@ -224,14 +206,14 @@ class Flat:
                 pen.line((left, y, right, y), _LIGHT)
                 pen.text((left - 40, y - 7), f"{value:+g}" if value else "0", _BLACK, self._font)
             pen.text((left, bottom + 2), f"force on device {i + 1} [N], last {HISTORY:g} s", _BLACK, self._font)
-            x = np.linspace(left, right, COLUMNS)
+            x = np.linspace(left, right, drawn.COLUMNS)
             for j in np.flatnonzero(np.isfinite(low[:, i])):
                 ends = middle - np.array([low[j, i], high[j, i]]) / most * (bottom - top) / 2
-                pen.line((x[j], ends[0], x[j], ends[1] - 1), _rgb(colour(i)), 2)
+                pen.line((x[j], ends[0], x[j], ends[1] - 1), _rgb(drawn.colour(i)), 2)
 
 
-def _rgb(colour: Colour) -> tuple[int, int, int]:
-    red, green, blue = (round(255 * part) for part in colour)
+def _rgb(parts: drawn.Colour) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * part) for part in parts)
     return red, green, blue
 
 
@@ -270,7 +252,7 @@ def _gif(path: Path, pictures: Iterable[Picture], fps: float) -> int:
 
 def _palette(first: Picture) -> Image.Image:
     """The colours of the first picture, and of what may appear later: forces, in light and in shade."""
-    shades = [np.multiply(colour, light) for colour in (*PALETTE, ALARM) for light in (1.0, 0.75, 0.5)]
+    shades = [np.multiply(shade, light) for shade in (*drawn.PALETTE, drawn.ALARM) for light in (1.0, 0.75, 0.5)]
     strip = np.repeat(np.array(shades) * 255, -(-first.shape[1] // len(shades)), axis=0)[: first.shape[1]]
     later = np.repeat(strip[None].astype(np.uint8), first.shape[0] // 4, axis=0)
     return Image.fromarray(np.concatenate([first, later])).quantize(_COLOURS, dither=Image.Dither.NONE)
@@ -284,7 +266,8 @@ def _mp4(path: Path, pictures: Iterable[Picture], fps: float) -> int:
             for picture in pictures:
                 file.write(picture.tobytes())
                 count += 1
-        source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", "{}x{}".format(*SIZE), "-r", f"{fps:g}", "-i", str(raw)]
+        size = "{}x{}".format(*drawn.SIZE)
+        source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", f"{fps:g}", "-i", str(raw)]
         command = ["ffmpeg", "-loglevel", "error", "-y", *source, "-pix_fmt", "yuv420p", str(whole)]
         done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
         if done.returncode:

@@ -13,6 +13,7 @@ import json
 import os
 import re
 import resource
+import shlex
 import shutil
 import signal
 import sys
@@ -31,6 +32,7 @@ import numpy as np
 
 mpl.use("Agg")
 import matplotlib.pyplot  # noqa: F401 - once, before the forks
+from combined import combined
 
 from cli import options
 from cli.main import COMMANDS
@@ -133,6 +135,9 @@ def cases() -> Iterator[Case]:
     yield from streams()
     yield from silence()
     yield from names_in_pictures()
+    for command, words, codes, people in combined():
+        quick = QUICK[command] if command != "audit" else ()
+        yield Case(f"{command} {words}", (command, *quick, *shlex.split(words)), codes, before=written("h.py", people))
 
 
 QUICK = {  # what a command needs beside the option in question
@@ -143,7 +148,6 @@ QUICK = {  # what a command needs beside the option in question
     "trace": ("t.npz",),
     "accuracy": (),
     "suite": ("--only", "I"),
-    "hunt": ("--draws", "1"),
     "design": (),
     "audit": ("--K", "400,300", "--B", ".1,.1"),
     "check": ("c.json",),
@@ -158,15 +162,14 @@ QUICK = {  # what a command needs beside the option in question
 NO_NUMBERS = ("x", "", "nan", "1,,2", "\x1b[31m1", "9" * 5000, "-1e999")
 
 NUMERIC = {
-    "run": "theta psi lam delta T T-max latency loss jitter energy-budget substeps duration vertex seed",
+    "run": "theta psi lam delta T T-max latency loss varying-delay energy-budget substeps duration vertex seed",
     "validate": "humans shards generations duration seed theta",
     "zwidth": "grid K-range B-range mark humans points trials duration start press threshold quantisation friction",
     "view": "fps duration",
     "accuracy": "duration",
     "suite": "humans",
-    "hunt": "draws hands duration",
-    "design": "ranges samples band high-gain seconds order jitter delta",
-    "audit": "K B jitter",
+    "design": "ranges samples band high-gain seconds order varying-delay delta",
+    "audit": "K B varying-delay",
     "compare": "points band seconds",
     "export": "seed",
     "bridge": "pace quantile guard measure force-cap max-speed continuous-force thermal-time duration seed baud",
@@ -387,14 +390,16 @@ def scenarios() -> Iterator[Case]:
     for command in ("audit", "run"):
         words = (command, *QUICK[command], "--scenario", "s.toml")
         yield Case(f"scenario: a chain of 1500 masses, {command}", words, before=long_chain)
-    box = '\n[box]\nsprings = [{ between = ["contact 1", "mass"], stiffness = %s }]\n'
+    ranges = '\n[ranges]\nsprings = [{ between = ["contact 1", "mass"], stiffness = %s }]\n'
     for number in ("[900.0, 700.0]", "[1.0, 2.0]", "[-1.0, 900.0]", "[nan, 900.0]", "[700.0, 1e300]", "[700.0]", "1.0"):
         words = ("audit", *QUICK["audit"], "--scenario", "s.toml")
-        yield Case(f"scenario: ranges {number}", words, before=written("s.toml", TEXT + box % number))
-    jitter = "\n[jitter]\nlo = %s\nhi = %s\n"
+        yield Case(f"scenario: ranges {number}", words, before=written("s.toml", TEXT + ranges % number))
+    varying_delay = "\n[varying_delay]\nlo = %s\nhi = %s\n"
     for lo, hi in (("[0]", "[2]"), ("[2, 2]", "[1, 1]"), ("[0, 0]", "[1000000, 3]"), ("[-1, 0]", "[2, 3]"), ("1", "2")):
         words = ("run", *QUICK["run"], "--scenario", "s.toml")
-        yield Case(f"scenario: jitter {lo} {hi}", words, before=written("s.toml", TEXT + jitter % (lo, hi)))
+        yield Case(
+            f"scenario: varying_delay {lo} {hi}", words, before=written("s.toml", TEXT + varying_delay % (lo, hi))
+        )
 
 
 def humans_and_delays() -> Iterator[Case]:
@@ -502,7 +507,7 @@ def couplings() -> Iterator[Case]:
         ("certificate.margin", 1e9),
         ("certificate.proof", "magic"),
         ("certificate.condition", "this-environment"),
-        ("certificate.promise", "a set"),
+        ("certificate.promise", "these ranges"),
         ("certificate.seal", "x"),
         ("certificate.scenario", "x"),
         ("certificate.versions", {}),
@@ -697,8 +702,8 @@ def silence() -> Iterator[Case]:
         (("suite", "--only", "I,"), "--only"),
         (("run", *QUICK["run"], "--theta", "1,"), "--theta"),
         (("run", *QUICK["run"], "--delta", ",1"), "--delta"),
-        (("run", *QUICK["run"], "--jitter", "1,"), "--jitter"),
-        (("run", *QUICK["run"], "--loss", "0.1", "--pattern", "random"), "--jitter|--pattern"),
+        (("run", *QUICK["run"], "--varying-delay", "1,"), "--varying-delay"),
+        (("run", *QUICK["run"], "--loss", "0.1", "--pattern", "random"), "--varying-delay|--pattern"),
         (("run", *QUICK["run"], "--playout"), "--playout"),
         (("run", *QUICK["run"], "--energy-budget", "1,0.5"), "--energy-budget"),
         (("run", *QUICK["run"], "--engine", "exact", "--integrator", "RK4"), "--integrator"),
@@ -715,7 +720,7 @@ def silence() -> Iterator[Case]:
         (("design", "--seconds", "9"), "--seconds"),
         (("design", "--high-gain", "2"), "--high-gain"),
         (("design", "--coupling", "ccl", "--limiter"), "limiter"),
-        (("design", "--jitter", "1-2,0-3", "--condition", "any-environment"), "jitter"),
+        (("design", "--varying-delay", "1-2,0-3", "--condition", "any-environment"), "varying-delay"),
         (("design", "--coupling", "ccl", "--order", "99"), "--order"),
         (("design", "--samples", "5"), "--samples"),
         (("export", "c.json", "--without-theta"), "--without-theta"),
@@ -751,7 +756,6 @@ def silence() -> Iterator[Case]:
         (("view", "--video", ""), "--video"),
         (("view", "--video", "v.gif", "--script", "x"), "--script"),
         (("view", "--video", "v.gif", "--script", "-1:quit"), "--script"),
-        (("hunt", "--draws", "0"), "--draws"),
     ]:
         yield Case(" ".join(words), words, says=says)
     yield Case("accuracy of a feather", ("accuracy", "--scenario", "s.toml"), (BUT,), before=feather)

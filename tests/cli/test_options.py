@@ -9,6 +9,7 @@ import pytest
 from cli import options, render
 from cli.audit import main as audit
 from cli.run import main as run
+from design.files import one_line
 from sim.scenario import InputError
 
 
@@ -20,7 +21,7 @@ def parser():
     made.add_argument("--K", type=options.several(float, 0, 1e3, "N/m"))
     made.add_argument("--theta", type=options.several(int))
     made.add_argument("--mark", type=options.pair, action="append")
-    made.add_argument("--jitter", type=options.delay_ranges)
+    made.add_argument("--varying-delay", type=options.delay_ranges)
     options.add_condition_option(made)
     return made
 
@@ -36,7 +37,7 @@ def parser():
         ("--K 1,2000", "--K is 2000, allowed are 0 to 1000 N/m"),
         ("--theta 1,x", "--theta is '1,x', expected whole numbers separated by commas"),
         ("--mark 1,2,3", "--mark is '1,2,3', expected two numbers separated by a comma"),
-        ("--jitter 1", "--jitter is '1', expected LO,HI or LO-HI,LO-HI,.. in whole samples"),
+        ("--varying-delay 1", "--varying-delay is '1', expected LO,HI or LO-HI,LO-HI,.. in whole samples"),
         ("--condition any", "--condition is 'any', allowed are this-environment, any-environment"),
         ("--nonsense", "unrecognized arguments: --nonsense (--help lists the options)"),
     ],
@@ -48,13 +49,13 @@ def test_one_line_for_bad_words(words, message):
 
 
 def test_good_words():
-    words = "--count 3 --length 1e-3 --K 1,2 --theta 0 --mark 5000,0 --mark 1,2 --jitter 1-2,0-3"
+    words = "--count 3 --length 1e-3 --K 1,2 --theta 0 --mark 5000,0 --mark 1,2 --varying-delay 1-2,0-3"
     args = parser().parse_args(words.split())
     assert (args.count, args.length, args.K, args.theta) == (3, 1e-3, (1.0, 2.0), (0,))
     assert args.mark == [(5000.0, 0.0), (1.0, 2.0)]
     assert options.per_channel("--theta", args.theta, 3) == (0, 0, 0)
-    assert options.ranges_per_channel("--jitter", args.jitter, 2) == ((1, 0), (2, 3))
-    assert options.ranges_per_channel("--jitter", options.delay_ranges("1,2"), 2) == ((1, 1), (2, 2))
+    assert options.ranges_per_channel("--varying-delay", args.varying_delay, 2) == ((1, 0), (2, 3))
+    assert options.ranges_per_channel("--varying-delay", options.delay_ranges("1,2"), 2) == ((1, 1), (2, 2))
     with pytest.raises(InputError, match="--K has 2 entries, expected 3"):
         options.per_channel("--K", args.K, 3)
 
@@ -98,3 +99,12 @@ def test_a_figure_is_a_field(capsys):
     screen.print(render.facts("a loop", render.rows_of(reports[0])))
     lines = capsys.readouterr().out.splitlines()
     assert [part.strip() for part in lines[3].strip("│").split("│")] == ["growth [1/s]", "+1.00"]
+
+
+def test_a_message_quotes_eighty_characters_and_no_control_character():
+    long, path = "y" * 300, "/tmp/" + "p" * 100 + "/a.toml"
+    line = one_line(f"{path}: T = '{long}' and the device's\n x{long}\x1b[31m, 'I', 'II'")
+    assert path in line
+    assert line.endswith("x1b[31m, 'I', 'II'")
+    assert max(len(word) for word in line.split() if "/" not in word) == 80
+    assert one_line("the scenario's words " + "and more " * 20 + "'x'").endswith("'x'")

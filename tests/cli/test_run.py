@@ -73,11 +73,12 @@ def test_the_default_is_the_design_for_this_environment_with_the_price_of_others
 
 
 def test_where_one_environment_is_not_all_the_default_is_any_environment(tmp_path):
-    """Walls that make and break contact, and ranges, are covered by any-environment alone."""
-    for name in ("one-wall", "omega-pair-box"):
+    """Ranges, and limited forces before walls, are covered by any-environment alone."""
+    kinds = ["none", "spring-damper"]
+    for name, rows in (("one-wall", [*kinds, "spring-damper"]), ("omega-pair-ranges", kinds)):
         _, report = run(tmp_path, "--scenario", name, "--no-plot", "--duration", "0.5")
         assert report["certificate"]["condition"] == "any-environment"
-        assert [row["coupling"] for row in report["alternatives"]] == ["none", "spring-damper"]
+        assert [row["coupling"] for row in report["alternatives"]] == rows
     _, report = run(tmp_path, "--no-plot", "--duration", "0.5", "--no-alternatives")
     assert report["alternatives"] == []
     with pytest.raises(InputError, match="--side-by-side is for runs without walls"):

@@ -11,7 +11,7 @@ from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.loop import force_map
 from controller.lti import Lti, SingularLoop, inverse, numbers, rational
 from design import exact
-from design.exact import Matrix, block_diag, definiteness, prove_positive_real, strictly_positive
+from design.exact import Matrix, block_diag, definiteness, find_storage, prove_positive_real, reached, strictly_positive
 
 T = 1.2e-3
 STAR = Network(
@@ -144,6 +144,7 @@ def test_the_exact_inverse_is_an_inverse():
     with pytest.raises(SingularLoop):
         inverse(numbers([[1, 2], [2, 4]], Fraction(1)))
     assert block_diag(Matrix.zeros(0, 0), Matrix.eye(2)).equals(Matrix.eye(2))
+    assert str(definiteness(Matrix.eye(2))) == "positive definite"
 
 
 @pytest.mark.parametrize("coupling", COUPLINGS, ids=lambda c: type(c).__name__)
@@ -189,4 +190,93 @@ def test_a_wrong_storage_matrix_proves_nothing():
     assert prove_positive_real(unstable, Matrix.of([[-1]])) == (
         "P is not positive definite, or by so little that it is not proved"
     )
+    assert find_storage(unstable) == (None, "the block has a pole on or outside the unit circle")
     assert prove_positive_real(G, Matrix.eye(2)) == "P has shape (2, 2), the model has 1 states"
+
+
+def random_exact(rng: np.random.Generator, n: int, m: int) -> Lti:
+    A, B, C, D = (rng.integers(-9, 10, shape) for shape in ((n, n), (n, m), (m, n), (m, m)))
+    return Lti(*(numbers(part, Fraction(1)) / 10 for part in (A, B, C, D)), Fraction(1))
+
+
+def test_the_kyp_matrix_is_what_a_step_adds_to_the_storage():
+    """x'Px - (Ax + Bu)'P(Ax + Bu) + 2u'(Cx + Du), for every x and u: the energy that goes in less what is stored."""
+    rng = np.random.default_rng(6)
+    for _ in range(5):
+        G = random_exact(rng, 3, 2)
+        half = rng.integers(-5, 6, (3, 3))
+        P = numbers(half + half.T, Fraction(1)) / 7
+        M = exact._kyp_matrix(G, Matrix.of(P)).fractions()
+        for _ in range(20):
+            x, u = (numbers(rng.integers(-9, 10, k), Fraction(1)) for k in (3, 2))
+            after, both = G.A @ x + G.B @ u, np.concatenate([x, u])
+            assert both @ M @ both == x @ P @ x - after @ P @ after + 2 * u @ (G.C @ x + G.D @ u)
+
+
+def test_the_exact_test_refuses_alone(monkeypatch):
+    """Without the quick refusal in floating point: a P of another sign, or a little too large, is refused."""
+    monkeypatch.setattr(exact, "_refuted_in_floating_point", lambda G, P: False)
+    G = Lti(*([[v]] for v in (0.5, 1, 0.5, 1)), Fraction(1))  # (3/4 P)(2 - P) > (1/2 - P/2)^2
+    low, high = (4 - np.sqrt(12)) / 4, (4 + np.sqrt(12)) / 4
+    for p, expected in ((low, (False, True)), (high, (True, False))):
+        for factor, proved in zip((1 - 1e-9, 1 + 1e-9), expected, strict=True):
+            found = prove_positive_real(G, Matrix.of([[Fraction(p * factor)]]))
+            assert (found is None) == proved
+
+
+def test_what_floating_point_refuses_exact_arithmetic_refuses_too():
+    """At M = e P, P ill-conditioned, e of the size of rounding: the matrix is definite and its computed one is not."""
+    rng, indefinite = np.random.default_rng(7), 0
+    for _ in range(60):
+        n = int(rng.integers(2, 6))
+        half = rng.normal(size=(n, n)) @ np.diag(10.0 ** rng.uniform(-3, 0, n)) * 10.0 ** rng.uniform(-3, 3, n)[:, None]
+        P = Matrix.of([[Fraction(v) for v in row] for row in half @ half.T])
+        r = Fraction(1) - Fraction(1, 2 ** int(rng.integers(44, 53)))
+        eye, zero = numbers(np.eye(n), Fraction(1)), numbers(np.zeros((n, 1)), Fraction(1))
+        G = Lti(r * eye, zero, zero.T, numbers([[1]], Fraction(1)), Fraction(1))
+        M = P.floats() - G.floats().A.T @ P.floats() @ G.floats().A
+        indefinite += np.linalg.eigvalsh(M)[0] < 0
+        if definiteness(exact._kyp_matrix(G, P)).definite:
+            assert not exact._refuted_in_floating_point(G, P)
+    assert indefinite > 10
+
+
+def test_states_that_no_input_reaches_are_left_out_and_those_that_cancel_do_no_harm():
+    A = [[0.5, 0, 0, 0], [0, 0.5, 0, 0], [1, -1, 0.2, 0], [0, 0, 0.3, 0.1]]
+    B, C = [[1], [1], [0], [0]], [[0.1, 0, 0.1, 0.1]]
+    G = Lti(*(numbers(part, Fraction(1)) for part in (A, B, C, [[1]])), Fraction(1))
+    assert reached(G) is G
+    P, reason = find_storage(G)  # the third and fourth are pushed by equal and opposite states
+    assert reason is None
+    assert P.shape == (4, 4)
+    late = Lti(G.A.T, numbers([[0], [0], [1], [0]], Fraction(1)), G.C, G.D, Fraction(1))
+    assert reached(late).order == 3
+    np.testing.assert_allclose(at(reached(late), 1.3j), at(late, 1.3j), rtol=1e-12)
+
+
+def test_a_riccati_equation_with_a_wrong_answer_proves_nothing(monkeypatch):
+    G = Lti(*([[v]] for v in (0.5, 1, 0.5, 1)), Fraction(1))
+    for wrong in (-1.0, 100.0):
+        monkeypatch.setattr(exact, "_riccati", lambda *words, p=wrong: np.array([[p]]))
+        P, reason = find_storage(G)
+        assert P is None
+        assert "negative direction" in reason
+
+
+def test_numbers_beyond_floating_point_are_left_to_exact_arithmetic(recwarn):
+    G = Lti(*([[v]] for v in (0.5, 1, 0.5, 10**308)), Fraction(1))  # D + D' overflows
+    assert prove_positive_real(G, Matrix.of([[1]])) is None
+    assert prove_positive_real(G, Matrix.of([[-1]])) is not None
+    assert not recwarn.list
+
+
+def test_a_model_of_more_states_than_are_tried_is_told_so():
+    assert exact.too_large(exact.LARGEST) is None
+    assert exact.too_large(exact.LARGEST + 1) == "a proof over 301 states takes long: up to 300 are tried"
+
+
+def test_products_are_in_lowest_terms():
+    half = Matrix.of([["1/2", "3/2"]])
+    assert (half @ Matrix.of([[2], [2]])).den == 1
+    assert half.scaled(4).den == 1
+    assert half.scaled(0.1).equals(Matrix.of([[0.05, 0.15]]))

@@ -15,7 +15,7 @@ from scipy.optimize import minimize_scalar
 from worlds import STIFF, T
 
 from controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, Box, Network, Spring, UncertainSpring
+from controller.environment import FIGURE_4, Network, Ranges, Spring, UncertainSpring
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, rational
 from design import certificate
@@ -27,7 +27,7 @@ from design.conditions import (
     this_environment_demand,
 )
 from design.exact import find_storage, prove_positive_real
-from design.multipliers import JitterProof, switching_block
+from design.multipliers import SwitchingSweep, switching_block
 from design.result import NotProved, from_ratio
 from design.stored import Stored, digest, sealed
 
@@ -266,7 +266,7 @@ def disarmed(monkeypatch):
         return from_ratio(condition, 0.5, asked.delta, 1.0)
 
     def switching(asked: Loop, coupling, alpha=None):
-        return JitterProof(from_ratio("jitter-proof", 0.5, asked.delta, 1.0), alpha or ALPHA, 0.5)
+        return SwitchingSweep(from_ratio("switching", 0.5, asked.delta, 1.0), alpha or ALPHA, 0.5)
 
     monkeypatch.setattr(certificate, "required_damping", content)
     monkeypatch.setattr(certificate, "swept", switching)
@@ -301,7 +301,9 @@ def test_each_condition_is_proved_by_its_own_block():
 @pytest.mark.usefixtures("disarmed")
 def test_every_vertex_of_a_range_is_proved():
     """The stiffest spring decides, and is named."""
-    asked = change(loop(to_ground(1000.0), (1,)), box=Box((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),)))
+    asked = change(
+        loop(to_ground(1000.0), (1,)), ranges=Ranges((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),))
+    )
     assert_loop_limit(asked, NoCoupling(), "this-environment", 1.5 * 1600 * T)
     with pytest.raises(NotProved, match=r"^vertex 2 \(tip 0-ground 1600 N/m, 0 N s/m\): the condition is violated"):
         prove(change(asked, delta=(1.5 * 1600 * T * (1 - CLOSE),)), NoCoupling(), "this-environment")
@@ -354,7 +356,7 @@ def test_the_proof_of_one_condition_does_not_serve_the_other():
 
 def test_the_proof_of_the_nominal_environment_does_not_serve_a_vertex():
     asked = loop(to_ground(1000.0), (1,), delta=(1.5 * 1600 * T * 1.001,))
-    asked = change(asked, box=Box((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),)))
+    asked = change(asked, ranges=Ranges((UncertainSpring(("tip 0", "ground"), (500.0, 1600.0)),)))
     made = prove(asked, NoCoupling(), "this-environment")
     assert made.required == pytest.approx((1.5 * 1600 * T,), rel=1e-9)  # of the neediest vertex
     nominal = made.matrices["P"]

@@ -99,8 +99,8 @@ def test_where_it_is_not_derived_it_is_refused():
     assert judged["any-environment"].reason == LATE
     with pytest.raises(NotProved, match="count it as a whole sample"):
         prove(loop, SOFT, "any-environment")
-    with pytest.raises(ValueError, match="latency and jitter"):
-        change(loop, jitter=DelayRange((0, 1), (1, 1)))
+    with pytest.raises(ValueError, match="latency and varying_delay"):
+        change(loop, varying_delay=DelayRange((0, 1), (1, 1)))
     walled = Network(("tip",), walls=(Wall(("tip", GROUND), 500.0),))
     with pytest.raises(ValueError, match=r"latency and environment\.walls"):
         Loop(T, (0,), (0,), (0,), (1.0,), walled, latency=((0.0, TAU),))

@@ -25,7 +25,7 @@ from design.conditions import this_environment
 from design.frequency import hermitian, on_circle
 from design.optimal import design
 from design.program import MARGIN, Case, Options, Span, span_of
-from design.robustness import box_around, robustness, vertices
+from design.robustness import ranges_around, robustness, vertices
 from design.stored import Stored, save
 from design.stored import load as load_file
 from design.transparency import transparency
@@ -241,11 +241,11 @@ def test_a_coupling_for_ranges_is_proved_at_every_vertex_and_searched_between():
     loop = loop_of("n3")
     nominal = best("n3")
     assert not robustness(loop, nominal.coupling).kept
-    ranged = msgspec.structs.replace(loop, box=box_around(loop.environment, 10.0))
+    ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
     found = design(ranged, SHORT)
     assert found.proved
     assert len(found.certificate.matrices) == len(ranged.members())
-    assert found.certificate.guarantee == "a set"
+    assert found.certificate.guarantee == "these ranges"
     spread = robustness(loop, found.coupling)
     assert spread.kept
     for network in vertices(loop.environment).values():
@@ -453,6 +453,6 @@ def test_forces_that_are_limited_are_part_of_the_design(name):
 
 def test_limited_forces_are_not_proved_for_ranges():
     loop = loop_of("n3")
-    ranged = msgspec.structs.replace(loop, box=box_around(loop.environment, 10.0))
+    ranged = msgspec.structs.replace(loop, ranges=ranges_around(loop.environment, 10.0))
     with pytest.raises(ValueError, match="limited forces are proved for one environment"):
         design(ranged, replace(SHORT, limiter=True))

@@ -12,9 +12,9 @@ from cli.design import main as cli_design
 from controller.coupling import SpringDamper
 from controller.environment import FIGURE_4, Network, Spring
 from controller.loop import DelayRange, Loop
-from design.certificate import assess, prove, required_damping, verify
+from design.certificate import assess, prove, prove_limiter, required_damping, verify
 from design.conditions import any_environment, any_environment_demand, even_damping, this_environment_demand
-from design.multipliers import swept
+from design.multipliers import limiter_requirement, swept
 from design.spring_damper import design
 from design.stored import Stored, digest
 
@@ -29,12 +29,12 @@ def test_a_report_on_switching_delays_is_for_the_longest_period(tmp_path):
     needs = []
     for more in ([], ["--T-max", "1.8e-3"]):
         file, soft = tmp_path / "r.json", ["--condition", "this-environment"]
-        cli_design(["--jitter", "1,2", *soft, *more, "--json", str(file), "--out", str(tmp_path / "c.json")])
+        cli_design(["--varying-delay", "1,2", *soft, *more, "--json", str(file), "--out", str(tmp_path / "c.json")])
         report = json.loads(file.read_text())
         stored = msgspec.json.decode((tmp_path / "c.json").read_bytes(), type=Stored)
         loop = stored.loop.switching(None)
         buffered = required_damping(change(loop, theta=(2, 2)), stored.coupling.build(loop.T), "this-environment")
-        needs.append((report["jitter_proof"]["playout"]["required_damping"], list(buffered.required)))
+        needs.append((report["switching"]["playout"]["required_damping"], list(buffered.required)))
     for shown, swept_alone in needs:
         assert shown == pytest.approx(swept_alone, rel=1e-6)
 
@@ -48,7 +48,7 @@ def test_the_longest_period_scales_the_required_damping(condition):
 
 
 def test_so_it_does_with_delays_that_switch_and_with_the_multiplier_of_a_delayed_environment():
-    switching = change(LOOP, jitter=DelayRange((0, 1), (1, 2)))
+    switching = change(LOOP, varying_delay=DelayRange((0, 1), (1, 2)))
     even, uneven = (swept(change(switching, T_max=longest), SOFT).requirement for longest in (None, LONG))
     assert uneven.required == pytest.approx([1.6 * b for b in even.required], rel=1e-6)  # of the search for alpha
     soft = msgspec.structs.replace(
@@ -60,6 +60,15 @@ def test_so_it_does_with_delays_that_switch_and_with_the_multiplier_of_a_delayed
     asked = [required_damping(one, found.coupling, "any-environment", found.phi) for one in (delayed, longer)]
     assert asked[1].ratio == pytest.approx(asked[0].ratio, rel=1e-7)
     assert verify(Stored.of(longer, found.coupling, prove(longer, found.coupling, "any-environment", found.phi))).proved
+
+
+def test_so_it_does_while_forces_are_limited():
+    """The lag of the limiter is a number of the controller, which no period changes; proved exactly, too."""
+    loop, c = change(LOOP, delta=(3.0, 3.0)), ((0.3,), (0.3,))
+    longer = change(loop, T_max=LONG)
+    even, uneven = (limiter_requirement(one, SOFT, c=c).requirement for one in (loop, longer))
+    assert uneven.required == pytest.approx([1.6 * b for b in even.required], rel=1e-9)
+    assert prove_limiter(longer, SOFT, c=c).required == uneven.required
 
 
 def test_the_any_environment_line_by_hand():

@@ -15,8 +15,8 @@ from cli.run import main as run_main
 from cli.validate import main as validate_main
 from controller import coupling as built
 from controller.coupling import SpringDamper
-from controller.delay import LOST, Jitter, ages
-from controller.environment import FIGURE_4, Box, UncertainSpring, environment
+from controller.delay import LOST, VaryingDelay, ages
+from controller.environment import FIGURE_4, Ranges, UncertainSpring, environment
 from controller.loop import DelayRange, Loop, force_map
 from controller.lti import Sampled
 from design import certify
@@ -26,7 +26,7 @@ from design.conditions import this_environment
 from design.exact import Matrix
 from design.files import InputError
 from design.frequency import hermitian
-from design.multipliers import jitter_proof, switching_block
+from design.multipliers import switching_block, switching_sweep
 from design.result import NotProved
 from design.stored import Certificate, Stored, digest, load, save, sealed
 from hw.control import certified_couplings
@@ -66,7 +66,7 @@ def test_the_proof_survives_the_file(stored, file):
     assert read == stored
     assert verify(read).proved
     proof = read.certificate.switching
-    assert proof.required == pytest.approx(jitter_proof(sent(SOFT), *[(1, 1), (2, 2)], DELTA).requirement.required)
+    assert proof.required == pytest.approx(switching_sweep(sent(SOFT), *[(1, 1), (2, 2)], DELTA).requirement.required)
     assert 1.07 < proof.required[0] < 1.08
     assert proof.margin == pytest.approx(1.37 / proof.required[0])
 
@@ -98,13 +98,13 @@ def test_other_ranges_are_proved_too(lo, hi):
 @pytest.mark.parametrize("coupling", [SOFT, STIFF])
 def test_every_constant_delay_of_the_range_asks_no_more(coupling):
     """Why a file that is proved for switching covers constants: by the energy, which knows no z."""
-    switching = jitter_proof(sent(coupling), (1, 0), (2, 3), DELTA).requirement.ratio
+    switching = switching_sweep(sent(coupling), (1, 0), (2, 3), DELTA).requirement.ratio
     for theta in product((1, 2), (0, 1, 2, 3)):
         F = force_map(environment(FIGURE_4, T), coupling, theta, (0, 0))
         assert this_environment(F, DELTA).ratio <= switching * (1 + 1e-9)
 
 
-def test_what_is_not_jitter_proof_is_not_certified_as_such():
+def test_what_is_not_safe_under_switching_is_not_certified_as_such():
     assert prove(PAIR, STIFF, "this-environment").switching is msgspec.UNSET
     with pytest.raises(NotProved, match=r"^delays switching within \[1, 2\] samples: needs 2\.04"):
         prove(LOOP, STIFF, "this-environment")
@@ -126,7 +126,7 @@ def test_files_without_a_range_keep_their_digests():
 
 
 def test_a_changed_file_is_refused(stored):
-    wider = change(LOOP, jitter=DelayRange((1, 1), (2, 3)))
+    wider = change(LOOP, varying_delay=DelayRange((1, 1), (2, 3)))
     assert "digest differs" in verify(change(stored, loop=wider)).reason
     proof = change(stored.certificate.switching, alpha=(100.0, 100.0))
     forged = change(stored, certificate=change(stored.certificate, switching=proof))
@@ -169,7 +169,7 @@ def test_a_proof_goes_with_its_range(stored):
 def test_a_multiplier_below_zero_lends_no_damping():
     """On a channel whose delay is constant alpha stands in no second row: a negative one would add damping for free."""
     loop = PAIR.switching(DelayRange((1, 2), (2, 2)))
-    found = jitter_proof(sent(STIFF), (1, 2), (2, 2), DELTA)
+    found = switching_sweep(sent(STIFF), (1, 2), (2, 2), DELTA)
     with pytest.raises(ValueError, match="expected a positive number where the delay varies and 0 elsewhere"):
         condition_block(loop, STIFF, (found.alpha[0], -1e6))
     assert refuted(loop, STIFF, msgspec.UNSET).endswith("no proof is on file")
@@ -178,25 +178,27 @@ def test_a_multiplier_below_zero_lends_no_damping():
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"lo": [2, 2], "hi": [1, 1]}, "expected 0 <= lo <= hi on every channel - at `$.loop.jitter`"),
-        ({"lo": [1, 1, 1], "hi": [2, 2, 2]}, "jitter has 3 ranges for 2 channels"),
-        ({"lo": [2, 2], "hi": [3, 3]}, "theta is [1, 2], outside of its jitter, [2, 3] samples"),
+        ({"lo": [2, 2], "hi": [1, 1]}, "expected 0 <= lo <= hi on every channel - at `$.loop.varying_delay`"),
+        ({"lo": [1, 1, 1], "hi": [2, 2, 2]}, "varying_delay has 3 ranges for 2 channels"),
+        ({"lo": [2, 2], "hi": [3, 3]}, "theta is [1, 2], outside of its varying_delay, [2, 3] samples"),
         ({"lo": [1, 1], "high": [2, 2]}, "unknown field `high`"),
     ],
 )
 def test_a_range_that_makes_no_sense_is_no_file(file, tmp_path, fields, message):
     text = json.loads((tmp_path / "proof.json").read_text())
-    text["loop"]["jitter"] = fields
+    text["loop"]["varying_delay"] = fields
     (tmp_path / "bad.json").write_text(json.dumps(text))
     with pytest.raises(InputError) as error:
         load(tmp_path / "bad.json")
     assert message in str(error.value)
 
 
-def test_a_loop_has_a_range_or_a_box():
-    box = Box((UncertainSpring(("mass", "contact 1"), (640.0, 840.0)),))
-    with pytest.raises(ValueError, match="jitter and box: switching delays are judged in one linear environment"):
-        change(LOOP, box=box)
+def test_a_loop_has_a_range_of_delays_or_ranges():
+    ranges = Ranges((UncertainSpring(("mass", "contact 1"), (640.0, 840.0)),))
+    with pytest.raises(
+        ValueError, match="varying_delay and ranges: switching delays are judged in one linear environment"
+    ):
+        change(LOOP, ranges=ranges)
 
 
 # the commands
@@ -240,54 +242,56 @@ def test_a_run_says_what_the_file_covers(run, file):
         outcome = run(file, "--theta", theta)
         assert remark + f"the constant theta = [{theta[0]}, {theta[2]}]" in outcome["remarks"]
         assert outcome["certificates"]["this-environment"]["certified"]
-    outcome = run(file, "--jitter", "1,2", "--playout")
+    outcome = run(file, "--varying-delay", "1,2", "--playout")
     assert remark + "the constant theta = [2, 2]" in outcome["remarks"]
-    assert outcome["jitter"]["covered"]
-    same = run(file, "--jitter", "1,2")["jitter"]
+    assert outcome["varying_delay"]["covered"]
+    same = run(file, "--varying-delay", "1,2")["varying_delay"]
     assert same["covered"]
     assert "proved in the coupling's file for delays switching within [1, 2] samples" in same["covers"]
-    narrow = run(file, "--jitter", "1-2,2-2")
+    narrow = run(file, "--varying-delay", "1-2,2-2")
     assert remark + "delays switching within [1, 2], [2, 2] samples" in narrow["remarks"]
-    assert narrow["jitter"]["on_file"] == {"lo": [1, 1], "hi": [2, 2]}
+    assert narrow["varying_delay"]["on_file"] == {"lo": [1, 1], "hi": [2, 2]}
 
 
 def test_what_the_file_does_not_cover_is_judged_anew(run, file, constant_file):
-    wide = run(file, "--jitter", "0,3")
+    wide = run(file, "--varying-delay", "0,3")
     line = (
         "the file proves delays switching within [1, 2] samples: delays switching within [0, 3] samples are judged anew"
     )
     assert any(remark.startswith(line) for remark in wide["remarks"])
-    assert wide["jitter"]["on_file"] is None
+    assert wide["varying_delay"]["on_file"] is None
     late = run(file, "--theta", "3,2")
     assert any("another loop (different theta)" in remark for remark in late["remarks"])
-    other = run(file, "--jitter", "1,2", "--delta", "1.5")
+    other = run(file, "--varying-delay", "1,2", "--delta", "1.5")
     assert any("another loop (different delta)" in remark for remark in other["remarks"])
-    assert "proved exactly" in other["jitter"]["covers"]
-    plain = run(constant_file, "--jitter", "1,2")
+    assert "proved exactly" in other["varying_delay"]["covers"]
+    plain = run(constant_file, "--varying-delay", "1,2")
     line = "the file proves constant delays: delays switching within [1, 2] samples are judged anew here"
     assert line in plain["remarks"]
-    assert not plain["jitter"]["covered"]
+    assert not plain["varying_delay"]["covered"]
     # the buffer's constant (2, 2) needs 1.70 of 1.37 N s/m: it is no way out for these gains
-    assert "the constant [2, 2], for which it is not certified either" in plain["jitter"]["covers"]
-    lossy = run(file, "--jitter", "1,2", "--loss", "0.1")["jitter"]
+    assert "the constant [2, 2], for which it is not certified either" in plain["varying_delay"]["covers"]
+    lossy = run(file, "--varying-delay", "1,2", "--loss", "0.1")["varying_delay"]
     assert not lossy["covered"]
 
 
 def test_a_tampered_file_covers_nothing(run, stored, tmp_path):
     broken = sealed(change(stored.certificate, switching=change(stored.certificate.switching, margin=9.0)))
     save(change(stored, certificate=broken), tmp_path / "broken.json")
-    outcome = run(str(tmp_path / "broken.json"), "--jitter", "1,2")
+    outcome = run(str(tmp_path / "broken.json"), "--varying-delay", "1,2")
     assert any("does not hold: delays switching within" in remark for remark in outcome["remarks"])
-    assert outcome["jitter"]["on_file"] is None
-    assert outcome["jitter"]["covered"]  # by the proof that the run finds itself
-    assert "proved exactly" in outcome["jitter"]["covers"]
+    assert outcome["varying_delay"]["on_file"] is None
+    assert outcome["varying_delay"]["covered"]  # by the proof that the run finds itself
+    assert "proved exactly" in outcome["varying_delay"]["covers"]
 
 
 def test_validate_and_audit_say_the_same(file, constant_file, tmp_path, capsys):
     quick = ["--humans", "3", "--engine", "exact", "--duration", "0", "--no-plot", "--out", str(tmp_path / "v")]
-    _, outcome = told(capsys, validate_main, "--coupling", file, "--jitter", "1,2", *quick)
+    _, outcome = told(capsys, validate_main, "--coupling", file, "--varying-delay", "1,2", *quick)
     assert "proved in the coupling's file" in outcome["switching"]["covers"]
-    code, outcome = told(capsys, audit_main, "--coupling", constant_file, "--jitter", "1,2", "--out", str(tmp_path))
+    code, outcome = told(
+        capsys, audit_main, "--coupling", constant_file, "--varying-delay", "1,2", "--out", str(tmp_path)
+    )
     assert code == 1
     assert any("judged anew" in note for note in outcome["notes"])
 
@@ -296,10 +300,10 @@ def test_without_an_exact_proof_the_file_keeps_the_constants(tmp_path, capsys, m
     """A limit on states between the two models: said in the report, and the file claims no switching."""
     monkeypatch.setattr(positive_real, "LARGEST", condition_block(LOOP, SOFT, (1.0, 1.0)).order - 1)
     out = str(tmp_path / "c.json")
-    options = ["--condition", "this-environment", "--jitter", "1,2", "--out", out]
+    options = ["--condition", "this-environment", "--varying-delay", "1,2", "--out", out]
     code, outcome = told(capsys, design_main, *options)
     assert code == 0
-    assert outcome["jitter_proof"]["proof"] == "sampled"
+    assert outcome["switching"]["proof"] == "sampled"
     assert outcome["stored"]["proof"] == "rational"
     assert outcome["stored"]["switching"]["proof"] is None
     assert "states takes long" in outcome["stored"]["switching"]["reason"]
@@ -308,9 +312,9 @@ def test_without_an_exact_proof_the_file_keeps_the_constants(tmp_path, capsys, m
 
 
 def test_a_design_for_a_range_without_its_theta_is_refused(tmp_path):
-    options = ["--condition", "this-environment", "--jitter", "2,3", "--out", str(tmp_path / "c.json")]
+    options = ["--condition", "this-environment", "--varying-delay", "2,3", "--out", str(tmp_path / "c.json")]
     with pytest.raises(
-        ValueError, match=r"--jitter is 2-3: theta is \[1, 2\], outside of its jitter, \[2, 3\] samples"
+        ValueError, match=r"--varying-delay is 2-3: theta is \[1, 2\], outside of its varying_delay, \[2, 3\] samples"
     ):
         design_main(options)
 
@@ -319,25 +323,29 @@ def test_a_design_for_a_range_without_its_theta_is_refused(tmp_path):
 
 
 def test_the_scenarios_range_is_the_loops():
-    scenario = scenario_of().replace(jitter=Jitter((1, 1), (2, 2)))
+    scenario = scenario_of().replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
     assert scenario.loop("I") == LOOP
-    for steady in (Jitter((1, 1), (2, 2), "constant"), Jitter((1, 2), (1, 2)), Jitter((1, 2), (1, 2), loss=0.1)):
-        assert scenario.replace(jitter=steady).loop("I") == PAIR
+    for steady in (
+        VaryingDelay((1, 1), (2, 2), "constant"),
+        VaryingDelay((1, 2), (1, 2)),
+        VaryingDelay((1, 2), (1, 2), loss=0.1),
+    ):
+        assert scenario.replace(varying_delay=steady).loop("I") == PAIR
 
 
 def test_certify_judges_any_switching():
     coupling = built.SpringDamper(SOFT.K, SOFT.B)
     found = certify(LOOP, coupling)
-    assert found["jitter-proof"].certified
-    assert found["jitter-proof"].proof == "rational"
+    assert found["switching"].certified
+    assert found["switching"].proof == "rational"
     assert found["this-environment"] == certify(PAIR, coupling)["this-environment"]
-    assert "jitter-proof" not in certify(PAIR, coupling)
+    assert "switching" not in certify(PAIR, coupling)
 
 
 @pytest.mark.parametrize(("K", "certified"), [((2000.0, 1500.0), True), ((7806.0, 3137.0), False)])
-def test_certify_judges_every_vertex_of_a_box(K, certified):
+def test_certify_judges_every_vertex_of_the_ranges(K, certified):
     """The nominal environment alone would certify both."""
-    loop = change(PAIR, box=Box((UncertainSpring(("mass", "contact 1"), (640.0, 960.0), absent=True),)))
+    loop = change(PAIR, ranges=Ranges((UncertainSpring(("mass", "contact 1"), (640.0, 960.0), absent=True),)))
     coupling = built.SpringDamper(K, (0.105, 1.68))
     found, nominal = certify(loop, coupling)["this-environment"], certify(PAIR, coupling)["this-environment"]
     at = [

@@ -1,4 +1,4 @@
-"""The search for the worst environment of a box, and what a violation between the vertices does to a guarantee."""
+"""The search for the worst environment of ranges, and what a violation between the vertices does to a guarantee."""
 
 import json
 from itertools import product
@@ -11,11 +11,11 @@ from worlds import VERTICES_ONLY, environment_by_hand, filter_by_hand
 from cli.check import main as check_main
 from cli.design import _store
 from controller.coupling import ForceFilter, InternalModel
-from controller.environment import FIGURE_4, Box, Member, Network, Region, Spring, UncertainSpring, members, regions
+from controller.environment import FIGURE_4, Member, Network, Ranges, Region, Spring, UncertainSpring, members, regions
 from design import optimal
 from design.api import certify
-from design.certificate import check_set, prove, verify
-from design.coverage import set_part, set_rows
+from design.certificate import check_ranges, prove, verify
+from design.coverage import ranges_part, ranges_rows
 from design.environments import search
 from design.program import Options
 from design.result import Design
@@ -24,20 +24,20 @@ from sim import scenario
 from sim.scenario import SCENARIOS
 
 T, THETA, DELTA = 1.2e-3, (1, 2), 1.37
-BOX = scenario.load(SCENARIOS / "omega-pair-box.toml").loop("I")
+RANGED = scenario.load(SCENARIOS / "omega-pair-ranges.toml").loop("I")
 _first, _second = FIGURE_4.springs
 STIFF = (msgspec.structs.replace(_first, stiffness=840.0), msgspec.structs.replace(_second, stiffness=735.0))
-#: that edge of the box on which it is violated, as a box of its own
+#: that edge of the ranges on which it is violated, as ranges of its own
 EDGE = msgspec.structs.replace(
-    BOX, environment=Network(FIGURE_4.contacts, STIFF, {"mass": 2.0}), box=Box(masses={"mass": (0.5, 2.0)})
+    RANGED, environment=Network(FIGURE_4.contacts, STIFF, {"mass": 2.0}), ranges=Ranges(masses={"mass": (0.5, 2.0)})
 )
 #: the mass alone, over four octaves
-MASS = msgspec.structs.replace(BOX, box=Box(masses={"mass": (0.25, 4.0)}))
+MASS = msgspec.structs.replace(RANGED, ranges=Ranges(masses={"mass": (0.25, 4.0)}))
 
 
 @pytest.fixture(scope="module")
 def known():
-    return check_set(BOX, VERTICES_ONLY)
+    return check_ranges(RANGED, VERTICES_ONLY)
 
 
 def needed(network: Network, coupling: InternalModel) -> float:
@@ -73,14 +73,14 @@ def point_of(member: Member) -> np.ndarray:
 
 
 def test_a_region_for_every_way_in_which_the_contacts_can_be():
-    box = Box(
+    ranges = Ranges(
         (
             UncertainSpring(("contact 1", "mass"), (640.0, 960.0), (0.5, 1.0), absent=True),
             UncertainSpring(("mass", "contact 2"), (560.0, 840.0)),
         ),
         {"mass": (0.5, 2.0)},
     )
-    there, lost = regions(FIGURE_4, box)
+    there, lost = regions(FIGURE_4, ranges)
     np.testing.assert_array_equal(np.array([there.low, there.high]), [[640, 0.5, 560, 0.5], [960, 1, 840, 2]])
     np.testing.assert_array_equal(np.array([lost.low, lost.high]), [[560, 0.5], [840, 2]])
     network = there.at("x", np.array([700.0, 0.7, 600.0, 1.5])).network
@@ -89,13 +89,13 @@ def test_a_region_for_every_way_in_which_the_contacts_can_be():
     assert lost.at("x", np.array([600.0, 1.5])).network.springs[0] == Spring(("contact 1", "mass"), 0, 0)
 
 
-def test_the_corners_of_the_regions_are_the_vertices_of_the_box():
+def test_the_corners_of_the_regions_are_the_vertices_of_the_ranges():
     corners = {
         str(region.at("", np.array(corner)).network)
-        for region in regions(FIGURE_4, BOX.box)
+        for region in regions(FIGURE_4, RANGED.ranges)
         for corner in product(*zip(region.low, region.high, strict=True))
     }
-    _, *vertices = members(FIGURE_4, BOX.box)
+    _, *vertices = members(FIGURE_4, RANGED.ranges)
     assert corners == {str(vertex.network) for vertex in vertices}
 
 
@@ -156,10 +156,10 @@ def test_neither_the_vertices_nor_random_points_see_it_but_no_set_is_promised(kn
     assert len(known.at_samples) == 64
     assert all(r.certified for r in (*known.at_members, *known.at_samples))
     assert not known.proved
-    part = set_part(known)
+    part = ranges_part(known)
     assert (part["proof"], part["certified"], part["search"]["violated"]) == ("rational", False, True)
     assert part["reason"].startswith("proved at the vertices, but violated between them: 1.04")
-    assert any("not guaranteed" in words for _, words in set_rows(part))
+    assert any("not guaranteed" in words for _, words in ranges_rows(part))
 
 
 def test_fewer_samples_do_not_make_it_a_guarantee():
@@ -172,9 +172,9 @@ def test_fewer_samples_do_not_make_it_a_guarantee():
 def test_its_file_is_stored_for_the_environment_alone(known, tmp_path):
     assert known.at_members[0].certified
     design = Design(VERTICES_ONLY, "this-environment", "rms", 0.07, known.at_members[0], 1, 0.0)
-    assert _store(BOX, design, known, tmp_path / "c.json")["proof"] == "rational"
+    assert _store(RANGED, design, known, tmp_path / "c.json")["proof"] == "rational"
     stored = load(tmp_path / "c.json")
-    assert (stored.loop.box, stored.certificate.guarantee) == (None, "this environment")
+    assert (stored.loop.ranges, stored.certificate.guarantee) == (None, "this environment")
 
 
 def test_design_check_searches_again_and_rejects_a_file_that_was_made_without(tmp_path, capsys):

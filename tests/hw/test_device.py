@@ -55,6 +55,7 @@ class Rig:
         if self.said and isinstance(self.said[-1], State):
             self.state = self.said[-1]
             assert self.state.applied == self.forces
+            assert (self.state.phase, self.state.cause) == self.at
         return self.said
 
     def arm(self) -> None:
@@ -245,6 +246,11 @@ def test_the_margin_says_how_long_before_its_latch_a_force_came():
         assert (rig.state.echo, rig.state.margin_us) == (k, margin)
         rig.tick()
         assert (rig.state.echo, rig.state.margin_us) == (k, NO_MARGIN)
+    slow = Device(INFO._replace(period_ns=3_000_000))
+    slow.receive(encode(CONFIG._replace(theta=15, hold=2)), 0)
+    slow.tick(3000, (0, 0))
+    slow.receive(encode(Force(Command.IDLE, 16, 1, (0, 0))), 3000)
+    assert slow.margin == 32_767  # of 45,000: the most that the wire can say
     rig = Rig()
     rig.tick()
     rig.answer(command=Command.IDLE, back=1, after=100)  # the tick it was for began 100 us ago
@@ -269,6 +275,16 @@ def test_the_watchdog_holds_four_ticks_then_ramps_to_zero():
     assert seen[4:7] == [(Phase.RAMP, (750, -749)), (Phase.RAMP, (500, -499)), (Phase.RAMP, (250, -249))]
     assert seen[7:] == [(Phase.STOPPED, (0, 0))] * 3
     assert rig.at == (Phase.STOPPED, Cause.WATCHDOG)
+
+
+def test_whoever_is_armed_and_says_nothing_is_held_as_long_as_one_who_falls_silent():
+    rig = armed()
+    seen = [rig.tick() and rig.at for _ in range(9)]
+    assert [phase for phase, _ in seen] == [Phase.HOLDING] * 4 + [Phase.RAMP] * 3 + [Phase.STOPPED] * 2
+    rig.say(CONFIG)
+    rig.tick()
+    rig.arm()
+    assert [rig.tick() and rig.device.phase for _ in range(5)] == [Phase.HOLDING] * 4 + [Phase.RAMP]
 
 
 def test_holding_keeps_the_force_as_it_is_even_on_its_way():

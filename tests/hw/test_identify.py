@@ -1,5 +1,9 @@
 """Identification on the emulated device, in virtual time: known parameters come back, and a bound is a lower bound."""
 
+import re
+from dataclasses import replace
+from pathlib import Path
+from runpy import run_path
 from types import SimpleNamespace
 
 import msgspec
@@ -21,14 +25,14 @@ from sim.trace import Trace
 STEP = 5e-6  # [m] a coarse encoder: half of an Omega's 0.01 mm
 
 
-def record_of(scenario, *faults):
+def record_of(scenario, *faults, seconds=1.5):
     """A chirp of 1 N and a release, recorded through the whole link."""
     recorder = Recorder(scenario.channels)
     session = Session(
         scenario.replace(delta=(1e-6,) * scenario.channels), Limits((1.0, 1.0)), LinkSettings(measure=100)
     )
     session.record = recorder
-    excitation = chirp(scenario.channels, scenario.T, 1, 1.0, (3.0, 200.0), 1.5)
+    excitation = chirp(scenario.channels, scenario.T, 1, 1.0, (3.0, 200.0), seconds)
     faults = tuple(map(FaultInjection.parse, faults))
     rehearsal = Rehearsal(session, Emulator(nobody(scenario)), lambda ages: [excitation], faults)
     rehearsal.run_until_armed(excitation.seconds + 0.1)
@@ -40,7 +44,8 @@ def record_of(scenario, *faults):
 def test_known_parameters_come_back():
     """A compliant and a rigid device, neither of them the ones the search begins with.
 
-    Masses and stiffness to 0.2 %; friction to 0.5 %, of which the record of 1.5 s a sweep leaves 0.3 %.
+    All to 0.2 %. The bound of the lighter axis is a hundredth below; that of the heavier one more, since which law dry
+    friction has is not known, and the record does not exclude all.
     """
     scenario = load()
     compliant = msgspec.structs.replace(
@@ -52,21 +57,21 @@ def test_known_parameters_come_back():
         encoder_step=STEP,
     )
     scenario = scenario.replace(device=(compliant, RigidDevice(mass=0.16, damping=2.0, encoder_step=STEP)))
-    recorder, session = record_of(scenario)
+    recorder, session = record_of(scenario, seconds=2.5)
     first, second = estimate(recorder, session, scenario)
     found = first.transmission
     assert first.friction.mass == pytest.approx(0.38, rel=2e-3)
     assert found.motor_mass == pytest.approx(0.08, rel=2e-3)
-    assert first.viscous == pytest.approx(0.8, rel=5e-3)
+    assert first.viscous == pytest.approx(0.8, rel=2e-3)
     assert found.stiffness == pytest.approx(9000.0, rel=2e-3)
     reduced = 0.08 * 0.3 / 0.38
     assert found.mode_hz == pytest.approx(np.sqrt(9000.0 / reduced) / (2 * np.pi), rel=2e-3)
     assert second.friction.mass == pytest.approx(0.16, rel=2e-3)
-    assert second.viscous == pytest.approx(2.0, rel=5e-3)
+    assert second.viscous == pytest.approx(2.0, rel=2e-3)
     assert second.transmission is None
-    for found, true in ((first, 0.8), (second, 2.0)):
+    for found, true, least in ((first, 0.8, 0.95), (second, 2.0, 0.99)):
         assert found.friction.coulomb == pytest.approx(0.0, abs=1e-3)  # [N], of a chirp of 1 N
-        assert 0.95 * true < found.delta <= true
+        assert least * true < found.delta <= true
         assert found.friction.stiffness == pytest.approx(0.0, abs=0.1)  # [N/m]
 
 
@@ -82,58 +87,55 @@ def played(force, T, mass, b, c, substeps=64):
 
 
 def test_dry_friction_is_told_from_viscous():
-    """Bounds of the estimate: 10 % of c and 2 % of b, since the record has few cycles in which dry friction rules."""
     T = 1.2e-3
     force = chirp(1, T, 1, 1.0, (3.0, 60.0), 1.5).signal[:, 0]
     x = np.round(played(force, T, 0.25, 1.37, 0.1) / STEP) * STEP
     found = identify(x, force, np.ones(x.size, dtype=bool), T, STEP, rigid=True)
-    assert found.friction.coulomb == pytest.approx(0.1, rel=0.1)
-    assert found.viscous == pytest.approx(1.37, rel=0.02)
-    assert found.delta < found.viscous
+    assert found.friction.coulomb == pytest.approx(0.1, rel=0.01)
+    assert found.viscous == pytest.approx(1.37, rel=0.005)
+    assert 0.98 * 1.37 < found.delta < 1.37
 
 
-def rig(T, seconds, **odd):
-    """One mass with what rigs have, by Euler in small steps: x (N,) [m] and the force (N,) [N] that it was told."""
-    told = chirp(1, T, 1, 1.0, (3.0, 200.0), seconds).signal[:, 0]
-    x, v, felt, out, h = 0.0, 0.0, 0.0, [], T / 32
-    for f in told:
-        out.append(x + odd.get("eccentric", 0.0) * np.sin(2 * np.pi * x / 0.04))
-        for _ in range(32):
-            felt = felt + (f - felt) * -np.expm1(-h / odd["lag"]) if "lag" in odd else f
-            outside = odd.get("constant", 0.0) - odd.get("spring", 0.0) * x
-            outside += odd.get("cogging", 0.0) * np.sin(2 * np.pi * x / 0.004 + 1.0)
-            dry = odd.get("coulomb", 0.0) * np.tanh(v / odd.get("slip", 0.002))
-            v += h * (felt + outside - dry - (1.0 + odd.get("hand", 0.0)) * v) / 0.25
-            x += h * v
-    return np.round(np.array(out) / STEP) * STEP, told
-
-
-@pytest.mark.parametrize(
-    ("odd", "least"),
-    [
-        ({"constant": 1e-3}, 0.95),
-        ({"spring": 1.0}, 0.95),
-        ({"cogging": 2e-3}, 0.95),
-        ({"lag": 0.36e-3}, 0.95),
-        ({"eccentric": 2e-5}, 0.95),
-        ({"coulomb": 0.05, "slip": 0.02}, 0.90),
-        ({"coulomb": 0.03, "constant": 5e-3, "spring": 2.0}, 0.90),
-    ],
+ODD = (
+    *("ideal", "constant 0.001", "cable 1", "cogging 0.002", "gap 1e-05", "lag 0.3", "eccentric 2e-05", "loss 3"),
+    *(
+        "coulomb 0.05, slip 0.02",
+        "coulomb 0.05, slip 0.0005",
+        "coulomb 0.04, static 0.03",
+        "coulomb 0.03, bristle 2000",
+    ),
+    *("drag 0.5", "drift 0.002", "late 0.3", "constant 0.02, coulomb 0.03"),
 )
-def test_rigs_that_are_not_ideal_have_bounds(odd, least):
-    """Viscous friction is 1 N s/m: the bound is never above, and at most a tenth below."""
-    x, told = rig(1.2e-3, 2.5, **odd)
-    found = identify(x, told, np.ones(x.size, dtype=bool), 1.2e-3, STEP, rigid=True)
-    assert least < found.delta <= 1.0
-    assert found.friction.stiffness == pytest.approx(odd.get("spring", 0.0), abs=0.3)
+HANDS = {
+    "resting": (0.05, 0.2, 30.0),
+    "finger": (0.01, 0.1, 20.0),
+    "touch": (0.002, 0.1, 10.0),
+    "grip": (0.4, 3.0, 300.0),
+}
 
 
-def test_a_finger_on_the_handle_is_found_out():
-    """0.1 N s/m that are not the device's, and 20 N/m that say so: as 10 N/m of a light touch do."""
-    for spring in (10.0, 20.0):
-        x, told = rig(1.2e-3, 1.5, spring=spring, hand=0.1)
-        with pytest.raises(ValueError, match=r"handle is sprung by .* a hand or a finger rests on it"):
-            identify(x, told, np.ones(x.size, dtype=bool), 1.2e-3, STEP, rigid=True)
+@pytest.fixture(scope="module")
+def odd():
+    """What comes of the benchmark's rigs with one imperfection each, by its own plant, and of hands on the first."""
+    bench = run_path(str(Path(__file__).parents[1] / "benchmarks/odd_rigs.py"))
+    rigs, signal = bench["rigs"]()[: len(ODD)], bench["excitation"]()
+    rigs += [replace(rigs[0], name=name, hand=hand) for name, hand in HANDS.items()]
+    x = bench["records"](rigs, signal, substeps=8)
+    return {rig.name: bench["judged"](rig, x[:, i], signal)[0] for i, rig in enumerate(rigs)}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_rigs_that_are_not_ideal_have_bounds(odd, name):
+    """Viscous friction is 1 N s/m: the bound is never above, and at most a twentieth below."""
+    assert 0.95 < odd[name].delta <= 1.0
+    assert odd[name].viscous == pytest.approx(1.0, rel=0.01)
+    assert odd[name].stiffness == pytest.approx(1.0 if name == "cable 1" else 0.0, abs=0.1)
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_a_hand_or_finger_on_the_handle_is_found_out(odd, name):
+    """Its damping, 0.1 to 3 N s/m, is not the device's; its spring says that it is there."""
+    assert re.search(r"handle is sprung by .* a hand or a finger rests on it", odd[name])
 
 
 def test_an_axis_that_does_not_move_gives_nothing():
@@ -186,14 +188,14 @@ def coarse():
 
 def test_bounds_hold_wherever_the_encoder_stands(coarse):
     """Five origins within a step. All bounds must be below the truth: with the standstill as 1000 samples, half were
-    above. Nor may they be far below, or they would be of no use: 5 %.
+    above. Nor may they be far below, or they would be of no use: 2 %.
     """
     T, step, force, exact = coarse
     for origin in np.arange(0.1, 1.0, 0.2):
         x = step * np.round(exact / step + origin)
         found = identify(x, force, np.ones(x.size, dtype=bool), T, step, rigid=True)
-        assert 0.95 * 0.5 < found.delta <= 0.5
-        assert found.viscous == pytest.approx(0.5, rel=0.02)
+        assert 0.98 * 0.5 < found.delta <= 0.5
+        assert found.viscous == pytest.approx(0.5, rel=0.01)
 
 
 def test_a_standstill_counts_as_few_samples():

@@ -71,19 +71,41 @@ def test_an_impossible_gain_is_a_fault(gain):
 
 
 @pytest.mark.parametrize(
-    ("field", "value"),
+    ("field", "least", "most"),
     [
-        ("slew", 2001.0),
-        ("jump", 4e-3),
-        ("watchdog_us", 50_000),
-        ("ramp_in", 0.01),
-        ("ramp_out", 1.0),
-        ("slew", math.nan),
+        ("slew", 1.0, 2000.0),
+        ("jump", 1e-6, 3e-3),
+        ("watchdog_us", 1000, 20_000),
+        ("ramp_in", 0.1, 0.25),
+        ("ramp_out", 0.1, 0.25),
+        ("speed", 1e-3, 2.5),
+        ("thermal", 0.1, 1000.0),
+        ("cap", (1e-3,), (12.0,)),
+        ("continuous", (1e-3,), (6.0,)),
     ],
 )
-def test_limits_cannot_be_loosened(field, value):
-    with pytest.raises(ValueError, match=field):
-        Limits((12.0,), **{field: value})
+def test_limits_cannot_be_loosened(field, least, most):
+    """Both ends are allowed, and nothing beyond."""
+
+    def limits(value):
+        return Limits(**{"cap": (6.0,)} | {field: value})
+
+    def times(factor, value):
+        return tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
+
+    assert (getattr(limits(least), field), getattr(limits(most), field)) == (least, most)
+    for value in (times(0.99, least), times(1.01, most), times(math.nan, most)):
+        with pytest.raises(ValueError, match=field):
+            limits(value)
+
+
+def test_what_a_device_is_told_is_what_the_limits_say():
+    """0.25 s and 2000 N/s in ticks of 1.2 ms and steps of 0.4 mN; 4 ticks held and 5 ms to zero."""
+    config = configuration(INFO, Limits((12.0, 3.0)), 2)
+    assert (config.theta, config.hold, config.ramp, config.ramp_in) == (2, 4, 5, 209)
+    assert (config.cap, config.slew) == ((30_000, 7500), (6000, 6000))
+    slow = configuration(INFO._replace(period_ns=10_000_000), Limits((12.0, 3.0)), 0)
+    assert (slow.hold, slow.ramp, slow.ramp_in) == (1, 1, 25)  # 20 ms without a force are the most
 
 
 def test_no_cap_above_twelve_newtons():
@@ -106,6 +128,13 @@ def test_a_displacement_that_is_no_number_never_passes(x):
         check_jump((x,), (0.0,), 1, LIMITS)
     with pytest.raises(Fault):
         check_range((x,), (0.1,))
+
+
+def test_what_is_just_at_a_limit_is_within_it():
+    check_speed((1e-3, 0.0), (0.0, 0.0), 1e-3, LIMITS)
+    check_jump((3e-3, 0.0), (0.0, 0.0), 1, LIMITS)
+    check_jolt((3e-3, 0.0), (0.0, 0.0), (0.0, 0.0), LIMITS)
+    check_range((0.1, -0.1), (0.1, 0.1))
 
 
 def test_the_gain_takes_its_time():

@@ -25,11 +25,12 @@ from cli import bridge, identify, replay
 from cli import emulator as emulator_command
 from cli.options import Parser
 from cli.session_cli import add_link_options, check_link
-from controller.delay import Jitter
+from controller.delay import VaryingDelay
 from hw.control import certified_coupling, certified_couplings
 from hw.limits import ENDED, Limits, Stage
 from hw.monitor import LinkSettings
 from hw.recording import IncidentLog
+from hw.seam import SerialDevice
 from hw.session import Session
 from hw.transport import Live, SerialPort
 from sim.scenario import InputError
@@ -86,7 +87,8 @@ def rungs(scenario):
 def run(emulator, scenario, plan, glance=lambda session: None, pace=PACE):
     session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=150))
     with SerialPort(emulator.path, 921_600) as port:
-        live = Live(session, port, plan, True, seconds=60.0, glance=glance, pace=pace)
+        device = SerialDevice(port, lambda: pace * time.monotonic())
+        live = Live(session, device, plan, True, seconds=60.0, glance=glance, pace=pace)
         live.run()
     return session, live
 
@@ -248,26 +250,20 @@ def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
 
 
 class Designing:
-    """A session that waits for a coupling, and a port that swallows everything."""
+    """A session that waits for a coupling, with no device."""
 
     stage, measurement = Stage.MEASURED, SimpleNamespace(result=None)
 
     def load(self, rungs, now):
         self.stage = Stage.DISARMED if self.stage == Stage.MEASURED else self.stage
-        return b""
+        return ()
 
     def arm(self, now):
         raise AssertionError("armed by a key from before there was anything to arm")
 
     def stop(self, cause, now):
         self.stage = Stage.FINISHED
-        return b""
-
-    def fileno(self):
-        return self.idle
-
-    def discard(self):
-        pass
+        return ()
 
 
 @pytest.mark.parametrize(("typed", "stage"), [(b"a", Stage.DISARMED), (b"aq", Stage.FINISHED)])
@@ -275,21 +271,19 @@ def test_a_key_typed_during_the_design_does_not_arm(typed, stage):
     """It waits in the terminal's buffer until the session is disarmed: it is read before; other keys still count."""
     keyboard, person = os.pipe()
     session = Designing()
-    session.idle, other = os.pipe()
 
     def plan(ages):
         os.write(person, typed)
         return []
 
-    live = Live(session, session, plan, False, 1.0, keyboard)
-    live._load()
+    live = Live(session, None, plan, False, 1.0, keyboard)
+    live.load()
     assert select.select([keyboard], [], [], 0)[0] == []
     assert session.stage == stage
     os.close(person)
     live._pressed()  # the terminal is gone
     assert live.signals == [signal.SIGHUP]
-    for end in (keyboard, session.idle, other):
-        os.close(end)
+    os.close(keyboard)
 
 
 def test_ctrl_c_does_not_wait_for_the_end_of_a_design(emulator, scenario):
@@ -411,6 +405,8 @@ def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
 @pytest.mark.parametrize("module", [bridge, emulator_command, identify])
 def test_delays_that_vary_in_the_scenario_are_refused_by_name(module, scenario, tmp_path, monkeypatch):
     """The link has the delays that it has; a table that nothing reads would promise something else."""
-    monkeypatch.setattr(module, "scenario_from", lambda args: scenario.replace(jitter=Jitter((1, 1), (2, 2))))
-    with pytest.raises(InputError, match=r"jitter: hw\.\w+ takes the delays that its link has"):
+    monkeypatch.setattr(
+        module, "scenario_from", lambda args: scenario.replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
+    )
+    with pytest.raises(InputError, match=r"varying_delay: hw\.\w+ takes the delays that its link has"):
         module.main([] if module is emulator_command else ["--emulate", "--out", str(tmp_path)])

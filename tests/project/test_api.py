@@ -88,8 +88,8 @@ def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
     assert figures == transparency_of(loop, found.coupling)
     assert transparency_of(loop, NoCoupling()).mismatch_db == -np.inf  # F = Theta Psi E = Lambda E in case I
     assert guarantee(loop, certify(loop, SpringDamper([2870, 2320], [5.47, 5.55]))) is None
-    box = load("omega-pair-box").loop("I")
-    assert guarantee(box, certify(box, SpringDamper([300, 300], [0.1, 0.1]))) == "any passive environment"
+    ranges = load("omega-pair-ranges").loop("I")
+    assert guarantee(ranges, certify(ranges, SpringDamper([300, 300], [0.1, 0.1]))) == "any passive environment"
 
 
 def test_a_session_is_rehearsed():
@@ -158,7 +158,7 @@ def test_a_design_is_certified_and_goes_where_a_coupling_goes():
 
 def test_delays_that_vary_are_simulated():
     text = (SCENARIOS / "omega-pair.toml").read_text()
-    scenario = parse(text + "\n[jitter]\nlo = [0, 1]\nhi = [2, 3]\n").replace(duration=0.3)
+    scenario = parse(text + "\n[varying_delay]\nlo = [0, 1]\nhi = [2, 3]\n").replace(duration=0.3)
     first, again, other = (simulate(scenario, SOFT, seed=seed) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first.f, again.f)
     assert np.any(first.f != other.f)
@@ -238,3 +238,12 @@ def test_an_argument_of_another_type_is_named(call, message):
 def test_numbers_of_numpy_are_numbers():
     findings = validate(SHORT, SOFT, humans=np.int64(2), seed=np.int64(1), engine="exact", duration=np.float64(0))
     assert findings.index.size == 2
+
+
+def test_help_waits_for_no_library_that_it_does_not_need():
+    """MuJoCo, SciPy's parts, cvxpy and matplotlib take a quarter of a second to one each."""
+    slow = ("mujoco", "scipy.linalg", "scipy.optimize", "scipy.sparse", "cvxpy", "matplotlib.pyplot")
+    commands = "run, design, audit, check, validate, identify"
+    code = f"import sys\nfrom cli import {commands}\nprint([name for name in {slow} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"

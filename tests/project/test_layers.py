@@ -1,6 +1,8 @@
 """Who may import whom, without circles of files or of folders, and which package lives where."""
 
 import ast
+import re
+import tokenize
 from pathlib import Path
 
 import pytest
@@ -25,7 +27,7 @@ HOMES = {
     "cvxpy": {"design/lmi.py", "design/fixed_order.py", "design/spring_damper.py"},
     "distributed": {"sim/shards.py"},
     "serial": {"hw/transport.py", "hw/port.py"},
-    "matplotlib": {"sim/plots.py"},
+    "matplotlib": {"sim/map_plot.py", "sim/plots.py"},
     "PIL": {"sim/view/"},
 }
 
@@ -122,3 +124,27 @@ def test_the_check_sees_forbidden_arrows_and_circles(tmp_path):
     assert imported(wrong) == {"numpy", "sim.run"}
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"a"}}) == ["a", "b", "c", "a"]
     assert circle({"a": {"b"}, "b": {"c"}}) is None
+
+
+def prose(path: Path) -> str:
+    """Comments and docstrings."""
+    with path.open("rb") as file:
+        tokens = list(tokenize.tokenize(file.readline))
+    said = [t for t in tokens if t.type in (tokenize.COMMENT, tokenize.STRING)]
+    return "\n".join(t.string for t in said if t.string.startswith(("#", '"""')))
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_what_a_docstring_names_is_there(path):
+    """A file of ours by its path, or a name by its module."""
+    text = prose(path)
+    for name in re.findall(rf"\b(?:{'|'.join((*WORLDS, 'docs', 'tests', 'examples'))})/[\w/]+\.\w+", text):
+        assert (ROOT / name).exists(), f"{name} is named, and does not exist"
+    for world, module, name in re.findall(
+        rf"(?<!from )\b({'|'.join(WORLDS)})\.(?!py\b|step\b)([a-z_]+)(?:\.(\w+))?", text
+    ):
+        file, front = ROOT / world / f"{module}.py", ROOT / world / "__init__.py"
+        if not file.exists():
+            assert (ROOT / world / module).is_dir() or re.search(rf"\b{module}\b", front.read_text()), (world, module)
+        elif name:
+            assert re.search(rf"\b{name}\b", file.read_text()), f"{world}.{module} has no {name}"

@@ -8,6 +8,7 @@ import pytest
 from cli import run as command
 from cli import trace
 from controller.coupling import NoCoupling
+from sim.random_loops import traces
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, load
 from sim.stability import close, dominant_mode, stability_part
@@ -169,3 +170,15 @@ def test_a_mode_that_nothing_excites_is_called_so_and_the_verdict_is_the_exact_o
 def ran(scenario, engine):
     simulation = assemble(scenario, NoCoupling())
     return simulation, run(simulation, make_engine(simulation, engine, *settle(simulation, engine)[:2]))
+
+
+def test_no_trace_of_a_random_loop_says_the_opposite_of_its_eigenvalues():
+    """Number 11 is of two devices that nothing joins: one would buzz, only the other is moved.
+
+    `python -m sim.suite --only traces` does so for 460.
+    """
+    found = list(traces(1, 40))
+    assert [row for row in found if not row.holds] == []
+    assert found[11].not_excited
+    assert found[11].exact_per_s > 100
+    assert sum(row.not_excited for row in found) < 8 < sum(row.exact_per_s > 0 for row in found)

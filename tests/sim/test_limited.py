@@ -9,9 +9,11 @@ from worlds import SOFT
 
 from cli.run import main
 from controller.coupling import SpringDamper
-from design.certificate import assess
+from design.certificate import assess, prove, prove_limiter
 from design.coverage import covered_limits
+from design.stored import Stored, save
 from sim.api import simulate
+from sim.couplings import choose, limits_of
 from sim.run import assemble, run
 from sim.scenario import load
 
@@ -38,6 +40,21 @@ def test_which_limiter_a_coupling_may_have():
     refused = covered_limits(loop, stiff, assess(loop, stiff))
     assert refused.rho is None
     assert "needs 1.385" in refused.reason
+
+
+def test_the_limiter_that_a_file_proves_is_the_one_that_runs(tmp_path):
+    """beta = 0.03 on file, where 0.01 is usual; in a loop with other damping the same beta with a multiplier anew."""
+    scenario, path = weak(12.0, 5.657), tmp_path / "own.json"
+    loop = scenario.loop("I")
+    proof = prove_limiter(loop, BUILT, 0.03)
+    save(Stored.of(loop, BUILT, prove(loop, BUILT, "this-environment", limiter=proof)), path)
+    found = limits_of(scenario, choose(scenario, "I", str(path)))
+    assert found.certificate == proof
+    assert (found.rho, found.c, found.proved) == (proof.rho, proof.c, True)
+    assert found.rho == pytest.approx((34.25, 34.25))
+    devices = tuple(msgspec.structs.replace(device, damping=1.5) for device in scenario.device)
+    stronger = scenario.replace(device=devices)
+    assert limits_of(stronger, choose(stronger, "I", str(path))).rho == pytest.approx((37.5, 37.5))
 
 
 @pytest.mark.parametrize(("coupling", "rho"), [(SOFT, (0.0, 0.0)), (BUILT, (11.4167, 11.4167))])

@@ -57,7 +57,7 @@ def test_no_hand_is_given_more_than_the_budget_by_a_hostile_loop(start, vary):
     simulation = assemble(scenario, coupling)
     if vary:
         rng = np.random.default_rng(7)
-        scenario = scenario.replace(jitter={"lo": (0, 1), "hi": (2, 3), "loss": 0.05})
+        scenario = scenario.replace(varying_delay={"lo": (0, 1), "hi": (2, 3), "loss": 0.05})
         delays = rng.integers((0, 1), (3, 4), (scenario.samples, 2))
         delays = np.where(rng.random(delays.shape) < 0.05, -1, delays)
         delays[500:530] = -1  # a gap that the device must not hold through

@@ -262,8 +262,18 @@ def test_a_measured_hand_and_a_population_from_files(tmp_path):
             load_humans(file, 2)
         assert message in str(caught.value)
     python = tmp_path / "who.py"
-    python.write_text("class Draw:\n    def draw(self, rng, n):\n        return []\npopulation = Draw()\n")
-    assert callable(load_humans(python, 2).population.draw)
+    drawn = "from models.human import Human, Link\nclass Draw:\n    def draw(self, rng, n):\n        return {}\n"
+    python.write_text(drawn.format("[Human((Link(0.3, 3.0, 200.0),))] * n") + "population = Draw()\n")
+    assert len(load_humans(python, 2).population.draw(None, 3)) == 3
+    for text, message in [
+        (drawn.format("[]") + "population = Draw()\n", "population.draw(rng, 2) gives not two humans"),
+        (drawn.format("[1] * n") + "population = Draw()\n", "human[0] is 1, expected a Human"),
+        ("humans, persons = [], [1]\n", "persons[0] is 1, expected a models.human.Person"),
+    ]:
+        python.write_text(text)
+        with pytest.raises(InputError) as caught:
+            load_humans(python, 2)
+        assert message in str(caught.value)
 
 
 def test_a_state_space_is_no_coupling():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib import pyplot as plt
 
-from sim import plots
+from sim import map_plot, plots
 from sim.trace import Trace
 
 
@@ -14,7 +14,7 @@ from sim.trace import Trace
 def drawn(monkeypatch, tmp_path):
     """Draws, and returns the axes; the picture is written, too, and no figure is left open."""
     seen = []
-    save = plots._save
+    save = plots.save
 
     def look(figure, path, dpi=130):
         seen.append(figure)
@@ -22,7 +22,7 @@ def drawn(monkeypatch, tmp_path):
         assert not plt.get_fignums()
         return path
 
-    monkeypatch.setattr(plots, "_save", look)
+    monkeypatch.setattr(plots, "save", look)
 
     def draw(function, *arguments, **keywords):
         assert function(*arguments, path=tmp_path / "a.png", **keywords) == tmp_path / "a.png"
@@ -111,7 +111,7 @@ def test_an_onset_is_drawn_at_its_size_and_slope_and_what_is_not_credible_is_gre
     figure = drawn(plots.plot_run, result, title="t", frequency_hz=84.0, onset=onset)
     curve = lines(figure.axes[1])["slope predicted: +1.4 1/s"]
     assert np.diff(np.log(curve[:, 1]))[0] == pytest.approx(1.4 * np.diff(curve[:, 0])[0])
-    names = [f"device 1, {what}" for what in ("encoder (thin)", "force", "handle (thick)")]
+    names = [f"device 1, {what}" for what in ("handle (thick)", "encoder (thin)", "force")]
     assert legend(figure)[:3] == names
     handles, encoders = (lines(figure.axes[0])[f"device 1, {what}"] for what in ("handle (thick)", "encoder (thin)"))
     np.testing.assert_allclose(handles[:, 1], 1e3 * handle)
@@ -217,7 +217,7 @@ def told(**changes):
         return {"B": B, "K": K, "verdict": verdict, "differs_from_linear": differs}
 
     effects = {"encoder_step_m": [1e-5, 0.0], "friction_n": [0.0, 0.0], "force_limit_n": None}
-    points = [point(0, 10, "rests"), point(2, 20, "oscillates", True), point(1, 20, plots.UNDECIDED)]
+    points = [point(0, 10, "rests"), point(2, 20, "oscillates", True), point(1, 20, map_plot.UNDECIDED)]
     simulation = {"points": points, "effects": effects, "nonlinear": True}
     head = {"axes": "coupling", "rigid": True, "coupling": None, "one_sided": False, "population": {"humans": 7}}
     loop = {"theta": [1, 1], "psi": [0, 1], "T": 1e-3, "delta": [1.37, 2.0], "velocity_filter_hz": None}
@@ -225,7 +225,7 @@ def told(**changes):
 
 
 def test_a_map_shows_verdicts_edges_and_points(drawn):
-    figure = drawn(plots.plot_zwidth, k_b_map(), told())
+    figure = drawn(map_plot.plot_zwidth, k_b_map(), told())
     (axis,) = figure.axes
     cells = axis.collections[0].get_array()
     np.testing.assert_array_equal(cells.mask.ravel(), [False] * 4 + [True, False])
@@ -239,7 +239,7 @@ def test_a_map_shows_verdicts_edges_and_points(drawn):
         "any passive environment: certified below this edge",
         "MuJoCo: rests (1)",
         "MuJoCo: oscillates (1)",
-        f"MuJoCo: {plots.UNDECIDED} (1)",
+        f"MuJoCo: {map_plot.UNDECIDED} (1)",
         "unlike the linear loop (1)",
     ]
     title = "rigid wall: theta 1, T 1 ms, delta 1.37, 2 N s/m\npsi 0, 1, encoder step 10 um"
@@ -249,12 +249,12 @@ def test_a_map_shows_verdicts_edges_and_points(drawn):
 def test_a_map_of_an_environment_shows_what_was_designed_for(drawn):
     springs = {"contact_springs": [{"B": 1.0, "K": 15.0}, {"B": 9.0, "K": 15.0}]}
     empty = {"points": [], "effects": told()["simulation"]["effects"], "nonlinear": False}
-    figure = drawn(plots.plot_zwidth, k_b_map(), told(axes="environment", designed_for=springs, simulation=empty))
+    figure = drawn(map_plot.plot_zwidth, k_b_map(), told(axes="environment", designed_for=springs, simulation=empty))
     marks = [line.get_xydata().tolist() for line in figure.axes[0].lines if line.get_marker() == "P"]
     assert marks == [[[1.0, 15.0]]]  # the other one is not on the map
     assert "this environment: certified inside this edge" in legend(figure)
 
 
 def test_lines_are_told_apart_without_colours():
-    styles = [str(style["linestyle"]) for style in plots._STYLES]
+    styles = [str(style["linestyle"]) for style in plots.STYLES]
     assert len(set(styles)) == len(styles)

@@ -62,7 +62,7 @@ def test_workers_that_die_again_and_again_leave_what_is_done(tmp_path, monkeypat
     whole = validate(QUESTION)
     table = Table(QUESTION, tmp_path)
     table.put(1, shards.examine(QUESTION, QUESTION.batches()[1]))
-    monkeypatch.setattr(shards, "_as_worker", die)
+    monkeypatch.setattr(shards, "as_worker", die)
     found = validate(QUESTION, 2, table=table)
     assert found.lost == "worker processes died 3 times in a row"
     np.testing.assert_array_equal(found.index, np.arange(BATCH, 2 * BATCH))
@@ -106,13 +106,20 @@ def children(pid: int) -> list[int]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="the kernel lists no children here")
-@pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGKILL])
-def test_workers_end_with_the_process_that_started_them(tmp_path, end):
-    command = [sys.executable, "-m", "sim.validate", "--humans", "100000", "--shards", "2", "--out", str(tmp_path)]
+@pytest.mark.parametrize(
+    ("end", "words", "workers_and_their_clerk"),
+    [
+        (signal.SIGTERM, ["sim.validate", "--humans", "100000", "--shards", "2"], 3),
+        (signal.SIGKILL, ["sim.validate", "--humans", "100000", "--shards", "2"], 3),
+        (signal.SIGKILL, ["sim.suite", "--only", "endurance"], 2),
+    ],
+)
+def test_workers_end_with_the_process_that_started_them(tmp_path, end, words, workers_and_their_clerk):
+    command = [sys.executable, "-m", *words, "--out", str(tmp_path)]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
     process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
-    while len(workers := children(process.pid)) < 3:  # the third keeps count of shared resources
+    while len(workers := children(process.pid)) < workers_and_their_clerk:  # the last keeps count of shared resources
         assert time.monotonic() < deadline
         time.sleep(0.1)
     time.sleep(2)

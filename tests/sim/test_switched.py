@@ -1,4 +1,4 @@
-"""The loop that switches: mode matrices against the simulated loop, the worst switching, sim.run with jitter."""
+"""The loop that switches: mode matrices against the simulated loop, the worst switching, sim.run with them."""
 
 import json
 from dataclasses import replace
@@ -10,7 +10,7 @@ from worlds import STIFF
 
 from cli.run import main
 from cli.validate import main as validate
-from controller.delay import Jitter, ages, realising
+from controller.delay import VaryingDelay, ages, realising
 from controller.process import StepBuffer
 from design import stored
 from models.scene import Crowd, plant, variants
@@ -82,7 +82,7 @@ def test_constant_delays_give_the_trace_of_the_constant_loop():
 
 def test_the_worst_period_grows_more_than_any_constant_delay():
     """(1, 2) is certified; switching within 1 to 2 makes the loop with its ordinary humans grow, exactly."""
-    worst = worst_switching(ASSEMBLY, STIFF, Jitter((1, 1), (2, 2), "adversarial"))
+    worst = worst_switching(ASSEMBLY, STIFF, VaryingDelay((1, 1), (2, 2), "adversarial"))
     assert worst.growth > 1.5  # found by a search: 2.05 1/s at the time of writing
     assert set(np.unique(worst.ages)) <= {1, 2}
     period, held = len(worst.ages), own_hold()
@@ -105,10 +105,10 @@ def test_the_worst_period_grows_more_than_any_constant_delay():
 
 def test_greedy_ages_repeat_the_trajectory_that_chose_them():
     """The growth under the packet delays of greedy ages is positive, and random delays do not reach it."""
-    G, jitter, ticks = without_theta(ASSEMBLY, STIFF), Jitter((1, 1), (2, 2)), 1600
+    G, varying_delay, ticks = without_theta(ASSEMBLY, STIFF), VaryingDelay((1, 1), (2, 2)), 1600
     process, held = replace(ASSEMBLY.process, F=G), one(ASSEMBLY.plant)
-    delays = realising(greedy_ages(process, held, ASSEMBLY.scene, jitter, ticks))
-    drawn = jitter.draw(np.random.default_rng(0), ticks)[:, :, None]
+    delays = realising(greedy_ages(process, held, ASSEMBLY.scene, varying_delay, ticks))
+    drawn = varying_delay.draw(np.random.default_rng(0), ticks)[:, :, None]
     rates = []
     for each in (delays, drawn):
         free = replace(unlimited(process), delays=each)
@@ -118,7 +118,7 @@ def test_greedy_ages_repeat_the_trajectory_that_chose_them():
 
 
 def test_switching_depends_on_the_seed_only():
-    scenario = load().replace(jitter=Jitter((1, 1), (2, 2)))
+    scenario = load().replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
     loop = assemble(scenario, STIFF)
     first, again, other = (switching(loop, STIFF, seed, 50)[0].process.delays for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
@@ -132,32 +132,32 @@ def run(tmp_path, *options):
 
 
 def test_both_engines_meet_the_same_delays(tmp_path):
-    report = run(tmp_path, "--jitter", "1,2", "--pattern", "bursty", "--loss", "0.05", "--duration", "1")
+    report = run(tmp_path, "--varying-delay", "1,2", "--pattern", "bursty", "--loss", "0.05", "--duration", "1")
     # RK4 in four substeps per period: 1e-7 is what the constant loop reaches too
     assert report["error"]["position_relative_rms"] < 1e-7
-    jitter = report["jitter"]
-    assert not jitter["covered"]
-    assert jitter["age"]["least"] == [1, 1]
-    assert max(jitter["age"]["largest"]) > 2  # losses
-    assert min(jitter["lost_packets"]) > 0
+    varying_delay = report["varying_delay"]
+    assert not varying_delay["covered"]
+    assert varying_delay["age"]["least"] == [1, 1]
+    assert max(varying_delay["age"]["largest"]) > 2  # losses
+    assert min(varying_delay["lost_packets"]) > 0
     assert report["reproducibility"] == []
 
 
 def test_the_adversarial_pattern_shows_growth(tmp_path):
     stored.save(stored.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
-    options = ["--coupling", str(tmp_path / "stiff.json"), "--jitter", "1,2", "--pattern", "adversarial"]
+    options = ["--coupling", str(tmp_path / "stiff.json"), "--varying-delay", "1,2", "--pattern", "adversarial"]
     report = run(tmp_path, *options, "--duration", "1", "--engine", "exact")
     assert report["stability"]["verdict"] == "unstable"
     assert report["stability"]["exact_verdict"] == "stable"
-    assert report["jitter"]["period"]["growth_rate_per_s"] > 1.5
+    assert report["varying_delay"]["period"]["growth_rate_per_s"] > 1.5
     assert any("not covered" in remark for remark in report["remarks"])
 
 
 def test_a_playout_buffer_is_the_constant_largest_delay(tmp_path):
-    report = run(tmp_path, "--jitter", "1-2,2-3", "--playout", "--duration", "1", "--engine", "exact")
+    report = run(tmp_path, "--varying-delay", "1-2,2-3", "--playout", "--duration", "1", "--engine", "exact")
     assert report["run"]["theta"] == [2, 3]
-    assert report["jitter"]["constant"]
-    assert report["jitter"]["covered"]
+    assert report["varying_delay"]["constant"]
+    assert report["varying_delay"]["covered"]
     assert report["certificate"]["certified"]
 
 
@@ -165,25 +165,25 @@ def test_recorded_delays_and_total_loss(tmp_path):
     (tmp_path / "delays.csv").write_text("# of one afternoon\n1, 2\n2 2\n1,-1\n")
     quick = ["--coupling", "published", "--engine", "exact", "--duration", "0.3"]
     report = run(tmp_path, "--pattern", str(tmp_path / "delays.csv"), *quick)
-    assert (report["jitter"]["lo"], report["jitter"]["hi"]) == ([1, 2], [2, 2])
-    assert report["jitter"]["lost_packets"] == [0, 83]  # of 250 ticks every third
+    assert (report["varying_delay"]["lo"], report["varying_delay"]["hi"]) == ([1, 2], [2, 2])
+    assert report["varying_delay"]["lost_packets"] == [0, 83]  # of 250 ticks every third
     report = run(tmp_path, "--loss", "1", *quick)
-    assert report["jitter"]["age"] is None
+    assert report["varying_delay"]["age"] is None
     assert np.load(tmp_path / "out" / "trace.npz")["f"].any() == np.False_  # no force ever arrives
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--jitter", "2,1"], "jitter on channel 1 is 2 to 1"),
-        (["--jitter", "1-2,1-2,1-2"], "--jitter has 3 ranges, expected 2"),
-        (["--jitter", "a"], "--jitter is 'a', expected LO,HI"),
-        (["--jitter", "3,4"], "theta[0] is 1, outside of its jitter, 3 to 4"),
+        (["--varying-delay", "2,1"], "varying_delay on channel 1 is 2 to 1"),
+        (["--varying-delay", "1-2,1-2,1-2"], "--varying-delay has 3 ranges, expected 2"),
+        (["--varying-delay", "a"], "--varying-delay is 'a', expected LO,HI"),
+        (["--varying-delay", "3,4"], "theta[0] is 1, outside of its varying_delay, 3 to 4"),
         (["--playout"], "--playout without a range of delays"),
         (["--pattern", "random"], "--pattern without a range of delays"),
-        (["--jitter", "1,2", "--loss", "2"], "jitter.loss is 2"),
-        (["--jitter", "1,2", "--pattern", "wild"], "No such file"),
-        (["--jitter", "1,2", "--playout", "--theta", "1"], "jitter.playout makes it the largest delay"),
+        (["--varying-delay", "1,2", "--loss", "2"], "varying_delay.loss is 2"),
+        (["--varying-delay", "1,2", "--pattern", "wild"], "No such file"),
+        (["--varying-delay", "1,2", "--playout", "--theta", "1"], "varying_delay.playout makes it the largest delay"),
     ],
 )
 def test_bad_ranges_are_refused_in_one_line(options, message):
@@ -192,26 +192,26 @@ def test_bad_ranges_are_refused_in_one_line(options, message):
     assert message in str(error.value)
 
 
-def test_a_scenario_file_may_have_jitter():
+def test_a_scenario_file_may_have_varying_delays():
     text = (SCENARIOS / "omega-pair.toml").read_text()
-    scenario = parse(text + '\n[jitter]\nlo = [1, 1]\nhi = [2, 3]\npattern = "bursty"\nloss = 0.01\n')
-    assert scenario.jitter == Jitter((1, 1), (2, 3), "bursty", 0.01)
+    scenario = parse(text + '\n[varying_delay]\nlo = [1, 1]\nhi = [2, 3]\npattern = "bursty"\nloss = 0.01\n')
+    assert scenario.varying_delay == VaryingDelay((1, 1), (2, 3), "bursty", 0.01)
     assert scenario.switches
-    with pytest.raises(InputError, match=r"jitter.*did you mean `loss`"):
-        parse(text + "\n[jitter]\nlo = [1, 1]\nhi = [2, 3]\nlos = 0.01\n")
+    with pytest.raises(InputError, match=r"varying_delay.*did you mean `loss`"):
+        parse(text + "\n[varying_delay]\nlo = [1, 1]\nhi = [2, 3]\nlos = 0.01\n")
     with pytest.raises(InputError, match="theta"):
-        parse(text + "\n[jitter]\nlo = [2, 2]\nhi = [3, 3]\n")
+        parse(text + "\n[varying_delay]\nlo = [2, 2]\nhi = [3, 3]\n")
 
 
 def validated(tmp_path, *options):
     out = tmp_path / "v"
-    fixed = ["--engine", "exact", "--humans", "20", "--no-plot", "--jitter", "1,2"]
+    fixed = ["--engine", "exact", "--humans", "20", "--no-plot", "--varying-delay", "1,2"]
     code = validate([*fixed, *options, "--out", str(out), "--json", str(tmp_path / "v.json")])
     return code, json.loads((tmp_path / "v.json").read_text())["switching"]
 
 
 def test_random_humans_under_the_worst_switching(tmp_path):
-    """The constants' design fails for most humans, the jitter-proof one for none; 0 and 1 are what is claimed."""
+    """The constants' design fails for most humans, the switching-proof one for none; 0 and 1 are what is claimed."""
     stored.save(stored.Stored(load().loop("I"), STIFF.form()), tmp_path / "stiff.json")
     code, stiff = validated(tmp_path, "--pattern", "adversarial", "--coupling", str(tmp_path / "stiff.json"))
     assert stiff["unstable"]["exact"] >= 10
@@ -220,7 +220,7 @@ def test_random_humans_under_the_worst_switching(tmp_path):
     code, soft = validated(tmp_path, "--pattern", "adversarial")
     assert soft["unstable"]["exact"] == 0
     assert soft["covered"]
-    assert soft["jitter_proof"]["proof"] == "rational"
+    assert soft["switching"]["proof"] == "rational"
     assert code == 0
 
 
@@ -239,7 +239,7 @@ def test_the_population_meets_lost_packets(tmp_path):
 
 def test_both_engines_see_the_population_grow_alike():
     """Four humans, adversarial delays: MuJoCo's growth within 0.01 1/s of the exact one, as of its constant loops."""
-    scenario = load().replace(jitter=Jitter((1, 1), (2, 2), "adversarial"))
+    scenario = load().replace(varying_delay=VaryingDelay((1, 1), (2, 2), "adversarial"))
     loop = assemble(scenario, STIFF)
     links = np.stack([draw(scenario.population, 2, 0, i, 1) for i in range(4)])
     held_by = variants(scenario.device, Crowd(links))

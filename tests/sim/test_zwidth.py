@@ -3,6 +3,7 @@
 import csv
 import json
 
+import msgspec
 import mujoco
 import numpy as np
 import pytest
@@ -244,11 +245,15 @@ def walled(count):
     return contact(network, SpringDamper([2000.0], [0.5]), (1,), (0,), T)
 
 
-@pytest.mark.parametrize("walls", [0, 1, 2])
+@pytest.mark.parametrize("walls", [0, 1, 2, "limited"])
 def test_many_processes_are_each_as_alone(walls):
     """Rounding apart, since the sums are in another order."""
     rng, limit, step = np.random.default_rng(2), np.array([5.0]), np.array([1e-5])
-    if walls:
+    if walls == "limited":
+        sweep, devices = rigid(1), Effects(1e-5, saturation=True).on(rigid(1).devices)
+        devices = tuple(msgspec.structs.replace(device, force_limit=0.5) for device in devices)
+        processes = sweep.processes(np.array([500.0, 900.0]), np.array([0.2, 0.3]), devices)
+    elif walls:
         contacts = [walled(walls), walled(walls)]
         processes = [Process(c.open, limit, step, c) for c in contacts]
     else:
@@ -265,6 +270,7 @@ def test_many_processes_are_each_as_alone(walls):
             tape.tick(k)
             np.testing.assert_allclose(together.f[k, :, i], tape.f[k, :, 0], rtol=1e-9, atol=1e-12)
     assert np.abs(together.f).max() > 0.1
+    assert walls != "limited" or (np.abs(together.f[:20]) == 0.5).mean() > 0.2
 
 
 def test_coulomb_friction_stops_a_device_where_coulomb_says():

@@ -1,4 +1,4 @@
-"""A box around the environment: its vertices, one Q for all of them, the proof at each, and what is said of the set."""
+"""Ranges of the environment: their vertices, one Q for all of them, the proof at each, and what is guaranteed."""
 
 import json
 from dataclasses import replace
@@ -16,23 +16,25 @@ from cli.run import main as run_main
 from cli.validate import main as validate_main
 from controller.coupling import SpringDamper
 from controller.coupling import SpringDamper as StoredSpringDamper
-from controller.environment import FIGURE_4, Box, Network, Spring, UncertainSpring, environment, inside, members
+from controller.delay import VaryingDelay
+from controller.environment import FIGURE_4, Network, Ranges, Spring, UncertainSpring, environment, inside, members
 from controller.loop import Loop, force_map
 from design import optimal
-from design.certificate import check_set, prove, verify
-from design.coverage import set_part
+from design.certificate import check_ranges, prove, verify
+from design.coverage import ranges_part
 from design.program import Options
 from design.result import NotProved
-from design.stored import Stored, digest, load, sealed
+from design.stored import Stored, digest, load, save, sealed
+from sim import scenario
 from sim.scenario import SCENARIOS, InputError, parse
 
 T, THETA = 1.2e-3, (1, 2)
 #: the first spring softer or stiffer or lost: three vertices beside the environment
-SMALL = Box((UncertainSpring(("mass", "contact 1"), (640.0, 840.0), absent=True),))
+SMALL = Ranges((UncertainSpring(("mass", "contact 1"), (640.0, 840.0), absent=True),))
 LOOP = Loop(T, THETA, (0, 0), THETA, (1.37, 1.37), FIGURE_4, SMALL)
 TEXT = (SCENARIOS / "omega-pair.toml").read_text()
-BOX_TEXT = """
-[[box.springs]]
+RANGES_TEXT = """
+[[ranges.springs]]
 between = ["mass", "contact 1"]
 stiffness = [640.0, 840.0]
 absent = true
@@ -43,7 +45,7 @@ SHORT = Options(ladder=((4, 3), (8, 6)))
 
 @pytest.fixture(scope="module")
 def robust():
-    """The optimal coupling for the small box."""
+    """The optimal coupling for the small ranges."""
     return optimal.design(LOOP, SHORT)
 
 
@@ -59,23 +61,23 @@ def stored(robust):
 
 @pytest.fixture(scope="module")
 def scenario_file(tmp_path_factory):
-    path = tmp_path_factory.mktemp("box") / "small.toml"
-    path.write_text(TEXT + BOX_TEXT)
+    path = tmp_path_factory.mktemp("ranges") / "small.toml"
+    path.write_text(TEXT + RANGES_TEXT)
     return path
 
 
-# the set
+# the ranges
 
 
 def test_vertices_are_the_ends_of_every_range_and_what_may_be_absent():
-    box = Box(
+    ranges = Ranges(
         (
             UncertainSpring(("contact 1", "mass"), (640.0, 960.0), (0.5, 1.0), absent=True),
             UncertainSpring(("mass", "contact 2"), (560.0, 840.0)),
         ),
         {"mass": (0.5, 2.0)},
     )
-    nominal, *vertices = members(FIGURE_4, box)
+    nominal, *vertices = members(FIGURE_4, ranges)
     assert nominal.network == FIGURE_4
     found = {(v.network.springs[0], v.network.springs[1], v.network.masses["mass"]) for v in vertices}
     first = [Spring(("contact 1", "mass"), k, b) for k, b in [*product((640, 960), (0.5, 1)), (0, 0)]]
@@ -87,21 +89,21 @@ def test_vertices_are_the_ends_of_every_range_and_what_may_be_absent():
 
 def test_a_contact_that_is_made():
     """The environment has no spring to the ground, the vertices have one: that it may be absent is the environment."""
-    box = Box((UncertainSpring(("mass", "ground"), (300.0, 500.0), (2.0, 2.0), absent=True),))
-    nominal, *vertices = members(FIGURE_4, box)
+    ranges = Ranges((UncertainSpring(("mass", "ground"), (300.0, 500.0), (2.0, 2.0), absent=True),))
+    nominal, *vertices = members(FIGURE_4, ranges)
     assert len(nominal.network.springs) == 2
     assert [v.network.springs[2] for v in vertices] == [
         Spring(("mass", "ground"), 300.0, 2.0),
         Spring(("mass", "ground"), 500.0, 2.0),
     ]
-    drawn = [m.network.springs[2] for m in inside(FIGURE_4, box, 20, seed=0)]
+    drawn = [m.network.springs[2] for m in inside(FIGURE_4, ranges, 20, seed=0)]
     assert Spring(("mass", "ground"), 0.0, 0.0) in drawn
     assert any(300 < spring.stiffness < 500 for spring in drawn)
 
 
 def test_a_vertex_that_is_the_environment_is_not_listed_twice():
-    box = Box(masses={"mass": (1.0, 2.0)})
-    assert [m.network.masses["mass"] for m in members(FIGURE_4, box)] == [1.0, 2.0]
+    ranges = Ranges(masses={"mass": (1.0, 2.0)})
+    assert [m.network.masses["mass"] for m in members(FIGURE_4, ranges)] == [1.0, 2.0]
 
 
 def test_samples_lie_inside_and_do_not_depend_on_their_number():
@@ -118,46 +120,49 @@ def test_the_number_of_vertices_is_limited():
     nodes = [f"n{i}" for i in range(7)]
     springs = [Spring((a, b), 100.0, 1.0) for a, b in pairwise(nodes)]
     network = Network(("n0",), tuple(springs), dict.fromkeys(nodes[1:], 1.0))
-    box = Box(tuple(UncertainSpring(s.between, (50.0, 200.0)) for s in springs), {"n1": (0.5, 2.0)})
+    ranges = Ranges(tuple(UncertainSpring(s.between, (50.0, 200.0)) for s in springs), {"n1": (0.5, 2.0)})
     with pytest.raises(
-        ValueError, match="box has 128 vertices, allowed are 64: leave out the ranges that matter least"
+        ValueError, match="ranges have 128 vertices, allowed are 64: leave out the ranges that matter least"
     ):
-        members(network, box)
+        members(network, ranges)
 
 
 @pytest.mark.parametrize(
-    ("box", "message"),
+    ("ranges", "message"),
     [
-        ("[box]", "box is empty"),
-        ("[box]\nmass = 1", "unknown field `mass`"),
-        ("[box]\nmasses = { mas = [0.5, 2.0] }", "box.masses names 'mas', which no spring reaches"),
+        ("[ranges]", "ranges are empty"),
+        ("[ranges]\nmass = 1", "unknown field `mass`"),
+        ("[ranges]\nmasses = { mas = [0.5, 2.0] }", "ranges.masses names 'mas', which no spring reaches"),
         (
-            "[box]\nmasses = { mass = [2.0, 3.0] }",
-            "box.masses.mass is 2 to 3 kg, which leaves out the environment's own 1",
+            "[ranges]\nmasses = { mass = [2.0, 3.0] }",
+            "ranges.masses.mass is 2 to 3 kg, which leaves out the environment's own 1",
         ),
-        ("[box]\nmasses = { mass = [2.0, 0.5] }", "expected \\[least, most\\] in kg"),
-        ("[box]\nmasses = { mass = [1.0, 1.0] }", "nothing is uncertain"),
-        ("[box]\nmasses = { mass = [0.5, inf] }", "expected \\[least, most\\] in kg"),
-        ("[box]\nsprings = [{ between = ['contact 1', 'mass'] }]", "nothing is uncertain"),
-        ("[box]\nsprings = [{ between = ['contact 1', 'mass'], stiffness = [900, 950] }]", "the environment's own 800"),
-        ("[box]\nsprings = [{ between = ['contact 1', 'mass'], stiffness = [-1, 950] }]", "0 <= least"),
-        ("[box]\nsprings = [{ between = ['contact 1', 'wall'], absent = true }]", "there is no node 'wall'"),
-        ("[box]\nsprings = [{ between = ['contact 1', 'ground'], stiffness = [1, 2] }]", "absent = true"),
-        ("[box]\nsprings = [{ between = ['contact 1', 'mass'], stifness = [1, 2] }]", "did you mean `stiffness`"),
-        ("[box]\nspring = 1", "did you mean `springs`"),
+        ("[ranges]\nmasses = { mass = [2.0, 0.5] }", "expected \\[least, most\\] in kg"),
+        ("[ranges]\nmasses = { mass = [1.0, 1.0] }", "nothing is uncertain"),
+        ("[ranges]\nmasses = { mass = [0.5, inf] }", "expected \\[least, most\\] in kg"),
+        ("[ranges]\nsprings = [{ between = ['contact 1', 'mass'] }]", "nothing is uncertain"),
+        (
+            "[ranges]\nsprings = [{ between = ['contact 1', 'mass'], stiffness = [900, 950] }]",
+            "the environment's own 800",
+        ),
+        ("[ranges]\nsprings = [{ between = ['contact 1', 'mass'], stiffness = [-1, 950] }]", "0 <= least"),
+        ("[ranges]\nsprings = [{ between = ['contact 1', 'wall'], absent = true }]", "there is no node 'wall'"),
+        ("[ranges]\nsprings = [{ between = ['contact 1', 'ground'], stiffness = [1, 2] }]", "absent = true"),
+        ("[ranges]\nsprings = [{ between = ['contact 1', 'mass'], stifness = [1, 2] }]", "did you mean `stiffness`"),
+        ("[ranges]\nspring = 1", "did you mean `springs`"),
     ],
 )
-def test_a_box_that_makes_no_sense_is_refused_by_name(box, message):
+def test_ranges_that_make_no_sense_is_refused_by_name(ranges, message):
     with pytest.raises(InputError, match=message):
-        parse(f"{TEXT}\n{box}")
+        parse(f"{TEXT}\n{ranges}")
 
 
 def test_a_vertex_that_cannot_be_simulated_is_refused():
     """A node without mass must be held by something at every vertex."""
     springs = (Spring(("tip", "node"), 100.0, 1.0), Spring(("node", "ground"), 50.0, 1.0))
-    box = Box(tuple(UncertainSpring(s.between, absent=True) for s in springs))
+    ranges = Ranges(tuple(UncertainSpring(s.between, absent=True) for s in springs))
     with pytest.raises(ValueError, match=r"vertex 3 .*no mass and nothing that holds it"):
-        Loop(T, (0,), (0,), (0,), (1.0,), Network(("tip",), springs), box)
+        Loop(T, (0,), (0,), (0,), (1.0,), Network(("tip",), springs), ranges)
 
 
 # one R for all
@@ -197,7 +202,7 @@ def test_one_filter_holds_at_every_vertex_where_that_of_the_environment_alone_do
 
 
 def test_the_sweep_agrees_with_the_condition_by_hand(robust):
-    check = check_set(LOOP, robust.coupling, samples=0)
+    check = check_ranges(LOOP, robust.coupling, samples=0)
     for member, requirement in zip(check.members, check.at_members, strict=True):
         # a dense grid may miss the very peak of the 6 Hz resonance
         assert 1 - least_room(member.network, robust.coupling) == pytest.approx(requirement.ratio, abs=2e-3)
@@ -205,27 +210,27 @@ def test_the_sweep_agrees_with_the_condition_by_hand(robust):
 
 def test_an_environment_that_no_device_feels_asks_nothing():
     """Both springs lost: the forces are zero, and so is their mismatch."""
-    both = Box(tuple(UncertainSpring(s.between, absent=True) for s in FIGURE_4.springs))
-    loop = change(LOOP, box=both)
+    both = Ranges(tuple(UncertainSpring(s.between, absent=True) for s in FIGURE_4.springs))
+    loop = change(LOOP, ranges=both)
     found = optimal.design(loop, SHORT)
-    check = check_set(loop, found.coupling, samples=4)
+    check = check_ranges(loop, found.coupling, samples=4)
     assert check.proved
     nothing = check.at_members[[m.name for m in check.members].index(check.members[-1].name)]
     assert nothing.ratio == 0
 
 
 def test_ranges_however_wide_have_an_answer():
-    box = Box((UncertainSpring(("contact 1", "mass"), (700.0, 4000.0)),))
-    found = optimal.design(change(LOOP, box=box), SHORT)
+    ranges = Ranges((UncertainSpring(("contact 1", "mass"), (700.0, 4000.0)),))
+    found = optimal.design(change(LOOP, ranges=ranges), SHORT)
     assert found.proved
-    assert found.certificate.guarantee == "a set"
+    assert found.certificate.guarantee == "these ranges"
 
 
 # the proof
 
 
-def test_every_vertex_is_proved_and_the_file_says_a_set(stored):
-    assert stored.certificate.guarantee == "a set"
+def test_every_vertex_is_proved_and_the_file_says_these_ranges(stored):
+    assert stored.certificate.guarantee == "these ranges"
     assert set(stored.certificate.matrices) == {"P", "P1", "P2", "P3"}
     assert verify(stored).proved
 
@@ -243,51 +248,70 @@ def test_a_broken_proof_of_one_vertex_is_rejected_by_name(stored, tmp_path):
     assert "expected P, P1, P2, P3" in verdict.reason
 
 
-def test_a_wider_box_is_another_claim(stored):
-    wider = change(LOOP, box=Box((UncertainSpring(("mass", "contact 1"), (640.0, 850.0), absent=True),)))
+def test_wider_ranges_are_another_claim(stored):
+    wider = change(LOOP, ranges=Ranges((UncertainSpring(("mass", "contact 1"), (640.0, 850.0), absent=True),)))
     assert "digest differs" in verify(change(stored, loop=wider)).reason
     smuggled = change(stored, loop=LOOP.at(FIGURE_4))
     assert not verify(smuggled).proved
 
 
-def test_a_coupling_for_one_environment_is_not_proved_for_the_set(nominal_only):
+def test_a_coupling_for_one_environment_is_not_proved_for_the_ranges(nominal_only):
     with pytest.raises(NotProved, match=r"^vertex 2 .*needs 1\.4029"):
         prove(LOOP, nominal_only.coupling, "this-environment")
-    part = set_part(check_set(LOOP, nominal_only.coupling, samples=8))
+    part = ranges_part(check_ranges(LOOP, nominal_only.coupling, samples=8))
     assert not part["certified"]
     assert part["vertices_certified"] == 2
 
 
 def test_nothing_is_promised_where_a_sample_inside_violates(robust):
     """The vertices alone would be proved: what is found inside is not passed over."""
-    check = check_set(LOOP, robust.coupling, samples=6)
+    check = check_ranges(LOOP, robust.coupling, samples=6)
     assert check.proved
     broken = replace(check, at_samples=(*check.at_samples[:-1], replace(check.at_samples[-1], required=(1.4, 1.4))))
     assert not broken.proved
 
 
-def test_a_fixed_coupling_may_be_promised_a_set_or_any_environment():
+def test_a_fixed_coupling_may_be_promised_ranges_or_any_environment():
     for gains, any_environment in (((878.7, 551.8), True), ((2000.0, 1500.0), False)):
-        check = check_set(LOOP, SpringDamper(gains, (0.3865, 0.522)), samples=8)
+        check = check_ranges(LOOP, SpringDamper(gains, (0.3865, 0.522)), samples=8)
         assert check.proved
         data = StoredSpringDamper(gains, (0.3865, 0.522))
         if any_environment:
             assert prove(LOOP, data, "any-environment").guarantee == "any passive environment"
-        assert prove(LOOP, data, "this-environment").guarantee == "a set"
+        assert prove(LOOP, data, "this-environment").guarantee == "these ranges"
 
 
-def test_files_without_a_box_have_the_digest_that_they_always_had():
-    """Made before there were boxes, for this loop and coupling."""
+def test_files_without_ranges_have_the_digest_that_they_always_had():
+    """Made before there were ranges, for this loop and coupling."""
     plain = LOOP.at(FIGURE_4)
     expected = "b8cae9c8ced7f5c0abcd4246af3ea609fa292b47b365d074618a2702234f644a"
     assert digest(plain, StoredSpringDamper((7806.0, 3137.0), (0.105, 1.68)).form()) == expected
     assert digest(LOOP, StoredSpringDamper((7806.0, 3137.0), (0.105, 1.68)).form()) != expected
+    # made by version 0.1.0 for these ranges, where they were called a box
+    older = "dcd355b51f9e5c56cfd8feaaec5d21474d31921375d564f152cf7df6be5ec28d"
+    assert digest(LOOP, StoredSpringDamper((2000.0, 1500.0), (0.3865, 0.522)).form()) == older
+
+
+def test_files_and_scenarios_by_the_older_names_are_read(stored, scenario_file, tmp_path):
+    """box, jitter and "a set" are what files of earlier versions say; seals and digests are those of then."""
+    file = tmp_path / "c.json"
+    save(stored, file)
+    file.write_text(file.read_text().replace('"ranges":', '"box":').replace('"these ranges"', '"a set"'))
+    assert load(file) == stored
+    text = scenario_file.read_text()
+    older, delays = text.replace("[ranges", "[box"), "\n[jitter]\nlo = [1, 1]\nhi = [2, 2]\n"
+    assert older != text
+    assert parse(older) == parse(text)
+    assert parse(TEXT + delays).varying_delay == VaryingDelay((1, 1), (2, 2))
+    with pytest.raises(InputError, match="ranges and box, its older name: give one of them"):
+        parse(text + "\n[box]\nmasses = { mass = [0.5, 2.0] }\n")
+    assert scenario.load("omega-pair-box") == scenario.load("omega-pair-ranges")
 
 
 # the commands
 
 
-def test_design_check_run_audit_and_validate_speak_of_the_set(scenario_file, tmp_path, capsys):
+def test_design_check_run_audit_and_validate_speak_of_the_ranges(scenario_file, tmp_path, capsys):
     file, report = tmp_path / "c.json", tmp_path / "r.json"
     common = ["--scenario", str(scenario_file), "--json", str(report)]
 
@@ -297,29 +321,29 @@ def test_design_check_run_audit_and_validate_speak_of_the_set(scenario_file, tmp
         return code, json.loads(report.read_text())
 
     code, design = told(design_main, "--coupling", "optimal", "--samples", "8", "--out", str(file), *common)
-    assert (code, design["promise"], design["set"]["vertices"]) == (0, "a set", 3)
+    assert (code, design["promise"], design["ranges"]["vertices"]) == (0, "these ranges", 3)
     alone, whole = design["price"]
-    assert (alone["coupling"], whole["coupling"], whole["violated"]) == ("nominal only", "whole set", 0)
+    assert (alone["coupling"], whole["coupling"], whole["violated"]) == ("nominal only", "whole ranges", 0)
     assert alone["violated"] >= 1
     assert alone["rms_mismatch_db"]["nominal"] < whole["rms_mismatch_db"]["nominal"]
-    assert load(file).certificate.guarantee == "a set"
+    assert load(file).certificate.guarantee == "these ranges"
 
     code, checked = told(check_main, str(file), "--json", str(report))
-    assert (code, checked["promise"], checked["vertices"]) == (0, "a set", 3)
+    assert (code, checked["promise"], checked["vertices"]) == (0, "these ranges", 3)
 
     out = ["--out", str(tmp_path / "out"), *common]
     code, run = told(
         run_main, "--coupling", str(file), "--vertex", "3", "--engine", "exact", "--duration", "1", "--no-plot", *out
     )
-    assert (code, run["promise"]) == (0, "a set")
+    assert (code, run["promise"]) == (0, "these ranges")
     assert run["run"]["environment"].startswith("vertex 3 (mass-contact 1 absent")
     assert np.abs(np.load(tmp_path / "out" / "trace.npz")["f"][:, 0]).max() < 1e-3  # of the other's force, filtered
 
     code, audit = told(audit_main, "--coupling", str(file), *out)
-    assert (code, audit["promise"], audit["certified"]) == (0, "a set", True)
+    assert (code, audit["promise"], audit["certified"]) == (0, "these ranges", True)
 
     quick = ["--humans", "24", "--engine", "exact", "--duration", "0", "--no-plot"]
-    code, validated = told(validate_main, "--coupling", str(file), "--environments", "box", *quick, *out)
+    code, validated = told(validate_main, "--coupling", str(file), "--environments", "ranges", *quick, *out)
     assert (code, validated["certified"], validated["environments"]["count"]) == (0, True, 8)
     assert validated["unstable"]["exact"] == 0
     assert validated["worst"]["environment"] in validated["environments"]["names"]
@@ -331,7 +355,7 @@ def test_a_violated_vertex_leaves_the_commands_with_1(scenario_file, tmp_path, c
     outcome = json.loads(capsys.readouterr().out)
     assert outcome["promise"] == "this environment"
     assert outcome["certificate"]["certified"]
-    assert load(tmp_path / "s.json").loop.box is None
+    assert load(tmp_path / "s.json").loop.ranges is None
     assert verify(load(tmp_path / "s.json")).proved
 
 
@@ -348,6 +372,6 @@ def test_a_vertex_that_does_not_exist(scenario_file, tmp_path, options, message)
         run_main(["--scenario", str(scenario_file), "--out", str(tmp_path), *options])
 
 
-def test_a_box_that_is_not_there_cannot_be_drawn_from(tmp_path):
-    with pytest.raises(InputError, match="--environments box: the scenario has no ranges"):
-        validate_main(["--environments", "box", "--out", str(tmp_path)])
+def test_ranges_that_are_not_there_cannot_be_drawn_from(tmp_path):
+    with pytest.raises(InputError, match="--environments ranges: the scenario has no ranges"):
+        validate_main(["--environments", "ranges", "--out", str(tmp_path)])

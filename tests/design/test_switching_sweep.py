@@ -18,7 +18,7 @@ from design.coverage import switching_part
 from design.exact import Matrix
 from design.frequency import hermitian
 from design.lmi import solve
-from design.multipliers import half_widths, jitter_proof, switching_block
+from design.multipliers import half_widths, switching_block, switching_sweep
 from sim.scenario import InputError
 
 
@@ -27,7 +27,7 @@ def sent(coupling=STIFF, T=T) -> Lti:
 
 
 def loop_of(lo, hi, delta=DELTA, network=FIGURE_4) -> Loop:
-    return Loop(T, lo, (0,) * len(lo), lo, delta, network, jitter=DelayRange(lo, hi))
+    return Loop(T, lo, (0,) * len(lo), lo, delta, network, varying_delay=DelayRange(lo, hi))
 
 
 def condition(z, G, alpha, lo, hi, damping, T=T):
@@ -48,10 +48,10 @@ def block(z, G, alpha, lo, hi, damping):
 def test_a_spring_needs_what_its_longest_delay_needs(lo, hi):
     """By hand: Theta_nom asks KT (lo + hi + 1)/2, at w = 0; the error alpha/2 + (hK)^2/(2 alpha), at the least hK.
 
-    Together KT (hi + 1/2), what the constant delay hi needs: for a spring, jitter costs nothing more.
+    Together KT (hi + 1/2), what the constant delay hi needs: for a spring, varying delays cost nothing more.
     """
     K = 800.0
-    found = jitter_proof(Lti.constant([[K]], T), [lo], [hi], [1.37])
+    found = switching_sweep(Lti.constant([[K]], T), [lo], [hi], [1.37])
     assert found.requirement.required[0] == pytest.approx(K * T * (hi + 0.5), rel=1e-6)  # SETTLED is 1e-7
     assert found.alpha[0] == pytest.approx(K * (hi - lo) / 2, rel=1e-2, abs=1e-9)  # flat around its optimum
 
@@ -59,7 +59,7 @@ def test_a_spring_needs_what_its_longest_delay_needs(lo, hi):
 @pytest.mark.parametrize("theta", [(1, 2), (0, 3)])
 def test_a_range_of_one_delay_is_the_this_environment_condition(theta):
     F = force_map(environment(FIGURE_4, T), STIFF, theta, (0, 0))
-    found = jitter_proof(sent(), theta, theta, DELTA).requirement
+    found = switching_sweep(sent(), theta, theta, DELTA).requirement
     assert found.required == pytest.approx(this_environment(F, DELTA).required, rel=1e-12)
     assert found.frequency_hz == pytest.approx(this_environment(F, DELTA).frequency_hz, rel=1e-4)
 
@@ -68,7 +68,7 @@ def test_the_least_factor_is_that_of_a_convex_solver():
     """An SDP in (s, alpha) at 13 frequencies: its optimum is the multiplier's bound there, from other code."""
     lo, hi = (0, 1), (3, 2)
     G, delta = sent(), np.array([1.37, 0.9])
-    found = jitter_proof(G, lo, hi, delta)
+    found = switching_sweep(G, lo, hi, delta)
     per_hz = 2 * np.pi * T
     near = found.requirement.frequency_hz * per_hz * np.linspace(0.98, 1.02, 5)
     w = np.concatenate([near, np.geomspace(3e-2, 3, 8)])
@@ -92,7 +92,7 @@ def test_the_least_factor_is_that_of_a_convex_solver():
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((0, 2), (3, 2))])
 def test_a_dense_sweep_agrees(lo, hi):
     """20000 frequencies: positive just above the requirement, not just below; no alpha does with 0.1 % less."""
-    G, found = sent(), jitter_proof(sent(), lo, hi, DELTA)
+    G, found = sent(), switching_sweep(sent(), lo, hi, DELTA)
     z = np.exp(1j * np.geomspace(1e-4, np.pi, 20_000))
     alpha, needed, response = np.array(found.alpha), np.array(found.requirement.required), G.at(z)
 
@@ -108,9 +108,9 @@ def test_a_dense_sweep_agrees(lo, hi):
 def test_the_energy_holds_for_the_worst_ages_of_any_motion():
     """The claim itself, without z: sum f'dx + sum dx'(Delta/T)dx >= 0 from rest, with ages chosen against it."""
     G, lo, hi = sent(), 1, 3
-    needed = np.array(jitter_proof(G, (lo, lo), (hi, hi), DELTA).requirement.required)
+    needed = np.array(switching_sweep(G, (lo, lo), (hi, hi), DELTA).requirement.required)
     rng, ticks = np.random.default_rng(0), 3000
-    w = 2 * np.pi * T * jitter_proof(G, (lo, lo), (hi, hi), DELTA).requirement.frequency_hz
+    w = 2 * np.pi * T * switching_sweep(G, (lo, lo), (hi, hi), DELTA).requirement.frequency_hz
     spare = []
     for trial in range(12):
         x = np.sin(w * rng.uniform(0.6, 1.4) * np.arange(ticks)[:, None] + rng.uniform(0, 6, 2)) * rng.normal(size=2)
@@ -131,19 +131,19 @@ def test_the_energy_holds_for_the_worst_ages_of_any_motion():
 
 
 def test_what_is_refused():
-    floating = jitter_proof(sent(NoCoupling()), (1, 1), (2, 2), DELTA)
+    floating = switching_sweep(sent(NoCoupling()), (1, 1), (2, 2), DELTA)
     assert (
         floating.requirement.ratio
         > this_environment(force_map(environment(FIGURE_4, T), NoCoupling(), (2, 2), (0, 0)), DELTA).ratio
     )
     unstable = Lti([[1.1]], [[1.0]], [[1.0]], [[1.0]], T)
-    found = jitter_proof(unstable, [1], [2], [1.0])
+    found = switching_sweep(unstable, [1], [2], [1.0])
     assert not found.requirement.certified
     assert "pole" in found.requirement.reason
     with pytest.raises(ValueError, match="lo <= hi"):
-        jitter_proof(sent(), (2, 2), (1, 1), DELTA)
+        switching_sweep(sent(), (2, 2), (1, 1), DELTA)
     with pytest.raises(ValueError, match="for 1 channels"):
-        jitter_proof(sent(), (1,), (2,), DELTA)
+        switching_sweep(sent(), (1,), (2,), DELTA)
 
 
 @pytest.mark.parametrize(("lo", "hi"), [((1, 1), (2, 2)), ((1, 1), (1, 3)), ((1, 2), (1, 2))])
@@ -174,7 +174,7 @@ def test_a_wall_with_damping():
     """One channel, K = 2000 N/m and B = 1 N s/m, 0 to 1 samples: above the delay-free KT/2 + B and the constant 1."""
     wall = Network(("a",), (Spring(("a", GROUND), 2000.0, 1.0),))
     G = environment(wall, T)
-    needs = jitter_proof(G, [0], [1], [1.37]).requirement.required[0]
+    needs = switching_sweep(G, [0], [1], [1.37]).requirement.required[0]
     constant = [this_environment(force_map(G, NoCoupling(), [n], [0]), [1.37]).required[0] for n in (0, 1)]
     assert constant[0] == pytest.approx(2000 * T / 2 + 1)
     assert needs >= max(constant) * (1 - 1e-6)
@@ -186,30 +186,32 @@ def audit(tmp_path, *options):
 
 
 def test_audit_reports_switching_beside_the_constants(tmp_path):
-    code, report = audit(tmp_path, "--K", "7806,3137", "--B", "0.105,1.68", "--jitter", "1,2")
+    code, report = audit(tmp_path, "--K", "7806,3137", "--B", "0.105,1.68", "--varying-delay", "1,2")
     assert code == 1  # certified for the constant (1, 2), not for what was asked
     assert report["this-environment"]["certified"]
-    assert report["jitter-proof"]["required_damping"] == pytest.approx([2.0413] * 2, rel=1e-4)
-    assert report["jitter-proof"]["playout"]["required_damping"] == pytest.approx([1.7022] * 2, rel=1e-4)
-    code, report = audit(tmp_path, "--K", "879,552", "--B", "0.39,0.52", "--jitter", "1-2,1-2")
+    assert report["switching"]["required_damping"] == pytest.approx([2.0413] * 2, rel=1e-4)
+    assert report["switching"]["playout"]["required_damping"] == pytest.approx([1.7022] * 2, rel=1e-4)
+    code, report = audit(tmp_path, "--K", "879,552", "--B", "0.39,0.52", "--varying-delay", "1-2,1-2")
     assert code == 0
-    assert report["jitter-proof"]["proof"] == "rational"
+    assert report["switching"]["proof"] == "rational"
     code, report = audit(tmp_path, "--K", "879,552", "--B", "0.39,0.52")
-    assert report["jitter-proof"] is None
+    assert report["switching"] is None
 
 
-def test_audit_of_a_wall_with_varying_delay(tmp_path):
+def test_audit_of_a_wall_with_varying_delays(tmp_path):
     """A spring of 800 N/m at 1 ms, 0 to 1 samples: KT (hi + 1/2), as the constant delay of 1."""
     options = ["--rigid", "--K", "800", "--B", "0", "--T", "1e-3", "--theta", "1", "--delta", "1.37"]
-    code, report = audit(tmp_path, *options, "--jitter", "0,1")
+    code, report = audit(tmp_path, *options, "--varying-delay", "0,1")
     assert code == 0
-    assert report["jitter-proof"]["required_damping"] == pytest.approx([1.2], rel=1e-6)  # SETTLED is 1e-7
+    assert report["switching"]["required_damping"] == pytest.approx([1.2], rel=1e-6)  # SETTLED is 1e-7
 
 
-@pytest.mark.parametrize(("jitter", "message"), [("2,3", "expected 0 <= LO <= theta = 1"), ("1", "expected LO,HI")])
-def test_audit_refuses_a_range_without_the_constant(tmp_path, jitter, message):
+@pytest.mark.parametrize(
+    ("varying_delay", "message"), [("2,3", "expected 0 <= LO <= theta = 1"), ("1", "expected LO,HI")]
+)
+def test_audit_refuses_a_range_without_the_constant(tmp_path, varying_delay, message):
     with pytest.raises(InputError, match=message):
-        main(["--K", "879,552", "--B", "0.39,0.52", "--jitter", jitter, "--out", str(tmp_path)])
+        main(["--K", "879,552", "--B", "0.39,0.52", "--varying-delay", varying_delay, "--out", str(tmp_path)])
 
 
 def test_the_multiplier_is_the_best_one_in_random_loops():
@@ -222,7 +224,7 @@ def test_the_multiplier_is_the_best_one_in_random_loops():
         gains = SpringDamper(np.exp(rng.uniform(4, 9, channels)), rng.uniform(0, 5, channels))
         G = force_map(environment(star, 1e-3), gains, (0,) * channels, (0,) * channels)
         lo = rng.integers(0, 4, channels)
-        found = jitter_proof(
+        found = switching_sweep(
             G, lo.tolist(), (lo + rng.integers(0, 4, channels)).tolist(), rng.uniform(0.1, 5, channels)
         )
         # SETTLED is 1e-7, and ten times that for what the sweep finds between grid points

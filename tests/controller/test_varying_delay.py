@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from controller.coupling import SpringDamper
-from controller.delay import LOST, HeldLine, Jitter, ages, newest, packet_delays, realising
+from controller.delay import LOST, HeldLine, VaryingDelay, ages, newest, packet_delays, realising
 from controller.environment import FIGURE_4, environment
 from controller.loop import force_map
 from controller.process import Process, StepBuffer
@@ -69,8 +69,8 @@ def test_a_constant_delay_is_the_linear_block():
 
 
 def test_the_age_stays_within_the_range_and_grows_by_one_at_most():
-    jitter = Jitter((1, 0), (4, 3))
-    delays = jitter.draw(np.random.default_rng(2), 5000)
+    varying_delay = VaryingDelay((1, 0), (4, 3))
+    delays = varying_delay.draw(np.random.default_rng(2), 5000)
     age = ages(delays[:, :, None])[10:, :, 0]
     assert age.min(axis=0).tolist() == [1, 0]
     assert age.max(axis=0).tolist() == [4, 3]
@@ -92,27 +92,27 @@ def test_wanted_ages_are_realised_by_delays_within_the_range():
 
 def test_patterns_are_what_they_are_called():
     rng, ticks = np.random.default_rng(4), 40_000
-    assert (Jitter((1,), (3,), "constant").draw(rng, 9, [[2]]) == 2).all()
-    counts = np.bincount(Jitter((1,), (3,)).draw(rng, ticks).ravel())
+    assert (VaryingDelay((1,), (3,), "constant").draw(rng, 9, [[2]]) == 2).all()
+    counts = np.bincount(VaryingDelay((1,), (3,)).draw(rng, ticks).ravel())
     # binomial: four standard deviations of a third of the packets
     np.testing.assert_allclose(counts[1:], ticks / 3, atol=4 * np.sqrt(ticks * 2 / 9))
-    bursty = Jitter((1,), (2,), "bursty", calm=20, burst=5).draw(rng, ticks).ravel()
+    bursty = VaryingDelay((1,), (2,), "bursty", calm=20, burst=5).draw(rng, ticks).ravel()
     starts = int((np.diff(bursty) == 1).sum())
     # a burst every 25 packets: about 1600, each stretch geometric, so 4 standard deviations are about 6 percent
     assert starts == pytest.approx(ticks / 25, rel=0.1)
     assert (bursty == 2).mean() == pytest.approx(0.2, rel=0.15)
-    recorded = Jitter((0,), (2,), "recorded", recorded=((0,), (2,), (LOST,)))
+    recorded = VaryingDelay((0,), (2,), "recorded", recorded=((0,), (2,), (LOST,)))
     assert recorded.draw(rng, 5).ravel().tolist() == [0, 2, LOST, 0, 2]
 
 
 def test_loss_and_playout():
-    jitter = Jitter((1,), (3,), loss=0.25, playout=True)
-    delays = jitter.draw(np.random.default_rng(5), 10_000)
+    varying_delay = VaryingDelay((1,), (3,), loss=0.25, playout=True)
+    delays = varying_delay.draw(np.random.default_rng(5), 10_000)
     assert set(np.unique(delays)) == {LOST, 3}
     assert (delays == LOST).mean() == pytest.approx(0.25, abs=4 * np.sqrt(0.25 * 0.75 / 10_000))  # 4 deviations
-    assert not jitter.steady
-    assert Jitter((1,), (3,), playout=True).steady
-    assert (Jitter((1,), (2,), loss=1.0).draw(np.random.default_rng(5), 50) == LOST).all()
+    assert not varying_delay.steady
+    assert VaryingDelay((1,), (3,), playout=True).steady
+    assert (VaryingDelay((1,), (2,), loss=1.0).draw(np.random.default_rng(5), 50) == LOST).all()
 
 
 @pytest.mark.parametrize(
@@ -120,8 +120,8 @@ def test_loss_and_playout():
     [
         ({"lo": (1,), "hi": (2, 2)}, "one each per channel"),
         ({"lo": (3,), "hi": (2,)}, "channel 1 is 3 to 2"),
-        ({"lo": (1,), "hi": (2,), "loss": 1.5}, "jitter.loss is 1.5"),
-        ({"lo": (1,), "hi": (2,), "burst": 0}, "jitter.burst is 0"),
+        ({"lo": (1,), "hi": (2,), "loss": 1.5}, "varying_delay.loss is 1.5"),
+        ({"lo": (1,), "hi": (2,), "burst": 0}, "varying_delay.burst is 0"),
         ({"lo": (1,), "hi": (2,), "pattern": "recorded"}, "go together"),
         ({"lo": (1,), "hi": (2,), "pattern": "recorded", "recorded": ((3,),)}, "packet 0, channel 1: delay 3"),
         ({"lo": (1,), "hi": (2,), "pattern": "recorded", "recorded": ((1, 1),)}, "2 delays for 1 channels"),
@@ -129,13 +129,13 @@ def test_loss_and_playout():
 )
 def test_impossible_ranges_are_refused(fields, message):
     with pytest.raises(ValueError, match=message):
-        Jitter(**fields)
+        VaryingDelay(**fields)
 
 
 @pytest.mark.parametrize("pattern", ["constant", "adversarial"])
 def test_patterns_that_depend_on_the_loop_ask_for_its_delays(pattern):
     with pytest.raises(ValueError, match="give its delays"):
-        Jitter((1,), (2,), pattern).draw(np.random.default_rng(0), 10)
+        VaryingDelay((1,), (2,), pattern).draw(np.random.default_rng(0), 10)
 
 
 def test_a_process_refuses_delays_that_do_not_fit():

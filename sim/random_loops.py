@@ -1,0 +1,154 @@
+"""Loops drawn at random, against two laws: `python -m sim.suite --only proofs,traces`.
+
+An exact proof succeeds where the sweep asks for less damping than there is, and nowhere else. The verdict that is read
+from a simulated trace is never the opposite of the eigenvalues'; where nothing excites the mode that decides, it says
+so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from controller.coupling import Coupling, NoCoupling, SpringDamper
+from controller.environment import Network, Spring
+from controller.loop import Loop
+from design.certificate import prove, required_damping
+from design.result import NotProved
+from models.device import CompliantDevice, RigidDevice
+from models.human import Human, Population, Voluntary
+from sim.run import assemble, make_engine, run
+from sim.scenario import InputError, Scenario
+from sim.stability import NOT_EXCITED, disagree, stability_part
+from sim.stepping import settle
+
+_TOO_CLOSE = 1e-4  # of the damping: a proof needs some room
+_HANDS = Population()
+
+
+def random_network(rng: np.random.Generator) -> Network:
+    """One to three contacts, up to three nodes between: springs, dampers or both anywhere, masses, ground, or none."""
+    tips = [f"tip {i}" for i in range(rng.integers(1, 4))]
+    names = tips + [f"node {i}" for i in range(rng.integers(0, 4))]
+    everywhere, springs = names + (["ground"] if rng.random() < 0.6 else []), {}
+    for _ in range(int(rng.integers(len(names), 3 * len(names) + 1)) if len(everywhere) > 1 else 0):
+        ends, kind = rng.choice(everywhere, 2, replace=False).tolist(), rng.integers(3)
+        stiffness, damping = np.exp(rng.uniform(3, 8)) * (kind != 0), np.exp(rng.uniform(-4, 1.5)) * (kind != 1)
+        springs[frozenset(ends)] = Spring(tuple(ends), round(float(stiffness), 3), round(float(damping), 4))
+    reached = [n for n in names if any(n in s.between for s in springs.values())]
+    masses = {n: round(float(np.exp(rng.uniform(-4, 2))), 4) for n in reached if rng.random() < 0.6}
+    return Network(tuple(tips), tuple(springs.values()), masses)
+
+
+def _delayed(rng: np.random.Generator) -> Loop:
+    """A random network behind random delays, its devices' damping left at 1 N s/m."""
+    while True:
+        try:
+            network = random_network(rng)
+            m = len(network.contacts)
+            theta, psi = (tuple(rng.integers(0, 1 + n, m).tolist()) for n in (3, rng.random() < 0.3))
+            return Loop(1e-3, theta, psi, theta, (1.0,) * m, network)
+        except ValueError:  # nothing holds one of its nodes
+            continue
+
+
+def _coupling(rng: np.random.Generator, m: int) -> Coupling:
+    gains = np.exp(rng.uniform(5, 9, m)).round(3), (rng.uniform(0, 3, m) * (rng.random() < 0.8)).round(4)
+    return NoCoupling() if rng.random() < 0.15 else SpringDamper(*gains)
+
+
+@dataclass(frozen=True)
+class _Proof:
+    """One network, with half as much to one and a half times the damping that its loop asks for."""
+
+    number: int
+    required: float  # of the damping that there is
+    proved: bool
+    reason: str | None
+
+    @property
+    def holds(self) -> bool:
+        return self.proved == (self.required < 1) or 1 - _TOO_CLOSE <= self.required <= 1
+
+
+def proofs(seed: int, count: int = 500) -> Iterator[_Proof]:
+    """Whether this-environment is proved, for so many random networks, and whether the sweep says that it should be."""
+    rng = np.random.default_rng(seed)
+    for number in range(count):
+        loop = _delayed(rng)
+        m = loop.channels
+        coupling = _coupling(rng, m)
+        least = min(required_damping(loop, coupling, "this-environment").ratio, 100.0)
+        loop = msgspec.structs.replace(loop, delta=(float(max(least * rng.uniform(0.5, 1.5), 1e-3)),) * m)
+        ratio, reason = required_damping(loop, coupling, "this-environment").ratio, None
+        try:
+            proved = prove(loop, coupling, "this-environment").proof == "rational"
+        except NotProved as error:
+            proved, reason = False, str(error)
+        yield _Proof(number, ratio, proved, reason)
+
+
+@dataclass(frozen=True)
+class _Told:
+    """What one run says of its stability, and what its eigenvalues say."""
+
+    number: int
+    engine: str
+    exact_per_s: float  # growth by the eigenvalues
+    trace_per_s: float | None  # growth in the trace, None where there is none
+    verdict: str | None
+    reason: str | None
+    not_excited: bool
+    holds: bool
+
+
+def _scenario(rng: np.random.Generator) -> Scenario:
+    """Random hands on random devices around a random network; in a third all devices, hands and motions are alike."""
+    loop = _delayed(rng)
+    m, alike = loop.channels, rng.random() < 1 / 3
+    device, human = [], []
+    for _ in range(1 if alike else m):
+        damping, mass = np.exp(rng.uniform(-2, 2)), np.exp(rng.uniform(-3, 0))
+        stiffness = np.exp(rng.uniform(9, 12))
+        device.append(
+            RigidDevice(mass=mass, damping=damping)
+            if rng.random() < 0.5
+            else CompliantDevice(damping=damping, motor_mass=mass, transmission_stiffness=stiffness)
+        )
+        (hand,) = _HANDS.draw(rng, 1)
+        moves = rng.random() < 0.8
+        human.append(Human(hand.links, Voluntary(0.02, float(rng.uniform(0.2, 3))) if moves else None))
+    shared = m if alike else 1
+    tap = {"channel": 1, "force": 2.0, "start": 0.1, "duration": 0.02} if rng.random() < 0.5 else None
+    return Scenario(
+        name="random",
+        T=float(rng.choice([5e-4, 1e-3, 2e-3])),
+        theta=(loop.theta[0],) * m if alike else loop.theta,
+        psi=(loop.psi[0],) * m if alike else loop.psi,
+        device=tuple(device) * shared,
+        human=tuple(human) * shared,
+        environment=loop.network,
+        duration=1.5,
+    ).replace(tap=tap)
+
+
+def traces(seed: int, count: int = 460) -> Iterator[_Told]:
+    """Whether so many runs, half of them MuJoCo's, tell of their stability what their eigenvalues tell."""
+    rng, number = np.random.default_rng(seed), 0
+    while number < count:
+        scenario, engine = _scenario(rng), str(rng.choice(["exact", "mujoco"]))
+        coupling = _coupling(rng, scenario.channels)
+        try:
+            simulation = assemble(scenario, coupling)
+            trace = run(simulation, make_engine(simulation, engine, *settle(simulation, engine)[:2]))
+        except InputError:  # no number of steps does, which is said
+            continue
+        part = stability_part(simulation, trace)
+        growth, exact = part["growth_rate_per_s"], part["exact_growth_rate_per_s"]
+        silent, other = part.get("reason") == NOT_EXCITED, growth is not None and bool(disagree(exact, growth))
+        opposite = other or (growth is None and part["verdict"] not in (None, part["exact_verdict"]))
+        yield _Told(number, engine, exact, growth, part["verdict"], part.get("reason"), silent, not opposite)
+        number += 1
