@@ -16,8 +16,9 @@ from design.environments import in_each
 from design.optimal import at, compromise, design
 from design.program import DEFAULT, Case, Options
 from design.result import DesignFailed, finite
+from design.transparency import decibels
 
-_MINIMISED = {"rms": "rms_mismatch_db", "sup": "relative_mismatch_db"}
+_MINIMISED = {"rms": "rms_mismatch", "sup": "relative_mismatch"}
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ def spread(loop: Loop, options: Options = DEFAULT, percent: float = 10.0) -> _Sp
         alone, wide = compromise(loop, list(vertices(loop.network, percent).values()), options)
     except DesignFailed:
         return None
-    mismatch, before = (getattr(one.figures, _MINIMISED[options.objective]) for one in (wide, alone))
+    mismatch, before = (decibels(getattr(one.figures, _MINIMISED[options.objective])) for one in (wide, alone))
     return _Spread(mismatch, mismatch - before, wide.g, robustness(loop, wide.coupling, percent).worst)
 
 

@@ -25,7 +25,7 @@ from design.conditions import this_environment
 from design.frequency import hermitian, on_circle
 from design.optimal import design
 from design.program import MARGIN, Case, Options, Span, span_of
-from design.robustness import ranges_around, robustness, vertices
+from design.robustness import ranges_around, robustness, spread, vertices, widest_ranges
 from design.stored import Stored, save
 from design.stored import load as load_file
 from design.transparency import transparency
@@ -251,6 +251,22 @@ def test_a_coupling_for_ranges_is_proved_at_every_vertex_and_searched_between():
     for network in vertices(loop.environment).values():
         assert this_environment(loop.at(network).F(found.coupling), loop.delta).certified
     assert nominal.figures.rms_mismatch < found.figures.rms_mismatch < 10 ** (1 / 20) * nominal.figures.rms_mismatch
+
+
+def test_more_ranges_than_can_be_proved_leave_those_that_matter_least():
+    loop = loop_of("o06")
+    kept, note = widest_ranges(loop, 10.0)
+    assert len(kept.springs) + len(kept.masses) == 6
+    assert len(msgspec.structs.replace(loop, ranges=kept).members()) == 65  # with the nominal one
+    assert "7 ranges have 128 vertices" in note
+    assert widest_ranges(loop_of("n3"), 10.0)[1] is None
+
+
+@pytest.mark.parametrize("objective", ["rms", "sup"])
+def test_the_price_of_a_range_is_that_of_the_figure_that_is_minimised(objective):
+    found = spread(loop_of("n3"), Options(objective=objective, ladder=((4, 3),)))
+    assert 0 < found.price_db < 1.5
+    assert found.worst < 1
 
 
 def test_requests_that_make_no_sense_are_refused():
