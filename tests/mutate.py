@@ -44,7 +44,7 @@ GOAL = 0.95
 TABLE = {
     "design/exact.py": "design/test_exact design/test_exact_blocks",
     "design/certificate.py": "design/test_certificate design/test_exact_blocks design/test_switching_file "
-    "design/test_limiter",
+    "design/test_limiter design/test_walls_making",
     "design/conditions.py": "design/test_exact_blocks design/test_margin design/test_latency design/test_encoder_steps",
     "controller/process.py": "controller/test_process controller/test_contact",
     "controller/contact.py": "controller/test_process controller/test_contact controller/test_limiter",
