@@ -24,7 +24,7 @@ from controller.lti import Array
 from design import compare
 from design.certificate import CONDITIONS
 from design.compare import AXES, FEEL_HZ, LADDERS, Judged, Limit, Perceived, Setting, optimum, settings
-from design.optimal import Options
+from design.program import Options
 from design.result import OLDER_NAMES, DesignFailed, certificate_part, finite
 from design.transparency import transparency
 from sim import report

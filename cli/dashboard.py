@@ -21,7 +21,7 @@ from hw.session import Session
 
 _WIDTH = 72  # columns
 _BAR = 30  # characters of a bar
-_COUNTED = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale")
+_COUNTED = ("gaps", "misses", "late", "clipped", "device_errors", "duplicates", "stale", "host_errors")
 
 
 def _snapshot(session: Session) -> dict[str, Any]:
@@ -37,8 +37,7 @@ def _snapshot(session: Session) -> dict[str, Any]:
         "gain": session.gain,
         "theta": session.config.theta if session.config else None,
         "margin_us": session.link.least_margin,
-        "counters": {name: getattr(session.counters, name) for name in _COUNTED}
-        | {"host_errors": session.decoder.rejected},
+        "counters": {name: getattr(session.counters, name) for name in _COUNTED},
     }
 
 

@@ -19,8 +19,10 @@ from design.coverage import Limits, cost_part, covered_limits, price, ranges_par
 from design.designs import KINDS, NO_LONGER, design_by_kind, usual_condition
 from design.files import out_file
 from design.guarantees import ANY, HERE, guarantee_of, switching_guarantee
-from design.optimal import OBJECTIVES, Optimal, Options, ranges_around, robustness, spread
+from design.optimal import Optimal
+from design.program import DEFAULT, OBJECTIVES, Options
 from design.result import METHODS, Design, DesignFailed, NotProved, finite, listed
+from design.robustness import robustness_parts, widest_ranges
 from design.spring_damper import STIFFEST
 from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
@@ -77,17 +79,19 @@ def main(argv: list[str]) -> int:
         "stored": _store(loop, design, whole, out, limits.certificate),
         "limiter": limits.part([device.force_limit for device in scenario.device]),
         "switching": _switching_figures(loop, design),
-        "robustness": _robustness(loop, design),
+        "robustness": None,
     }
-    if best:
-        with render.progress("working out the price of ranges and the bound"):
+    with render.progress("working out robustness and its price, and the bound"):
+        if design.condition == "this-environment":
+            outcome |= robustness_parts(loop, design.coupling, Options(**optimal_options(args)[0]) if best else DEFAULT)
+        if best:
             outcome |= _best_figures(args, loop, best)
     if args.compare:
         from design import fixed_order  # cvxpy takes a second to import
 
         with render.progress("comparing the methods"):
             outcome["comparison"] = [asdict(row) for row in fixed_order.compare(loop)]
-    render.publish(args, outcome, _tables(scenario, outcome), outcome.get("notes", ()))
+    render.publish(args, outcome, _tables(scenario, outcome), outcome.get("notes", args.notes))
     holds = outcome["certificate"]["certified"] and (outcome["promise"] == ANY or not whole or whole.proved)
     switching = outcome["jitter_proof"] = outcome["switching"]  # and by its older name
     return options.DONE if holds and (switching is None or switching["certified"]) else options.DOES_NOT_HOLD
@@ -180,12 +184,13 @@ _OPTIONS = {
 
 def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
     """The scenario's loop with the range of delays that --varying-delay gives. Raises InputError."""
-    loop = scenario.loop(args.case)
+    loop, args.notes = scenario.loop(args.case), []
     if args.ranges is not None:
         if loop.ranges or loop.environment.walls:
             raise InputError(f"--ranges and {'[ranges]' if loop.ranges else 'environment.walls'}: give one of them")
         try:
-            loop = msgspec.structs.replace(loop, ranges=ranges_around(loop.network, args.ranges))
+            around, note = widest_ranges(loop, args.ranges)
+            loop, args.notes = msgspec.structs.replace(loop, ranges=around), [note] if note else []
         except ValueError as error:
             raise InputError(f"--ranges {args.ranges:g}: {error}") from None
     args.condition = args.condition or usual_condition(loop, args.coupling)
@@ -255,7 +260,6 @@ _MOST_FOR_A_BOUND = 2  # devices: for more the bound takes minutes
 
 def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[str, Any]:
     """What an optimal coupling is reported with: how it was found, and how it stands to what is possible."""
-    price = None if loop.ranges else spread(loop, Options(**optimal_options(args)[0]))
     limit: dict[str, Any] = {"rms_mismatch_db": None}
     if loop.channels > _MOST_FOR_A_BOUND:
         limit["reason"] = f"worked out for up to {_MOST_FOR_A_BOUND} devices"
@@ -265,23 +269,9 @@ def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[s
         limit["rms_mismatch_db"] = bound(loop, args.band_hz or BAND_HZ).rms_db
     return {
         "bound": limit,
-        "designed_for_it": price and {name: finite(value) for name, value in asdict(price).items()},
         "rendered_stiffness": finite(best.g),
         "ladder": [asdict(rung) for rung in best.ladder],
-        "notes": list(optimal_options(args)[1]),
-    }
-
-
-def _robustness(loop: Loop, design: Design) -> dict[str, Any] | None:
-    """What the coupling needs where springs and masses are a little off; None with walls, and where that is covered."""
-    if loop.environment.walls or design.condition == "any-environment":
-        return None
-    there = robustness(loop, design.coupling)
-    return {
-        "percent": there.percent,
-        "required_over_available": finite(there.worst),
-        "where": there.where,
-        "certified": there.kept,
+        "notes": [*args.notes, *optimal_options(args)[1]],
     }
 
 
@@ -385,7 +375,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("guarantee, delays", switching["promise"] if switching.get("proof") else None),
         ("designed for", f"{_OBJECTIVE_WORDS[outcome['objective_name']]}: {outcome['objective']:.5g}"),
         ("transparency error", render.transparency_error(transparent)),
-        *_robustness_rows(outcome["robustness"]),
+        *render.robustness_rows(outcome),
         *_best_rows(outcome),
         ("convex problems", f"{outcome['sdps']} in {outcome['wall_s']:.2f} s"),
         ("stored", f"{stored['file']} (proof: {stored['proof'] or stored['reason']})"),
@@ -406,23 +396,14 @@ def _best_rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
     """What only an optimal coupling has."""
     if "bound" not in outcome:
         return []
-    limit, price = outcome["bound"], outcome["designed_for_it"]
+    limit = outcome["bound"]
     words = limit.get("reason") or f"no linear coupling can be better than {limit['rms_mismatch_db']:.2f} dB rms"
     climbed = ", ".join(f"{rung['mismatch_db']:.2f}" for rung in outcome["ladder"])
     return [
-        ("designed for that", price and f"{price['price_db']:.2f} dB worse over a small basis (--ranges)"),
         ("bound", words),
         ("rendered stiffness", render.optional(outcome["rendered_stiffness"], "{:.3f} of the environment's")),
         ("ladder [dB]", climbed or None),
     ]
-
-
-def _robustness_rows(there: dict[str, Any] | None) -> list[tuple[str, str | None]]:
-    if there is None:
-        return []
-    need = render.optional(there["required_over_available"], "{:.3f}", "infinite")
-    words = f"{need} of the damping is needed at {there['where']}, the worst within {there['percent']:g} %"
-    return [("robustness", words)]
 
 
 def _switching_words(proof: dict[str, Any]) -> str:

@@ -251,6 +251,17 @@ def transparency_error(part: Mapping[str, Any]) -> str:
     return f"{sup} at most, {rms} rms (0 dB: as wrong as no force)"
 
 
+def robustness_rows(outcome: Mapping[str, Any]) -> _Rows:
+    """What a wrong model of the environment costs, and what a design that allows for it would."""
+    there, price = outcome.get("robustness"), outcome.get("designed_for_it")
+    if there is None:
+        return []
+    need = optional(there["required_over_available"], "{:.3f}", "infinite")
+    words = f"{need} of the damping is needed at {there['where']}, the worst within {there['percent']:g} %"
+    costs = price and f"{price['price_db']:.2f} dB worse over a small basis (--ranges)"
+    return [("robustness", words), ("designed for that", costs)]
+
+
 def verdict(word: str | None) -> str:
     """Stable or not."""
     return {"stable": "[green]stable[/]", "unstable": "[red]unstable[/]"}.get(word or "", "not decided")

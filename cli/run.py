@@ -14,8 +14,9 @@ from controller.loop import Loop
 from design.certificate import RangesCheck, assess, check_ranges
 from design.coverage import ranges_part, ranges_rows
 from design.files import write
-from design.guarantees import guarantee_of
+from design.guarantees import ANY, guarantee_of
 from design.result import listed
+from design.robustness import robustness_parts
 from design.transparency import BAND_HZ, transparency
 from sim import report
 from sim.accuracy import ForceError, credible_part, force_error, position_error
@@ -65,6 +66,7 @@ def main(argv: list[str]) -> int:
     alike = force_error(done.ran, done.trace, loop.lam)
     outcome["ideal_force"] = alike.part()
     outcome |= _net(done, requirements)
+    outcome |= _robustness(chosen, loop, outcome)
     others = _alternatives(args, scenario, done)
     outcome["alternatives"] = [other.part() for other in others]
     outcome["remarks"] = [*done.warnings, *chosen.notes, *report.remarks(outcome)]
@@ -271,6 +273,15 @@ def _certified(chosen: Chosen, requirements: dict[str, Any], loop: Loop, whole: 
     }
 
 
+def _robustness(chosen: Chosen, loop: Loop, outcome: dict[str, Any]) -> dict[str, Any]:
+    """What a wrong model of the environment costs a guarantee for this environment alone."""
+    alone = chosen.condition == "this-environment" and outcome["certificate"]["certified"]
+    if not alone or outcome["promise"] == ANY:
+        return {"robustness": None, "designed_for_it": None}
+    with render.progress("working out robustness and its price"):
+        return robustness_parts(loop, chosen.coupling)
+
+
 def _stability(chosen: Chosen, run: _Run, certified: bool) -> dict[str, Any]:
     delays = report.delays_part(run.simulation, chosen, run.period, run.trace.t.size, certified)
     if delays and run.simulation.scenario.switches:
@@ -432,6 +443,7 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         *(ranges_rows(outcome["ranges"]) if outcome["ranges"] else []),
         ("guarantee", f"holds for {outcome['promise']}" if outcome["promise"] else "none"),
         ("transparency error", render.transparency_error(transparent)),
+        *render.robustness_rows(outcome),
         ("force error", _force_error(outcome["ideal_force"])),
         ("rendered stiffness", rendered or "-"),
         *_net_rows(outcome),

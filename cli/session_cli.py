@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 import termios
+import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -19,12 +20,13 @@ from cli.render import console, progress
 from hw.control import Program, link_delay
 from hw.emulator import Emulator, FaultInjection, spawned
 from hw.emulator import nobody as without_hands
+from hw.force_dimension import FORCE_DIMENSION, ForceDimension
 from hw.monitor import Ages, LinkSettings
 from hw.recording import IncidentLog
 from hw.rehearsal import Rehearsal
-from hw.seam import FORCE_DIMENSION, DeviceWire, ForceDimension
+from hw.seam import HapticDevice, SerialDevice
 from hw.session import Operator, Session
-from hw.transport import Live, SerialPort, Wire, preflight
+from hw.transport import Live, SerialPort, preflight
 from sim.scenario import InputError, Scenario
 
 _USUAL_BAUD = 921_600
@@ -193,13 +195,12 @@ def hold_session(
         incidents.attach(session)
         if args.rehearse:
             return _rehearsed(args, session, plan, seconds, seed, incidents, nobody, coulomb)
-        port: Wire
+        device: HapticDevice
+        serial: SerialDevice | None = None
         if host_clocked(args):
             axes = args.port.partition(":")[2] or None
-            device = stack.enter_context(ForceDimension(session.scenario, axes))
-            port = DeviceWire(device)
-            stack.callback(port.close)
-            if not device.guarded:
+            device = adapter = stack.enter_context(ForceDimension(session.scenario, axes))
+            if not adapter.guarded:
                 console(args).print(
                     "the device has no watchdog of its own: were this program killed, its force would stay"
                 )
@@ -207,7 +208,8 @@ def hold_session(
             options = [*_emulator_options(args, seed, seconds), *["--nobody"][:nobody], f"--coulomb={coulomb}"]
             with progress("starting the emulator" if args.emulate else "opening the port"):
                 path = args.port or stack.enter_context(spawned(options))
-            port = stack.enter_context(SerialPort(path, session.settings.baud))
+            port, pace = stack.enter_context(SerialPort(path, session.settings.baud)), float(args.pace)
+            device = serial = SerialDevice(port, lambda: pace * time.monotonic())
         if args.port and not getattr(args, "no_preflight", True):
             with progress("looking at this machine"):
                 found = preflight(args.port)
@@ -224,7 +226,7 @@ def hold_session(
         auto_arm = args.arm or args.emulate
         live = Live(
             session,
-            port,
+            device,
             plan,
             auto_arm,
             seconds,
@@ -234,7 +236,7 @@ def hold_session(
             deadman,
         )
         live.run()
-    return _Held(live.signals, live.dropped)
+    return _Held(live.signals, serial.dropped if serial else 0)
 
 
 def _rehearsed(

@@ -215,6 +215,14 @@ class Lti(ReadOnly):
             X[:first] += S[:first, first:end] @ X[first:end]
         return (self.C @ U @ X).reshape(self.outputs, self.inputs, points.size)
 
+    def at_rest(self, x: Array) -> Array:
+        """The state z = A z + B x in which it rests with the inputs x held.
+
+        Where it drifts (an environment with a free mass, whose place no x decides), the shortest such z.
+        """
+        z: Array = np.linalg.lstsq(np.eye(self.order) - self.A, self.B @ x, rcond=None)[0]
+        return z
+
     @cached_property
     def _schur(self) -> tuple[Complex, Complex]:
         """S, U with A = U S U* and S upper triangular: once per block, however often it is evaluated."""

@@ -9,6 +9,7 @@ directions S^-1/2 dS S^-1/2, and the best length of a step follows from their ei
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,19 +26,28 @@ _RIDGE = 1e-9  # of its column: what a direction that neither objective nor ineq
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """constant + sum_a x_a slope_a > 0 at k frequencies."""
+    """constant + sum_a x_a slope_a > 0 at k frequencies, as real vectors (`_packed`)."""
 
-    constant: Complex  # (k, r, r), Hermitian
-    slope: Complex  # (k, n, r, r), Hermitian
+    constant: Array  # (k, r^2)
+    slope: Array  # (k, r^2, n)
+
+    @classmethod
+    def of(cls, constant: Complex, slope: Complex) -> Block:
+        """Of Hermitian matrices: constant (k, r, r), slope (k, n, r, r)."""
+        return cls(_packed(constant), np.ascontiguousarray(np.swapaxes(_packed(slope), 1, 2)))
 
     @property
     def degree(self) -> int:
-        return self.constant.shape[0] * self.constant.shape[1]
+        return len(self.constant) * math.isqrt(self.constant.shape[1])
 
     def at(self, x: Array) -> Complex:
         """S(x), shape (k, r, r)."""
-        k, n, r, _ = self.slope.shape
-        return self.constant + (x @ self.slope.reshape(k, n, r * r)).reshape(k, r, r)
+        return _unpacked(self.constant + self.slope @ x)
+
+    def changed(self, U: Array) -> Block:
+        """The same of y where x = U^-1 y."""
+        slope = scipy.linalg.solve_triangular(U, self.slope.reshape(-1, len(U)).T, trans=1).T
+        return Block(self.constant, np.ascontiguousarray(slope).reshape(self.slope.shape))
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +84,7 @@ class Program:
         stacked = np.vstack([self.A, *rows, _RIDGE * np.diag(scale)])
         U = np.asarray(scipy.linalg.qr(stacked, mode="r")[0])[: x.size]
         A = scipy.linalg.solve_triangular(U, self.A.T, trans=1).T
-        blocks = tuple(Block(block.constant, _changed(block.slope, U)) for block in self.blocks)
+        blocks = tuple(block.changed(U) for block in self.blocks)
         return Program(A, self.b, scipy.linalg.solve_triangular(U, self.c, trans=1), blocks), U
 
 
@@ -112,8 +122,9 @@ def _solved(hessian: Array, right: Array) -> Array:
     ridge = 0.0
     while True:
         try:
-            factor = scipy.linalg.cho_factor(unit + ridge * np.eye(len(unit)))
-            return scale * scipy.linalg.cho_solve(factor, scale * right)
+            return scale * scipy.linalg.cho_solve(
+                scipy.linalg.cho_factor(unit + ridge * np.eye(len(unit))), scale * right
+            )
         except np.linalg.LinAlgError:
             ridge = max(10 * ridge, 1e-14)
 
@@ -142,23 +153,36 @@ def _length(program: Program, step: Array, x: Array, t: float) -> float:
 def _eigenvalues(block: Block, x: Array, step: Array) -> Array:
     """Those of S^-1/2 dS S^-1/2 for the step, at every frequency."""
     inverse = _inverse_root(block.at(x))
-    k, n, r, _ = block.slope.shape
-    moved = (step @ block.slope.reshape(k, n, r * r)).reshape(k, r, r)
+    moved = _unpacked(block.slope @ step)
     return np.linalg.eigvalsh(inverse @ moved @ np.conj(np.swapaxes(inverse, 1, 2))).ravel()
 
 
 def _directions(block: Block, x: Array) -> tuple[Array, Array]:
-    """(rows, ones): the real vectors of S^-1/2 slope_a S^-1/2 as columns, (k r^2, n), and that of the identity."""
-    adjoint = np.conj(np.swapaxes(_inverse_root(block.at(x)), 1, 2))
-    k, n, r, _ = block.slope.shape
-    half = (block.slope.reshape(k, n * r, r) @ adjoint).reshape(k, n, r, r)
-    H = (np.conj(np.swapaxes(half, 2, 3)).reshape(k, n * r, r) @ adjoint).reshape(k, n, r, r)
-    upper = np.triu_indices(r, 1)
-    off = np.asarray(H[:, :, upper[0], upper[1]] * np.sqrt(2))
-    on = np.real(np.diagonal(H, axis1=2, axis2=3))
-    rows = np.concatenate([on, np.real(off), np.imag(off)], axis=2)
-    ones = np.tile(np.concatenate([np.ones(r), np.zeros(r * (r - 1))]), k)
-    return np.swapaxes(rows, 1, 2).reshape(k * r * r, n), ones
+    """(rows, ones): the vectors of S^-1/2 slope_a S^-1/2 as columns, (k r^2, n), and that of the identity."""
+    W = _inverse_root(block.at(x))[:, None]
+    r = W.shape[-1]
+    units = _unpacked(np.eye(r * r))
+    turned = np.swapaxes(_packed(W @ units @ np.conj(np.swapaxes(W, 2, 3))), 1, 2)  # (k, r^2, r^2)
+    rows = turned @ block.slope
+    return rows.reshape(-1, rows.shape[2]), np.tile(_packed(np.eye(r, dtype=complex)), len(rows))
+
+
+def _packed(H: Complex) -> Array:
+    """Hermitian matrices (.., r, r) as real vectors (.., r^2) of the same inner product."""
+    upper = np.triu_indices(H.shape[-1], 1)
+    off = np.sqrt(2) * H[..., upper[0], upper[1]]
+    return np.concatenate([np.real(np.diagonal(H, axis1=-2, axis2=-1)), np.real(off), np.imag(off)], axis=-1)
+
+
+def _unpacked(v: Array) -> Complex:
+    """The Hermitian matrices of `_packed`."""
+    r = math.isqrt(v.shape[-1])
+    upper, count = np.triu_indices(r, 1), r * (r - 1) // 2
+    H = np.zeros((*v.shape[:-1], r, r), dtype=complex)
+    H[..., upper[0], upper[1]] = (v[..., r : r + count] + 1j * v[..., r + count :]) / np.sqrt(2)
+    H = H + np.conj(np.swapaxes(H, -2, -1))
+    H[..., np.arange(r), np.arange(r)] = v[..., :r]
+    return H
 
 
 def _inverse_root(S: Complex) -> Complex:
@@ -172,12 +196,3 @@ def _definite(S: Complex) -> bool:
     except np.linalg.LinAlgError:
         return False
     return bool(np.isfinite(S).all())
-
-
-def _changed(slope: Complex, U: Array) -> Complex:
-    """The slopes of y where x = U^-1 y."""
-    k, n, r, _ = slope.shape
-    columns = np.moveaxis(slope, 1, 0).reshape(n, -1)
-    solved = scipy.linalg.solve_triangular(U, np.hstack([np.real(columns), np.imag(columns)]), trans=1)
-    half = columns.shape[1]
-    return np.moveaxis((solved[:, :half] + 1j * solved[:, half:]).reshape(n, k, r, r), 0, 1)

@@ -165,7 +165,7 @@ class _Dual:
         for i, weights in self.forbidden:
             slope[:, at, i] = z[:, None] ** -np.arange(len(weights)) @ weights
             at += 1
-        return Block(np.zeros((points.size, m, m), dtype=np.complex128), hermitian(slope))
+        return Block.of(np.zeros((points.size, m, m), dtype=np.complex128), hermitian(slope))
 
     def start(self) -> Array:
         """h = 0 and C_0 = I/delta: D = I."""

@@ -29,7 +29,7 @@ from design.conditions import (
 )
 from design.designs import design_by_kind
 from design.frequency import Response, frequencies, on_circle
-from design.optimal import LADDER, Options
+from design.program import LADDER, Options
 from design.result import PUBLISHED, Condition, Design, DesignFailed, NotProved, Requirement, finite
 from design.stored import digest
 from design.transparency import decibels, transparency

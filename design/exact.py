@@ -346,9 +346,9 @@ def find_storage(G: Lti) -> tuple[Matrix | None, str | None]:
     if G.order == 0:
         return Matrix.zeros(0, 0), prove_positive_real(G, Matrix.zeros(0, 0))
     reason: str | None = None
-    for share in (0.5, 0.9, 0.1):
+    for share, again in ((0.5, False), (0.5, True), (0.9, True), (0.1, True)):
         try:
-            P = _riccati(block, margin, share)
+            P = _riccati(block, margin, share, again)
         except (np.linalg.LinAlgError, ValueError) as error:
             reason = f"the Riccati equation has no solution: {error}"
             continue
@@ -387,12 +387,20 @@ def _least_eigenvalue(G: Lti) -> tuple[float, float]:
     return 1 - value, w
 
 
-def _riccati(G: Lti, margin: float, share: float) -> Array:
+def _riccati(G: Lti, margin: float, share: float, again: bool) -> Array:
+    """P of the equation; `again` in coordinates where it is nearly I, which takes off what rounding has left."""
     n, m = G.B.shape
     gain = np.linalg.norm(_states(G), 2, axis=(1, 2)).max() ** 2
     drive = (1 - share) * margin / max(gain, 1.0)  # the gain is at least one unless no input reaches any state
     R = G.D + G.D.T - 2 * share * margin * np.eye(m)
-    return -scipy.linalg.solve_discrete_are(G.A, G.B, -drive * np.eye(n), R, s=G.C.T)
+    P = -scipy.linalg.solve_discrete_are(G.A, G.B, -drive * np.eye(n), R, s=G.C.T)
+    if not again:
+        return P
+    size, V = np.linalg.eigh(P)
+    root = np.sqrt(np.maximum(size, size[-1] * 1e-16))
+    into, out = V / root, (V * root).T
+    better = -scipy.linalg.solve_discrete_are(out @ G.A @ into, out @ G.B, -drive * into.T @ into, R, s=(G.C @ into).T)
+    return out.T @ better @ out
 
 
 def _rounded_positive_real(P: Array) -> Matrix:

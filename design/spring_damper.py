@@ -241,6 +241,7 @@ class _SampledLoop:
         self.target = delay(loop.lam, loop.T).at(on_circle(self.band)) @ E
         self.delta = even_damping(loop.delta, loop.T, loop.T_max)
         self.root = np.sqrt(loop.T / self.delta)
+        self._last: tuple[_Responses, Array, Array, Complex] | None = None
         self._known: dict[int, tuple[_Responses, Array, tuple[Complex, Array, Complex, Complex]]] = {}
 
     def coupling(self, x: Array) -> SpringDamper:
@@ -305,26 +306,38 @@ class _SampledLoop:
         Delay in the environment can make the loop unstable where the sampled condition still holds, so there the
         distance of its poles from the circle is the last entry.
         """
-        room = 1 - _SAMPLED_RESERVE - np.linalg.eigvalsh(self._needed(x))[:, -1]
+        room = 1 - _SAMPLED_RESERVE + self._least(x)[0]
         return np.append(room, self.stability(x)) if any(self.loop.psi) else room
 
     def room_slope(self, x: Array) -> Array:
         """The gradient of `room`, (k, 2N) or (k + 1, 2N); poles are differenced."""
         _, E, theta = self.loop_at_conditions
         by, _, S, right = self._solved(x, self.loop_at_conditions)
-        v = np.linalg.eigh(self._needed(x))[1][:, :, -1:] * self.root[:, None]
+        v = self._least(x)[1][:, :, None]
         into = (v.conj().swapaxes(1, 2) @ theta @ E @ S)[:, 0]
         turned = into * (right @ v)[:, :, 0] / (on_circle(self.conditions) - 1)[:, None]
         slope = np.concatenate([*(turned * by).real], axis=1)
         if not any(self.loop.psi):
             return slope
-        at, steps = self.stability(x), _DIFFERENCE * np.eye(x.size)
-        return np.vstack([slope, [(self.stability(x + step) - at) / _DIFFERENCE for step in steps]])
+        return np.vstack([slope, self._stability_slope(x)])
 
-    def _needed(self, x: Array) -> Complex:
-        """Whose largest eigenvalue is the damping ratio that each sampled frequency asks for."""
-        ratio = self.force(x, self.loop_at_conditions) / (on_circle(self.conditions) - 1)[:, None, None]
-        return -hermitian(self.root[:, None] * ratio * self.root)
+    def _stability_slope(self, x: Array) -> Array:
+        at, steps = self.stability(x), _DIFFERENCE * np.eye(x.size)
+        return np.array([(self.stability(x + step) - at) / _DIFFERENCE for step in steps])
+
+    def _least(self, x: Array) -> tuple[Array, Complex]:
+        """Least eigenvalue (k,) of `_block` in units of Delta_D/T, and v whose v* block v it is; of the last x."""
+        at = self.loop_at_conditions
+        if self._last is None or self._last[0] is not at or not np.array_equal(self._last[1], x):
+            block = self._block(x)
+            root = np.tile(self.root, block.shape[1] // self.loop.channels)
+            values, vectors = np.linalg.eigh(root[:, None] * block * root)
+            self._last = (at, x.copy(), values[:, 0].astype(float), vectors[:, :, 0] * root)
+        return self._last[2], self._last[3]
+
+    def _block(self, x: Array) -> Complex:
+        """What must be positive definite with the damping, at each sampled frequency, Hermitian."""
+        return hermitian(self.force(x, self.loop_at_conditions) / (on_circle(self.conditions) - 1)[:, None, None])
 
     def stability(self, x: Array) -> float:
         """By how much more than CLOSEST_POLE the poles keep away from the circle."""
@@ -332,15 +345,17 @@ class _SampledLoop:
         return float(1 - _CLOSEST_POLE - np.abs(F.poles()).max(initial=0.0))
 
     def search(self, x: Array) -> OptimizeResult:
-        return self.minimised(x, [])
+        return self.minimised(x, [], self.room_slope)
 
-    def minimised(self, x: Array, more: list[tuple[float, float]]) -> OptimizeResult:
-        """The local optimum from x; `more` bounds the unknowns behind the gains."""
+    def minimised(
+        self, x: Array, more: list[tuple[float, float]], slope: Callable[[Array], Array] | None = None
+    ) -> OptimizeResult:
+        """The local optimum from x; `more` bounds what is behind the gains; without `slope` room is differenced."""
         N = self.loop.channels
         from scipy.optimize import minimize  # slow to load
 
         bounds = [(np.log(_SOFTEST), np.log(STIFFEST))] * N + [(0.0, 20.0)] * N + more
-        condition = {"type": "ineq", "fun": self.room, "jac": None if more else self.room_slope}  # None: differenced
+        condition = {"type": "ineq", "fun": self.room, "jac": slope}
         options = {"maxiter": 100, "ftol": 1e-7}
         problem = {"bounds": bounds, "constraints": condition, "options": options}
         return minimize(self.square_mismatch, x, jac=self.square_mismatch_slope, method="SLSQP", **problem)
@@ -477,6 +492,7 @@ class _LimiterLoop(_SampledLoop):
 
     def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
         self.rho = limiter_lag(loop.delta, loop.T, BETA)
+        self._undelayed: tuple[_Responses, _Responses] | None = None
         super().__init__(loop, band_hz)
 
     def coupling(self, x: Array) -> SpringDamper:
@@ -497,21 +513,42 @@ class _LimiterLoop(_SampledLoop):
 
     def room(self, x: Array) -> Array:
         """The least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency."""
-        loop, (D, E, _) = self.loop, self.loop_at_conditions
-        now = np.broadcast_to(np.eye(loop.channels, dtype=complex), E.shape)
-        G = Sampled(on_circle(self.conditions)[None], self.force(x, (D, E, now))[None], loop.T)
-        demand = limiter_demand(G, loop.theta, loop.delta, self.rho, self.weights(x), loop.T_max)
-        block = hermitian(demand.free.G[0] + (1 - _SAMPLED_RESERVE) * demand.gain.G[0])
-        root = np.tile(self.root, 2)
-        room = np.linalg.eigvalsh(root[:, None] * block * root)[:, 0].astype(float)
-        return np.append(room, self.stability(x)) if any(loop.psi) else room
+        room = self._least(x)[0]
+        return np.append(room, self.stability(x)) if any(self.loop.psi) else room
+
+    def room_slope(self, x: Array) -> Array:
+        """Its gradient: the block's first columns hold G, and c_i takes itself from N_i."""
+        loop, (_, E, theta), v = self.loop, self.loop_at_conditions, self._least(x)[1]
+        (by, _, S, right), z = self._solved(self._gains(x), self._now()), on_circle(self.conditions)[:, None]
+        first, second = np.split(v, 2, axis=1)
+        N = -np.stack([_polynomials(n, self.conditions)[0] for n in loop.theta], axis=1) - self.weights(x).T
+        late = np.diagonal(theta, axis1=1, axis2=2) / (z - 1)
+        into = np.einsum("ki,kij->kj", first.conj() * late + second.conj() * N, E @ S)
+        turned = into * np.einsum("kij,kj->ki", right, first)
+        steps = np.einsum("kij,kj->ki", self.force(x, self._now()), first) - (1 - 1 / z) * np.array(self.rho) * second
+        slope = np.concatenate([*(turned * by).real, -(second.conj() * steps).real], axis=1)
+        return np.vstack([slope, self._stability_slope(x)]) if any(loop.psi) else slope
+
+    def _now(self) -> _Responses:
+        """Of the forces as they leave, before Theta."""
+        D, E, _ = at = self.loop_at_conditions
+        if self._undelayed is None or self._undelayed[0] is not at:
+            now = np.broadcast_to(np.eye(self.loop.channels, dtype=complex), E.shape)
+            self._undelayed = (at, (D, E, now))
+        return self._undelayed[1]
+
+    def _block(self, x: Array) -> Complex:
+        loop = self.loop
+        G = Sampled(on_circle(self.conditions)[None], self.force(x, self._now())[None], loop.T)
+        demand = limiter_demand(G, loop.theta, loop.delta, self.rho, self.weights(x).tolist(), loop.T_max)
+        return hermitian(demand.free.G[0] + (1 - _SAMPLED_RESERVE) * demand.gain.G[0])
 
     def search(self, x: Array) -> OptimizeResult:
-        return self.minimised(x, [(0.0, _MOST_WEIGHT)] * self.loop.channels)
+        return self.minimised(x, [(0.0, _MOST_WEIGHT)] * self.loop.channels, self.room_slope)
 
-    def weights(self, x: Array) -> list[list[float]]:
+    def weights(self, x: Array) -> Array:
         """c, a row of one lag per channel."""
-        return np.maximum(x[2 * self.loop.channels :, None], 0.0).tolist()
+        return np.maximum(x[2 * self.loop.channels :, None], 0.0)
 
     def _gains(self, x: Array) -> Array:
         return x[: 2 * self.loop.channels]
@@ -524,7 +561,7 @@ def _limited_optimum(loop: Loop, band_hz: tuple[float, float], start: SpringDamp
     for searches in range(1, _MOST_ROUNDS_FROZEN_ENVIRONMENT + 1):
         x = sampled.search(x).x
         coupling = sampled.coupling(x)
-        requirement = sampled.proof(coupling, sampled.weights(x)).requirement
+        requirement = sampled.proof(coupling, sampled.weights(x).tolist()).requirement
         if requirement.ratio <= 1 - RESERVE:
             return coupling, searches
         if sampled.room(x).min() < -_STUCK or requirement.frequency_hz is None:
@@ -571,9 +608,28 @@ def design(
     raise ValueError(f"condition is {condition!r}, expected 'any-environment' or 'this-environment'")
 
 
+#: Devices whose search ends within half a minute: matrix inequalities cost their sixth power, eigenvalues their third.
+_MOST_ANY, _MOST_LIMITED = 16, 12
+
+
+def _require_few(loop: Loop, most: int, what: str) -> None:
+    if loop.channels > most:
+        raise DesignFailed(None, (), f"{loop.channels} devices, allowed are {most} for a spring-damper by {what}")
+
+
 def design_with(loop: Loop, condition: str, limiter: bool | None = None, **options: Any) -> Design:
-    """A spring-damper, with the limiter's block in the place of the linear one where that is asked for or usual."""
-    if limiter is False or condition == "any-environment":  # with rho = 0 any-environment covers limited forces anyway
+    """A spring-damper, with the limiter's block in the place of the linear one where that is asked for or usual.
+
+    Raises DesignFailed at once for so many devices that the search would take minutes.
+    """
+    if condition == "any-environment":  # with rho = 0 it covers limited forces anyway
+        _require_few(
+            loop, _MOST_ANY, "any-environment: use a moving average, which needs no search, or this-environment"
+        )
+        return design(loop, condition, **options)
+    if limiter:
+        _require_few(loop, _MOST_LIMITED, "the limiter's block: leave the limiter out")
+    if limiter is False or loop.channels > _MOST_LIMITED:
         return design(loop, condition, **options)
     refusal = limiter_refusal(loop)
     if limiter and refusal:

@@ -18,11 +18,11 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from controller.budget import EPS, EnergyBudget
+from controller.contact import Limiter, limited
 from controller.coupling import Coupling
 from controller.environment import environment
 from controller.loop import force_map
 from controller.lti import Array, Lti
-from controller.process import Limiter, limited
 from design.certificate import assess
 from design.coverage import Limits as ForceLimits
 from design.guarantees import guarantee_of

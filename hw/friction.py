@@ -25,7 +25,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are used
@@ -133,14 +132,14 @@ class _Balance:
         self._reach = round(_REACH * self.sigma / T)
         # what holds a body at rest, or dithers it, is not in g
         clear = _moving(x, step, T) & _slow(force, self.sigma, T)
-        clear = ~scipy.ndimage.binary_dilation(~clear, iterations=round(_NEARBY * self.sigma / T))
-        rows = np.flatnonzero(clear[self._reach : -self._reach]) + self._reach
+        spoilt = scipy.ndimage.binary_dilation(~clear, iterations=round(_NEARBY * self.sigma / T)).astype(bool)
+        rows = np.flatnonzero(~spoilt[self._reach : -self._reach]) + self._reach
         if len(rows) < _FEW:
             raise ValueError(f"the axis moves in {len(rows)} samples only, at least {_FEW} are needed")
         self.independent = len(rows) * T / (2 * np.sqrt(np.pi) * self.sigma)  # samples behind so long a window
         self.rows = rows[:: max(1, int(_SPACING * self.sigma / T))]
         self._length = scipy.fft.next_fast_len(len(x) + 2 * self._reach)
-        self._filters = {n: scipy.fft.fft(_window(n, self.sigma, T), self._length) for n in range(5)}
+        self._filters = {n: np.fft.fft(_window(n, self.sigma, T), self._length) for n in range(5)}
         short = (step**2 / 12 * T / (4 * np.sqrt(np.pi) * _SPEED_NOISE**2)) ** (1 / 3)
         self.speed = _filtered(self.x, 1, float(np.clip(short, T, self.sigma / 2)), T)
         applied, rate, bend = _held(force, self.sigma, T)
@@ -153,11 +152,13 @@ class _Balance:
         self.common = [acceleration, velocity, zero + 1.0, drift, place, *lag, jerk, snap]
         self.drag = self.speed * np.abs(self.speed)
 
-    def _of(self, signal: NDArray[Any], *orders: int) -> list[NDArray[Any]]:
-        """Derivatives (rows,) of the filtered signal (N,), which may be complex."""
-        spectrum = scipy.fft.fft(signal, self._length)
-        found = [scipy.fft.ifft(spectrum * self._filters[order])[self.rows + self._reach] for order in orders]
-        return found if np.iscomplexobj(signal) else [one.real for one in found]
+    def _complex(self, signal: NDArray[np.complex128] | Array, *orders: int) -> list[NDArray[np.complex128]]:
+        """Derivatives (rows,) of the filtered signal (N,)."""
+        spectrum = np.fft.fft(signal, self._length)
+        return [np.fft.ifft(spectrum * self._filters[order])[self.rows + self._reach] for order in orders]
+
+    def _of(self, signal: Array, *orders: int) -> list[Array]:
+        return [one.real for one in self._complex(signal, *orders)]
 
     def laws(self, step: float) -> list[tuple[float, Array]]:
         """Dry friction (N,) within +-1 by every law, and the speed [m/s] at which it is at 3/4 (0: by position)."""
@@ -177,8 +178,8 @@ class _Balance:
 
     def waves(self, periods: Array) -> list[_Pair]:
         """For every period [m] a force that repeats with position, and an encoder's error that does."""
-        waves = [(p, wave) for p in periods.tolist() for wave in self._of(np.exp(2j * np.pi * self.x / p), 0, 2)]
-        return [_Pair(period, np.stack([np.real(wave), np.imag(wave)], axis=1)) for period, wave in waves]
+        waves = [(p, wave) for p in periods.tolist() for wave in self._complex(np.exp(2j * np.pi * self.x / p), 0, 2)]
+        return [_Pair(period, np.stack([wave.real, wave.imag], axis=1)) for period, wave in waves]
 
 
 @dataclass(frozen=True, eq=False)

@@ -257,7 +257,7 @@ class _Spectrum:
 
     def __init__(self, model: _Model) -> None:
         force, moved = np.fft.rfft(model.force), np.fft.rfft(np.diff(model.x, append=model.x[-1]))
-        loud = np.flatnonzero(np.abs(force) > 0.2 * np.abs(force).max())
+        loud = 1 + np.flatnonzero(np.abs(force[1:]) > 0.2 * np.abs(force).max())  # a free mass has no answer at 0 Hz
         self.model, self.z = model, np.exp(2j * np.pi * loud / len(model.force))
         self.measured = np.log(np.abs(moved[loud] / force[loud]) + _FLOOR)
 

@@ -149,6 +149,7 @@ class Counters:
     late: int = 0  # answers that reached the device after their latch
     misses: int = 0  # ticks without an answer in time, by the device's count
     device_errors: int = 0  # frames that the device rejected
+    host_errors: int = 0  # frames of the device that could not be read
     clipped: int = 0  # ticks with a force at the cap, by the limiter or by being cut
     slowed: int = 0  # forces at the slew limit
     limited: int = 0  # ticks in which the energy budget made forces smaller

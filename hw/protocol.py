@@ -158,6 +158,11 @@ class State(NamedTuple):
         return _CAUSES[self.status >> 4 & 7]
 
     @property
+    def drives(self) -> bool:
+        """Whether the motors are moved as by nobody who was told to stop; a ramp is on its way to zero."""
+        return self.phase in (Phase.ARMED, Phase.HOLDING) or (self.phase != Phase.RAMP and any(self.applied))
+
+    @property
     def deadman(self) -> bool:
         """Whether somebody holds the deadman at the device."""
         return self.status >= DEADMAN

@@ -258,7 +258,7 @@ def outcome(case: str, session: Session, recorder: Recorder, dropped: int, pace:
 
 def _link(session: Session, recorder: Recorder, dropped: int) -> dict[str, Any]:
     measured = session.measurement
-    counters = asdict(session.counters) | {"host_errors": session.decoder.rejected, "host_dropped_bytes": dropped}
+    counters = asdict(session.counters) | {"host_dropped_bytes": dropped}
     part: dict[str, Any] = {
         "measured_age_us": _percentiles(np.array(measured.ages)),
         "measured_missing": measured.missing,

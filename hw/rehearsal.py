@@ -1,4 +1,4 @@
-"""A whole session in virtual time: the bridge's session and the emulated device, with a line between them.
+"""A whole session in virtual time: the bridge's session and the emulated device, with a serial line between them.
 
 Nothing waits and nothing is random but by seed, so a session of seconds runs in a fraction of one and always the same.
 """
@@ -19,17 +19,18 @@ from design.guarantees import guarantee_of
 from design.result import COUPLING, Design, Requirement, bare, number, of_kind, whole
 from hw.control import CertifiedCoupling, Program, certified_coupling, certified_couplings, timed
 from hw.emulator import Emulator, FaultInjection, Line
-from hw.limits import ENDED, Fault, Stage
+from hw.limits import ENDED, Stage
 from hw.monitor import Ages, LinkSettings
 from hw.protocol import Phase
 from hw.recording import Recorder, result_of
-from hw.session import Operator, Session, session_for
+from hw.seam import Driver, PortLost, SerialDevice
+from hw.session import Operator, Said, Session, session_for
 from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 from sim.trace import Trace
 
 _MEASURE = 200  # answers that are timed: virtual time does not scatter
 _QUANTILE, _GUARD_US = 0.99, 100.0  # of the ages that the delay covers, and what is added [us]; as hw.bridge has it
-_POLL_US = 1000
+_BEGIN_US = 500  # after the device's first tick
 _GRACE_US = 20_000  # after the end
 _LATENCY_US = 60  # one way, and as long for the host to answer: the measured median age of 130 us
 
@@ -46,21 +47,24 @@ class _Moment(NamedTuple):
 
 @dataclass
 class Rehearsal:
-    """What happens, in order of time; `actions` are what a person does: (seconds after arming, call)."""
+    """What happens, in order of time: a port whose other end is the emulator, and the session at it.
+
+    `actions` are what a person does: (seconds after arming, call).
+    """
 
     session: Session
     emulator: Emulator
     plan: Plan
     faults: tuple[FaultInjection, ...] = ()
     seed: int = 0
-    actions: Sequence[tuple[float, Callable[[Session, int], bytes]]] = ()
+    actions: Sequence[tuple[float, Callable[[Session, int], Said]]] = ()
     host_stalls: Sequence[tuple[float, float]] = ()  # (seconds after arming, seconds) in which the host is frozen
     arm: bool = True  # once; a softer coupling waits for a person
     operator: Operator | None = None  # in place of `arm`: the rule of a live session
     latency_us: float = _LATENCY_US
     clock: float = 1.0  # how long a tick of the device lasts, in T
     keep: bool = True  # every tick of the device in `moments`
-    glance: Callable[[Session], None] = lambda session: None  # called every millisecond
+    glance: Callable[[Session], None] = lambda session: None  # called at every turn
     moments: list[_Moment] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -69,43 +73,111 @@ class Rehearsal:
         self._queue: list[tuple[float, int, str, Any]] = []
         self._number = count()
         self._done: set[int] = set()
-        self._gone = False
+        self._now, self._read, self._gone = 0.0, b"", False  # [us]; what has come in
         self._ended = 0.0
         self._period = 1e6 * self.session.scenario.T * self.clock
+        device = SerialDevice(self, lambda: 1e-6 * self._now)
+        self._driver = Driver(self.session, device, self.plan, lambda: round(self._now))
         self._at(0, "tick", 0)
-        self._at(500, "start", None)
-        self._at(_POLL_US, "poll", None)
 
     def run(self, seconds: float) -> Session:
         """Until `seconds` of virtual time are over. Returns the session."""
-        while self._queue[0][0] <= 1e6 * seconds:
-            self._next()
+        while self._now <= 1e6 * seconds:
+            self._turn()
         return self.session
 
     def run_until_armed(self, seconds: float) -> Session:
         """Until `seconds` after arming, or a little longer than a session that is never armed."""
-        while self.armed_us is None and not (
-            self.session.stage in ENDED and self._queue[0][0] > self._ended + _GRACE_US
-        ):
-            self._next()
+        while self.armed_us is None and not self._over:
+            self._turn()
         return self.run(1e-6 * self.armed_us + seconds) if self.armed_us is not None else self.session
 
     def run_to_the_end(self, most: float) -> Session:
         """Until the session has ended and its device has come to rest, or for `most` seconds of virtual time."""
-        while not (self.session.stage in ENDED and self._queue[0][0] > self._ended + _GRACE_US):
-            if self._queue[0][0] > 1e6 * most:
-                break
-            self._next()
+        while not self._over and self._now <= 1e6 * most:
+            self._turn()
         return self.session
 
-    def _next(self) -> None:
-        now, _, what, data = heapq.heappop(self._queue)
-        getattr(self, f"_on_{what}")(now, data)
-        if self.session.stage not in ENDED:
-            self._ended = now + self._period
+    @property
+    def _over(self) -> bool:
+        return self.session.stage in ENDED and self._now > self._ended + _GRACE_US
+
+    def _turn(self) -> None:
+        """One call of the device, then what a person does."""
+        if not self.session.log:
+            self._pass(_BEGIN_US)
+            self.session.start(round(self._now))
+        if self.session.stage == Stage.LOST and self._gone:
+            self._pass(1000)
+        else:
+            self._driver.turn()
+        session, now = self.session, round(self._now)
+        since = self.emulator.since_armed(now)
+        for i, (when, call) in enumerate(self.actions):
+            if since is not None and since >= when and i not in self._done:
+                self._done.add(i)
+                self._driver.do(call(session, now))
+        if self.operator:
+            self._driver.do(self.operator.look(session, now))
+        elif session.stage == Stage.DISARMED and self.arm and session.program is session.programs[0]:
+            self._driver.do(session.arm(now))
+        self.glance(session)
+        if session.stage not in ENDED:
+            self._ended = self._now
+
+    # the host's end of the line
+
+    def wait(self, seconds: float) -> bool:
+        """Time goes on until something has come in, or so many seconds are over, and as long as the host is frozen."""
+        until = self._now + 1e6 * seconds
+        while not self._read and not self._gone and self._queue[0][0] <= until:
+            self._next()
+        if not self._read and not self._gone:
+            self._now = until
+        if (frozen := self._frozen_for()) > 0:
+            self._pass(frozen)
+        return bool(self._read) or self._gone
+
+    def read(self) -> bytes:
+        """What has come in. Raises PortLost where the cable was pulled."""
+        if self._gone:
+            raise PortLost("the port is gone")
+        data, self._read = self._read, b""
+        return data
+
+    def write(self, data: bytes) -> int:
+        """Frames to the device, one by one: the line may lose them."""
+        since = self.emulator.since_armed(round(self._now))
+        for frame in filter(None, data.split(b"\0")):
+            for when, part in self._down.send(frame + b"\0", self._now + self.latency_us / 6, since):
+                self._at(when, "device", part)
+        return len(data)
+
+    def discard(self) -> None:
+        self._read = b""
+
+    def _frozen_for(self) -> float:
+        """[us] for which the host does nothing."""
+        since = self.emulator.since_armed(round(self._now))
+        ends = [
+            start + lasts for start, lasts in self.host_stalls if since is not None and start <= since < start + lasts
+        ]
+        return 1e6 * (max(ends) - (since or 0.0)) + 1 if ends else 0.0
+
+    # what happens in time
 
     def _at(self, when: float, what: str, data: Any) -> None:
         heapq.heappush(self._queue, (when, next(self._number), what, data))
+
+    def _pass(self, us: float) -> None:
+        until = self._now + us
+        while self._queue[0][0] <= until:
+            self._next()
+        self._now = until
+
+    def _next(self) -> None:
+        self._now, _, what, data = heapq.heappop(self._queue)
+        getattr(self, f"_on_{what}")(self._now, data)
 
     def _on_tick(self, now: float, due: float) -> None:
         emulator, clock = self.emulator, round(now)
@@ -117,63 +189,19 @@ class Rehearsal:
             self.moments.append(_Moment(clock, emulator.device.phase, emulator.applied))
         self._at(now + self._period * emulator.stretch, "tick", None)
         if emulator.unplugged and not self._gone:
-            self._gone = True
             self._at(now + self.latency_us, "gone", None)
         for when, part in self._up.send(data, now, emulator.since_armed(clock)) if data else []:
             self._at(when, "host", part)
         return None
 
     def _on_host(self, now: float, data: bytes) -> None:
-        if (frozen := self._frozen(now)) > now:
-            return self._at(frozen, "host", data)
-        session = self.session
-        self._send(session.receive(data, round(now)), now)
-        if session.stage == Stage.MEASURED:
-            try:
-                programs = self.plan(session.measurement.result)
-            except Fault as fault:
-                return self._send(session.refuse(str(fault), round(now)), now)
-            return self._send(session.load(programs, round(now)), now)
-        if self.operator:
-            return self._send(self.operator.look(session, round(now)), now)
-        if session.stage == Stage.DISARMED and self.arm and session.program is session.programs[0]:
-            self._send(session.arm(round(now)), now)  # once: a softer coupling waits for a person
-        return None
-
-    def _on_start(self, now: float, _: None) -> None:
-        self._send(self.session.start(round(now)), now)
-
-    def _on_poll(self, now: float, _: None) -> None:
-        if (frozen := self._frozen(now)) > now:  # what came in the meantime is read first
-            return self._at(frozen + 1, "poll", None)
-        self._at(now + _POLL_US, "poll", None)
-        since = self.emulator.since_armed(round(now))
-        for i, (when, call) in enumerate(self.actions):
-            if since is not None and since >= when and i not in self._done:
-                self._done.add(i)
-                self._send(call(self.session, round(now)), now)
-        self.glance(self.session)
-        return self._send(self.session.poll(round(now)), now)
+        self._read += data
 
     def _on_gone(self, now: float, _: None) -> None:
-        self.session.lost("the port is gone", round(now))
+        self._gone = True
 
     def _on_device(self, now: float, data: bytes) -> None:
         self.emulator.receive(data, round(now))
-
-    def _send(self, data: bytes, now: float) -> None:
-        since = self.emulator.since_armed(round(now))
-        for frame in filter(None, data.split(b"\0")):
-            for when, part in self._down.send(frame + b"\0", now + self.latency_us / 6, since):
-                self._at(when, "device", part)
-
-    def _frozen(self, now: float) -> float:
-        since = self.emulator.since_armed(round(now))
-        if since is not None:
-            for start, lasts in self.host_stalls:
-                if start <= since < start + lasts:
-                    return now + 1e6 * (start + lasts - since) + 1
-        return now
 
     # what came of it
 
@@ -258,7 +286,7 @@ def rehearse(
 
     stopped: list[float] = []  # [s] after arming
 
-    def stop(session: Session, now: int) -> bytes:
+    def stop(session: Session, now: int) -> Said:
         stopped.append(seconds)
         return session.stop("asked to", now)
 

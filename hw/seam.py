@@ -1,302 +1,197 @@
-"""The seam for devices: four calls that a session needs, whoever has the clock, and two kinds of devices behind them.
+"""The seam for devices: four calls that a session needs of them, and the loop that makes these calls.
 
-Over the serial link (docs/protocol.md) the device's timer is the clock. A device that is driven by its maker's library
-has none: the host reads the position, computes, and writes the force, which acts at once, a fraction of a period after
-the sample (theta = 0). The certificate is for what the host keeps, measured at zero force: periods up to T_max, and
-latencies within [t1, t2].
+A device at a serial port (docs/protocol.md) is one implementation, one that the host clocks another
+(hw/force_dimension.py). None of the calls waits for longer than a tick: keys, signals and time-outs
+are looked at between any two.
 """
 
 from __future__ import annotations
 
-import os
-import re
-import select
 import time
-from collections.abc import Callable
-from importlib import import_module
-from typing import Any, Protocol, Self
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
-from hw.device import Device
-from hw.emulator import info_of
-from hw.protocol import (
-    NO_MARGIN,
-    Ack,
-    Config,
-    Decoder,
-    Force,
-    Hello,
-    Info,
-    Message,
-    Phase,
-    Reason,
-    Refused,
-    State,
-    Stop,
-    config_crc,
-    encode,
-)
-from hw.transport import PortLost, Wire
-from sim.scenario import InputError, Scenario
+from hw import protocol as wire
+from hw.control import Program
+from hw.limits import Fault, Stage
+from hw.monitor import Ages
+from hw.session import Said, Session
 
-FORCE_DIMENSION = "force-dimension"  # in place of a port
-_BINDINGS = "forcedimension_core.dhd"
-_SATURATED = 2  # what setForce says of motors that cannot
-_WATCHDOG = 160  # times 125 us: after 20 ms without a force the device drops it by itself, where it can
-_PATIENCE = 2.0  # [s] for an answer
-_RESEND = 0.1  # [s]
-_SPIN = 2e-4  # [s] before a tick that are waited for awake: a sleep ends late
-_SHORTEST = 0.75  # of T, that a period after a late one may be
+_RESEND = 0.1  # [s] after which a question is asked again
+_STOPPING = 0.05  # [s] in which a device that was told to stop must rest
+_LONGEST_WAIT = 5e-4  # [s] of one call
+
+
+class PortLost(OSError):
+    """The device is gone."""
 
 
 class HapticDevice(Protocol):
     """What can be driven. Numbers are those of the wire: counts and steps, with their units in INFO."""
 
-    def info(self) -> Info:
-        """Who it is."""
+    @property
+    def errors(self) -> int:
+        """Frames that could not be read, so far."""
         ...
 
-    def configure(self, config: Config) -> Refused:
-        """How to run; ACCEPTED, or why not."""
+    def info(self) -> wire.Info | None:
+        """Who it is; None as long as it has not answered."""
         ...
 
-    def exchange(self, force: Force | None) -> State:
-        """Give the force that answers the last STATE (None: there is none), and wait for the next. Raises PortLost."""
+    def configure(self, config: wire.Config) -> int | None:
+        """How to run; Refused.ACCEPTED, or why not, or None as long as it has not answered."""
         ...
 
-    def stop(self, reason: Reason) -> None:
+    def exchange(self, force: wire.Force | None) -> wire.State | None:
+        """Give the force that answers the last STATE (None: there is none), and wait for the next, if one comes."""
+        ...
+
+    def stop(self, reason: wire.Reason) -> None:
         """To zero force: by the device's ramp, for an emergency stop at once."""
         ...
 
 
+class Port(Protocol):
+    """Bytes. All of these raise PortLost where the port is gone."""
+
+    def wait(self, seconds: float) -> bool:
+        """Whether there is something to read, at the latest after so many seconds."""
+        ...
+
+    def read(self) -> bytes: ...
+    def write(self, data: bytes) -> int:
+        """How many of these bytes could be sent."""
+        ...
+
+    def discard(self) -> None:
+        """Forget what has come in."""
+        ...
+
+
 class SerialDevice:
-    """A device at a serial port, which has the clock: for loops of one's own (hw.bridge waits for keys, too)."""
+    """A device at a serial port, which has the clock."""
 
-    def __init__(self, port: Wire) -> None:
-        self._port, self._decoder, self._waiting = port, Decoder(), list[Message]()
+    def __init__(self, port: Port, clock: Callable[[], float] = time.monotonic) -> None:
+        self._port, self._clock = port, clock
+        self._decoder, self._waiting = wire.Decoder(), list[wire.Message]()
+        self._question: wire.Hello | wire.Config | None = None
+        self._begun = self._asked = 0.0  # [s] when the question was asked first, and last
+        self.dropped = 0  # bytes that the port would not take at once
 
-    def info(self) -> Info:
-        """Raises PortLost where nobody answers, as all of these do."""
-        return self._ask(Hello(), lambda m: isinstance(m, Info))
+    @property
+    def errors(self) -> int:
+        return self._decoder.rejected
 
-    def configure(self, config: Config) -> Refused:
-        crc = config_crc(config)
-        return Refused(self._ask(config, lambda m: isinstance(m, Ack) and m.crc == crc).refused)
+    def info(self) -> wire.Info | None:
+        answer = self._answer(wire.Hello())
+        return answer if isinstance(answer, wire.Info) else None
 
-    def exchange(self, force: Force | None) -> State:
+    def configure(self, config: wire.Config) -> int | None:
+        """Asked again while the device is still on its way to zero force. Raises Fault where it drives by itself."""
+        answer = self._answer(config)
+        if (
+            not isinstance(answer, wire.Ack)
+            or answer.crc != wire.config_crc(config)
+            or answer.refused == wire.Refused.RUNNING
+        ):
+            return None
+        self._question = None
+        return answer.refused
+
+    def exchange(self, force: wire.Force | None) -> wire.State | None:
         if force is not None:
-            self._port.write(encode(force))
-        return self._next(lambda m: isinstance(m, State), _PATIENCE)
+            self._write(wire.encode(force))
+        message = self._next()  # one a call: a flood of other frames must not keep anybody from looking at the time
+        return message if isinstance(message, wire.State) else None
 
-    def stop(self, reason: Reason) -> None:
-        self._port.write(encode(Stop(reason)))
+    def stop(self, reason: wire.Reason) -> None:
+        self._write(wire.encode(wire.Stop(reason)))
 
-    def _ask(self, question: Hello | Config, answers: Callable[[Message], bool]) -> Any:
-        end = time.monotonic() + _PATIENCE
-        while True:
-            self._port.write(b"\0" + encode(question))
-            try:
-                return self._next(answers, _RESEND)
-            except PortLost:
-                if time.monotonic() > end:
-                    raise
+    def _answer(self, question: wire.Hello | wire.Config) -> wire.Message | None:
+        """What came, to a question that is asked now and then; a device that drives meanwhile is told to stop."""
+        now = self._clock()
+        if question != self._question:  # what came before is of no use
+            self._port.discard()
+            self._waiting.clear()
+            self._question, self._begun, self._asked = question, now, now - _RESEND
+        if now - self._asked >= _RESEND:
+            self._asked = now
+            self._write(b"\0" + wire.encode(question))  # the zero ends whatever was left in the line
+        message = self._next()
+        if isinstance(message, wire.State) and message.drives:
+            self.stop(wire.Reason.FAULT)
+            if isinstance(question, wire.Config) and now - self._begun > _STOPPING:
+                raise Fault("the device drives, and nobody asked it to")
+        return message
 
-    def _next(self, wanted: Callable[[Message], bool], patience: float) -> Any:
-        """The next message that is `wanted`; others before it are dropped."""
-        end = time.monotonic() + patience
-        while True:
-            while self._waiting:
-                if wanted(message := self._waiting.pop(0)):
-                    return message
-            left = end - time.monotonic()
-            if left <= 0 or not select.select([self._port], [], [], left)[0]:
-                raise PortLost(f"no answer within {patience:g} s, {self._decoder.rejected} unreadable frames")
+    def _next(self) -> wire.Message | None:
+        if not self._waiting and self._port.wait(_LONGEST_WAIT):
             self._waiting += self._decoder.feed(self._port.read())
+        return self._waiting.pop(0) if self._waiting else None
+
+    def _write(self, data: bytes) -> None:
+        self.dropped += len(data) - self._port.write(data)
 
 
-# a device without a clock
-
-
-class _Library(Protocol):
-    """What is asked of the Force Dimension SDK's Python package; every call gives -1 for an error."""
-
-    openID: Callable[..., int]
-    close: Callable[..., int]
-    getSystemName: Callable[..., str | None]
-    getSerialNumber: Callable[..., int]
-    getPosition: Callable[..., int]
-    setForce: Callable[..., int]
-    enableForce: Callable[..., int]
-    setWatchdog: Callable[..., int]
-    errorGetLastStr: Callable[..., str]
-
-
-def library() -> _Library:
-    """The package, which needs the maker's library. Raises InputError where one of them is missing."""
-    try:
-        found: Any = import_module(_BINDINGS)
-        return found
-    except ImportError as error:
-        package = _BINDINGS.split(".")[0]
-        what = f"the Python package {package} and Force Dimension's SDK (https://www.forcedimension.com)"
-        raise InputError(f"--port {FORCE_DIMENSION} needs {what}: {error}") from None
-
-
-class ForceDimension:
-    """One axis of each of several Force Dimension devices, clocked by this host.
-
-    The state machine is the firmware's (hw/device.py): armed by ARM, capped, slewed, ramped out.
-    """
+class Driver:
+    """Makes the calls for a session, turn by turn."""
 
     def __init__(
         self,
-        scenario: Scenario,
-        axes: str | None = None,
-        sdk: _Library | None = None,
-        clock: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
+        session: Session,
+        device: HapticDevice,
+        plan: Callable[[Ages], Sequence[Program]],
+        clock: Callable[[], int],
     ) -> None:
-        """`axes` are indices with axes, "0x,1x" (the default: x of the first ones). Raises InputError."""
-        self._where = _axes(axes, scenario.channels)
-        self._sdk = sdk or library()
-        self._clock, self._sleep, self._begun = clock, sleep, clock()
-        self._ids: dict[int, int] = {}
-        for index in dict.fromkeys(index for index, _ in self._where):
-            if (ID := self._sdk.openID(index)) < 0:
-                raise InputError(f"--port {FORCE_DIMENSION}: device {index}: {self._sdk.errorGetLastStr()}")
-            self._ids[index] = ID
-        first = next(iter(self._ids.values()))
-        name = (self._sdk.getSystemName(ID=first) or "Force Dimension").encode("ascii", "replace").decode()[:16]
-        self._info = info_of(scenario)._replace(firmware=name, serial=max(0, self._sdk.getSerialNumber(ID=first)))
-        self.guarded = {self._sdk.setWatchdog(_WATCHDOG, ID=ID) for ID in self._ids.values()} == {0}
-        self._device, self._decoder = Device(self._info), Decoder()
-        self._T = 1e-9 * self._info.period_ns
-        self._due = clock()
+        """`plan` gives couplings for the delay that was measured, `clock` the time [us]."""
+        self.session, self.device, self.plan, self.clock = session, device, plan, clock
+        self._force: wire.Force | None = None
 
-    def info(self) -> Info:
-        """What the library does not tell, damping and step of the encoder among it, is the scenario's."""
-        return self._info
-
-    def configure(self, config: Config) -> Refused:
-        self._device.configure(config)
-        (ack,) = self._decoder.feed(self._device.ack)
-        self._device.ack = b""
-        assert isinstance(ack, Ack)
-        if not ack.refused:
-            for ID in self._ids.values():
-                self._heeded(self._sdk.enableForce(True, ID=ID))
-            self._write(self._device.zero)
-        return Refused(ack.refused)
-
-    def exchange(self, force: Force | None) -> State:
-        if force is not None:
-            self._device.receive(encode(force), came := self._now())
-            self._write(self._device.applied)
-            if self._device.margin != NO_MARGIN:  # of a force that acts: writing it takes time
-                self._device.margin = max(-0x7FFF, self._device.margin - (self._now() - came))
-        while (left := self._due - self._clock()) > 0:
-            self._sleep(left - _SPIN if left > 2 * _SPIN else 0.0)
-        now = self._clock()
-        self._due = max(self._due, now - (1 - _SHORTEST) * self._T) + self._T
-        before = self._device.applied
-        _, out = self._device.tick(self._now(), self._counts())
-        if self._device.applied != before or force is None:
-            self._write(self._device.applied)
-        return next(m for m in self._decoder.feed(out) if isinstance(m, State))
-
-    def stop(self, reason: Reason) -> None:
-        self._device.receive(encode(Stop(reason)), self._now())
-        if self._device.phase == Phase.ESTOP:
-            self._write(self._device.zero)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Zero force, and the motors off, whatever came before."""
-        for ID in self._ids.values():
-            self._sdk.setForce([0.0, 0.0, 0.0], ID=ID)
-            self._sdk.enableForce(False, ID=ID)
-            self._sdk.close(ID=ID)
-
-    def _now(self) -> int:
-        return round(1e6 * (self._clock() - self._begun))
-
-    def _counts(self) -> tuple[int, ...]:
-        places = {index: [0.0, 0.0, 0.0] for index in self._ids}
-        for index, ID in self._ids.items():
-            self._heeded(self._sdk.getPosition(places[index], ID=ID))
-        steps = zip(self._where, self._info.encoder_step, strict=True)
-        return tuple(round(places[index][axis] / (1e-12 * step)) for (index, axis), step in steps)
-
-    def _write(self, steps: tuple[int, ...]) -> None:
-        forces = {index: [0.0, 0.0, 0.0] for index in self._ids}
-        for (index, axis), n, step in zip(self._where, steps, self._info.force_step, strict=True):
-            forces[index][axis] = 1e-6 * n * step
-        for index, ID in self._ids.items():
-            if self._heeded(self._sdk.setForce(forces[index], ID=ID)) == _SATURATED:
-                self._device.fault()
-
-    def _heeded(self, code: int) -> int:
-        if code < 0:
-            raise PortLost(f"the device is gone: {self._sdk.errorGetLastStr()}")
-        return code
-
-
-def _axes(text: str | None, channels: int) -> list[tuple[int, int]]:
-    """Device index and axis of every channel. Raises InputError."""
-    parts = text.split(",") if text else [f"{i}x" for i in range(channels)]
-    if len(parts) != channels or not all(re.fullmatch(r"\d+[xyz]", part) for part in parts):
-        example = ",".join(f"{i}x" for i in range(channels))
-        raise InputError(
-            f"--port {FORCE_DIMENSION}:{text}: expected a device's index and an axis for each of {channels} channels, "
-            f"as in {FORCE_DIMENSION}:{example}"
-        )
-    found = [(int(part[:-1]), "xyz".index(part[-1])) for part in parts]
-    if len(set(found)) != channels:
-        raise InputError(f"--port {FORCE_DIMENSION}:{text}: two channels have the same axis")
-    return found
-
-
-class DeviceWire:
-    """A device behind the messages of a session: what Live reads and writes in place of a port."""
-
-    def __init__(self, device: HapticDevice) -> None:
-        self._device, self._decoder = device, Decoder()
-        self._answers, self._force = b"", None
-        self._streams = False
-        self._ready, self._other = os.pipe()  # always readable: the device itself waits for its tick
-        os.write(self._other, b"\0")
-
-    def fileno(self) -> int:
-        return self._ready
-
-    def read(self) -> bytes:
-        """Answers to questions, or the next STATE. Raises PortLost."""
-        if self._answers or not self._streams:
-            answers, self._answers = self._answers, b""
-            return answers
-        force, self._force = self._force, None
-        return encode(self._device.exchange(force))
-
-    def write(self, data: bytes) -> int:
-        """Raises PortLost."""
-        for message in self._decoder.feed(data):
-            if isinstance(message, Force):
+    def do(self, said: Said) -> None:
+        """What the session says."""
+        for message in said:
+            if isinstance(message, wire.Force):
                 self._force = message
-            elif isinstance(message, Hello):
-                self._answers += encode(self._device.info())
-            elif isinstance(message, Config):
-                refused = self._device.configure(message)
-                self._streams |= refused == Refused.ACCEPTED
-                self._answers += encode(Ack(config_crc(message), refused))
-            elif isinstance(message, Stop):
-                self._device.stop(Reason(message.reason))
-        return len(data)
+            else:
+                self._force = None
+                self.device.stop(wire.Reason(message.reason))
 
-    def discard(self) -> None:
-        """Forget the force that nobody waits for."""
-        self._force = None
+    def turn(self) -> None:
+        """One call of the device, and what the session makes of it."""
+        session = self.session
+        try:
+            self._call(session)
+            session.counters.host_errors = self.device.errors
+            self.do(session.poll(self.clock()))
+            if session.stage == Stage.MEASURED:
+                self.load()
+        except PortLost as lost:
+            session.lost(str(lost), self.clock())
 
-    def close(self) -> None:
-        os.close(self._ready)
-        os.close(self._other)
+    def _call(self, session: Session) -> None:
+        answer: Any
+        if session.stage == Stage.CONNECTING:
+            if (answer := self.device.info()) is not None:
+                self.do(session.met(answer, self.clock()))
+        elif session.stage == Stage.CONFIGURING:
+            assert session.config
+            try:
+                answer = self.device.configure(session.config)
+            except Fault as fault:
+                return self.do(session.fail(str(fault), self.clock()))
+            if answer is not None:
+                self.do(session.configured(answer, self.clock()))
+        else:
+            force, self._force = self._force, None
+            if (state := self.device.exchange(force)) is not None:
+                self.do(session.take(state, self.clock()))
+        return None
+
+    def load(self) -> None:
+        """Couplings for the measured delay, while the device rests at zero force."""
+        session = self.session
+        try:
+            programs = self.plan(session.measurement.result)
+        except Fault as fault:
+            return self.do(session.refuse(str(fault), self.clock()))
+        return self.do(session.load(programs, self.clock()))

@@ -1,4 +1,4 @@
-"""One session with a device: bytes and the time go in, bytes come out. No port, no clock, no thread.
+"""One session with a device: what it says and the time go in, forces and stops come out. No port, no clock, no thread.
 
     connecting -> configuring -> measuring -> measured -> configuring -> disarmed
                      (load: a certified coupling)     (arm: a person)  -> arming -> armed -> disarming -> finished
@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from hw import protocol as wire
 from hw.control import BudgetPlan, Drive, Program, SentBudget, TraceRow
 from hw.limits import (
     DRIVING,
@@ -27,33 +28,19 @@ from hw.limits import (
     watchdog_for,
 )
 from hw.monitor import Counters, LinkMonitor, LinkSettings, Measurement, check_state
-from hw.protocol import (
-    Ack,
-    Command,
-    Config,
-    Decoder,
-    Force,
-    Hello,
-    Info,
-    Message,
-    Phase,
-    Reason,
-    Refused,
-    State,
-    Stop,
-    config_crc,
-    encode,
-)
 from sim.scenario import InputError, Scenario
 
-_RESEND_US, _PATIENCE_US = 100_000, 2_000_000  # of a question: asked again, and given up
+_PATIENCE_US = 2_000_000  # after which a question is given up
 _ARMING_US = 500_000  # in which a device must follow ARM
 _QUIET_US = 1_000_000  # longest silence of a device that has no force to take away
-_STOPPING_US = 50_000  # in which a device that was stopped must say so
+_STOPPING_US = 50_000  # in which STOP is repeated to a device that says nothing
 _OBEYING_US = 30_000  # in which one that was told to stop must rest: the longest hold and ramp, and half as long again
 _DEADMAN_US = 1_000_000  # after which nobody is there
 _STRONGEST = 12.0  # [N] whatever a scenario allows
 _KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
+
+
+Said = tuple[wire.Force | wire.Stop, ...]  # to the device
 
 
 class _Event(NamedTuple):
@@ -72,24 +59,23 @@ class Session:
             raise ValueError(f"cap has {len(limits.cap)} entries for {scenario.channels} channels")
         self.scenario, self.limits, self.settings = scenario, limits, settings or LinkSettings()
         self.probe = probe_delay(scenario.T)
-        self.decoder, self.counters = Decoder(), Counters()
+        self.counters = Counters()
         self.link = LinkMonitor(self.settings, self.counters)
         self.measurement = Measurement(self.settings.measure, self.probe, scenario.T, self.settings.missed)
         self.stage, self.cause = Stage.CONNECTING, ""
         self.log: list[_Event] = []
-        self.info: Info | None = None  # what the device is; None before it said so
-        self.config: Config | None = None  # how the device was asked to run, last
+        self.info: wire.Info | None = None  # what the device is; None before it said so
+        self.config: wire.Config | None = None  # how the device was asked to run, last
         self.programs: tuple[Program, ...] = ()
         self.program: Program | None = None
         self.drive: Drive | None = None  # the coupling at work, from one arming to the next end
-        self.armings: list[tuple[Program, Config]] = []  # what forces came from, arming by arming
+        self.armings: list[tuple[Program, wire.Config]] = []  # what forces came from, arming by arming
         self.budgets: list[SentBudget] = []  # arming by arming, where the settings ask for one
         self.record: Callable[[TraceRow], None] = lambda row: None
         self.listen: Callable[[_Event], None] = lambda event: None
         self.missed_while_driving = 0  # ticks
         self.now = self.entered = self.heard = 0  # [us]
         self._units: Units | None = None
-        self._question = _Question(Hello(), 0)
         self._shutdown: _Shutdown | None = None
         self._after: Stage | None = Stage.FINISHED  # what a ramp-out ends in; None: with a softer coupling, disarmed
 
@@ -111,28 +97,27 @@ class Session:
 
     # what a person or the driver does
 
-    def start(self, now: int) -> bytes:
-        """Ask the device who it is."""
+    def start(self, now: int) -> None:
+        """Wait for the device to say who it is."""
         self.now = now
         self._enter(Stage.CONNECTING, "HELLO")
-        return self._ask(Hello())
 
-    def load(self, programs: Sequence[Program], now: int) -> bytes:
+    def load(self, programs: Sequence[Program], now: int) -> Said:
         """Take the couplings for the measured delay, the fastest first; the device is told its theta."""
         self.now = now
         if self.stage != Stage.MEASURED:
-            return b""
+            return ()
         if not programs or not all(program.certified for program in programs):
             return self.refuse("the coupling is not certified", now)
         self.programs = tuple(programs)
         return self._take(0, "certified")
 
-    def refuse(self, cause: str, now: int) -> bytes:
+    def refuse(self, cause: str, now: int) -> Said:
         """End the session before it has moved anything."""
         self.now = now
-        return b"" if self.stage in ENDED else self._end(Stage.REFUSED, cause)
+        return () if self.stage in ENDED else self._end(Stage.REFUSED, cause)
 
-    def arm(self, now: int) -> bytes:
+    def arm(self, now: int) -> Said:
         """A person's wish to feel forces; does nothing unless the session is disarmed, and a deadman is held."""
         self.now = now
         if self.stage == Stage.DISARMED and not self.held:
@@ -153,7 +138,7 @@ class Session:
             )
             self.armings.append((self.program, self.config))
             self._enter(Stage.ARMING, "asked to")
-        return b""
+        return ()
 
     def _fresh_budget(self) -> SentBudget | None:
         if self.settings.energy_budget is None:
@@ -165,162 +150,131 @@ class Session:
         self.budgets.append(SentBudget(plan))
         return self.budgets[-1]
 
-    def stop(self, cause: str, now: int) -> bytes:
+    def stop(self, cause: str, now: int) -> Said:
         """The planned end: by a ramp where forces act, at once where none do."""
         self.now = now
         if self.stage in ENDED:
-            return b""
+            return ()
         if self.stage == Stage.DISARMING:
             self._after = self._after or Stage.FINISHED
-            return b""
+            return ()
         if self.stage == Stage.ARMED or (self.stage == Stage.ARMING and self.gain > 0):
             self._ramp_out(Stage.FINISHED, cause)
-            return b""
-        return self._end(Stage.FINISHED, cause, Reason.DONE)
+            return ()
+        return self._end(Stage.FINISHED, cause, wire.Reason.DONE)
 
-    def fail(self, cause: str, now: int) -> bytes:
+    def fail(self, cause: str, now: int) -> Said:
         """A fault found outside of the session: zero force at once."""
         self.now = now
-        return b"" if self.stage in ENDED else self._end(Stage.STOPPED, cause)
+        return () if self.stage in ENDED else self._end(Stage.STOPPED, cause)
 
-    def estop(self, cause: str, now: int) -> bytes:
+    def estop(self, cause: str, now: int) -> Said:
         """Zero force at once, latched on both sides. Also from a session that has ended."""
         self.now = now
         if self.stage == Stage.ESTOP:
-            return b""
-        return self._end(Stage.ESTOP, cause, Reason.ESTOP)
+            return ()
+        return self._end(Stage.ESTOP, cause, wire.Reason.ESTOP)
 
-    def lost(self, cause: str, now: int) -> bytes:
+    def lost(self, cause: str, now: int) -> Said:
         """The port is gone."""
         self.now = now
-        return b"" if self.stage in ENDED else self._end(Stage.LOST, cause)
+        return () if self.stage in ENDED else self._end(Stage.LOST, cause)
 
     # what the link does
 
-    def receive(self, data: bytes, now: int) -> bytes:
-        """Bytes from the device; time-outs are looked at however many of them there are."""
-        out = b""
-        for message in self.decoder.feed(data):
-            try:
-                self.now = now
-                out += self._understand(message)
-            except Fault as fault:
-                out += self.fail(str(fault), now)
-            except Exception as error:  # whatever it is: first the force to zero, then the explanation
-                out += self.fail(f"{type(error).__name__} in the bridge: {error}", now)
-        return out + self.poll(now)
+    def met(self, info: wire.Info, now: int) -> Said:
+        """Who the device is."""
+        return self._guarded(now, lambda: self._on_info(info))
 
-    def poll(self, now: int) -> bytes:
+    def configured(self, refused: int, now: int) -> Said:
+        """The device runs as `config` says, or why not."""
+        return self._guarded(now, lambda: self._on_answer(refused))
+
+    def take(self, state: wire.State, now: int) -> Said:
+        """What answers a STATE."""
+        return self._guarded(now, lambda: self._on_state(state))
+
+    def _guarded(self, now: int, understand: Callable[[], Said]) -> Said:
+        self.now = now
+        try:
+            return understand()
+        except Fault as fault:
+            return self.fail(str(fault), now)
+        except Exception as error:  # whatever it is: first the force to zero, then the explanation
+            return self.fail(f"{type(error).__name__} in the bridge: {error}", now)
+
+    def poll(self, now: int) -> Said:
         """Look at the time."""
         self.now = now
         if self.stage in ENDED:
-            return self._shutdown.again(now) if self._shutdown else b""
+            return self._shutdown.again(now) if self._shutdown else ()
         if self.stage in (Stage.CONNECTING, Stage.CONFIGURING):
-            return self._ask_again()
+            return self._no_answer() if now - self.entered > _PATIENCE_US else ()
         if self.stage == Stage.ARMING and self.gain == 0 and now - self.entered > _ARMING_US:
             return self._end(Stage.STOPPED, f"the device did not arm within {_ARMING_US // 1000} ms")
         silence = now - self.heard
         if silence > (self.limits.watchdog_us if self.stage in DRIVING else _QUIET_US) and self.stage != Stage.MEASURED:
             return self._end(Stage.LOST, f"no new STATE for {silence / 1000:.1f} ms")
-        return b""
+        return ()
 
-    def _understand(self, message: Message) -> bytes:
-        match message:
-            case State():
-                return self._on_state(message)
-            case Info() if self.stage == Stage.CONNECTING:
-                return self._on_info(message)
-            case Ack() if self.stage == Stage.CONFIGURING:
-                return self._on_ack(message)
-            case Info() | Ack():
-                return b""  # the answer to a question that was asked twice
-        self.counters.unexpected += 1
-        return b""
+    def _no_answer(self) -> Said:
+        question, n = "HELLO" if self.stage == Stage.CONNECTING else "CONFIG", self.counters.host_errors
+        noise = f"; {n} unreadable frame{'s' if n > 1 else ''}: wrong baud rate?" if n else ""
+        waited = 1e-6 * (self.now - self.entered)
+        return self._end(Stage.LOST, f"no answer to {question} within {waited:.1f} s{noise}")
 
-    # questions: who are you (HELLO), and run like this (CONFIG)
-
-    def _ask(self, question: Hello | Config) -> bytes:
-        self._question = _Question(question, self.now)
-        return b"\0" + encode(question)  # the zero ends whatever was left in the line
-
-    def _ask_again(self) -> bytes:
-        """The question once more, where it is time for it; given up where there was time enough."""
-        question = self._question
-        waited = self.now - question.begun
-        if waited > _PATIENCE_US:
-            name = type(question.message).__name__.upper()
-            n = self.decoder.rejected
-            noise = f"; {n} unreadable frame{'s' if n > 1 else ''}: wrong baud rate?" if n else ""
-            return self._end(Stage.LOST, f"no answer to {name} within {waited / 1e6:.1f} s{noise}")
-        if self.now - question.asked < _RESEND_US:
-            return b""
-        question.asked = self.now
-        return b"\0" + encode(question.message)
-
-    def _on_info(self, info: Info) -> bytes:
+    def _on_info(self, info: wire.Info) -> Said:
         if reasons := objections(info, self.scenario, self.limits, self.settings.baud):
             return self._end(Stage.REFUSED, "; ".join(reasons))
         self.info, self._units = info, Units.of(info)
         name = "".join(c if c.isprintable() else "?" for c in info.firmware) or "device"
         return self._configure(self.probe, f"{name} {info.serial}, to be measured")
 
-    def _configure(self, theta: int, cause: str) -> bytes:
-        assert self.info
-        self._enter(Stage.CONFIGURING, cause)
-        self.config = configuration(self.info, self.limits, theta)
-        return self._ask(self.config)
-
-    def _on_ack(self, ack: Ack) -> bytes:
-        if self.config is None or ack.crc != config_crc(self.config):
-            self.counters.unexpected += 1
-            return b""
-        if ack.refused == Refused.RUNNING:
-            return b""  # it is still on its way to zero force: it will be asked again
-        if ack.refused != Refused.ACCEPTED:
-            known = [r.name.lower() for r in Refused if r == ack.refused]
-            return self._end(Stage.REFUSED, f"the device refuses the configuration: {(known or [ack.refused])[0]}")
+    def _on_answer(self, refused: int) -> Said:
+        assert self.config
+        if refused != wire.Refused.ACCEPTED:
+            known = [r.name.lower() for r in wire.Refused if r == refused]
+            return self._end(Stage.REFUSED, f"the device refuses the configuration: {(known or [refused])[0]}")
         self.link.restart()
         self.heard = self.now
         self._enter(Stage.DISARMED if self.program else Stage.MEASURING, f"theta = {self.config.theta}")
-        return b""
+        return ()
 
-    def _take(self, index: int, cause: str) -> bytes:
+    def _configure(self, theta: int, cause: str) -> Said:
+        assert self.info
+        self._enter(Stage.CONFIGURING, cause)
+        self.config = configuration(self.info, self.limits, theta)
+        return ()
+
+    def _take(self, index: int, cause: str) -> Said:
         self.program = self.programs[index]
         self.link.needed = self.program.margin_us
         return self._configure(self.program.link, f"{self.program.name}: {cause}")
 
     # the stream of STATEs
 
-    def _on_state(self, state: State) -> bytes:
-        if self.stage == Stage.CONNECTING:  # another session's device: to zero force first
-            return encode(Stop(Reason.FAULT)) if _drives(state) else b""
+    def _on_state(self, state: wire.State) -> Said:
         if self.info is None or state.axes != self.info.axes:
             self.counters.unexpected += 1
-            return b""
+            return ()
         if self.stage in ENDED:
             return self._on_state_after_the_end(state)
-        if self.stage == Stage.CONFIGURING:
-            if not _drives(state):
-                return b""
-            if self.now - self.entered > _STOPPING_US:
-                raise Fault("the device drives, and nobody asked it to")
-            return encode(Stop(Reason.DONE))
         ticks = self.link.take(state)
         if not ticks:
-            return b""
+            return ()
         self.heard = self.now
-        if state.phase == Phase.ESTOP:
+        if state.phase == wire.Phase.ESTOP:
             return self.estop(f"pressed, {state.cause.name.lower()}", self.now)
         assert self.config is not None
         check_state(state, self.config, self.stage, self.gain)
         if self.stage in DRIVING:
-            ended = b"" if self.held else self.stop("the deadman at the device was let go", self.now)
+            ended = () if self.held else self.stop("the deadman at the device was let go", self.now)
             return ended or self._on_driving(state, ticks)
         if self.stage == Stage.MEASURING:
             return self._measure(state)
-        return self._answer(state, Command.IDLE)
+        return self._answer(state, wire.Command.IDLE)
 
-    def _on_state_after_the_end(self, state: State) -> bytes:
+    def _on_state_after_the_end(self, state: wire.State) -> Said:
         assert self._shutdown
         if cause := self._shutdown.disobeyed(state, self.now):
             if self.stage == Stage.FINISHED:
@@ -329,9 +283,9 @@ class Session:
                 self._log(cause)
         return self._shutdown.heard(state)
 
-    def _on_driving(self, state: State, ticks: int) -> bytes:
+    def _on_driving(self, state: wire.State, ticks: int) -> Said:
         assert self.drive
-        ready = state.phase != Phase.DISARMED
+        ready = state.phase != wire.Phase.DISARMED
         direction = (-1 if self.stage == Stage.DISARMING else 1) if ready else 0
         self.missed_while_driving += self.link.missed
         first = self.drive.reference is None
@@ -345,23 +299,23 @@ class Session:
             self._enter(Stage.ARMED, "full gain")
         if self.stage == Stage.DISARMING and self.gain == 0.0:
             return self._ramped_out()
-        return self._answer(state, Command.RUN if ready else Command.ARM, steps)
+        return self._answer(state, wire.Command.RUN if ready else wire.Command.ARM, steps)
 
-    def _answer(self, state: State, command: Command, steps: tuple[int, ...] | None = None) -> bytes:
+    def _answer(self, state: wire.State, command: wire.Command, steps: tuple[int, ...] | None = None) -> Said:
         """The FORCE for a STATE: zero where no `steps` are given."""
         assert self.config
         apply_at = (state.tick + self.config.theta) & 0xFFFF
-        return encode(Force(command, apply_at, state.tick, steps or (0,) * state.axes))
+        return (wire.Force(command, apply_at, state.tick, steps or (0,) * state.axes),)
 
-    def _measure(self, state: State) -> bytes:
+    def _measure(self, state: wire.State) -> Said:
         try:
             if not self.measurement.note(state, self.link.margin, self.link.missed):
-                return self._answer(state, Command.IDLE)
+                return self._answer(state, wire.Command.IDLE)
         except Fault as fault:
             return self._end(Stage.REFUSED, str(fault))
         ages = self.measurement.result
         self._enter(Stage.MEASURED, f"{len(ages.values)} answers, median age {ages.median} us")
-        return b""
+        return ()
 
     # to zero force, and what comes then
 
@@ -375,12 +329,12 @@ class Session:
         self._after = after
         self._enter(Stage.DISARMING, cause)
 
-    def _ramped_out(self) -> bytes:
+    def _ramped_out(self) -> Said:
         if self._after:
-            return self._end(self._after, self.cause, Reason.DONE)
+            return self._end(self._after, self.cause, wire.Reason.DONE)
         assert self.program is not None
         softer = self.programs.index(self.program) + 1
-        return encode(Stop(Reason.DONE)) + self._take(softer, f"softer, since {self.cause}")
+        return (wire.Stop(wire.Reason.DONE), *self._take(softer, f"softer, since {self.cause}"))
 
     def _enter(self, stage: Stage, cause: str) -> None:
         self.stage, self.cause, self.entered = stage, cause, self.now
@@ -390,11 +344,11 @@ class Session:
         self.log.append(_Event(self.now, self.stage, cause))
         self.listen(self.log[-1])
 
-    def _end(self, stage: Stage, cause: str, reason: Reason = Reason.FAULT) -> bytes:
+    def _end(self, stage: Stage, cause: str, reason: wire.Reason = wire.Reason.FAULT) -> Said:
         self.drive = None
         self._shutdown = _Shutdown(reason, bool(self.armings), self.now, self.scenario.T)
         self._enter(stage, cause)
-        return encode(Stop(reason))
+        return (wire.Stop(reason),)
 
 
 def _limits_for(scenario: Scenario, cap: float = _STRONGEST, **more: Any) -> Limits:
@@ -411,49 +365,32 @@ def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONG
         raise InputError(str(error)) from None
 
 
-@dataclass
-class _Question:
-    """What the device was asked last, and since when."""
-
-    message: Hello | Config
-    begun: int  # [us]
-    asked: int = -1  # [us] for the last time
-
-    def __post_init__(self) -> None:
-        self.asked = self.begun
-
-
-def _drives(state: State) -> bool:
-    """Whether it moves its motors as nobody may who was told to stop; a ramp is on its way to zero."""
-    return state.phase in (Phase.ARMED, Phase.HOLDING) or (state.phase != Phase.RAMP and any(state.applied))
-
-
 class _Shutdown:
     """STOP, told until the device says that it rests; an emergency stop, until it says that it has latched it."""
 
-    def __init__(self, reason: Reason, acted: bool, now: int, T: float) -> None:
+    def __init__(self, reason: wire.Reason, acted: bool, now: int, T: float) -> None:
         """`acted`: forces have acted, so that a device which says nothing is told again, every T seconds."""
-        self._stop, self._latch = encode(Stop(reason)), reason == Reason.ESTOP
+        self._stop, self._latch = (wire.Stop(reason),), reason == wire.Reason.ESTOP
         self._repeat, self._every = acted or self._latch, 1e6 * T
         self._began = self._told = now
         self._rests, self._obeys = False, True
 
-    def heard(self, state: State) -> bytes:
+    def heard(self, state: wire.State) -> Said:
         """The answer to a STATE that came after the end."""
-        self._rests = not _drives(state) and (not self._latch or state.phase == Phase.ESTOP)
-        return b"" if self._rests else self._stop
+        self._rests = not state.drives and (not self._latch or state.phase == wire.Phase.ESTOP)
+        return () if self._rests else self._stop
 
-    def again(self, now: int) -> bytes:
+    def again(self, now: int) -> Said:
         """STOP, where no STATE has said for a tick that it was heard: the one before may be lost, and STATEs too."""
         due = now - self._told >= self._every and now - self._began < _STOPPING_US
         if self._rests or not due or not self._repeat:
-            return b""
+            return ()
         self._told = now
         return self._stop
 
-    def disobeyed(self, state: State, now: int) -> str | None:
+    def disobeyed(self, state: wire.State, now: int) -> str | None:
         """Said once, of a device that goes on driving."""
-        if not self._obeys or now - self._began <= _OBEYING_US or not _drives(state):
+        if not self._obeys or now - self._began <= _OBEYING_US or not state.drives:
             return None
         self._obeys = False
         return f"told to stop, the device still drives after {_OBEYING_US // 1000} ms: cut its power"
@@ -474,7 +411,7 @@ class Operator:
     _armed_at: int | None = None  # [us]
     _seen_at: int | None = None  # [us] when somebody showed up last
 
-    def look(self, session: Session, now: int) -> bytes:
+    def look(self, session: Session, now: int) -> Said:
         """What is to be said at `now` [us] because of where the session stands."""
         if session.stage == Stage.DISARMED:
             self._armed_at = None
@@ -489,9 +426,9 @@ class Operator:
                 return session.stop(f"the deadman was let go for {_DEADMAN_US / 1e6:g} s", now)
         if self._armed_at is not None and now - self._armed_at > 1e6 * self.seconds:
             return session.stop("the time is over", now)
-        return b""
+        return ()
 
-    def press(self, key: str, session: Session, now: int) -> bytes:
+    def press(self, key: str, session: Session, now: int) -> Said:
         """A key of a person, who is there then. `a` means something to a disarmed session only."""
         self._seen_at = now
         match _KEYS.get(key):
@@ -502,9 +439,9 @@ class Operator:
                 return session.stop(f"key {key}", now)
             case "estop":
                 return session.estop("space bar", now)
-        return b""
+        return ()
 
-    def _arm_once(self, session: Session, now: int) -> bytes:
+    def _arm_once(self, session: Session, now: int) -> Said:
         if self._asked:  # a softer coupling is ready, and nobody is there to arm it
             softer = session.program.name if session.program else "none"
             return session.refuse(f"nobody to arm the softer coupling, {softer}", now)

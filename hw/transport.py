@@ -1,4 +1,4 @@
-"""Wire: how a session's bytes travel (a serial port here, by pyserial), and one thread that waits for nothing else.
+"""Wire: a session in real time over a serial port, by pyserial, and one thread that waits for nothing else.
 
 Python holds up a loop by itself: a full garbage collection takes 40 ms with MuJoCo and cvxpy loaded. So what is loaded
 is frozen and the collector is off while forces act.
@@ -15,23 +15,19 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import Self
 
 from hw.control import Program
 from hw.limits import ENDED, Fault, Stage
 from hw.monitor import Ages
+from hw.seam import Driver, HapticDevice, PortLost
 from hw.session import Operator, Session
 from sim.scenario import InputError
 
 _CHUNK = 4096  # bytes read at once; a tick brings a few dozen
 _UNUSED = 9600  # baud that a port without UART is told: it does nothing, but 1200 resets many boards
-_LONGEST_WAIT = 1e-3  # [s] between two looks at the time-outs
 _STALL_SECONDS, _STALL_MS = 2.0, 2.0  # how long stalls are measured, and from which on something is said
 _GRACE_US = 50_000  # after the end, in which a STOP that was lost is repeated
-
-
-class PortLost(OSError):
-    """The device at the other end of the port is gone."""
 
 
 class SerialPort:
@@ -53,12 +49,12 @@ class SerialPort:
 
         self._fd = self._serial.fileno()
 
-    def fileno(self) -> int:
-        """For select."""
-        return self._fd
+    def wait(self, seconds: float) -> bool:
+        """Whether there is something to read, at the latest after so many seconds."""
+        return bool(select.select([self._fd], [], [], seconds)[0])
 
     def read(self) -> bytes:
-        """What is there, once select has said that something is. Raises PortLost.
+        """What is there, once wait() has said that something is. Raises PortLost.
 
         By the file descriptor, as write(): pyserial's own take 31 us of every tick.
         """
@@ -167,22 +163,13 @@ def _worst_stall() -> float:
     return worst
 
 
-class Wire(Protocol):
-    """What a session needs of a port."""
-
-    def fileno(self) -> int: ...
-    def read(self) -> bytes: ...
-    def write(self, data: bytes) -> int: ...
-    def discard(self) -> None: ...
-
-
-class Live:
-    """Moves bytes between a port and a session until the session has ended."""
+class Live(Driver):
+    """A session with a device until it has ended, with a person at the keyboard."""
 
     def __init__(
         self,
         session: Session,
-        port: Wire,
+        device: HapticDevice,
         plan: Callable[[Ages], Sequence[Program]],
         auto_arm: bool,
         seconds: float,
@@ -191,82 +178,70 @@ class Live:
         pace: float = 1.0,  # seconds of the session per second; 1 with any real device
         deadman: Callable[[], bool] | None = None,  # whether somebody showed up since the last call
     ) -> None:
-        self.session, self.port, self._plan = session, port, plan
+        super().__init__(session, device, plan, lambda: int(time.monotonic_ns() * pace) // 1000)
         self._operator = Operator(auto_arm, seconds, deadman)
-        self._keyboard, self._glance, self._pace = keyboard, glance, pace
+        self._keyboard, self._glance = keyboard, glance
         self.signals: list[int] = []
-        self.dropped = 0  # bytes that the port would not take at once
         self._glanced = 0
-
-    def now(self) -> int:
-        """The session's clock [us]."""
-        return int(time.monotonic_ns() * self._pace) // 1000
 
     def run(self) -> Session:
         """From HELLO to the end. Whatever is raised in between, the device is stopped first."""
         session = self.session
         with _signals(self.signals), _no_collections():
             try:
-                self._write(session.start(self.now()))
+                session.start(self.clock())
                 while session.stage not in ENDED:
-                    self._step()
-                    self._steer()
-                ended = self.now()
-                while session.stage != Stage.LOST and self.now() - ended < _GRACE_US:
-                    self._step()
-            except PortLost as lost:
-                session.lost(str(lost), self.now())
+                    self.turn()
+                ended = self.clock()
+                while session.stage != Stage.LOST and self.clock() - ended < _GRACE_US:
+                    super().turn()
             except BaseException as error:
-                self._write_at_last(session.fail(f"{type(error).__name__} in the bridge: {error}", self.now()))
+                with suppress(PortLost):
+                    self.do(session.fail(f"{type(error).__name__} in the bridge: {error}", self.clock()))
                 raise
         return session
 
-    def _step(self) -> None:
-        """Wait for bytes or for a millisecond, and answer."""
-        sources = [self.port] if self._keyboard is None else [self.port, self._keyboard]
-        ready = select.select(sources, [], [], _LONGEST_WAIT)[0]
-        if self.port in ready:
-            self._write(self.session.receive(self.port.read(), self.now()))
-        else:
-            self._write(self.session.poll(self.now()))
-        if self._keyboard in ready:
-            self._pressed()
+    def turn(self) -> None:
+        """Then what is no answer: keys, arming and the planned end, signals."""
+        super().turn()
+        try:
+            self._steer(self.clock())
+        except PortLost as lost:
+            self.session.lost(str(lost), self.clock())
 
-    def _steer(self) -> None:
-        """What is not an answer: couplings for the measured delay, arming and the planned end, signals."""
-        session, now = self.session, self.now()
-        if session.stage == Stage.MEASURED:
-            self._load()
-        self._write(self._operator.look(session, now))
+    def _steer(self, now: int) -> None:
+        session = self.session
+        if self._typed():
+            self._pressed()
+        self.do(self._operator.look(session, now))
         if signal.SIGUSR1 in self.signals:
-            self._write(session.estop("SIGUSR1", now))
+            self.do(session.estop("SIGUSR1", now))
         elif self.signals:
             name = signal.Signals(self.signals[0]).name
-            self._write(session.stop(name, now) if len(self.signals) == 1 else session.fail(f"{name} again", now))
+            self.do(session.stop(name, now) if len(self.signals) == 1 else session.fail(f"{name} again", now))
         if now - self._glanced > 100_000:
             self._glanced = now
             self._glance(session)
 
-    def _load(self) -> None:
-        """Design while the device rests at zero force; what it says meanwhile is of no use."""
-        session = self.session
-        self._glance(session)  # for it takes a while
+    def load(self) -> None:
+        """A design may be interrupted, and what was typed meanwhile is read before its coupling can be armed."""
+        self._glance(self.session)  # for it takes a while
         try:
             with _interruptible():
-                programs = self._plan(session.measurement.result)
+                programs = self.plan(self.session.measurement.result)
         except Fault as fault:
-            self._write(session.refuse(str(fault), self.now()))
-            return
+            return self.do(self.session.refuse(str(fault), self.clock()))
         except KeyboardInterrupt:
             self.signals.append(signal.SIGINT)
-            self._write(session.refuse("SIGINT during the design", self.now()))
-            return
-        if self._keyboard is not None and select.select([self._keyboard], [], [], 0)[0]:
-            self._pressed()  # of now: an `a` from before may not arm what was not there to be armed
+            return self.do(self.session.refuse("SIGINT during the design", self.clock()))
+        if self._typed():
+            self._pressed()
         gc.collect()  # the solver is loaded now
         gc.freeze()
-        self.port.discard()
-        self._write(session.load(programs, self.now()))
+        return self.do(self.session.load(programs, self.clock()))
+
+    def _typed(self) -> bool:
+        return self._keyboard is not None and bool(select.select([self._keyboard], [], [], 0)[0])
 
     def _pressed(self) -> None:
         """Do what was typed; a terminal that is gone is a person who is gone, as SIGHUP says it."""
@@ -278,15 +253,7 @@ class Live:
             self._keyboard = None
             self.signals.append(signal.SIGHUP)
         for key in keys.decode(errors="replace"):
-            self._write(self._operator.press(key, self.session, self.now()))
-
-    def _write(self, data: bytes) -> None:
-        if data:
-            self.dropped += len(data) - self.port.write(data)
-
-    def _write_at_last(self, data: bytes) -> None:
-        with suppress(PortLost):
-            self._write(data)
+            self.do(self._operator.press(key, self.session, self.clock()))
 
 
 @contextmanager

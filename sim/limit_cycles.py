@@ -14,8 +14,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.contact import Contact, Limiter
 from controller.lti import Array, Lti
-from controller.process import Contact, Limiter, Process, StepBuffer
+from controller.process import Process, StepBuffer
 from controller.timing import Timing
 from design.conditions import Latency
 from models.device import Device

@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 
 from controller.budget import EPS, EnergyBounding, EnergyBudget, PassivityControl, Shell
+from controller.contact import Limiter, contact, limited
 from controller.coupling import Coupling
 from controller.delay import LOST, Ticks, ages
 from controller.loop import DelayRange
 from controller.lti import Array, Lti
-from controller.process import Limiter, Net, Process, contact, limited
+from controller.process import Net, Process
 from design.result import Requirement
 from sim.run import Simulation
 from sim.scenario import Scenario

@@ -16,11 +16,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from controller.contact import contact, limited
 from controller.coupling import Coupling
 from controller.environment import environment, held
 from controller.loop import force_map
 from controller.lti import Array, Lti
-from controller.process import Net, Process, StepBuffer, contact, limited
+from controller.process import Net, Process, StepBuffer
 from controller.timing import Timing
 from models.scene import Scene, build, plant
 from sim.engines import (

@@ -10,7 +10,10 @@ import difflib
 import hashlib
 import re
 import runpy
+import sys
 from collections.abc import Sequence
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any, Self, get_args
 
@@ -21,7 +24,7 @@ from controller.delay import VaryingDelay
 from controller.environment import Network, Ranges, Spring, UncertainSpring, Wall, environment
 from controller.loop import DelayRange, Loop, named_first, named_today
 from controller.timing import Periods, Timing, drawn
-from design.files import InputError, read_text, toml, write
+from design.files import InputError, printable, read_text, toml, write
 from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
 from models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
 
@@ -331,8 +334,12 @@ def _humans_of(text: str, source: str) -> _HumanFile:
 def _run_file(path: str | Path) -> _HumanFile:
     """The people that a Python file defines. Raises InputError where it cannot be read or run, or they hold nothing."""
     read_text(path, f"--human {path}")
+    heard: Any = StringIO()
+    heard.close = lambda: None
     try:
-        names = runpy.run_path(str(path))
+        with redirect_stdout(heard):  # where a report may be written to
+            names = runpy.run_path(str(path))
+        sys.stderr.write(printable(heard.getvalue()))
         hands, persons = _kept(tuple(names.get("humans", ()))), tuple(names.get("persons", ()))
         for i, person in enumerate(persons):
             if not isinstance(person, Person):

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from controller.contact import Limiter, State
 from controller.loop import Loop
 from controller.lti import Array, Lti
-from controller.process import Limiter, Process, State, StepBuffer
+from controller.process import Process, StepBuffer
 from controller.timing import Timing
 from design.result import finite
 from models.scene import Scene, Variants

@@ -20,6 +20,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from controller.contact import Limiter, contact, limited
 from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.delay import delay
 from controller.environment import (
@@ -34,7 +35,7 @@ from controller.environment import (
 )
 from controller.loop import Loop
 from controller.lti import Array, Complex, Lti, Sampled, SingularLoop, as_like
-from controller.process import Limiter, Process, contact, limited
+from controller.process import Process
 from design.audit import check_loop, edge
 from design.certificate import CONDITIONS, any_environment_of
 from design.conditions import any_environment_ratios, even_damping, this_environment, this_environment_ratios

@@ -57,3 +57,25 @@ def filter_by_hand(coupling: ForceFilter, z: np.ndarray) -> np.ndarray:
         R = R + (first * z[:, None, None] + second) * section
         through = through * (b2 * z * z + b1 * z + 1) / (z * z + b1 * z + b2)
     return R
+
+
+class FakePort:
+    """The host's end of a serial line: `coming` will be read, `sent` was written, `now` is its clock [us]."""
+
+    def __init__(self):
+        self.coming, self.sent, self.now = b"", b"", 0
+
+    def wait(self, seconds):
+        self.now += 0 if self.coming else round(1e6 * seconds)
+        return bool(self.coming)
+
+    def read(self):
+        data, self.coming = self.coming, b""
+        return data
+
+    def write(self, data):
+        self.sent += data
+        return len(data)
+
+    def discard(self):
+        self.coming = b""

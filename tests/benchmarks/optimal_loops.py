@@ -20,7 +20,9 @@ from typing import TypeVar
 from threadpoolctl import threadpool_limits
 
 from design.bound import bound
-from design.optimal import Options, design, robustness
+from design.optimal import design
+from design.program import Options
+from design.robustness import robustness
 from sim.scenario import load
 
 T = TypeVar("T")

@@ -9,7 +9,7 @@ from design import fixed_order as ccl
 from design import optimal, spring_damper
 from design.audit import report
 from design.certificate import assess, prove, verify
-from design.optimal import LADDER, Options
+from design.program import LADDER, Options
 from design.result import CASE_I
 from design.stored import Stored
 from design.transparency import decibels

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from worlds import STIFF, T
 
+from controller.contact import BoxProblem, Limiter, contact, limited
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Wall, environment
 from controller.loop import force_map
 from controller.lti import Lti, SingularLoop
-from controller.process import BoxProblem, Limiter, Process, StepBuffer, contact, limited
+from controller.process import Process, StepBuffer
 
 LIMITS = (12.0, 5.657)
 

@@ -134,3 +134,11 @@ def test_encoders_do_not_move_the_device():
 def test_what_cannot_be_built(build, message):
     with pytest.raises(ValueError, match=message):
         build()
+
+
+def test_delays_are_of_every_channel():
+    F, free = Lti.constant(np.eye(2), 1e-3), (np.full(2, np.inf), np.zeros(2))
+    delays = np.ones((5, 2, 1), dtype=int)
+    assert Process(F, *free, delays=delays).delays.shape == (5, 2, 1)
+    with pytest.raises(ValueError, match="delays have 1 channels, expected 2"):
+        Process(F, *free, delays=delays[:, :1])

@@ -10,7 +10,7 @@ from worlds import PAIR, SOFT, SOFT_NETWORK, STIFF
 
 from controller import coupling as controller_coupling
 from controller.coupling import Compliance, ComplianceForm, InternalModelForm, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, Network, Spring
+from controller.environment import FIGURE_4, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, rational
 from design import certificate as design_certificate
@@ -381,6 +381,20 @@ def test_what_is_no_regular_file_or_too_large_is_one_line(tmp_path):
     os.truncate(tmp_path / "large.json", 50_000_001)
     with pytest.raises(InputError, match=r"large\.json: is larger than 50 MB"):
         load(tmp_path / "large.json")
+
+
+# what is asked, and of what
+
+
+def test_any_environment_asks_the_same_of_a_coupling_as_its_state_space_behind_walls_too():
+    own = design_certificate.any_environment_of(PAIR, SOFT)
+    whole = design_certificate.any_environment_of(PAIR, Compliance(SOFT.compliance(PAIR.T)))
+    assert max(own.required) == pytest.approx(max(whole.required), rel=1e-6)
+    assert own.certified
+    walled = change(FIGURE_4, walls=(Wall(("contact 1", "ground"), 3000.0),))
+    behind = required_damping(PAIR.at(walled), SOFT, "any-environment")
+    assert behind.condition == "any-environment"
+    assert behind.required == pytest.approx(required_damping(PAIR, SOFT, "any-environment").required, rel=1e-9)
 
 
 # time

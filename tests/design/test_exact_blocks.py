@@ -99,6 +99,11 @@ def both(demand):
 # this-environment
 
 
+def test_the_exact_block_holds_the_damping_exactly():
+    F, delta = Lti.constant([[1000]], rational(T)), Fraction(1, 3)
+    assert both(this_environment_demand(F, [delta])).D[0, 0] == delta / rational(T) - 500
+
+
 @pytest.mark.parametrize("theta", [0, 1, 4])
 def test_this_environment_against_a_spring(theta):
     """(theta + 1/2) K T."""
@@ -393,6 +398,10 @@ def test_an_asymmetry_of_1e_12_is_refused_behind_delay_and_for_switching_too():
     assert condition_block(switching, crossed(1e-4), ALPHA).order
     with pytest.raises(ValueError, match="not exactly symmetric and positive semidefinite"):
         condition_block(switching, skew, ALPHA)
+    limited = (change(asked, psi=(0, 0)), crossed(1e-4), (10.0, 10.0), ((), ()))
+    assert certificate._limiter_block(*limited).order
+    with pytest.raises(NotProved, match=r"^F\(1\) is not exactly symmetric"):
+        certificate._limiter_block(limited[0], skew, *limited[2:])
 
 
 def test_a_static_stiffness_that_is_indefinite_by_1e_12_is_refused():

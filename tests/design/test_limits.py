@@ -12,7 +12,7 @@ from controller.loop import force_map
 from design import compare as limit_curve
 from design.compare import AXES, LADDERS, SHORT, Setting, ladder_row, measured, optimum, remembered, settings
 from design.conditions import this_environment
-from design.optimal import LADDER, Options
+from design.program import LADDER, Options
 from design.result import CASE_I
 from sim.plots import plot_limits
 from sim.scenario import InputError, load

@@ -2,13 +2,20 @@
 
 import numpy as np
 import pytest
-from scipy.linalg import eig
+from scipy.linalg import eig, eigh
 
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.loop import force_map
 from controller.lti import Lti
-from design.conditions import any_environment, any_environment_per_channel, delayed_demand, this_environment
+from design.conditions import (
+    any_environment,
+    any_environment_per_channel,
+    delayed_demand,
+    least_multiple,
+    regular_part,
+    this_environment,
+)
 from design.frequency import frequencies, hermitian, on_circle, supremum
 from design.result import CASE_I, CASE_II
 
@@ -152,11 +159,38 @@ def test_refusals_say_why():
     assert "not symmetric" in this_environment(twisted, (1.0, 1.0)).reason
     assert "pushes outwards" in this_environment(Lti.constant([[-1.0]], T), [1.0]).reason
     assert "no damping" in this_environment(default(CASE_I), (0.0, 1.0)).reason
+    assert "no damping" in any_environment(Lti.constant([[1.0, 0.0], [0.0, 1.0]], T), [0, 0], (1.0, 0.0)).reason
+    assert "V(1) is not symmetric" in any_environment(twisted, [0, 0], (1.0, 1.0)).reason
     assert "not passive enough" in any_environment(Lti.constant([[0.0]], T), [0], [1.0]).reason
     with pytest.raises(ValueError, match="delta has 1 entries for 2 channels"):
         this_environment(default(CASE_I), [1.0])
     with pytest.raises(ValueError, match="expected dampings >= 0"):
         this_environment(default(CASE_I), (-1.0, 1.0))
+
+
+def test_the_frequency_at_which_a_condition_binds():
+    """Against a dense grid of the definition, -He[F/(z-1)] T/delta."""
+    F, w = default(CASE_I), np.linspace(1e-3, np.pi, 200_001)
+    z = np.exp(1j * w)
+    G = F.at(z) / (z - 1)[:, None, None]
+    needed = np.linalg.eigvalsh(-(G + np.conj(np.swapaxes(G, -1, -2))) / 2)[:, -1] * T
+    found = this_environment(F, (1.0, 1.0))
+    assert found.ratio == pytest.approx(needed.max(), rel=1e-6)
+    assert found.frequency_hz == pytest.approx(w[needed.argmax()] / (2 * np.pi * T), rel=1e-3)
+
+
+def test_the_least_multiple_is_a_generalised_eigenvalue():
+    free, half = RNG.normal(size=(5, 3, 3)), RNG.normal(size=(5, 3, 3))
+    free, gain = free + np.swapaxes(free, 1, 2), half @ np.swapaxes(half, 1, 2) + 0.1 * np.eye(3)
+    expected = [eigh(-one, other, eigvals_only=True)[-1] for one, other in zip(free, gain, strict=True)]
+    np.testing.assert_allclose(least_multiple(free, gain), expected, rtol=1e-9)
+
+
+def test_the_regular_part_has_the_hermitian_part_of_the_whole():
+    """E z/(z-1) less its pole, on the circle."""
+    z = np.exp(1j * np.array([0.1, 0.7, 2.9]))
+    whole = E.at(z) * (z / (z - 1))[:, None, None]
+    np.testing.assert_allclose(hermitian(regular_part(E).at(z)), hermitian(whole), rtol=1e-9, atol=1e-6)
 
 
 def test_supremum_finds_a_needle():

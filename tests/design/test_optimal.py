@@ -23,7 +23,9 @@ from design.bound import bound
 from design.certificate import verify
 from design.conditions import this_environment
 from design.frequency import hermitian, on_circle
-from design.optimal import Case, Options, Span, design, ranges_around, robustness, span_of, vertices
+from design.optimal import design
+from design.program import MARGIN, Case, Options, Span, span_of
+from design.robustness import ranges_around, robustness, spread, vertices, widest_ranges
 from design.stored import Stored, save
 from design.stored import load as load_file
 from design.transparency import transparency
@@ -60,7 +62,7 @@ def dense() -> np.ndarray:
 # what is returned ----------------------------------------------------------------------------------------------------
 
 #: name, rms mismatch [dB] that is reached with the two smallest rungs, share of the static stiffness
-REACHED = [("n0", -33.7, 0.99), ("n1", -12.6, 0.9), ("n2", -9.2, 0.75), ("n3", -4.9, 0.5), ("n4", -22.9, 0.9)]
+REACHED = [("n0", -33.7, 0.99), ("n1", -12.6, 0.9), ("n2", -9.4, 0.7), ("n3", -4.9, 0.5), ("n4", -22.9, 0.9)]
 
 
 @pytest.mark.parametrize(("name", "most", "stiffness"), REACHED)
@@ -76,7 +78,7 @@ def test_figures_are_reached(name, most, stiffness):
 def test_the_sweep_that_knows_no_solver_certifies_it(name):
     loop, found = loop_of(name), best(name)
     requirement = this_environment(force(loop, found.coupling), loop.delta)
-    assert requirement.ratio <= 1 - 0.9 * SHORT.margin
+    assert requirement.ratio <= 1 - 0.9 * MARGIN
     z = on_circle(dense())
     F = force(loop, found.coupling).at(z)
     root = np.sqrt(loop.T / np.asarray(loop.delta))
@@ -251,6 +253,22 @@ def test_a_coupling_for_ranges_is_proved_at_every_vertex_and_searched_between():
     assert nominal.figures.rms_mismatch < found.figures.rms_mismatch < 10 ** (1 / 20) * nominal.figures.rms_mismatch
 
 
+def test_more_ranges_than_can_be_proved_leave_those_that_matter_least():
+    loop = loop_of("o06")
+    kept, note = widest_ranges(loop, 10.0)
+    assert len(kept.springs) + len(kept.masses) == 6
+    assert len(msgspec.structs.replace(loop, ranges=kept).members()) == 65  # with the nominal one
+    assert "7 ranges have 128 vertices" in note
+    assert widest_ranges(loop_of("n3"), 10.0)[1] is None
+
+
+@pytest.mark.parametrize("objective", ["rms", "sup"])
+def test_the_price_of_a_range_is_that_of_the_figure_that_is_minimised(objective):
+    found = spread(loop_of("n3"), Options(objective=objective, ladder=((4, 3),)))
+    assert 0 < found.price_db < 1.5
+    assert found.worst < 1
+
+
 def test_requests_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="objective is 'max'"):
         Options(objective="max")
@@ -268,7 +286,7 @@ def test_the_barrier_finds_what_a_cone_solver_finds():
     n, r, k = 6, 2, 5
     A, b, c = rng.normal(size=(9, n)), rng.normal(size=9), rng.normal(size=n) / 3
     slope = hermitian(rng.normal(size=(k, n, r, r)) + 1j * rng.normal(size=(k, n, r, r)))
-    block = Block(np.tile(np.eye(r, dtype=complex), (k, 1, 1)), slope)
+    block = Block.of(np.tile(np.eye(r, dtype=complex), (k, 1, 1)), slope)
     program, U = Program(A, b, c, (block,)).conditioned(np.zeros(n))
     y = np.zeros(n)
     for t in np.geomspace(1, 1e7, 22):
@@ -444,7 +462,7 @@ def test_forces_that_are_limited_are_part_of_the_design(name):
         late = rho @ theta / x
         block = np.block([[theta @ G[k] / (x - 1) + D, -late], [N @ G[k] + 2 * D, D - late + rho @ M / x]])
         assert np.linalg.eigvalsh(block + block.conj().T)[0] > 0
-    assert found.figures.rms_mismatch_db < best(name).figures.rms_mismatch_db + 2.0
+    assert found.figures.rms_mismatch_db < best(name).figures.rms_mismatch_db + 2.5
     assert best(name).figures.rms_mismatch_db < found.figures.rms_mismatch_db + 0.05
     assert m == len(proof.c)
 

@@ -22,7 +22,7 @@ from controller.loop import Loop, force_map
 from design import optimal
 from design.certificate import check_ranges, prove, verify
 from design.coverage import ranges_part
-from design.optimal import Options
+from design.program import Options
 from design.result import NotProved
 from design.stored import Stored, digest, load, save, sealed
 from sim import scenario

@@ -14,6 +14,7 @@ from controller.delay import delay
 from controller.environment import FIGURE_4, Network, Spring, environment
 from controller.loop import Loop, force_map
 from controller.lti import Lti
+from design import spring_damper
 from design.api import instead, transparency_of
 from design.conditions import any_environment, any_environment_delayed, this_environment
 from design.designs import design_by_kind
@@ -21,6 +22,7 @@ from design.lmi import CROSS_CHECK, RESERVE, Shaping, check_passive, solve
 from design.result import DesignFailed, Infeasible
 from design.spring_damper import design, gain_set, solve_within, stiffest
 from design.transparency import decibels
+from sim.scenario import load
 
 CASES = {"I": (1, 2), "II": (0, 0)}
 WALL = Network(("c",), (Spring(("c", "ground"), 100.0),))
@@ -278,3 +280,24 @@ def test_a_long_delay_is_designed_for_in_seconds_and_passes_a_dense_sweep():
         assert 0.9997 * 1.37 < needed < 1.37
         # no linear law is stiffer than 2 delta/(n T), and a spring alone reaches half of that
         assert 1.37 / (n * T) < K < 2 * 1.37 / (n * T)
+
+
+@pytest.mark.parametrize("sampled", [spring_damper._SampledLoop, spring_damper._LimiterLoop])
+@pytest.mark.parametrize("psi", [(0, 0), (1, 0)])
+def test_the_slopes_of_the_conditions_are_those_of_differences(sampled, psi):
+    """Derivatives by hand against central differences, whose own error is 1e-8 of rounding."""
+    at = sampled(load().replace(psi=psi).loop("I"))
+    x = np.array([6.5, 6.1, 0.3, 0.45, *[0.2, 0.6] * (sampled is spring_damper._LimiterLoop)])
+    steps = 1e-6 * np.eye(x.size)
+    differenced = np.stack([(at.room(x + h) - at.room(x - h)) / 2e-6 for h in steps], axis=1)
+    np.testing.assert_allclose(at.room_slope(x), differenced, atol=1e-6)
+
+
+def test_what_would_take_minutes_is_refused_at_once():
+    names = tuple(f"c{i}" for i in range(17))
+    springs = tuple(Spring((name, "ground"), 300.0) for name in names)
+    many = Loop(T, *[(0,) * 17] * 3, (1.0,) * 17, Network(names, springs))
+    with pytest.raises(DesignFailed, match="17 devices, allowed are 16"):
+        spring_damper.design_with(many, "any-environment")
+    with pytest.raises(DesignFailed, match="17 devices, allowed are 12 for a spring-damper by the limiter"):
+        spring_damper.design_with(many, "this-environment", limiter=True)

@@ -17,7 +17,7 @@ from design.api import certify
 from design.certificate import check_ranges, prove, verify
 from design.coverage import ranges_part, ranges_rows
 from design.environments import search
-from design.optimal import Options
+from design.program import Options
 from design.result import Design
 from design.stored import Stored, load, save
 from sim import scenario

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from worlds import FakePort
 
 from hw.control import certified_couplings
 from hw.device import Device
@@ -23,9 +24,10 @@ from hw.monitor import (
     Measurement,
     check_state,
 )
-from hw.protocol import NO_MARGIN, Ack, Command, Config, Force, Phase, Reason, State, Stop, config_crc, encode
+from hw.protocol import NO_MARGIN, Command, Config, Force, Phase, Reason, Refused, State, Stop, encode
 from hw.recording import Recorder, outcome, result_of
 from hw.rehearsal import Rehearsal
+from hw.seam import Driver, SerialDevice
 from hw.session import Session
 from sim.scenario import load as scenario_of
 from sim.trace import growths
@@ -110,7 +112,7 @@ def test_a_session_stops_where_a_disarmed_device_pushes(scenario, rungs):
     assert session.stage == Stage.DISARMED
     last = session.link.last
     assert last
-    session.receive(encode(last._replace(tick=(last.tick + 1) & 0xFFFF, applied=(30000, -30000))), session.now)
+    session.take(last._replace(tick=(last.tick + 1) & 0xFFFF, applied=(30000, -30000)), session.now)
     assert (session.stage, session.cause) == (
         Stage.STOPPED,
         "the device is disarmed and applies (30000, -30000) steps",
@@ -132,19 +134,20 @@ def hand_driven(scenario, rungs):
     """A session at the first STATEs after arming, and what sends it one: `lie` is what the device's clock says."""
     session, t, k = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=50, test_encoders=False)), 0, 0
     session.start(t)
-    session.receive(encode(info_of(scenario)), t)
-    session.receive(encode(Ack(config_crc(session.config), 0)), t)
+    session.met(info_of(scenario), t)
+    session.configured(Refused.ACCEPTED, t)
 
     def send(phase, ticks=1, lasts=T_US, lie=None, counts=(0, 0), margin=17_900):
         nonlocal t, k
         t, k = t + lasts, k + ticks
         clock = t if lie is None else lie
-        session.receive(encode(State(phase, k & 0xFFFF, 0, margin, 0, 0, clock & 0xFFFFFFFF, counts, (0, 0))), t)
+        session.take(State(phase, k & 0xFFFF, 0, margin, 0, 0, clock & 0xFFFFFFFF, counts, (0, 0)), t)
+        session.poll(t)
 
     while session.stage == Stage.MEASURING:
         send(Phase.DISARMED)
     session.load(rungs, t)
-    session.receive(encode(Ack(config_crc(session.config), 0)), t)
+    session.configured(Refused.ACCEPTED, t)
     send(Phase.DISARMED)
     session.arm(t)
     send(Phase.DISARMED)
@@ -210,21 +213,28 @@ def test_a_device_that_holds_longer_than_agreed_is_stopped(scenario, rungs):
 def test_an_emergency_stop_is_told_until_the_device_has_latched_it(scenario, rungs):
     session, _ = hand_driven(scenario, rungs)
     session.estop("space bar", 0)
-    told = session.receive(encode(State(Phase.DISARMED, 900, 0, 0, 0, 0, 0, (0, 0), (0, 0))), 0)
-    assert told == encode(Stop(Reason.ESTOP))
-    assert session.receive(encode(State(Phase.ESTOP, 901, 0, 0, 0, 0, 0, (0, 0), (0, 0))), 0) == b""
+    told = session.take(State(Phase.DISARMED, 900, 0, 0, 0, 0, 0, (0, 0), (0, 0)), 0)
+    assert told == (Stop(Reason.ESTOP),)
+    assert session.take(State(Phase.ESTOP, 901, 0, 0, 0, 0, 0, (0, 0), (0, 0)), 0) == ()
 
 
 @pytest.mark.parametrize("configuring", [False, True])
-def test_a_device_that_drives_before_anybody_asked_is_told_to_stop(scenario, configuring):
-    session = Session(scenario, Limits((12.0, 12.0)))
+@pytest.mark.parametrize("status", [Phase.ARMED, Phase.DISARMED])
+def test_a_device_that_drives_before_anybody_asked_is_told_to_stop(scenario, configuring, status):
+    """Whatever its status says; one that goes on for 50 ms once it was asked to be configured is a fault."""
+    session, port = Session(scenario, Limits((12.0, 12.0))), FakePort()
+    driver = Driver(session, SerialDevice(port, lambda: 1e-6 * port.now), lambda ages: (), lambda: port.now)
     session.start(0)
     if configuring:
-        session.receive(encode(info_of(scenario)), 0)
-    driving = State(Phase.ARMED, 5, 0, 100, 0, 0, 0, (0, 0), (12_000, 0))
-    assert encode(Stop(Reason.DONE if configuring else Reason.FAULT)) in session.receive(encode(driving), 1000)
+        session.met(info_of(scenario), 0)
+    driver.turn()
+    driving = State(status, 5, 0, 100, 0, 0, 0, (0, 0), (12_000, 0))
+    port.coming = encode(driving)
+    driver.turn()
+    assert port.sent.endswith(encode(Stop(Reason.FAULT)))
     assert session.stage == (Stage.CONFIGURING if configuring else Stage.CONNECTING)
-    session.receive(encode(driving._replace(tick=70)), 70_000)
+    port.now, port.coming = 70_000, encode(driving._replace(tick=70))
+    driver.turn()
     if configuring:
         assert (session.stage, session.cause) == (Stage.STOPPED, "the device drives, and nobody asked it to")
 
@@ -279,11 +289,11 @@ def test_a_measurement_without_answers_ends(scenario, misses):
     """Whether or not the device counts what it does not hear."""
     session, most = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=50)), 8 * 50 + 2 * 15
     session.start(0)
-    session.receive(encode(info_of(scenario)), 0)
-    session.receive(encode(Ack(config_crc(session.config), 0)), 0)
+    session.met(info_of(scenario), 0)
+    session.configured(Refused.ACCEPTED, 0)
     for k in range(1, most + 1):
         silent = State(Phase.DISARMED, k, 0, NO_MARGIN, 0, k * misses & 0xFF, k * T_US, (0, 0), (0, 0))
-        session.receive(encode(silent), k * T_US)
+        session.take(silent, k * T_US)
     assert session.stage == Stage.REFUSED
     assert "100 % of the answers never reached the device" in session.cause
 
@@ -323,20 +333,8 @@ def test_an_estop_is_repeated_where_nobody_says_that_it_was_heard(scenario):
     """The first STOP may be lost, and the STATEs that would show it too."""
     session = Session(scenario, Limits((12.0, 12.0)))
     session.start(0)
-    stop = encode(Stop(Reason.ESTOP))
+    stop = (Stop(Reason.ESTOP),)
     assert session.estop("pressed", 1000) == stop
     sent = [session.poll(1000 + t) for t in range(0, 60_000, 100)]
     assert sent.count(stop) == pytest.approx(50_000 / 1200, abs=1)
-    session.receive(encode(info_of(scenario)), 70_000)
-    assert session.poll(80_000) == b""
-
-
-def test_a_force_that_a_resting_device_applies_is_told_to_stop(scenario):
-    """Its status says disarmed, its motors do not."""
-    session = Session(scenario, Limits((12.0, 12.0)))
-    session.start(0)
-    session.receive(encode(info_of(scenario)), 0)
-    pushing = State(Phase.DISARMED, 5, 0, 100, 0, 0, 0, (0, 0), (12_000, 0))
-    assert encode(Stop(Reason.DONE)) in session.receive(encode(pushing), 1000)
-    session.receive(encode(pushing._replace(tick=70)), 70_000)
-    assert session.stage == Stage.STOPPED
+    assert session.poll(80_000) == ()

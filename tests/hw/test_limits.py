@@ -135,6 +135,12 @@ def test_what_is_just_at_a_limit_is_within_it():
     check_jump((3e-3, 0.0), (0.0, 0.0), 1, LIMITS)
     check_jolt((3e-3, 0.0), (0.0, 0.0), (0.0, 0.0), LIMITS)
     check_range((0.1, -0.1), (0.1, 0.1))
+    assert shape((12.0, 0.0), (12.0, 0.0), 1.0, LIMITS, T).clipped  # the limiter leaves its forces there
+
+
+def test_the_gain_stays_within_its_ends():
+    gain = Gain(LIMITS, T)
+    assert (gain.rise(10_000), gain.rise(), gain.fall(10_000), gain.fall()) == (1.0, 1.0, 0.0, 0.0)
 
 
 def test_the_gain_takes_its_time():
@@ -208,6 +214,7 @@ def test_the_wire_carries_what_the_motor_does():
 def test_the_probe_is_the_longest_delay_whose_margin_can_be_told():
     assert probe_delay(1.2e-3) == 15
     assert probe_delay(5e-3) == 6
+    assert probe_delay(0.03) == 1
     with pytest.raises(ValueError, match=r"T is 0\.05 s"):
         probe_delay(0.05)
 

@@ -30,6 +30,7 @@ from hw.control import certified_coupling, certified_couplings
 from hw.limits import ENDED, Limits, Stage
 from hw.monitor import LinkSettings
 from hw.recording import IncidentLog
+from hw.seam import SerialDevice
 from hw.session import Session
 from hw.transport import Live, SerialPort
 from sim.scenario import InputError
@@ -86,7 +87,8 @@ def rungs(scenario):
 def run(emulator, scenario, plan, glance=lambda session: None, pace=PACE):
     session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=150))
     with SerialPort(emulator.path, 921_600) as port:
-        live = Live(session, port, plan, True, seconds=60.0, glance=glance, pace=pace)
+        device = SerialDevice(port, lambda: pace * time.monotonic())
+        live = Live(session, device, plan, True, seconds=60.0, glance=glance, pace=pace)
         live.run()
     return session, live
 
@@ -247,27 +249,36 @@ def test_a_signal_leaves_the_terminal_as_it_was(tmp_path):
             bridge_on.close()
 
 
+def test_a_device_is_identified_over_the_line(tmp_path, monkeypatch):
+    """Half a second a sweep, nobody at the handles: a bound below the emulated device's 1.37 N s/m, or why not."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    for pace in (1.0, *PACES):
+        options = ["--emulate", "--seconds", "0.5", "--measure", "60", "--pace", str(pace), "--out", str(tmp_path)]
+        identify.main(options)
+        report = json.loads((tmp_path / "report.json").read_text())
+        if report["session"]["log"][-1]["stage"] == "finished" and "without a STATE" not in report.get("reason", ""):
+            break
+    else:
+        pytest.fail(f"no session of {len(PACES) + 1} came to its end: {report['reason']}")
+    assert report["axes"] or "dry friction" in report["reason"]
+    assert all(0 < axis["friction"]["delta"] <= 1.37 for axis in report["axes"])
+
+
 class Designing:
-    """A session that waits for a coupling, and a port that swallows everything."""
+    """A session that waits for a coupling, with no device."""
 
     stage, measurement = Stage.MEASURED, SimpleNamespace(result=None)
 
     def load(self, rungs, now):
         self.stage = Stage.DISARMED if self.stage == Stage.MEASURED else self.stage
-        return b""
+        return ()
 
     def arm(self, now):
         raise AssertionError("armed by a key from before there was anything to arm")
 
     def stop(self, cause, now):
         self.stage = Stage.FINISHED
-        return b""
-
-    def fileno(self):
-        return self.idle
-
-    def discard(self):
-        pass
+        return ()
 
 
 @pytest.mark.parametrize(("typed", "stage"), [(b"a", Stage.DISARMED), (b"aq", Stage.FINISHED)])
@@ -275,21 +286,19 @@ def test_a_key_typed_during_the_design_does_not_arm(typed, stage):
     """It waits in the terminal's buffer until the session is disarmed: it is read before; other keys still count."""
     keyboard, person = os.pipe()
     session = Designing()
-    session.idle, other = os.pipe()
 
     def plan(ages):
         os.write(person, typed)
         return []
 
-    live = Live(session, session, plan, False, 1.0, keyboard)
-    live._load()
+    live = Live(session, None, plan, False, 1.0, keyboard)
+    live.load()
     assert select.select([keyboard], [], [], 0)[0] == []
     assert session.stage == stage
     os.close(person)
     live._pressed()  # the terminal is gone
     assert live.signals == [signal.SIGHUP]
-    for end in (keyboard, session.idle, other):
-        os.close(end)
+    os.close(keyboard)
 
 
 def test_ctrl_c_does_not_wait_for_the_end_of_a_design(emulator, scenario):

@@ -56,7 +56,7 @@ def test_the_time_is_over_after_full_gain_whatever_key_is_pressed(scenario, rung
     rehearsal = rehearsal_of(scenario, rungs, operator)
     session = rehearsal.run_until_armed(0.4)
     assert session.stage == Stage.ARMED
-    assert operator.press("a", session, session.now) == b""
+    assert operator.press("a", session, session.now) == ()
     rehearsal.run_until_armed(1.0)
     assert (session.stage, session.cause) == (Stage.FINISHED, "the time is over")
     at = {event.stage: event.t_us for event in session.log}
@@ -69,7 +69,7 @@ def test_a_key_arms_a_disarmed_session_only(scenario, rungs):
     rehearsal = rehearsal_of(scenario, rungs, operator, "down:jitter=0.0008@0.3")
     session = rehearsal.run(0.5)
     assert session.stage == Stage.DISARMED
-    assert operator.press("a", session, session.now) == b""
+    assert operator.press("a", session, session.now) == ()
     rehearsal.run_until_armed(0.3)
     assert session.stage == Stage.ARMED
     begun = session.now
@@ -88,5 +88,5 @@ def test_a_key_arms_a_disarmed_session_only(scenario, rungs):
 def test_other_keys_do_nothing(scenario, rungs, key):
     rehearsal = rehearsal_of(scenario, rungs, Operator(False, 1.0))
     session = rehearsal.run(0.5)
-    assert Operator(False, 1.0).press(key, session, session.now) == b""
+    assert Operator(False, 1.0).press(key, session, session.now) == ()
     assert session.stage == Stage.DISARMED

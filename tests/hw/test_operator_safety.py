@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from worlds import FakePort
 
 from cli import bridge, identify, replay
 from cli.bridge import _parser
@@ -22,6 +23,7 @@ from hw.limits import Limits, Stage
 from hw.monitor import LinkSettings
 from hw.recording import IncidentLog
 from hw.rehearsal import Rehearsal
+from hw.seam import Driver, SerialDevice
 from hw.session import Operator, Session, session_for
 from hw.transport import Preflight, preflight
 from sim.scenario import InputError
@@ -82,7 +84,7 @@ def test_the_deadman_at_the_device(scenario, rungs):
     rehearsal.emulator.device.deadman = False
     rehearsal.run(1.0)
     assert session.stage == Stage.DISARMED
-    assert session.arm(session.now) == b""
+    assert session.arm(session.now) == ()
     assert session.log[-1][1:] == (Stage.DISARMED, "the deadman at the device is not held")
     assert not any(np.any(m.applied) for m in rehearsal.moments)
     rehearsal.emulator.device.deadman = True
@@ -107,7 +109,7 @@ def test_any_key_is_somebody(scenario, rungs):
     for _ in range(5):
         session = rehearsal.run_until_armed(0.0) if rehearsal.armed_us is None else rehearsal.session
         rehearsal.run(1e-6 * session.now + 0.7)
-        assert operator.press("x", session, session.now) == b""
+        assert operator.press("x", session, session.now) == ()
     assert session.stage == Stage.ARMED
 
 
@@ -272,9 +274,12 @@ def test_a_device_is_identified_in_virtual_time(tmp_path):
 
 
 def test_unreadable_frames_ask_about_the_baud_rate(scenario):
-    session = Session(scenario, Limits((2.0, 2.0)))
+    session, port = Session(scenario, Limits((2.0, 2.0))), FakePort()
+    driver = Driver(session, SerialDevice(port, lambda: 1e-6 * port.now), lambda ages: (), lambda: port.now)
     session.start(0)
-    for now in range(0, 2_000_000, 5000):
-        session.receive(b"\x81\x92noise\x00", now)
-    session.poll(2_100_000)
-    assert session.cause == "no answer to HELLO within 2.1 s; 400 unreadable frames: wrong baud rate?"
+    for _ in range(401):
+        driver.turn()
+        port.now, port.coming = port.now + 5000, b"\x81\x92noise\x00"
+    while session.stage == Stage.CONNECTING:
+        driver.turn()
+    assert session.cause == "no answer to HELLO within 2.0 s; 400 unreadable frames: wrong baud rate?"

@@ -6,18 +6,22 @@ from types import ModuleType
 import numpy as np
 import pytest
 from scipy.linalg import expm
+from worlds import FakePort
 
 from cli import bridge, replay
 from cli.session_cli import check_link
 from controller.coupling import SpringDamper
 from hw.control import certified_coupling, certified_couplings, timed
+from hw.device import Device
+from hw.emulator import info_of
+from hw.force_dimension import ForceDimension, library
 from hw.limits import Limits, Stage
 from hw.monitor import Ages, LinkSettings
-from hw.protocol import Command, Config, Force, Phase, Reason, Refused, State
+from hw.protocol import Command, Config, Decoder, Force, Hello, Phase, Reason, Refused, State, encode
 from hw.recording import Recorder, save
-from hw.seam import DeviceWire, ForceDimension, SerialDevice, library
+from hw.seam import PortLost, SerialDevice
 from hw.session import Session
-from hw.transport import Live, PortLost
+from hw.transport import Live
 from models.scene import build, plant
 from sim.scenario import InputError
 from sim.scenario import load as scenario_of
@@ -118,17 +122,16 @@ def held_session(scenario, sdk, seconds=0.5, cap=12.0, glance=lambda session: No
     session = Session(scenario, Limits((cap,) * 2), LinkSettings(measure=150))
     session.record = recorder = Recorder(2)
     with ForceDimension(scenario, None, sdk, sdk.clock, sdk.sleep) as device:
-        wire, made = DeviceWire(device), []
+        made = []
 
         def plan(ages):
             judged, link = timed(scenario, ages, 0.99, 50.0, at_once=True)
             made.extend(certified_couplings(judged, "I", None, None, link, spare=0))
             return made
 
-        live = Live(session, wire, plan, True, seconds, glance=glance)
-        live.now = lambda: round(1e6 * sdk.now)
+        live = Live(session, device, plan, True, seconds, glance=glance)
+        live.clock = lambda: round(1e6 * sdk.now)
         live.run()
-        wire.close()
     return session, recorder, made
 
 
@@ -261,20 +264,18 @@ def test_the_emergency_stop_is_at_once(scenario):
     def glance(session):
         if session.stage == Stage.ARMED and np.abs(sdk.force).max() > 0.2:
             held.append(np.abs(sdk.force).max())
-            wire.write(session.estop("asked to", session.now))
+            live.do(session.estop("asked to", session.now))
             assert sdk.force.tolist() == [0.0, 0.0]
 
     session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=150))
     with ForceDimension(scenario, "1x,0x", sdk, sdk.clock, sdk.sleep) as device:
-        wire = DeviceWire(device)
 
         def plan(ages):
             return certified_couplings(timed(scenario, ages, 0.99, 50.0, True)[0], "I", None, None, 0, spare=0)
 
-        live = Live(session, wire, plan, True, 3.0, glance=glance)
-        live.now = lambda: round(1e6 * sdk.now)
+        live = Live(session, device, plan, True, 3.0, glance=glance)
+        live.clock = lambda: round(1e6 * sdk.now)
         live.run()
-        wire.close()
     assert (session.stage, session.cause) == (Stage.ESTOP, "asked to")
     assert held
 
@@ -339,34 +340,36 @@ def test_a_host_clock_has_no_baud_rate(scenario):
 
 
 class Line:
-    """An emulated device at the end of a pipe-like port: it ticks when it is waited for."""
+    """An emulated device at the end of a line: it ticks when it is waited for."""
 
     def __init__(self, device):
-        self.device, self.now, self.out = device, 0, b""
+        self.device, self.now, self.out, self.gone = device, 0, b"", False
 
-    def fileno(self):
-        return self.ready
+    def wait(self, seconds):
+        return True
 
     def write(self, data):
         self.device.receive(data, self.now + 200)
         return len(data)
 
     def read(self):
+        if self.gone:
+            raise PortLost("the port cannot be read: it was hung up")
         self.now += 1200
         return self.device.tick(self.now, (7, -7))[1]
 
+    def discard(self):
+        pass
 
-def test_the_serial_link_has_the_same_four_calls(monkeypatch):
-    from hw.device import Device
-    from hw.emulator import info_of
 
+def test_the_serial_link_has_the_same_four_calls():
     about = info_of(scenario_of())
     line = Line(Device(about))
-    monkeypatch.setattr("hw.seam.select.select", lambda *_: ([line], [], []))
-    device = SerialDevice(line)
+    device = SerialDevice(line, lambda: 1e-6 * line.now)
     assert device.info() == about
     assert device.configure(Config(1, 4, 4, 0, (32767, 1), (1, 1))) == Refused.CAP
-    assert device.configure(Config(1, 4, 4, 0, (9000, 9000), (9000, 9000))) == Refused.ACCEPTED
+    config = Config(1, 4, 4, 0, (9000, 9000), (9000, 9000))
+    assert device.configure(config) == Refused.ACCEPTED
     state = device.exchange(None)
     for command, force in [(Command.ARM, (0, 0)), (Command.RUN, (50, -60)), (Command.RUN, (70, -80))]:
         state = device.exchange(Force(command, (state.tick + 1) & 0xFFFF, state.tick, force))
@@ -375,15 +378,24 @@ def test_the_serial_link_has_the_same_four_calls(monkeypatch):
     assert (state.phase, state.applied) == (Phase.ARMED, (70, -80))
     device.stop(Reason.DONE)
     assert device.exchange(None).phase == Phase.RAMP
+    answers = [device.configure(config) for _ in range(200)]  # told that it is running, and asked again each 0.1 s
+    assert set(answers[: answers.index(Refused.ACCEPTED)]) == {None}
+    line.gone = True
+    with pytest.raises(PortLost, match="hung up"):
+        [device.exchange(None) for _ in range(300)]  # first what has come in before
 
 
-def test_a_silent_line_is_lost(monkeypatch):
-    monkeypatch.setattr("hw.seam.select.select", lambda *_: ([], [], []))
-    monkeypatch.setattr("hw.seam._PATIENCE", 0.01)
-    line = Line(None)
-    line.write = len
-    device = SerialDevice(line)
-    with pytest.raises(PortLost, match="no answer within"):
-        device.info()
-    with pytest.raises(PortLost, match=r"no answer within 0\.01 s, 0 unreadable frames"):
-        device.exchange(None)
+def test_a_silent_line_is_asked_again_and_never_waited_for():
+    port = FakePort()
+    device = SerialDevice(port, lambda: 1e-6 * port.now)
+    assert [device.info() for _ in range(700)] == [None] * 700
+    assert port.now == 350_000
+    assert [type(m) for m in Decoder().feed(port.sent)] == [Hello] * 4
+
+
+def test_a_flood_of_other_frames_keeps_nobody_from_looking_at_the_time():
+    """INFO for ever: every call comes back, so that the session's time-outs end it."""
+    flood = FakePort()
+    flood.wait, flood.read = lambda seconds: True, lambda: encode(info_of(scenario_of())) * 50
+    device = SerialDevice(flood)
+    assert [device.exchange(None) for _ in range(100)] == [None] * 100

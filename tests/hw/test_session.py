@@ -7,6 +7,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 from rich.console import Console
+from worlds import FakePort
 
 from cli import bridge
 from cli import replay as replay_command
@@ -19,9 +20,10 @@ from hw.emulator import Emulator, FaultInjection
 from hw.faults import CASES, Case, at, lively, person, rehearse_case
 from hw.limits import Fault, Limits, Stage, Units
 from hw.monitor import Ages, LinkSettings
-from hw.protocol import Command, Decoder, Force, Phase, State, Stop, encode
+from hw.protocol import Command, Decoder, Force, Hello, Phase, State, Stop, encode
 from hw.recording import Recorder, digest, load, outcome, recipes_of, replay, result_of, save, save_npz, steady_ticks
 from hw.rehearsal import Rehearsal
+from hw.seam import Driver, SerialDevice
 from hw.session import Session
 from models.scene import plant
 from sim.couplings import choose, limits_of
@@ -103,10 +105,11 @@ def test_a_device_that_repeats_itself_is_lost_while_its_bytes_keep_coming(scenar
     session = rehearsal.run_until_armed(0.5)
     assert session.stage == Stage.ARMED
     assert session.link.last
-    again, now = encode(session.link.last), session.now
+    again, now = session.link.last, session.now
     for _ in range(100):
         now += 100
-        session.receive(again, now)
+        session.take(again, now)
+        session.poll(now)
     assert session.stage == Stage.LOST
     assert session.log[-1].t_us - session.heard <= session.limits.watchdog_us + 100
 
@@ -123,9 +126,7 @@ def test_a_device_that_does_something_else_is_stopped(scenario, rungs, change, c
     session = rehearsal_of(scenario, rungs).run_until_armed(0.5)
     last = session.link.last
     assert last
-    (said,) = Decoder().feed(
-        session.receive(encode(last._replace(tick=(last.tick + 1) & 0xFFFF, **change)), session.now)
-    )
+    (said,) = session.take(last._replace(tick=(last.tick + 1) & 0xFFFF, **change), session.now)
     assert isinstance(said, Stop)
     assert session.stage == Stage.STOPPED
     assert cause in session.cause
@@ -137,7 +138,7 @@ def test_a_device_that_arms_by_itself_is_stopped(scenario, rungs):
     assert session.stage == Stage.DISARMED
     last = session.link.last
     assert last
-    session.receive(encode(last._replace(tick=(last.tick + 1) & 0xFFFF, status=Phase.ARMED)), session.now)
+    session.take(last._replace(tick=(last.tick + 1) & 0xFFFF, status=Phase.ARMED), session.now)
     assert (session.stage, session.cause) == (Stage.STOPPED, "the device is armed, and nobody asked it to")
 
 
@@ -160,24 +161,25 @@ def test_a_stop_that_is_lost_is_said_again(scenario, rungs):
     assert last
     session.fail("a test", session.now)
     for ahead in (1, 2):
-        answer = session.receive(encode(last._replace(tick=(last.tick + ahead) & 0xFFFF)), session.now)
-        assert [type(m) for m in Decoder().feed(answer)] == [Stop]
+        answer = session.take(last._replace(tick=(last.tick + ahead) & 0xFFFF), session.now)
+        assert [type(m) for m in answer] == [Stop]
 
 
 def test_random_bytes_move_nothing(scenario):
     """A megabyte of noise, and real frames with one byte changed: no crash, no stage but waiting, no FORCE."""
     rng = np.random.default_rng(5)
-    session = session_with(scenario)
+    session, port = session_with(scenario), FakePort()
+    driver = Driver(session, SerialDevice(port, lambda: 1e-6 * port.now), lambda ages: (), lambda: port.now)
     session.start(0)
-    state = encode(State(Phase.ARMED, 1, 0, 0, 0, 0, 0, (5, 5), (0, 0)))
-    said = b""
-    for now in range(250):
-        said += session.receive(rng.bytes(4000), now)
+    state = encode(State(Phase.DISARMED, 1, 0, 0, 0, 0, 0, (5, 5), (0, 0)))
+    for _ in range(250):
         broken = bytearray(state)
         broken[int(rng.integers(len(state)))] ^= int(rng.integers(1, 256))
-        said += session.receive(bytes(broken), now)
+        port.coming = rng.bytes(4000) + bytes(broken)
+        driver.turn()
     assert session.stage == Stage.CONNECTING
-    assert said == b""
+    assert {type(m) for m in Decoder().feed(port.sent)} == {Hello}
+    assert session.counters.host_errors > 1000
 
 
 # the exact engine

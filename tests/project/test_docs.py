@@ -5,6 +5,7 @@ import importlib.util
 import io
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -130,6 +131,16 @@ def test_what_counts_as_the_same_where_it_is_measured():
     line = "exact 0.032 s, 799 unstable; 96 x real time, loop / raw steps 1.19 (median of 10), error 3.3e-14"
     assert regenerate.same_line(line, re.sub(r"0\.032|96|1\.19", "7", line).replace("3.3e-14", "8e-15"), measured=True)
     assert not regenerate.same_line(line, line.replace("799", "790"), measured=True)
+
+
+def test_measured_blocks_are_compared_but_for_times(monkeypatch, tmp_path, capsys):
+    page = tmp_path / "page.md"
+    page.write_text("<!-- measured: rows -->\n```text\n$ python -m x\n3 rows in 0.2 s\n```\n")
+    monkeypatch.setattr(regenerate, "PAGES", [page])
+    for printed, found in (("noise\n3 rows in 9 s\n", 0), ("9 rows in 0.2 s\n", 1), ("", 1)):
+        monkeypatch.setattr(regenerate, "run", lambda *words, out=printed: SimpleNamespace(stdout=out))
+        assert regenerate.check() == found
+    assert "and there is    9 rows in 0.2 s" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)

@@ -1,0 +1,514 @@
+"""The convex program of the optimal coupling: a basis of filters R, what is asked of F = Theta R Psi E, its optimum.
+
+Everything is affine in R, and R = kappa I keeps every condition for a small kappa: there is always a start.
+Each condition is a linear matrix inequality at every frequency; design.barrier solves for those on a grid, and a dense
+sweep adds the frequencies at which it is missed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+import scipy  # its parts load when they are used
+from numpy.typing import NDArray
+
+from controller.coupling import ForceFilter, basis
+from controller.delay import delay
+from controller.loop import DelayRange, Loop
+from controller.lti import Array, Complex, Lti, Sampled, as_like
+from design.barrier import Block, Program, centre, towards
+from design.conditions import Demand, even_damping, least_multiple, this_environment_demand
+from design.frequency import frequencies, hermitian, on_circle, peaks, supremum
+from design.multipliers import SPARE, limiter_demand, limiter_lag, switching_block
+from design.result import number, one_of
+from design.transparency import BAND_HZ
+
+OBJECTIVES = ("rms", "sup")
+MARGIN = 0.002  # share of the damping that stays unused: what an exact proof always finds room in
+LADDER = ((4, 3), (8, 6), (14, 10), (22, 16))  # taps and real poles of the rungs
+_FASTEST, _SLOWEST, _SLOWEST_OF_MANY = 0.5, 0.0015, 0.008  # distance to 1 of the real poles' ends
+_FASTER = 0.25  # modes of smaller radius are left to the filter of the sum of all forces
+_NEAR = 0.3  # of its distance to 1: a real pole so close to a mode gives way to it
+_SLOWER = 0.999  # modes of larger radius get no section
+RICH, _EDGED = 2, 14  # channels up to which, and taps from which on, there are sections at the band's end
+_EDGES = (0.2, 0.07, 0.02)  # their damping ratios: they crowd at the band's end, where the error may jump
+FULL = 4  # channels up to which every force has a filter to every device
+_STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weight of g - 1 beside the relative mismatch; for more than RICH channels
+HIGH_HZ = 100.0  # above it the force is kept low by a soft row, or capped
+SOFT = 0.05, 0.3  # the soft row's weight: the first number times the mismatch so far, which counts up to the second
+_SMALL = 1e-5  # weight of the coefficients themselves: some have no effect where the environment has no inverse
+_DECIMALS = 10
+_GAPS = (0.05, 0.01)  # of the objective, or of what it gains over no force: gaps at which the inequalities are swept
+_FORGIVEN = 5e-4  # by which an inequality may fail between its frequencies: scaling makes up for it
+_MOST_SWEEPS = 6
+_STEEPER = 3.0  # factor between one centre of the barrier and the next
+SMALLEST = 1e-5  # least frequency of an inequality [rad/sample]: below it nothing changes
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is asked of an optimal coupling beside its loop. Raises ValueError naming the field that is wrong."""
+
+    objective: Literal["rms", "sup"] = "rms"  # of the mismatch relative to the environment, over the band
+    band_hz: tuple[float, float] = BAND_HZ
+    high_gain: float | None = None  # largest |F|/|E| above 100 Hz; None: kept low by a soft row
+    limiter: bool = False  # covered also while forces are limited
+    seconds: float = 60.0  # no rung is begun later than this; the sizes of rungs end most climbs far earlier
+    ladder: tuple[tuple[int, int], ...] = LADDER  # (taps, real poles)
+
+    def __post_init__(self) -> None:
+        one_of("objective", self.objective, OBJECTIVES)
+        number("seconds", self.seconds)
+        if self.high_gain is not None and not 1 <= number("high_gain", self.high_gain) < np.inf:
+            raise ValueError(f"high_gain is {self.high_gain}, expected a factor of at least 1")
+        if not 0 < self.band_hz[0] < self.band_hz[1]:
+            raise ValueError(f"band_hz is {self.band_hz}, expected two rising frequencies in Hz")
+        if not self.ladder or any(taps < 1 or poles < 0 for taps, poles in self.ladder):
+            raise ValueError(f"ladder is {self.ladder}, expected pairs of taps (1 or more) and poles (0 or more)")
+
+
+DEFAULT = Options()
+
+
+@dataclass(frozen=True, eq=False)
+class Constraint:
+    """A linear matrix inequality that the forces G = R Psi E as they leave are to keep at every frequency.
+
+    `block` is a condition's own statement, He[block(G, x)] > 0, affine in G and in own unknowns x together.
+    """
+
+    name: str
+    block: Callable[[Sampled, Array], Sampled]
+    unit: Array  # (r,) rows and columns of the block are scaled by it, so that its eigenvalues count in one measure
+    low: float = SMALLEST  # [rad/sample]
+    high: float = np.pi
+    start: tuple[float, ...] = ()  # own unknowns for which R = kappa I is strictly feasible for a small kappa
+    cost: tuple[float, ...] = ()  # of the own unknowns in the objective
+
+    def at(self, G: Sampled, own: Array) -> Complex:
+        """The scaled matrices, (n, k, r, r)."""
+        return hermitian(self.unit[:, None] * self.block(G, own).G * self.unit)
+
+
+# what is asked --------------------------------------------------------------------------------------------------------
+
+
+def this_environment(loop: Loop) -> Constraint:
+    """design.conditions.this_environment_demand with a little of the damping unused, in units of Delta/T."""
+
+    def block(G: Sampled, own: Array) -> Sampled:
+        demand = _demand(loop, _late(loop, G))
+        return demand.free + demand.gain * (1 - MARGIN)
+
+    gain = _demand(loop, Lti.constant(np.zeros((loop.channels, loop.channels)), loop.T)).gain
+    return Constraint("this-environment", block, 1 / np.sqrt(np.diag(gain.D)))
+
+
+def _demand(loop: Loop, F: Any) -> Demand[Any]:
+    return this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
+
+
+def switching(loop: Loop, span: DelayRange) -> Constraint:
+    """design.multipliers.switching_block for delays that switch within the span; alpha T/Delta are its unknowns."""
+    scale = even_damping(loop.delta, loop.T, loop.T_max) / loop.T
+    moves = np.flatnonzero(np.asarray(span.hi) - np.asarray(span.lo))
+
+    def block(G: Sampled, own: Array) -> Sampled:
+        alpha = np.zeros(scale.size)
+        alpha[moves] = own * scale[moves]
+        usable = [(1 - MARGIN) * d for d in loop.delta]
+        return switching_block(G, span.lo, span.hi, usable, alpha.tolist(), loop.T_max)[0]
+
+    unit = 1 / np.sqrt(np.concatenate([scale, scale[moves]]))
+    return Constraint("switching delays", block, unit, start=(0.5,) * moves.size, cost=(0.0,) * moves.size)
+
+
+@dataclass(frozen=True)
+class Slip:
+    """The limiter's lag and multiplier: its block is affine in the forces for given ones."""
+
+    beta: float  # rho = beta delta/T
+    c: tuple[tuple[float, ...], ...]  # (m, lags)
+
+    @classmethod
+    def even(cls, loop: Loop, beta: float, c: float) -> Slip:
+        return cls(beta, ((c,),) * loop.channels)
+
+
+def limiter(loop: Loop, slip: Slip) -> Constraint:
+    """design.multipliers.limiter_demand: forces that are limited. A little of rho stays unused, as of the damping."""
+    rho = limiter_lag(loop.delta, loop.T, slip.beta)
+    spare = np.diag([*rho, *rho]) * SPARE
+
+    def block(G: Sampled, own: Array) -> Sampled:
+        demand = limiter_demand(G, loop.theta, loop.delta, rho, slip.c, loop.T_max)
+        return demand.free + demand.gain * (1 - MARGIN) - spare
+
+    return Constraint("limiter", block, np.tile(1 / np.sqrt(even_damping(loop.delta, loop.T, loop.T_max) / loop.T), 2))
+
+
+def most_gain(loop: Loop, cap: float) -> Constraint:
+    """|F| < cap |E| above 100 Hz."""
+    E = loop.E()
+
+    def block(G: Sampled, own: Array) -> Sampled:
+        return _within(_late(loop, G), E.at(G.z), cap)
+
+    low = min(2 * np.pi * HIGH_HZ * loop.T, np.pi)
+    return Constraint("high-frequency gain", block, np.ones(2 * E.inputs), low=low)
+
+
+def worst_mismatch(loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> Constraint:
+    """|F - Lambda E| < tau |E| over the band, with tau its own unknown and its cost."""
+    E = loop.E()
+
+    def block(G: Sampled, own: Array) -> Sampled:
+        return _within(_late(loop, G) - as_like(G, delay(loop.lam, loop.T) @ E), E.at(G.z), own[0])
+
+    low, high = _band(loop, band_hz)
+    return Constraint("mismatch", block, np.ones(2 * E.inputs), low, high, start=(2.0,), cost=(1.0,))
+
+
+def _late(loop: Loop, G: Sampled) -> Sampled:
+    """F = Theta G."""
+    return as_like(G, delay(loop.theta, loop.T)) @ G
+
+
+def _within(M: Sampled, E: Complex, cap: float) -> Sampled:
+    """A block whose Hermitian part is [[cap I, M/|E|], [., cap I]]: |M| < cap |E| in the largest singular value."""
+    m = M.G.shape[-1]
+    S = np.zeros((*M.G.shape[:-2], 2 * m, 2 * m), dtype=complex)
+    S[..., np.arange(2 * m), np.arange(2 * m)] = cap
+    S[..., :m, m:] = 2 * M.G / np.linalg.norm(E, 2, axis=(-2, -1))[..., None, None]
+    return Sampled(M.z, S, M.T)
+
+
+# the basis -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Span:
+    """The functions of R, and which of them have a coefficient where: unknowns are g and R_1, R_2, .. there."""
+
+    poles: Array  # (n,)
+    pairs: Array  # (p, 2)
+    used: NDArray[np.bool_]  # (n + 2 p, m, m or m + 1)
+
+    @property
+    def unknowns(self) -> int:
+        return 1 + int(self.used.sum())
+
+    def responses(self, z: Complex) -> Complex:
+        """b_k(z) - 1 for k >= 1, shape (k, n + 2 p): what stays when R_0 = g I less the others."""
+        return basis(self.poles, z, self.pairs)[:, 1:] - 1
+
+    def sources(self) -> Array:
+        """The filtered signals as rows over the forces, (m or m + 1, m)."""
+        m, columns = self.used.shape[1:]
+        return np.vstack([np.eye(m), np.ones((columns - m, m))])
+
+    def matrices(self, x: Array) -> Array:
+        """R_1, R_2, .. of the unknowns, (n + 2 p, m, m or m + 1)."""
+        R = np.zeros(self.used.shape)
+        R[self.used] = x[1 : self.unknowns]
+        return R
+
+    def filter(self, x: Array, scale: float = 1.0) -> ForceFilter:
+        """The force filter in decimals: R_0 is what is missing to exactly g I."""
+        unit = 10**_DECIMALS
+        later = np.array([round(v * unit) for v in (scale * self.matrices(x)).ravel().tolist()], dtype=object)
+        later = later.reshape(self.used.shape)
+        m = self.used.shape[1]
+        first = -later.sum(axis=0) if len(later) else np.zeros(self.used.shape[1:], dtype=object)
+        first[np.arange(m), np.arange(m)] += round(max(scale * x[0], 0.0) * unit)
+        R = np.concatenate([first[None], later])
+        return ForceFilter(self.poles, self.pairs, np.array([int(v) / unit for v in R.flat]).reshape(R.shape))
+
+    def chain(self, T: float) -> Lti:
+        """A block with the poles of the basis."""
+        one = np.append(np.zeros(len(self.used)), 1.0)[:, None, None]  # the last function has every section
+        return ForceFilter(self.poles, self.pairs, one).filter(T)
+
+
+def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1]) -> Span:
+    """Taps, real poles even in the logarithm of the time constant, and the modes of E and of its inverse.
+
+    Poles are decimals from the start; a larger basis for one or two channels has sections where the band ends. With
+    more than FULL channels every device has a filter of its own force and one of the sum of all, and fast modes are
+    left to the latter.
+    """
+    m = E.inputs
+    modes = np.concatenate([E.poles(), _zeros(E)])
+    modes = modes[(np.abs(modes) < _SLOWER) & (np.abs(modes) > 0.02) & (modes.imag >= 0)]
+    slowest = _SLOWEST if m <= RICH else _SLOWEST_OF_MANY
+    slow = np.round(1 - np.geomspace(_FASTEST, slowest, poles), 4) if poles else np.zeros(0)
+    own_real = modes[np.abs(modes.imag) <= 1e-6].real
+    fast, real, pairs = [], [a for a in slow.tolist() if not (np.abs(own_real - a) < _NEAR * (1 - a)).any()], []
+    for mode in _distinct(modes):
+        if abs(mode.imag) > 1e-6:
+            pairs.append((-2 * mode.real, abs(mode) ** 2))
+        elif m > FULL and abs(mode) < _FASTER:
+            fast.append(float(mode.real))
+        elif not any(abs(mode.real - a) < 0.02 * (1 - abs(a)) for a in real):
+            real.append(float(mode.real))
+    if m <= RICH and taps >= _EDGED:
+        q = np.exp(2 * np.pi * end_hz * E.T * (1j - np.array(_EDGES)))
+        pairs += [(-2 * mode.real, abs(mode) ** 2) for mode in q if mode.imag > 0]
+    own = len(real) + taps - 1 + 2 * len(pairs)
+    fast += [0.0] * (len(fast) % 2)
+    pairs += [(-(a + b), a * b) for a, b in zip(fast[::2], fast[1::2], strict=True)]  # last: own chains end before
+    all_poles = np.concatenate([np.zeros(taps - 1), np.round(real, 4)])
+    count = all_poles.size + 2 * len(pairs)
+    used = np.ones((count, m, m), dtype=bool)
+    if m > FULL:
+        used = np.zeros((count, m, m + 1), dtype=bool)
+        used[:own, np.arange(m), np.arange(m)] = True
+        used[:, :, m] = True
+    return Span(all_poles, np.round(np.array(pairs).reshape(-1, 2), 6), used)
+
+
+def _zeros(E: Lti) -> Complex:
+    """The poles of E^-1; contacts are grounded by a millionth, so that there is one."""
+    D = E.D + 1e-6 * max(float(np.trace(E.D)) / E.inputs, 1e-12) * np.eye(E.inputs)
+    return np.linalg.eigvals(E.A - E.B @ np.linalg.solve(D, E.C)).astype(complex)
+
+
+def _distinct(modes: Complex) -> list[complex]:
+    kept: list[complex] = []
+    for mode in modes:
+        if all(abs(mode - other) >= 0.05 * (1 - abs(other)) for other in kept):
+            kept.append(mode)
+    return kept
+
+
+# the problem -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One environment in which the constraints are to hold, and how much its mismatch counts."""
+
+    loop: Loop  # around this environment alone
+    E: Lti
+    constraints: tuple[Constraint, ...] = ()
+    weight: float = 1.0
+
+    def delayed(self, z: Complex) -> Sampled:
+        """Psi E at z (k,)."""
+        return Sampled.of(delay(self.loop.psi, self.loop.T) @ self.E, z[None])
+
+    def need(self, coupling: ForceFilter) -> float:
+        """The damping that this-environment asks, on a refined sweep, in units of what there is.
+
+        The responses of environment and filter are multiplied: their series has defective poles, which cost digits.
+        """
+
+        def needed(w: Array) -> Array:
+            F = _late(self.loop, coupling.around(self.delayed(on_circle(w))))
+            demand = _demand(self.loop, F)
+            return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
+
+        chain = Span(coupling.poles, coupling.pairs, np.ones((len(coupling.R) - 1, 1, 1), dtype=bool)).chain(self.E.T)
+        return supremum(needed, frequencies(self.E, chain, low=SMALLEST / 10))[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The unknowns [g, R_1, R_2, .., own unknowns of the demands] with objective and inequalities."""
+
+    span: Span
+    cases: tuple[Case, ...]
+    options: Options
+    soft: float  # weight of the force above 100 Hz
+
+    @property
+    def own(self) -> list[tuple[int, int]]:
+        """Where the own unknowns of each demand begin and end, case by case."""
+        ends = [self.span.unknowns]
+        for case in self.cases:
+            ends += [ends[-1] + len(constraint.start) for constraint in case.constraints]
+        return list(pairwise(ends))
+
+    @property
+    def unknowns(self) -> int:
+        return self.span.unknowns + sum(len(c.start) for case in self.cases for c in case.constraints)
+
+    def start(self, kappa: float) -> Array:
+        """R = kappa I."""
+        x = np.zeros(self.unknowns)
+        x[0] = kappa
+        own = [value for case in self.cases for constraint in case.constraints for value in constraint.start]
+        x[self.span.unknowns :] = own
+        return x
+
+    def objective(self) -> tuple[Array, Array, Array]:
+        """A, b, c of |A x - b|^2 + c'x: squared relative mismatch, soft rows, and the share of static stiffness."""
+        rows, right = [], []
+        for case in self.cases:
+            if not case.weight:
+                continue
+            loop = case.loop
+            low, high = _band(loop, self.options.band_hz)
+            if self.options.objective == "rms":
+                w = frequencies(case.E, low=low, high=high, points=80)
+                logarithm = np.log(w)
+                weight = np.gradient(logarithm) / (logarithm[-1] - logarithm[0])
+                self._force_rows(case, w, np.sqrt(case.weight * weight), loop.lam, rows, right)
+            edge = 2 * np.pi * HIGH_HZ * loop.T
+            if edge < np.pi and self.soft > 0:
+                w = np.geomspace(edge, np.pi, 20)
+                self._force_rows(case, w, np.full(20, self.soft * np.sqrt(case.weight / 20)), None, rows, right)
+        static = np.zeros((1, self.unknowns))
+        static[0, 0] = held = static_weight(self.cases[0].loop)
+        cost = np.zeros(self.unknowns)
+        cost[self.span.unknowns :] = [v for case in self.cases for c in case.constraints for v in c.cost]
+        small = _SMALL * np.eye(self.span.unknowns, self.unknowns)
+        return np.vstack([*rows, static, small]), np.concatenate([*right, [held], np.zeros(len(small))]), cost
+
+    def _force_rows(
+        self, case: Case, w: Array, weight: Array, lam: Sequence[int] | None, rows: list[Array], right: list[Array]
+    ) -> None:
+        """Rows of weight |F - Lambda E|/|E|, without Lambda E where lam is None."""
+        z = on_circle(w)
+        E = case.E.at(z)
+        weight = weight / np.linalg.norm(E, axis=(1, 2))
+        turn = z[:, None] ** -np.asarray(case.loop.theta)
+        slope: Complex = np.zeros((self.unknowns, E.size), dtype=complex)
+        slope[: self.span.unknowns] = (self._slopes(case, z).G * (weight[:, None] * turn)[..., None]).reshape(
+            -1, E.size
+        )
+        target = np.zeros_like(E) if lam is None else (weight[:, None] * z[:, None] ** -np.asarray(lam))[..., None] * E
+        rows.extend([np.ascontiguousarray(part(slope).T) for part in (np.real, np.imag)])
+        right.extend([part(target).ravel() for part in (np.real, np.imag)])
+
+    def _slopes(self, case: Case, z: Complex) -> Sampled:
+        """What each of g, R_1, R_2, .. adds to the forces G as they leave, (unknowns, k, m, m)."""
+        delayed = case.delayed(z).G[0]
+        signals = self.span.sources() @ delayed  # (k, sources, m)
+        functions = self.span.responses(z)
+        G = np.zeros((self.span.unknowns, *delayed.shape), dtype=complex)
+        G[0] = delayed
+        which = np.argwhere(self.span.used)  # (function, row, source) of unknown 1, 2, ..
+        through = functions[:, which[:, 0], None] * signals[:, which[:, 2]]  # (k, unknowns - 1, m)
+        G[np.arange(1, len(G)), :, which[:, 1]] = np.swapaxes(through, 0, 1)
+        return Sampled(z[None], G, case.loop.T)
+
+    def block(self, case: Case, constraint: Constraint, own: tuple[int, int], w: Array) -> Block:
+        """The inequality of a constraint at these frequencies: an affine map, by what it makes of each unknown."""
+        slopes = self._slopes(case, on_circle(w))
+        nothing, units = Sampled(slopes.z, np.zeros_like(slopes.G[:1]), slopes.T), np.eye(own[1] - own[0])
+        none = np.zeros(len(units))
+        constant = constraint.at(nothing, none)
+        moved = constraint.at(slopes, none) - constant
+        slope = np.zeros((self.unknowns, *constant.shape[1:]), dtype=complex)
+        slope[: len(moved)] = moved
+        for a, unit in enumerate(units, start=own[0]):
+            slope[a] = (constraint.at(nothing, unit) - constant)[0]
+        return Block.of(constant[0], np.swapaxes(slope, 0, 1))
+
+    def positive(self) -> Block:
+        """g > 0."""
+        slope = np.zeros((1, self.unknowns, 1, 1), dtype=complex)
+        slope[0, 0] = 1
+        return Block.of(np.zeros((1, 1, 1), dtype=complex), slope)
+
+    def least(self, case: Case, constraint: Constraint, own: tuple[int, int], x: Array, w: Array) -> Array:
+        """The least eigenvalue of a constraint at x, (k,)."""
+        z = on_circle(w)
+        R = self.span.matrices(x) @ self.span.sources()
+        n, m, _ = R.shape
+        filtered = x[0] * np.eye(m) + (self.span.responses(z) @ R.reshape(n, m * m)).reshape(1, -1, m, m)
+        delayed = case.delayed(z)
+        G = Sampled(delayed.z, filtered @ delayed.G, delayed.T)
+        return np.linalg.eigvalsh(constraint.at(G, x[own[0] : own[1]])[0])[:, 0]
+
+    def grid(self, case: Case, constraint: Constraint) -> Array:
+        """The frequencies at which a constraint is imposed first."""
+        even = np.linspace(constraint.low, constraint.high, 50)
+        rising = np.geomspace(max(constraint.low, SMALLEST), constraint.high, 60)
+        modes = np.concatenate([case.E.poles(), self.span.chain(case.E.T).poles()])
+        modes = np.array(_distinct(modes[modes.imag > 1e-6]), dtype=complex)
+        around = (np.angle(modes)[:, None] + (1 - np.abs(modes))[:, None] * np.array([-1.0, 0.0, 1.0])).ravel()
+        w = np.unique(np.concatenate([even, rising, around]))
+        return w[(w >= max(constraint.low, SMALLEST)) & (w <= constraint.high)]
+
+    def room(self, x: Array, dense: bool = False) -> float:
+        """The least eigenvalue of any constraint at x, where each is imposed first or over the whole sweep."""
+        rooms, own = [], iter(self.own)
+        for case in self.cases:
+            for constraint in case.constraints:
+                w = self._sweep(case, constraint) if dense else self.grid(case, constraint)
+                rooms.append(self.least(case, constraint, next(own), x, w).min())
+        return float(min(rooms))
+
+    def _sweep(self, case: Case, constraint: Constraint) -> Array:
+        """A grid that knows every pole, over the band of a constraint."""
+        return frequencies(case.E, self.span.chain(case.E.T), low=max(constraint.low, SMALLEST), high=constraint.high)
+
+    def missed(self, x: Array) -> tuple[list[Array], float]:
+        """(where each constraint fails, case by case and constraint by constraint; by how much the worst does)."""
+        found, own, worst = [], iter(self.own), 0.0
+        for case in self.cases:
+            for constraint in case.constraints:
+                mine = next(own)
+                w = self._sweep(case, constraint)
+                fails = lambda w, case=case, constraint=constraint, mine=mine: -self.least(case, constraint, mine, x, w)  # noqa: E731
+                found.append(peaks(fails, w, above=0.0))
+                worst = max(worst, float(fails(found[-1]).max(initial=0.0)))
+        return found, worst
+
+    def solve(self, start: Array) -> Array:
+        """The optimum, from a strictly feasible start: on a dense sweep it fails by no more than FORGIVEN."""
+        asked = [(case, constraint) for case in self.cases for constraint in case.constraints]
+        imposed = [self.grid(case, constraint) for case, constraint in asked]
+        A, b, c = self.objective()
+        _, R = np.linalg.qr(np.column_stack([A, b]))
+        A, b = R[:, :-1], R[:, -1]
+        x, t, gaps = start, None, list(_GAPS)
+        inner = start
+        nothing = float(b @ b) + float(c.any())  # without any force; a supremum is 1 then
+        demanding = any(len(case.constraints) > 1 for case in self.cases)  # else scaling, which is exact, does the rest
+        back = _STEEPER**4 if demanding else _STEEPER
+        for _ in range(_MOST_SWEEPS):
+            parts = [self.block(*one, own, w) for one, own, w in zip(asked, self.own, imposed, strict=True)]
+            program = Program(A, b, c, (*parts, self.positive()))
+            x = towards(start, x, program)
+            program, U = program.conditioned(x)
+            y = U @ x
+            t = program.degree / max(program.value(y), 1e-12) if t is None else t / back
+            y = centre(program, y, t)
+            inner = scipy.linalg.solve_triangular(U, y)
+            while True:
+                value = program.value(y)
+                if program.degree / t <= gaps[0] * max(min(value, nothing - value), 1e-9):
+                    break
+                t *= _STEEPER
+                y = centre(program, y, t)
+            x = scipy.linalg.solve_triangular(U, y)
+            more, worst = self.missed(x)
+            if worst < _FORGIVEN and len(gaps) == 1:
+                break
+            gaps = gaps[-1:]
+            imposed = [np.union1d(w, extra) for w, extra in zip(imposed, more, strict=True)]
+        return self._kept(inner, start, x) if demanding else x
+
+    def _kept(self, inner: Array, start: Array, x: Array) -> Array:
+        """The point from x towards one inside where no constraint fails by the sweep: least eigenvalues are concave."""
+        _, worst = self.missed(x)
+        for base in (inner, start):
+            if (room := self.room(base, dense=True)) > 0:
+                return base + max(0.0, 1 - 1.01 * worst / (worst + room)) * (x - base)
+        return start
+
+
+def static_weight(loop: Loop) -> float:
+    return _STATIC if loop.channels <= RICH else _STATIC_OF_MANY
+
+
+def _band(loop: Loop, band_hz: tuple[float, float]) -> tuple[float, float]:
+    """The band in rad/sample."""
+    return 2 * np.pi * band_hz[0] * loop.T, min(2 * np.pi * band_hz[1] * loop.T, np.pi)

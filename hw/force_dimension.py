@@ -1,0 +1,170 @@
+"""Devices of Force Dimension, by their maker's library and its Python package: devices without a clock.
+
+The host is the clock: it reads the position, computes, and writes the force, which acts at once, a fraction of a period
+after the sample (theta = 0). The certificate is for what the host keeps, measured at zero force: periods up to T_max,
+and latencies within [t1, t2].
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any, Protocol, Self
+
+from hw.device import Device
+from hw.emulator import info_of
+from hw.protocol import NO_MARGIN, Ack, Config, Decoder, Force, Info, Phase, Reason, State, Stop, encode
+from hw.seam import PortLost
+from sim.scenario import InputError, Scenario
+
+FORCE_DIMENSION = "force-dimension"  # in place of a port
+_BINDINGS = "forcedimension_core.dhd"
+_SATURATED = 2  # what setForce says of motors that cannot
+_WATCHDOG = 160  # times 125 us: after 20 ms without a force the device drops it by itself, where it can
+_SPIN = 2e-4  # [s] before a tick that are waited for awake: a sleep ends late
+_SHORTEST = 0.75  # of T, that a period after a late one may be
+
+
+class _Library(Protocol):
+    """What is asked of the Force Dimension SDK's Python package; every call gives -1 for an error."""
+
+    openID: Callable[..., int]
+    close: Callable[..., int]
+    getSystemName: Callable[..., str | None]
+    getSerialNumber: Callable[..., int]
+    getPosition: Callable[..., int]
+    setForce: Callable[..., int]
+    enableForce: Callable[..., int]
+    setWatchdog: Callable[..., int]
+    errorGetLastStr: Callable[..., str]
+
+
+def library() -> _Library:
+    """The package, which needs the maker's library. Raises InputError where one of them is missing."""
+    try:
+        found: Any = import_module(_BINDINGS)
+        return found
+    except ImportError as error:
+        package = _BINDINGS.split(".")[0]
+        what = f"the Python package {package} and Force Dimension's SDK (https://www.forcedimension.com)"
+        raise InputError(f"--port {FORCE_DIMENSION} needs {what}: {error}") from None
+
+
+class ForceDimension:
+    """One axis of each of several Force Dimension devices, clocked by this host.
+
+    The state machine is the firmware's (hw/device.py): armed by ARM, capped, slewed, ramped out.
+    """
+
+    errors = 0  # frames that cannot be read: there are no frames
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        axes: str | None = None,
+        sdk: _Library | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        """`axes` are indices with axes, "0x,1x" (the default: x of the first ones). Raises InputError."""
+        self._where = _axes(axes, scenario.channels)
+        self._sdk = sdk or library()
+        self._clock, self._sleep, self._begun = clock, sleep, clock()
+        self._ids: dict[int, int] = {}
+        for index in dict.fromkeys(index for index, _ in self._where):
+            if (ID := self._sdk.openID(index)) < 0:
+                raise InputError(f"--port {FORCE_DIMENSION}: device {index}: {self._sdk.errorGetLastStr()}")
+            self._ids[index] = ID
+        first = next(iter(self._ids.values()))
+        name = (self._sdk.getSystemName(ID=first) or "Force Dimension").encode("ascii", "replace").decode()[:16]
+        self._info = info_of(scenario)._replace(firmware=name, serial=max(0, self._sdk.getSerialNumber(ID=first)))
+        self.guarded = {self._sdk.setWatchdog(_WATCHDOG, ID=ID) for ID in self._ids.values()} == {0}
+        self._device, self._decoder = Device(self._info), Decoder()
+        self._T = 1e-9 * self._info.period_ns
+        self._due = clock()
+
+    def info(self) -> Info:
+        """What the library does not tell, damping and step of the encoder among it, is the scenario's."""
+        return self._info
+
+    def configure(self, config: Config) -> int:
+        self._device.configure(config)
+        (ack,) = self._decoder.feed(self._device.ack)
+        self._device.ack = b""
+        assert isinstance(ack, Ack)
+        if not ack.refused:
+            for ID in self._ids.values():
+                self._heeded(self._sdk.enableForce(True, ID=ID))
+            self._write(self._device.zero)
+        return ack.refused
+
+    def exchange(self, force: Force | None) -> State | None:
+        if force is not None:
+            self._device.receive(encode(force), came := self._now())
+            self._write(self._device.applied)
+            if self._device.margin != NO_MARGIN:  # of a force that acts: writing it takes time
+                self._device.margin = max(-0x7FFF, self._device.margin - (self._now() - came))
+        while (left := self._due - self._clock()) > 0:
+            self._sleep(left - _SPIN if left > 2 * _SPIN else 0.0)
+        now = self._clock()
+        self._due = max(self._due, now - (1 - _SHORTEST) * self._T) + self._T
+        before = self._device.applied
+        _, out = self._device.tick(self._now(), self._counts())
+        if self._device.applied != before or force is None:
+            self._write(self._device.applied)
+        return next((m for m in self._decoder.feed(out) if isinstance(m, State)), None)
+
+    def stop(self, reason: Reason) -> None:
+        self._device.receive(encode(Stop(reason)), self._now())
+        if self._device.phase == Phase.ESTOP:
+            self._write(self._device.zero)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Zero force, and the motors off, whatever came before."""
+        for ID in self._ids.values():
+            self._sdk.setForce([0.0, 0.0, 0.0], ID=ID)
+            self._sdk.enableForce(False, ID=ID)
+            self._sdk.close(ID=ID)
+
+    def _now(self) -> int:
+        return round(1e6 * (self._clock() - self._begun))
+
+    def _counts(self) -> tuple[int, ...]:
+        places = {index: [0.0, 0.0, 0.0] for index in self._ids}
+        for index, ID in self._ids.items():
+            self._heeded(self._sdk.getPosition(places[index], ID=ID))
+        steps = zip(self._where, self._info.encoder_step, strict=True)
+        return tuple(round(places[index][axis] / (1e-12 * step)) for (index, axis), step in steps)
+
+    def _write(self, steps: tuple[int, ...]) -> None:
+        forces = {index: [0.0, 0.0, 0.0] for index in self._ids}
+        for (index, axis), n, step in zip(self._where, steps, self._info.force_step, strict=True):
+            forces[index][axis] = 1e-6 * n * step
+        for index, ID in self._ids.items():
+            if self._heeded(self._sdk.setForce(forces[index], ID=ID)) == _SATURATED:
+                self._device.fault()
+
+    def _heeded(self, code: int) -> int:
+        if code < 0:
+            raise PortLost(f"the device is gone: {self._sdk.errorGetLastStr()}")
+        return code
+
+
+def _axes(text: str | None, channels: int) -> list[tuple[int, int]]:
+    """Device index and axis of every channel. Raises InputError."""
+    parts = text.split(",") if text else [f"{i}x" for i in range(channels)]
+    if len(parts) != channels or not all(re.fullmatch(r"\d+[xyz]", part) for part in parts):
+        example = ",".join(f"{i}x" for i in range(channels))
+        raise InputError(
+            f"--port {FORCE_DIMENSION}:{text}: expected a device's index and an axis for each of {channels} channels, "
+            f"as in {FORCE_DIMENSION}:{example}"
+        )
+    found = [(int(part[:-1]), "xyz".index(part[-1])) for part in parts]
+    if len(set(found)) != channels:
+        raise InputError(f"--port {FORCE_DIMENSION}:{text}: two channels have the same axis")
+    return found

@@ -1,0 +1,148 @@
+"""One optimal coupling of each form wherever a coupling can run: a filter that covers limited forces, one behind an
+environment with delay and a free mass (psi = 1), and the pair of version 0.1 in a file of version 1."""
+
+import json
+import shutil
+import subprocess
+from concurrent.futures import Executor, Future
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from worlds import VERTICES_ONLY
+
+from cli import export, run, validate
+from controller.coupling import ForceFilter, InternalModel
+from controller.delay import delay
+from controller.lti import Sampled
+from design.certificate import prove, verify
+from design.optimal import design
+from design.program import Options
+from design.stored import Stored, save
+from design.stored import load as load_file
+from hw.control import certified_couplings
+from hw.emulator import Emulator
+from hw.limits import Limits, Stage
+from hw.monitor import LinkSettings
+from hw.rehearsal import Rehearsal
+from hw.session import Session
+from sim.couplings import choose, limits_of
+from sim.run import assemble
+from sim.run import run as close_loop
+from sim.scenario import load
+from sim.view import session as live
+from sim.view.events import GIVEN, Menu, first_loop
+
+FREE_MASS = next((Path(__file__).parents[1] / "loops").glob("n4*.toml"))
+SMALL = ((4, 3),)
+FORMS = ("filter", "delayed", "pair")
+CC = shutil.which("gcc") or shutil.which("cc")
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """form -> (scenario, its name in commands, file of the coupling)."""
+    folder, made = tmp_path_factory.mktemp("optimal"), {}
+    for form, name in zip(FORMS, ("omega-pair", str(FREE_MASS), "omega-pair"), strict=True):
+        scenario = load(name)
+        loop, path = scenario.loop("I"), folder / f"{form}.json"
+        if form == "pair":
+            save(Stored.of(loop, VERTICES_ONLY, prove(loop, VERTICES_ONLY, "this-environment")), path)
+            path.write_text(path.read_text().replace('"version": 2', '"version": 1'))
+        else:
+            found = design(loop, Options(ladder=SMALL, limiter=form == "filter"))
+            save(Stored.of(loop, found.coupling, found.certificate), path)
+        made[form] = scenario, name, path
+    return made
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_its_file_is_proved_again_and_drives_the_process(files, form):
+    """The forces are the convolution with an impulse response that comes from R, Psi and E on a circle |z| = 1.05."""
+    scenario, _, path = files[form]
+    stored, loop = load_file(path), scenario.loop("I")
+    assert verify(stored).proved
+    assert stored.version == (1 if form == "pair" else 2)
+    assert isinstance(stored.built(), InternalModel if form == "pair" else ForceFilter)
+    strong = tuple(msgspec.structs.replace(device, force_limit=1e4) for device in scenario.device)
+    simulation = assemble(scenario.replace(device=strong, duration=0.2), stored.built(), None)
+    exact, own = (close_loop(simulation, engine) for engine in ("exact", "mujoco"))
+    np.testing.assert_allclose(own.f, exact.f, atol=1e-7)
+    r, n = 1.05, 512
+    z = r * np.exp(2j * np.pi * np.arange(n) / n)
+    around = stored.built().around(Sampled.of(delay(loop.psi, loop.T) @ loop.E(), z[None]))
+    F = delay(loop.theta, loop.T).at(z) @ around.G[0]
+    response = np.fft.ifft(F, axis=0).real * r ** np.arange(n)[:, None, None]
+    x, ticks = exact.x, min(len(exact.x), 150)
+    by_hand = [sum(response[j] @ x[k - j] for j in range(k + 1)) for k in range(ticks)]
+    np.testing.assert_allclose(exact.f[:ticks], by_hand, atol=1e-6 * np.abs(exact.f).max())
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_it_runs_by_command_alone_and_in_a_batch(files, form, tmp_path):
+    _, name, path = files[form]
+    common = ["--scenario", name, "--coupling", str(path), "--no-plot", "--json", str(tmp_path / "r.json")]
+    asked = [*common, "--duration", "0.2", "--no-alternatives", "--out", str(tmp_path)]
+    assert run.main(asked) == 0
+    report = json.loads((tmp_path / "r.json").read_text())
+    assert report["promise"] == "this environment"
+    assert report["robustness"]["percent"] == 10
+    assert (report["designed_for_it"] is None) == (form == "pair")
+    assert (report["limiter"]["rho"] is not None) == (form == "filter")
+    assert validate.main([*common, "--humans", "6", "--duration", "0.1", "--out", str(tmp_path)]) == 0
+    batch = json.loads((tmp_path / "r.json").read_text())
+    assert (batch["unstable"], batch["holds"]) == ({"exact": 0, "mujoco": 0}, True)
+
+
+def test_its_forces_are_limited_as_the_file_proves(files):
+    scenario, _, path = files["filter"]
+    weak = tuple(msgspec.structs.replace(device, force_limit=0.3) for device in scenario.device)
+    scenario = scenario.replace(device=weak, duration=0.6)
+    coupling = load_file(path).built()
+    rho = limits_of(scenario, choose(scenario, "I", str(path))).rho
+    assert rho is not None
+    exact, own = (close_loop(assemble(scenario, coupling, rho), engine) for engine in ("exact", "mujoco"))
+    np.testing.assert_allclose(own.f, exact.f, atol=1e-7)
+    assert np.abs(exact.f).max() <= 0.3
+    assert exact.clipped(np.array([0.3, 0.3])).mean() > 0.1
+
+
+@pytest.mark.skipif(CC is None, reason="neither gcc nor cc is here: exported C files are not compiled")
+@pytest.mark.parametrize("form", FORMS)
+def test_its_process_is_exported_and_repeats_to_the_last_bit(files, form, tmp_path):
+    out, limit = tmp_path / "p.c", ["--force-limit", "3"] if form == "filter" else []
+    assert export.main([str(files[form][2]), "--process", *limit, "--out", str(out)]) == 0
+    built = [str(CC), "-std=c99", "-ffp-contract=off", "-DHAPTIC_LOOP_TEST", str(out), "-o", str(tmp_path / "p"), "-lm"]
+    subprocess.run(built, check=True)
+    done = subprocess.run([tmp_path / "p"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "process: 64 ticks repeat to the last bit\n")
+
+
+class _Never(Executor):
+    """No other coupling is made in the background."""
+
+    def submit(self, fn, /, *args, **kwargs) -> Future:
+        return Future()
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_live_window_runs_it_as_the_simulator_does(files, form):
+    scenario, _, path = files[form]
+    shown = first_loop(Menu("I", given=str(path)), scenario, GIVEN)
+    running = live.Session(shown, _Never(), (), np.inf)
+    frame = running.frame(0.25)
+    ticks = round(frame.t / scenario.T)
+    record = close_loop(shown.assembly, "exact", ticks=ticks + 1)
+    np.testing.assert_array_equal(frame.history, record.f[:ticks])
+
+
+@pytest.mark.parametrize("form", ["filter", "pair"])
+def test_the_bridge_rehearses_it(files, form):
+    scenario, _, path = files[form]
+    rungs = certified_couplings(scenario, "I", str(path), None, 1, spare=0)
+    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60))
+    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs)
+    assert rehearsal.run_until_armed(0.4).stage == Stage.ARMED
+    assert any(np.any(moment.applied) for moment in rehearsal.moments[-100:])
+    assert choose(scenario, "I", str(path)).notes == ()
