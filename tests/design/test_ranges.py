@@ -322,6 +322,7 @@ def test_design_check_run_audit_and_validate_speak_of_the_ranges(scenario_file, 
 
     code, design = told(design_main, "--coupling", "optimal", "--samples", "8", "--out", str(file), *common)
     assert (code, design["promise"], design["ranges"]["vertices"]) == (0, "these ranges", 3)
+    assert (design["guarantee"], design["set"]) == (design["promise"], design["ranges"])  # today's and older names
     alone, whole = design["price"]
     assert (alone["coupling"], whole["coupling"], whole["violated"]) == ("nominal only", "whole ranges", 0)
     assert alone["violated"] >= 1
