@@ -30,11 +30,11 @@ from design.transparency import BAND_HZ
 OBJECTIVES = ("rms", "sup")
 MARGIN = 0.002  # share of the damping that stays unused: what an exact proof always finds room in
 LADDER = ((4, 3), (8, 6), (14, 10), (22, 16))  # taps and real poles of the rungs
-_FASTEST, _SLOWEST, _SLOWEST_OF_MANY = 0.5, 0.0015, 0.008  # distance to 1 of the real poles' ends
+_FASTEST, _SLOWEST, _SLOWEST_OF_LARGE = 0.5, 0.008, 0.0015  # distance to 1 of the real poles' ends
 _FASTER = 0.25  # modes of smaller radius are left to the filter of the sum of all forces
 _NEAR = 0.3  # of its distance to 1: a real pole so close to a mode gives way to it
 _SLOWER = 0.999  # modes of larger radius get no section
-RICH, _EDGED = 2, 14  # channels up to which, and taps from which on, there are sections at the band's end
+RICH, _EDGED = 2, 20  # channels up to which, and taps from which on, there are sections at the band's end
 _EDGES = (0.2, 0.07, 0.02)  # their damping ratios: they crowd at the band's end, where the error may jump
 FULL = 4  # channels up to which every force has a filter to every device
 _STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weight of g - 1 beside the relative mismatch; for more than RICH channels
@@ -237,14 +237,15 @@ class Span:
 def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1]) -> Span:
     """Taps, real poles even in the logarithm of the time constant, and the modes of E and of its inverse.
 
-    Poles are decimals from the start; a larger basis for one or two channels has sections where the band ends. With
-    more than FULL channels every device has a filter of its own force and one of the sum of all, and fast modes are
-    left to the latter.
+    Poles are decimals from the start; a larger basis for one or two channels has slower ones, and sections where the
+    band ends. With more than FULL channels every device has a filter of its own force and one of the sum of all, and
+    fast modes are left to the latter.
     """
     m = E.inputs
     modes = np.concatenate([E.poles(), _zeros(E)])
     modes = modes[(np.abs(modes) < _SLOWER) & (np.abs(modes) > 0.02) & (modes.imag >= 0)]
-    slowest = _SLOWEST if m <= RICH else _SLOWEST_OF_MANY
+    large = m <= RICH and taps >= _EDGED
+    slowest = _SLOWEST_OF_LARGE if large else _SLOWEST
     slow = np.round(1 - np.geomspace(_FASTEST, slowest, poles), 4) if poles else np.zeros(0)
     own_real = modes[np.abs(modes.imag) <= 1e-6].real
     fast, real, pairs = [], [a for a in slow.tolist() if not (np.abs(own_real - a) < _NEAR * (1 - a)).any()], []
@@ -255,7 +256,7 @@ def span_of(E: Lti, taps: int, poles: int, end_hz: float = BAND_HZ[1]) -> Span:
             fast.append(float(mode.real))
         elif not any(abs(mode.real - a) < 0.02 * (1 - abs(a)) for a in real):
             real.append(float(mode.real))
-    if m <= RICH and taps >= _EDGED:
+    if large:
         q = np.exp(2 * np.pi * end_hz * E.T * (1j - np.array(_EDGES)))
         pairs += [(-2 * mode.real, abs(mode) ** 2) for mode in q if mode.imag > 0]
     own = len(real) + taps - 1 + 2 * len(pairs)
