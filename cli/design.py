@@ -18,12 +18,12 @@ from design.certificate import SAMPLES, RangesCheck, assess, check_ranges, lag, 
 from design.coverage import Limits, cost_part, covered_limits, price, ranges_part, ranges_rows, switching_part
 from design.designs import KINDS, NO_LONGER, design_by_kind, usual_condition
 from design.files import out_file
+from design.gain_search import STIFFEST
 from design.guarantees import ANY, HERE, guarantee_of, switching_guarantee
 from design.optimal import Optimal
 from design.program import DEFAULT, OBJECTIVES, Options
 from design.result import METHODS, Design, DesignFailed, NotProved, finite, listed
 from design.robustness import robustness_parts, widest_ranges
-from design.spring_damper import STIFFEST
 from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
 from sim import report

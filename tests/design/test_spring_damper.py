@@ -18,6 +18,7 @@ from design import spring_damper
 from design.api import instead, transparency_of
 from design.conditions import any_environment, any_environment_delayed, this_environment
 from design.designs import design_by_kind
+from design.gain_search import LimiterLoop, SampledLoop
 from design.lmi import CROSS_CHECK, RESERVE, Shaping, check_passive, solve
 from design.result import DesignFailed, Infeasible
 from design.spring_damper import design, gain_set, solve_within, stiffest
@@ -282,12 +283,12 @@ def test_a_long_delay_is_designed_for_in_seconds_and_passes_a_dense_sweep():
         assert 1.37 / (n * T) < K < 2 * 1.37 / (n * T)
 
 
-@pytest.mark.parametrize("sampled", [spring_damper._SampledLoop, spring_damper._LimiterLoop])
+@pytest.mark.parametrize("sampled", [SampledLoop, LimiterLoop])
 @pytest.mark.parametrize("psi", [(0, 0), (1, 0)])
 def test_the_slopes_of_the_conditions_are_those_of_differences(sampled, psi):
     """Derivatives by hand against central differences, whose own error is 1e-8 of rounding."""
     at = sampled(load().replace(psi=psi).loop("I"))
-    x = np.array([6.5, 6.1, 0.3, 0.45, *[0.2, 0.6] * (sampled is spring_damper._LimiterLoop)])
+    x = np.array([6.5, 6.1, 0.3, 0.45, *[0.2, 0.6] * (sampled is LimiterLoop)])
     steps = 1e-6 * np.eye(x.size)
     differenced = np.stack([(at.room(x + h) - at.room(x - h)) / 2e-6 for h in steps], axis=1)
     np.testing.assert_allclose(at.room_slope(x), differenced, atol=1e-6)

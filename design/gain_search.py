@@ -1,0 +1,368 @@
+"""Spring-damper gains for one environment: a local search from several starts, under a condition that is sampled.
+
+The set is not convex in (K, B), so nothing here is proved best. The rms mismatch is minimised by sequential quadratic
+programming with the condition at sampled frequencies; where the refined sweep of the condition finds it violated in
+between, that frequency is added and the search resumed. What is returned passes that sweep.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from controller.coupling import SpringDamper
+from controller.delay import delay
+from controller.loop import Loop, force_map
+from controller.lti import Array, Sampled
+from design.conditions import even_damping, this_environment
+from design.frequency import frequencies, hermitian, on_circle
+from design.lmi import RESERVE, Complex
+from design.multipliers import (
+    BETA,
+    Lags,
+    LimiterProof,
+    half_widths,
+    limiter_demand,
+    limiter_lag,
+    switching_block,
+    switching_sweep,
+)
+from design.multipliers import limiter as limiter_proof
+from design.result import Requirement
+from design.transparency import BAND_HZ, transparency
+
+if TYPE_CHECKING:  # slow to load
+    from scipy.optimize import OptimizeResult
+
+#: The sampled condition keeps half as much again as the promised reserve, for what lies between the samples.
+_SAMPLED_RESERVE = 1.5 * RESERVE
+_SOFTEST, STIFFEST = 1.0, 1e6  # [N/m], bounds of the search
+_CLOSEST_POLE = 1e-5  # from the unit circle
+_MOST_WEIGHT = 5.0  # of the limiter's multiplier
+_STUCK = 1e-3  # a search that leaves the sampled condition violated by this has no feasible point nearby
+_MOST_ROUNDS = 8
+
+
+_Responses = tuple[Complex, Complex, Complex]  # (z-1)/(Tz), Psi E and Theta at some frequencies
+_DIFFERENCE = 1e-7
+
+
+def polynomials(theta: int, w: Array) -> tuple[Array, Array]:
+    """1 + ... + z^-theta and 1 - z^-n at exp(jw), complex, (w,) each."""
+    n = theta + 1
+    turned = np.exp(-1j * w * n)
+    still = np.abs(np.exp(-1j * w) - 1) < 1e-12
+    window = np.where(still, n, (1 - turned) / np.where(still, 1, 1 - np.exp(-1j * w)))
+    return window, 1 - turned
+
+
+class SampledLoop:
+    """Mismatch and condition at fixed frequencies, as smooth functions of x = (log K, B/delta), shape (2N,)."""
+
+    def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
+        self.loop, self.E = loop, loop.E()
+        per_hz = 2 * np.pi * loop.T
+        low, high = (per_hz * f for f in band_hz)
+        self.band = frequencies(self.E, low=low, high=min(high, np.pi), points=80)
+        self.conditions = frequencies(self.E, low=1e-3, points=80)
+        self.loop_in_band, self.loop_at_conditions = self._responses(self.band), self._responses(self.conditions)
+        E = self.E.at(on_circle(self.band))
+        self.size2 = (np.abs(E) ** 2).sum(axis=(1, 2))
+        self.target = delay(loop.lam, loop.T).at(on_circle(self.band)) @ E
+        self.delta = even_damping(loop.delta, loop.T, loop.T_max)
+        self.root = np.sqrt(loop.T / self.delta)
+        self._last: tuple[_Responses, Array, Array, Complex] | None = None
+        self._known: dict[int, tuple[_Responses, Array, tuple[Complex, Array, Complex, Complex]]] = {}
+
+    def coupling(self, x: Array) -> SpringDamper:
+        log_k, b = np.split(x, 2)
+        return SpringDamper(np.exp(log_k), np.maximum(b, 0.0) * self.delta)
+
+    def point(self, coupling: SpringDamper) -> Array:
+        return np.concatenate([np.log(coupling.K), coupling.B / self.delta])
+
+    def judged(self, x: Array) -> Requirement:
+        """What the refined sweep of its condition says of the gains at x."""
+        return this_environment(self.loop.F(self.coupling(x)), self.loop.delta, self.loop.T_max)
+
+    def add(self, w: float) -> None:
+        """Impose the condition at the frequency w [rad/sample] too."""
+        self.conditions = np.append(self.conditions, w)
+        self.loop_at_conditions = self._responses(self.conditions)
+
+    def _responses(self, w: Array) -> _Responses:
+        """(z-1)/(Tz), Psi E and Theta at exp(jw)."""
+        loop, z = self.loop, on_circle(w)
+        delayed = delay(loop.psi, loop.T).at(z) @ self.E.at(z)
+        return (z - 1) / (loop.T * z), delayed, delay(loop.theta, loop.T).at(z)
+
+    def force(self, x: Array, responses: _Responses) -> Complex:
+        """F = Theta G (G + Psi E)^-1 Psi E with G = V^-1, (k, N, N)."""
+        by, b, _, right = self._solved(x, responses)
+        g = by[0] + by[1] * b
+        return np.diagonal(responses[2], axis1=1, axis2=2)[:, :, None] * g[:, :, None] * right
+
+    def _solved(self, x: Array, responses: _Responses) -> tuple[Complex, Array, Complex, Complex]:
+        """(dG by log K and by B/delta, (2, k, N); B/delta; S = (G + Psi E)^-1; S Psi E) at x; the last is remembered.
+
+        An unknown of channel i moves F by (Theta Psi E S)[:, i] (S Psi E)[i, :] times dG.
+        """
+        (D, E, _), N = responses, self.loop.channels
+        known = self._known.get(D.size)
+        if known is None or known[0] is not responses or not np.array_equal(known[1], x):
+            log_k, b = np.split(x, 2)
+            by = np.stack([np.broadcast_to(np.exp(log_k), (D.size, N)), D[:, None] * self.delta])
+            S = np.linalg.inv((by[0] + by[1] * b)[:, :, None] * np.eye(N) + E)
+            known = self._known[D.size] = (responses, x.copy(), (by, b, S, S @ E))
+        return known[2]
+
+    def square_mismatch(self, x: Array) -> float:
+        """Logarithm of the mean over log frequency of ||M||_F^2 / ||E||_F^2."""
+        M = self.force(x, self.loop_in_band) - self.target
+        ratio = (np.abs(M) ** 2).sum(axis=(1, 2)) / self.size2
+        log_w = np.log(self.band)
+        return float(np.log(np.trapezoid(ratio, log_w) / (log_w[-1] - log_w[0])))
+
+    def square_mismatch_slope(self, x: Array) -> Array:
+        """Its gradient by x; the unknowns behind the gains do not move it."""
+        gains, (_, E, theta) = x[: 2 * self.loop.channels], self.loop_in_band
+        by, _, S, right = self._solved(gains, self.loop_in_band)
+        M, log_w = self.force(x, self.loop_in_band) - self.target, np.log(self.band)
+        back = right @ M.conj().swapaxes(1, 2) @ theta @ E
+        moved = 2 * (np.einsum("kij,kji->ki", back, S) * by).real
+        total = np.trapezoid((np.abs(M) ** 2).sum(axis=(1, 2)) / self.size2, log_w)
+        slope = np.trapezoid(moved / self.size2[:, None], log_w, axis=1).ravel() / total
+        return np.concatenate([slope, np.zeros(x.size - slope.size)])
+
+    def room(self, x: Array) -> Array:
+        """1 - SAMPLED_RESERVE less the damping ratio that each sampled frequency asks for; (k,), or (k + 1,).
+
+        Delay in the environment can make the loop unstable where the sampled condition still holds, so there the
+        distance of its poles from the circle is the last entry.
+        """
+        room = 1 - _SAMPLED_RESERVE + self._least(x)[0]
+        return np.append(room, self.stability(x)) if any(self.loop.psi) else room
+
+    def room_slope(self, x: Array) -> Array:
+        """The gradient of `room`, (k, 2N) or (k + 1, 2N); poles are differenced."""
+        _, E, theta = self.loop_at_conditions
+        by, _, S, right = self._solved(x, self.loop_at_conditions)
+        v = self._least(x)[1][:, :, None]
+        into = (v.conj().swapaxes(1, 2) @ theta @ E @ S)[:, 0]
+        turned = into * (right @ v)[:, :, 0] / (on_circle(self.conditions) - 1)[:, None]
+        slope = np.concatenate([*(turned * by).real], axis=1)
+        if not any(self.loop.psi):
+            return slope
+        return np.vstack([slope, self._stability_slope(x)])
+
+    def _stability_slope(self, x: Array) -> Array:
+        at, steps = self.stability(x), _DIFFERENCE * np.eye(x.size)
+        return np.array([(self.stability(x + step) - at) / _DIFFERENCE for step in steps])
+
+    def _least(self, x: Array) -> tuple[Array, Complex]:
+        """Least eigenvalue (k,) of `_block` in units of Delta_D/T, and v whose v* block v it is; of the last x."""
+        at = self.loop_at_conditions
+        if self._last is None or self._last[0] is not at or not np.array_equal(self._last[1], x):
+            block = self._block(x)
+            root = np.tile(self.root, block.shape[1] // self.loop.channels)
+            values, vectors = np.linalg.eigh(root[:, None] * block * root)
+            self._last = (at, x.copy(), values[:, 0].astype(float), vectors[:, :, 0] * root)
+        return self._last[2], self._last[3]
+
+    def _block(self, x: Array) -> Complex:
+        """What must be positive definite with the damping, at each sampled frequency, Hermitian."""
+        return hermitian(self.force(x, self.loop_at_conditions) / (on_circle(self.conditions) - 1)[:, None, None])
+
+    def stability(self, x: Array) -> float:
+        """By how much more than CLOSEST_POLE the poles keep away from the circle."""
+        F = force_map(self.E, self.coupling(x), self.loop.theta, self.loop.psi)
+        return float(1 - _CLOSEST_POLE - np.abs(F.poles()).max(initial=0.0))
+
+    def search(self, x: Array) -> OptimizeResult:
+        return self.minimised(x, [], self.room_slope)
+
+    def minimised(
+        self, x: Array, more: list[tuple[float, float]], slope: Callable[[Array], Array] | None = None
+    ) -> OptimizeResult:
+        """The local optimum from x; `more` bounds what is behind the gains; without `slope` room is differenced."""
+        N = self.loop.channels
+        from scipy.optimize import minimize  # slow to load
+
+        bounds = [(np.log(_SOFTEST), np.log(STIFFEST))] * N + [(0.0, 20.0)] * N + more
+        condition = {"type": "ineq", "fun": self.room, "jac": slope}
+        options = {"maxiter": 100, "ftol": 1e-7}
+        problem = {"bounds": bounds, "constraints": condition, "options": options}
+        return minimize(self.square_mismatch, x, jac=self.square_mismatch_slope, method="SLSQP", **problem)
+
+
+# ----------------------------------------------------------------------------------------------------
+# Spring-damper gains that are safe under any switching of their delays: a local search like the one above.
+#
+# Its sampled condition is `switching_block`: the multiplier is searched together with the gains. What is returned
+# passes the sweep of `switching_sweep`, which knows nothing of the multiplier found here.
+
+
+_FIRST = 0.5  # the multiplier alpha T/delta that a search begins with where the start has none
+_MULTIPLIERS = (1e-4, 10.0)  # ... and its bounds
+
+
+class SwitchingLoop(SampledLoop):
+    """As SampledLoop, with x = (log K, B/delta, log alpha T/delta of the channels whose delay varies)."""
+
+    def __init__(self, loop: Loop, lo: Sequence[int], hi: Sequence[int]) -> None:
+        self.range, self.h = (lo, hi), half_widths(lo, hi)
+        self.active = np.flatnonzero(self.h)
+        super().__init__(loop)
+
+    def coupling(self, x: Array) -> SpringDamper:
+        return super().coupling(self._gains(x))
+
+    def point(self, coupling: SpringDamper) -> Array:
+        """The gains with their best multiplier."""
+        loop = self.loop
+        found = switching_sweep(loop.sent(coupling), *self.range, loop.delta, T_max=loop.T_max)
+        a = np.array(found.alpha)[self.active] * loop.T / self.delta[self.active]
+        a = np.clip(np.where(np.isfinite(a), a, _FIRST), *_MULTIPLIERS)
+        return np.concatenate([super().point(coupling), np.log(a)])
+
+    def judged(self, x: Array) -> Requirement:
+        sent = self.loop.sent(self.coupling(x))
+        return switching_sweep(sent, *self.range, self.loop.delta, T_max=self.loop.T_max).requirement
+
+    def force(self, x: Array, responses: _Responses) -> Complex:
+        return super().force(self._gains(x), responses)
+
+    def room(self, x: Array) -> Array:
+        """1 - SAMPLED_RESERVE less the damping ratio at each sampled frequency, with the multiplier in x."""
+        loop, m, alpha = self.loop, self.loop.channels, np.zeros(self.loop.channels)
+        alpha[self.active] = np.exp(x[2 * m :]) * (self.delta / loop.T)[self.active]
+        D, E, _ = self.loop_at_conditions
+        now = np.broadcast_to(np.eye(m, dtype=complex), E.shape)
+        G = Sampled(on_circle(self.conditions)[None], self.force(x, (D, E, now))[None], loop.T)
+        block = hermitian(switching_block(G, *self.range, loop.delta, alpha, loop.T_max)[0].G[0])
+        error = block[:, m:, :m]
+        schur = block[:, :m, :m] - np.conj(np.swapaxes(error, 1, 2)) @ (error / (2 * alpha[self.active])[:, None])
+        room = (np.linalg.eigvalsh(self.root[:, None] * schur * self.root)[:, 0] - _SAMPLED_RESERVE).astype(float)
+        return np.append(room, self.stability(x)) if any(self.loop.psi) else room
+
+    def search(self, x: Array) -> OptimizeResult:
+        return self.minimised(x, [(np.log(_MULTIPLIERS[0]), np.log(_MULTIPLIERS[1]))] * self.active.size)
+
+    def _gains(self, x: Array) -> Array:
+        return x[: 2 * self.loop.channels]
+
+
+# ----------------------------------------------------------------------------------------------------
+# Spring-damper gains that are safe also while forces are limited: the same search with the limiter's block
+# (design.multipliers.limiter_demand) in the place of the linear one, and its multiplier among the unknowns.
+
+
+class LimiterLoop(SampledLoop):
+    """As Sampled, with x = (log K, B/delta, c) and one weight c per channel, of the lag 1."""
+
+    def __init__(self, loop: Loop, band_hz: tuple[float, float] = BAND_HZ) -> None:
+        self.rho = limiter_lag(loop.delta, loop.T, BETA)
+        self._undelayed: tuple[_Responses, _Responses] | None = None
+        super().__init__(loop, band_hz)
+
+    def coupling(self, x: Array) -> SpringDamper:
+        return super().coupling(self._gains(x))
+
+    def point(self, coupling: SpringDamper) -> Array:
+        """The gains with their best multiplier."""
+        found = self.proof(coupling)
+        return np.concatenate([super().point(coupling), np.array(found.c)[:, 0]])
+
+    def proof(self, coupling: SpringDamper, c: Lags | None = None) -> LimiterProof:
+        """What the limiter asks at the multiplier `c` or the best one, by the refined sweep."""
+        loop = self.loop
+        return limiter_proof(loop.sent(coupling), loop.theta, loop.delta, self.rho, c, T_max=loop.T_max)
+
+    def judged(self, x: Array) -> Requirement:
+        return self.proof(self.coupling(x), self.weights(x).tolist()).requirement
+
+    def force(self, x: Array, responses: _Responses) -> Complex:
+        return super().force(self._gains(x), responses)
+
+    def room(self, x: Array) -> Array:
+        """The least eigenvalue of the block, in units of Delta_D/T, at each sampled frequency."""
+        room = self._least(x)[0]
+        return np.append(room, self.stability(x)) if any(self.loop.psi) else room
+
+    def room_slope(self, x: Array) -> Array:
+        """Its gradient: the block's first columns hold G, and c_i takes itself from N_i."""
+        loop, (_, E, theta), v = self.loop, self.loop_at_conditions, self._least(x)[1]
+        (by, _, S, right), z = self._solved(self._gains(x), self._now()), on_circle(self.conditions)[:, None]
+        first, second = np.split(v, 2, axis=1)
+        N = -np.stack([polynomials(n, self.conditions)[0] for n in loop.theta], axis=1) - self.weights(x).T
+        late = np.diagonal(theta, axis1=1, axis2=2) / (z - 1)
+        into = np.einsum("ki,kij->kj", first.conj() * late + second.conj() * N, E @ S)
+        turned = into * np.einsum("kij,kj->ki", right, first)
+        steps = np.einsum("kij,kj->ki", self.force(x, self._now()), first) - (1 - 1 / z) * np.array(self.rho) * second
+        slope = np.concatenate([*(turned * by).real, -(second.conj() * steps).real], axis=1)
+        return np.vstack([slope, self._stability_slope(x)]) if any(loop.psi) else slope
+
+    def _now(self) -> _Responses:
+        """Of the forces as they leave, before Theta."""
+        D, E, _ = at = self.loop_at_conditions
+        if self._undelayed is None or self._undelayed[0] is not at:
+            now = np.broadcast_to(np.eye(self.loop.channels, dtype=complex), E.shape)
+            self._undelayed = (at, (D, E, now))
+        return self._undelayed[1]
+
+    def _block(self, x: Array) -> Complex:
+        loop = self.loop
+        G = Sampled(on_circle(self.conditions)[None], self.force(x, self._now())[None], loop.T)
+        demand = limiter_demand(G, loop.theta, loop.delta, self.rho, self.weights(x).tolist(), loop.T_max)
+        return hermitian(demand.free.G[0] + (1 - _SAMPLED_RESERVE) * demand.gain.G[0])
+
+    def search(self, x: Array) -> OptimizeResult:
+        return self.minimised(x, [(0.0, _MOST_WEIGHT)] * self.loop.channels, self.room_slope)
+
+    def weights(self, x: Array) -> Array:
+        """c, a row of one lag per channel."""
+        return np.maximum(x[2 * self.loop.channels :, None], 0.0)
+
+    def _gains(self, x: Array) -> Array:
+        return x[: 2 * self.loop.channels]
+
+
+# ----------------------------------------------------------------------------------------------------
+# The search: frequencies are added where a refined sweep finds the condition violated between those sampled.
+
+
+def _optimum(sampled: SampledLoop, start: SpringDamper) -> tuple[SpringDamper | None, int]:
+    """(a local optimum that passes the refined sweep of its condition or None, searches)."""
+    x = sampled.point(start)
+    for searches in range(1, _MOST_ROUNDS + 1):
+        x = sampled.search(x).x
+        requirement = sampled.judged(x)
+        if requirement.ratio <= 1 - RESERVE:
+            return sampled.coupling(x), searches
+        stuck = sampled.room(x).min() < -_STUCK
+        if stuck or requirement.frequency_hz is None:  # None: unstable, so there is no frequency to add
+            return None, searches
+        sampled.add(max(2 * np.pi * sampled.loop.T * requirement.frequency_hz, 1e-6))
+    return None, _MOST_ROUNDS
+
+
+def least_rms(
+    sampled: Callable[[], SampledLoop], starts: Iterable[SpringDamper], band_hz: tuple[float, float] = BAND_HZ
+) -> tuple[SpringDamper | None, float, int]:
+    """(gains, rms mismatch as a ratio, searches) of the best local optimum; gains None if none was found.
+
+    `sampled` makes the condition, fresh for every start.
+    """
+    best, least, searches = None, np.inf, 0
+    for start in starts:
+        loop = (condition := sampled()).loop
+        coupling, runs = _optimum(condition, start)
+        searches += runs
+        if coupling is None:
+            continue
+        rms = transparency(loop.F(coupling), loop.E(), loop.lam, band_hz).rms_mismatch
+        if rms < least:
+            best, least = coupling, rms
+    return best, least, searches
