@@ -45,7 +45,8 @@ TABLE = {
     "design/exact.py": "design/test_exact design/test_exact_blocks",
     "design/certificate.py": "design/test_certificate design/test_exact_blocks design/test_switching_file "
     "design/test_limiter design/test_walls_making",
-    "design/conditions.py": "design/test_exact_blocks design/test_margin design/test_latency design/test_encoder_steps",
+    "design/conditions.py": "design/test_exact_blocks design/test_margin design/test_latency design/test_encoder_steps "
+    "design/test_moving_average",
     "controller/process.py": "controller/test_process controller/test_contact controller/test_varying_delay "
     "controller/test_budget sim/test_switched sim/test_nets",
     "controller/contact.py": "controller/test_process controller/test_contact controller/test_limiter",

@@ -32,8 +32,11 @@ def test_a_scaled_moving_average_needs_so_much_less_damping(theta, factor):
 
 
 def test_channels_whose_zeros_differ():
-    V = Lti.diag(window(1, 1.3, 1.02), window(2, 0.7, 1.02))
-    assert any_environment(V, [1, 2], [1.3, 0.7]).ratio == pytest.approx(1 / 1.02, rel=1e-5)
+    """Each at its own frequency; with three of them the singular directions come in an order of no symmetry."""
+    theta, delta = [1, 2, 4], [1.3, 0.7, 1.0]
+    for m in (2, 3):
+        V = Lti.diag(*[window(n, d, 1.02) for n, d in zip(theta[:m], delta[:m], strict=True)])
+        assert any_environment(V, theta[:m], delta[:m]).ratio == pytest.approx(1 / 1.02, rel=1e-5)
 
 
 @pytest.mark.parametrize(("weights", "theta"), [([1.0, 1.0], 2), ([1.0, 1.0], 0), ([1.0, 0.0, 1.0], 3)])
