@@ -711,7 +711,7 @@ def silence() -> Iterator[Case]:
         (("run", *QUICK["run"], "--vertex", "1"), "--vertex"),
         (("run", *QUICK["run"], "--no-plot", "--no-plot", "--side-by-side"), "--side-by-side"),
         (("design", "--best", "--coupling", "ccl"), "--coupling"),
-        (("run", *QUICK["run"], "--error", "nan"), "--error is nan, allowed are finite numbers"),
+        (("run", *QUICK["run"], "--error", "nan"), "--error is nan, allowed are 1e-18 to 1"),
         (("design", "--order", "2"), "--order"),
         (("design", "--method", "inner"), "--method"),
         (("design", "--compare"), "--compare"),

@@ -12,7 +12,9 @@ import pytest
 from cli.run import main
 from controller.coupling import SpringDamper
 from design.certificate import prove
+from design.designs import design_by_kind
 from design.stored import Stored, save
+from sim import couplings
 from sim import run as loop
 from sim.scenario import InputError, load
 from sim.trace import Trace
@@ -228,6 +230,7 @@ def test_json_on_standard_output_is_only_json(tmp_path):
 def test_a_terminal_sees_what_is_being_done(tmp_path, monkeypatch, capsys):
     """Each stage by its name, the optimal design by what it has reached; standard output is the report alone."""
     monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setattr(couplings, "design_by_kind", design_by_kind)  # one that is made before one's eyes
     code, _ = run(tmp_path, "--coupling", "optimal", "--duration", "0.1", "--no-plot", "--no-alternatives")
     shown, err = capsys.readouterr()
     assert code == 0

@@ -62,7 +62,7 @@ def dense() -> np.ndarray:
 # what is returned ----------------------------------------------------------------------------------------------------
 
 #: name, rms mismatch [dB] that is reached with the two smallest rungs, share of the static stiffness
-REACHED = [("n0", -33.7, 0.99), ("n1", -12.6, 0.9), ("n2", -9.4, 0.7), ("n3", -4.9, 0.5), ("n4", -22.9, 0.9)]
+REACHED = [("n0", -33.7, 0.99), ("n1", -12.6, 0.9), ("n2", -9.2, 0.75), ("n3", -4.9, 0.5), ("n4", -22.9, 0.9)]
 
 
 @pytest.mark.parametrize(("name", "most", "stiffness"), REACHED)
