@@ -231,3 +231,15 @@ def test_weights_for_separate_humans_gain_nothing_where_the_loop_is_reciprocal()
     for d in np.exp(rng.normal(size=(30, 2))):
         weighed = np.sqrt(d)[:, None] * X / np.sqrt(d)
         assert (np.linalg.eigvalsh((weighed + np.conj(np.swapaxes(weighed, 1, 2))) / 2)[:, -1] >= need - 1e-9).all()
+
+
+def test_a_map_that_is_nothing_but_rounding_needs_nothing():
+    """Two equal states that cancel, seen from other coordinates: F = 0, and in floating point 1e-13 of no symmetry."""
+    turn = np.random.default_rng(3).normal(size=(2, 2))
+    B, back = np.array([[1e3, 70.0], [-1e3, -70.0]]), np.linalg.inv(turn)
+    F = Lti(turn @ (0.5 * np.eye(2)) @ back, turn @ B, np.ones((2, 2)) @ back, np.zeros((2, 2)), 1e-3)
+    F1 = F.dc()
+    assert np.abs(F1 - F1.T).max() > 1e-9 * 1e-12
+    found = this_environment(F, [1.37, 1.37])
+    assert found.reason is None
+    assert found.ratio < 1e-9
