@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from controller.contact import contact
 from controller.coupling import Compliance, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.environment import FIGURE_4, GROUND, Network, Spring, Wall, environment
 from controller.loop import force_map
 from controller.lti import Lti
 from controller.process import Process, StepBuffer
@@ -142,3 +143,39 @@ def test_delays_are_of_every_channel():
     assert Process(F, *free, delays=delays).delays.shape == (5, 2, 1)
     with pytest.raises(ValueError, match="delays have 1 channels, expected 2"):
         Process(F, *free, delays=delays[:, :1])
+
+
+def test_a_step_of_an_encoder_is_finite():
+    for step in (np.inf, np.nan, -1e-6):
+        with pytest.raises(ValueError, match="encoder_step"):
+            process(wall(1000.0), step=step)
+
+
+def test_a_net_and_a_line_hear_the_tick_of_the_whole_run():
+    """A later block of a run begins at tick `first`."""
+    heard = []
+
+    class Net:
+        def send(self, x, force):
+            heard.append("send")
+
+        def apply(self, k, force):
+            heard.append(k)
+
+    delays = np.zeros((100, 1, 1), dtype=int)
+    delays[:50] = 1  # a packet that is sent at another tick is late
+    F = wall(1000.0)
+    buffer = StepBuffer(Process(F, np.array([np.inf]), NONE, delays=delays, net=lambda nsim: Net()), 3, 1)
+    buffer.first = 50
+    buffer.x[:3] = 1e-3
+    for k in range(3):
+        buffer.tick(k)
+    assert heard == ["send", 50, "send", 51, "send", 52]
+    np.testing.assert_allclose(buffer.f[:3, 0, 0], 1.0)
+
+
+def test_a_process_knows_its_walls():
+    network = Network(("a",), walls=(Wall(("a", GROUND), 1000.0),))
+    joined = contact(network, NoCoupling(), (0,), (0,), T)
+    assert Process(joined.open, np.array([np.inf]), NONE, joined).walls == network.walls != ()
+    assert process(wall(1000.0)).walls == ()
