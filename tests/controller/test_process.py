@@ -167,11 +167,11 @@ def test_a_net_and_a_line_hear_the_tick_of_the_whole_run():
     F = wall(1000.0)
     buffer = StepBuffer(Process(F, np.array([np.inf]), NONE, delays=delays, net=lambda nsim: Net()), 3, 1)
     buffer.first = 50
-    buffer.x[:3] = 1e-3
+    buffer.x[:3, 0, 0] = 1e-3 * np.arange(1, 4)
     for k in range(3):
         buffer.tick(k)
     assert heard == ["send", 50, "send", 51, "send", 52]
-    np.testing.assert_allclose(buffer.f[:3, 0, 0], 1.0)
+    np.testing.assert_allclose(buffer.f[:3, 0, 0], [1.0, 2.0, 3.0])
 
 
 def test_a_process_knows_its_walls():
