@@ -8,6 +8,7 @@ process of its own.
 
 from __future__ import annotations
 
+import argparse
 import os
 import resource
 import subprocess
@@ -97,5 +98,10 @@ def peers() -> None:
 
 if __name__ == "__main__":
     known = {f.__name__: f for f in (engines, hands, cold, peers)}
-    for name in sys.argv[1:] or known:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("goals", nargs="*", metavar="|".join(known), help="by default all")
+    asked = parser.parse_args().goals
+    if strange := set(asked) - set(known):
+        parser.error(f"goals are {', '.join(known)}, not {', '.join(strange)}")
+    for name in asked or known:
         known[name]()
