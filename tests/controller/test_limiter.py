@@ -224,3 +224,8 @@ def test_bad_limits_are_named():
         Limiter(G, (0, 0), np.ones(2), -np.ones(2))
     with pytest.raises(ValueError, match="a block of 2 x 2 cannot serve 3 channels"):
         Limiter(G, (0, 0, 0), np.ones(3), np.ones(3))
+
+
+def test_limits_have_room_between_them_on_every_axis():
+    with pytest.raises(ValueError, match="expected lower < upper"):
+        BoxProblem(np.eye(2), np.zeros(2), np.array([1.0, 0.0]))

@@ -12,7 +12,7 @@ from controller import coupling as controller_coupling
 from controller.coupling import Compliance, ComplianceForm, InternalModelForm, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
-from controller.lti import Lti, rational
+from controller.lti import Lti, SingularLoop, rational
 from design import certificate as design_certificate
 from design import spring_damper
 from design.certificate import Verdict, prove, required_damping, verify
@@ -22,6 +22,7 @@ from design.frequency import frequencies, on_circle, rounding
 from design.result import PUBLISHED, NotProved, from_ratio
 from design.stored import Stored, digest, load, save, sealed
 from sim.random_loops import proofs
+from sim.scenario import load as scenario
 
 DEFAULT = Loop(1.2e-3, (1, 2), (0, 0), (1, 2), (1.37, 1.37), FIGURE_4)
 change = msgspec.structs.replace
@@ -439,3 +440,28 @@ def test_the_proof_succeeds_exactly_where_the_sweep_says_so_on_any_network():
     found = list(proofs(11, 60))
     assert [row for row in found if not row.holds] == []
     assert 18 < sum(row.proved for row in found) < 42
+
+
+def test_every_block_is_measured_before_it_is_proved(monkeypatch):
+    """The states that each exact block will have: so many are one too many, and that is said."""
+    loop, coupling, c = scenario("omega-pair").loop("I"), SpringDamper((400.0, 300.0), (0.1, 0.1)), ((1.0,), (1.0,))
+    wall, one = scenario("one-wall").loop("I"), SpringDamper((400.0,), (0.1,))
+    limited = loop.sent(coupling).order + 2 * loop.channels + sum(loop.theta)
+    blocks = {
+        coupling.compliance(loop.T).order + sum(loop.theta): lambda: prove(loop, coupling, "any-environment"),
+        limited: lambda: design_certificate._limiter_block(loop, coupling, (0.0, 0.0), c),
+        wall.walled(one).order: lambda: design_certificate._walls_block(wall, one, [Fraction(1)]),
+    }
+    for states, make in blocks.items():
+        monkeypatch.setattr(design_certificate, "too_large", lambda n, most=states: "too many" if n >= most else None)
+        with pytest.raises(NotProved, match="too many"):
+            make()
+
+
+def test_walls_without_a_solution_are_refused(monkeypatch):
+    def singular(*_):
+        raise SingularLoop("no solution")
+
+    monkeypatch.setattr(design_certificate, "walls_demand", singular)
+    with pytest.raises(NotProved, match="algebraic loop without solution"):
+        design_certificate._walls_block(scenario("one-wall").loop("I"), SpringDamper((400.0,), (0.1,)), [Fraction(1)])

@@ -280,3 +280,8 @@ def test_products_are_in_lowest_terms():
     assert (half @ Matrix.of([[2], [2]])).den == 1
     assert half.scaled(4).den == 1
     assert half.scaled(0.1).equals(Matrix.of([[0.05, 0.15]]))
+
+
+def test_a_matrix_that_is_not_symmetric_is_refused():
+    with pytest.raises(ValueError, match="not exactly symmetric"):
+        strictly_positive(Matrix.of([[2, 1], [0, 2]]))

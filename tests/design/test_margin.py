@@ -243,3 +243,7 @@ def test_a_map_that_is_nothing_but_rounding_needs_nothing():
     found = this_environment(F, [1.37, 1.37])
     assert found.reason is None
     assert found.ratio < 1e-9
+
+
+def test_a_gain_with_a_negative_direction_is_never_enough():
+    assert least_multiple(np.eye(2)[None], np.diag([-1.0, 1.0])[None]) == np.inf
