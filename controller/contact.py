@@ -118,13 +118,27 @@ def contact(network: Network, coupling: Coupling, theta: Sequence[int], psi: Seq
 
 
 @dataclass(frozen=True, eq=False)
-class Complementarity(ReadOnly):
+class _Problem(ReadOnly):
+    """Complementarity in the forces of a tick; M says what each does to the ways along which all of them push."""
+
+    M: Array  # (n, n)
+
+    @cached_property
+    def _diagonal(self) -> Array:
+        return np.diag(self.M)[:, None].copy()
+
+    @cached_property
+    def _separate(self) -> bool:
+        """Whether no force moves another one's way within the tick."""
+        return np.count_nonzero(self.M - np.diag(np.diag(self.M))) == 0
+
+
+@dataclass(frozen=True, eq=False)
+class Complementarity(_Problem):
     """p >= 0, M p - q >= 0, p'(M p - q) = 0: one solution for every q if M has positive principal minors.
 
     Raises SingularLoop where it has not.
     """
-
-    M: Array  # (w, w)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "M", frozen(self.M, 2))
@@ -140,15 +154,6 @@ class Complementarity(ReadOnly):
         short = np.minimum(forces * diagonal, np.matmul(self.M, forces) - q).min(axis=1)
         best = np.take_along_axis(forces, short.argmax(axis=0)[None, None, :], axis=0)[0]
         return np.maximum(best, 0.0)
-
-    @cached_property
-    def _diagonal(self) -> Array:
-        return np.diag(self.M)[:, None].copy()
-
-    @cached_property
-    def _separate(self) -> bool:
-        """Whether no wall's force moves another wall within the tick."""
-        return np.count_nonzero(self.M - np.diag(np.diag(self.M))) == 0
 
     @cached_property
     def _candidates(self) -> Array:
@@ -184,7 +189,7 @@ PIVOT_ROUNDING = 1e-12  # of the numbers that are subtracted
 
 
 @dataclass(frozen=True, eq=False)
-class BoxProblem(ReadOnly):
+class BoxProblem(_Problem):
     """f = q - M v with lower <= f <= upper, v >= 0 where f is at its upper limit, <= 0 at its lower, 0 in between.
 
     There is exactly one solution for every q where M has positive principal minors. Sets on which M is singular, as of
@@ -192,7 +197,6 @@ class BoxProblem(ReadOnly):
     negative.
     """
 
-    M: Array  # (n, n)
     lower: Array  # (n,) -inf where there is no limit
     upper: Array  # (n,) > lower
 
@@ -213,14 +217,6 @@ class BoxProblem(ReadOnly):
         v = self._listed(q) if self._candidates else self._pivoted(q)
         f = np.where(v > 0, upper, np.where(v < 0, lower, q - self.M @ v))
         return v, np.minimum(np.maximum(f, lower), upper)
-
-    @cached_property
-    def _diagonal(self) -> Array:
-        return np.diag(self.M)[:, None].copy()
-
-    @cached_property
-    def _separate(self) -> bool:
-        return np.count_nonzero(self.M - np.diag(np.diag(self.M))) == 0
 
     @cached_property
     def regular(self) -> bool:
