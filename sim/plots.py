@@ -67,6 +67,7 @@ def _entries(axis: Axes) -> dict[str, Any]:
 
 
 def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
+    """The figure as a PNG, its texts taken literally; whole or not at all."""
     _literal(figure)
     try:
         return write(path, lambda file: figure.savefig(file, format="png", dpi=dpi))

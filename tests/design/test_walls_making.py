@@ -289,7 +289,7 @@ def test_hands_come_to_rest_at_the_requirement_and_some_swing_below(damping, sho
     loop, coupling = pressed_at_rest(damping), SpringDamper([1300.0], [0.45])
     need = walls_of(loop, coupling).requirement.required[0]
     fastest, made = swinging(loop, coupling, 1.02 * need)
-    assert made > 300
+    assert made > (300 if damping else 500)
     assert fastest < 0.02  # and falling: 60 hands, the slowest of them heavy
     assert swinging(loop, coupling, short * need)[0] > 0.5  # for ever, the wall made and left
 
