@@ -145,7 +145,7 @@ class StepBuffer:
         self.net = process.net(nsim) if process.net else None
         self.first = 0  # the tick of row 0
         self._straight = nsim == 1 and not (self._quantised or process.walls or self._line or self.net)
-        #: whether to try the next ticks by the linear law alone: no force is being limited, and nothing else can bend it
+        #: whether to try the next ticks by the linear law alone: nothing can bend it but a limiter that now rests
         self.calm = self._straight
         limiter, self._sent = process.limiter, []
         if self._straight and limiter:

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache, partial
+from functools import cache, lru_cache, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Protocol
 
@@ -58,6 +58,9 @@ _WHOLE = 1e-9  # of a step: rounding, where a number of steps is counted
 LEAST = 4  # steps per period of MuJoCo's own integrators
 
 
+_Stretch = Callable[[int], None]
+
+
 class Engine(Protocol):
     """Advances the plant by one period at a time, reading and writing a buffer."""
 
@@ -73,9 +76,19 @@ class Engine(Protocol):
         """Whether the engine itself has reported numbers that it cannot go on with."""
         ...
 
-    # An engine may also have, from `start` on, where one simulation has a linear law:
-    #   stretch(ticks)   the law and `advance` for so many, in fewer calls
-    #   back(k)          the plant goes back to the state of row k
+    # One that can may also have, from `start` on:
+    #   stretch(ticks)   the linear law and `advance` for so many ticks from row 0 on, in fewer calls; or None
+    #   back(k)          after a stretch the plant goes back to the state of row k
+
+
+class _NeverTroubled:
+    stretch: _Stretch | None = None
+
+    def back(self, k: int) -> None:
+        """The exact engines have no state of their own."""
+
+    def troubled(self) -> bool:
+        return False
 
 
 def default_integrator(scene: Scene) -> str:
@@ -146,9 +159,6 @@ def at_the_latch(plant: Plant, late: Sequence[float]) -> Array:
     return rows
 
 
-_Stretch = Callable[[int], None]
-
-
 class _Fused:
     """The plant's step and the law at its end in one product a tick: [f; s; z+] of the next one.
 
@@ -167,7 +177,7 @@ class _Fused:
         after = law @ seen
         self.product = np.vstack([after[:m], step, after[m:]]).dot
         self.held, self.before = list(memory[:, : places[1]]), list(memory[:, start:])
-        self.next, self.states = list(memory[1:, places[0] : places[3]]), list(memory[1:, places[1] : places[2]])
+        self.next, self.states = list(memory[1:, places[0] : places[3]]), memory[1:, places[1] : places[2]]
         self.further = list(memory[:, places[3] :])
         self._buffer, self._law = buffer, law.dot
 
@@ -205,14 +215,13 @@ def _exactly(buffer: StepBuffer, plant: Array) -> _Stretch:
     return stretch
 
 
-class ExactEngine:
+class ExactEngine(_NeverTroubled):
     """One matrix product per period, after the actuators' limits."""
 
     def __init__(self, plant: HeldPlant, force_limit: Array) -> None:
         self._plant = np.hstack([plant.A, plant.B])
         self._high = force_limit[:, None]
         self.advance: Callable[[int], None]  # from `start` on
-        self.stretch: _Stretch | None = None
 
     def start(self, buffer: StepBuffer) -> None:
         product, rows, states = np.ascontiguousarray(self._plant).dot, buffer.plant_row, buffer.plant_state
@@ -237,14 +246,8 @@ class ExactEngine:
 
         self.advance = limited
 
-    def back(self, k: int) -> None:
-        """Its only state is the row's."""
 
-    def troubled(self) -> bool:
-        return False
-
-
-class ExactTimedEngine:
+class ExactTimedEngine(_NeverTroubled):
     """A tick of a timing moves the plant, or simulation j plant j of many, exactly, after the actuators' limits."""
 
     def __init__(self, plant: Plant, timing: Timing, force_limit: Array) -> None:
@@ -271,11 +274,8 @@ class ExactTimedEngine:
         np.maximum(force, self._low, out=force)
         self._product(which[(buffer.first + k) % len(which)])(buffer.plant_row[k], buffer.plant_state[k + 1])
 
-    def troubled(self) -> bool:
-        return False
 
-
-class ExactBatchEngine:
+class ExactBatchEngine(_NeverTroubled):
     """Simulation j of the buffer moves by A[j], B[j] of the plants, after the actuators' limits."""
 
     def __init__(self, plants: HeldPlant, force_limit: Array) -> None:
@@ -291,9 +291,6 @@ class ExactBatchEngine:
         np.minimum(force, self._high, out=force)
         np.maximum(force, self._low, out=force)
         self._product(self._slabs[k], self._states[k + 1])
-
-    def troubled(self) -> bool:
-        return False
 
 
 def expm_each(matrices: Array) -> Array:
@@ -427,15 +424,15 @@ class _Access:
     def ticks(self, buffer: StepBuffer, timing: Timing | None) -> Callable[[int], None]:
         """What moves tick k of the buffer, from where the plant is."""
         one = (..., 0) if self.ctrl.ndim == 1 else ...
-        states = 2 * len(self.qacc)
-        rows, inputs = list(buffer.s[:, :states][one]), [row[one] for row in buffer.plant_input]
+        states = buffer.s[:, : 2 * len(self.qacc)][one]
+        rows, inputs = list(states), list(buffer.rows[:, -len(self.ctrl) :][one])
         if timing:
             return self._timed(buffer, timing, rows, inputs)
-        return self._by_exponentials(rows, inputs) if self.move else self._by_steps(rows, inputs)
+        shaped = list(states.reshape(-1, *self.state.shape))
+        return self._by_exponentials(rows, inputs, shaped) if self.move else self._by_steps(inputs, shaped)
 
-    def _by_steps(self, rows: list[Array], inputs: list[Array]) -> Callable[[int], None]:
+    def _by_steps(self, inputs: list[Array], written: list[Array]) -> Callable[[int], None]:
         ctrl, state, step, count = self.ctrl, self.state, self.step, self.substeps
-        written = [row.reshape(state.shape) for row in rows]
 
         def advance(k: int) -> None:
             ctrl[...] = inputs[k]
@@ -444,13 +441,12 @@ class _Access:
 
         return advance
 
-    def _by_exponentials(self, rows: list[Array], inputs: list[Array]) -> Callable[[int], None]:
+    def _by_exponentials(self, rows: list[Array], inputs: list[Array], shaped: list[Array]) -> Callable[[int], None]:
         assert self.move
         ctrl, state, qacc, forward, move = self.ctrl, self.state, self.qacc, self.forward, self.move
         sight = np.concatenate([rows[0], np.zeros_like(qacc)])  # [q; v; qacc]
         seen, qacc_seen = np.split(sight, [len(rows[0])])
-        shaped, each = [row.reshape(state.shape) for row in rows], range(self.substeps)
-        product = move(self.T / self.substeps)
+        product, each = move(self.T / self.substeps), range(self.substeps)
 
         def advance(k: int) -> None:
             ctrl[...] = inputs[k]
@@ -512,6 +508,7 @@ class MujocoEngine:
         self.model = discretised(scene, T, integrator, substeps)
         self.data = mujoco.MjData(self.model)
         self._warnings = self.data.warning.number
+        self.advance: Callable[[int], None]  # from `start` on
         self.stretch: _Stretch | None = None
         moves = cache(lambda h: _rosenbrock(_rates(scene, None), h)[0])
         self._whole = moves if integrator == EXPONENTIAL and substeps == 1 else None
@@ -533,18 +530,13 @@ class MujocoEngine:
 
     def start(self, buffer: StepBuffer) -> None:
         self._buffer, self.stretch, access = buffer, None, self._access
-        self.__dict__.pop("advance", None)
         access.put(buffer, 0)
+        self.advance = access.ticks(buffer, self._timing)
         if buffer.calm and not self._timing and not (self._rubs and buffer.process.limiter):
             if self._whole:
                 self.stretch = self._fused(buffer, self._whole(access.T))
             elif not access.move:
                 self.stretch = self._stepped(buffer)
-
-    @cached_property
-    def advance(self) -> Callable[[int], None]:
-        """From `start` on; made when the first tick is not of a stretch."""
-        return self._access.ticks(self._buffer, self._timing)
 
     def _fused(self, buffer: StepBuffer, move: Array) -> _Stretch:
         access, further = self._access, len(self._access.qacc)
@@ -552,7 +544,7 @@ class MujocoEngine:
         fused = _Fused(buffer, np.hstack([move[:, :-further], none, move[:, -further:]]), further)
         ctrl, state, qacc, forward = access.ctrl, access.state, access.qacc, access.forward
         product, held, before, after, rates = fused.product, fused.held, fused.before, fused.next, fused.further
-        shaped = [row.reshape(state.shape) for row in fused.states]
+        shaped = list(fused.states.reshape(-1, *state.shape))
 
         def stretch(ticks: int) -> None:
             fused.begin(ticks)
@@ -720,6 +712,7 @@ def quiet_warnings() -> Iterator[None]:
         mujoco.set_mju_user_warning(previous)
 
 
+@cache
 def _profiler_clock() -> ctypes.c_void_p | None:
     import mujoco
 

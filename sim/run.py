@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -157,7 +158,8 @@ def run(
         interrupted = True
     n, m, handles = simulation.scene.model.nq, process.channels, list(simulation.scene.handles)
     z, s, w, f = np.split(record[:done], np.cumsum(widths)[:3], axis=1)
-    np.clip(f, -process.force_limit, process.force_limit, out=f)  # from asked for into applied
+    for force, limit in zip(f.T, process.force_limit, strict=True):
+        np.clip(force, -limit, limit, out=force)  # from asked for into applied
     for part in (record, z, s, w, f):
         part.setflags(write=False)
     return Trace(
@@ -200,11 +202,12 @@ def run_blocks(
     # a diverging run is reported, not warned about
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
         engine.start(buffer)
+        ahead = outside(0, 0)
         for first in range(0, ticks, block):
-            count, ahead = min(block, ticks - first), first % (_AHEAD * block)
-            if not ahead:
-                w = outside(first, min(_AHEAD * block, ticks - first))[:, :, None]
-            buffer.w[:count] = w[ahead : ahead + count]
+            count, ahead = min(block, ticks - first), ahead[block:]
+            if not len(ahead):
+                ahead = outside(first, min(_AHEAD * block, ticks - first))
+            buffer.w[:count] = ahead[:count, :, None]
             run_block(buffer, engine, count)
             if look(buffer, first, count):
                 return
@@ -213,13 +216,13 @@ def run_blocks(
 
 def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
     """Close the loop for the first `ticks` rows of the buffer."""
-    done = 0
-    if buffer.calm and (stretch := getattr(engine, "stretch", None)):
-        stretch(ticks)  # the same by the linear law, whose forces are looked at afterwards
+    done, fast = 0, cast(Any, engine)
+    if buffer.calm and getattr(engine, "stretch", None):
+        fast.stretch(ticks)  # the same by the linear law, whose forces are looked at afterwards
         done = buffer.linear_until(ticks)
         if done == ticks:
             return
-        engine.back(done)
+        fast.back(done)
     tick, advance = buffer.ticking(), engine.advance
     for k in range(done, ticks):
         tick(k)  # sample x, compute f and z+

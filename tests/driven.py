@@ -30,7 +30,7 @@ def driven(process: Process, engine: Engine, outside: Outside, ticks: int, start
     return Driven(*(np.concatenate(rows) for rows in zip(*kept, strict=True)))
 
 
-def tick_by_tick(engine: Engine) -> Engine:
+def tick_by_tick(engine):
     """The engine without stretches: every tick is looked at before the next."""
     start = engine.start
 
