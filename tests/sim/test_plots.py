@@ -73,7 +73,12 @@ def test_every_sample_of_a_run_is_on_the_picture(drawn):
         np.testing.assert_allclose(lines(figure.axes[0])[f"device {i + 1}"][:, 1], f[:, i])  # mm of 1e-3 m a newton
     assert [line.get_label() for line in figure.axes[2].lines][2] == "device 2"
     assert figure.axes[0].get_ylabel() == "displacement of the handle [mm],\nwhere the encoder is"
-    assert legend(figure) == ["device 1", "device 2", "device 3", "pale: ideal environment (asked force 12 % off)"]
+    assert legend(figure) == [
+        "device 1",
+        "device 2",
+        "device 3",
+        "pale: what the object itself gives for this motion (force error 12 %)",
+    ]
 
 
 def test_a_handle_near_its_encoder_is_drawn_and_says_how_near(drawn):
