@@ -176,10 +176,9 @@ class StepBuffer:
 
         def tick(k: int) -> None:
             linear(seen[k], after[k])
-            if low <= one[k] <= high and lowest <= other[k] <= highest:
-                if not others or all(least <= force[k] <= most for force, least, most in others):
-                    return
-            transition(seen[k], after[k])
+            within = low <= one[k] <= high and lowest <= other[k] <= highest
+            if not within or (others and not all(least <= force[k] <= most for force, least, most in others)):
+                transition(seen[k], after[k])
 
         return tick
 
