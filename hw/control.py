@@ -43,13 +43,13 @@ class Controller(Protocol):
 
     T: float  # [s]
 
-    def step(self, x: Sequence[float]) -> Array:
+    def step(self, x: Sequence[float]) -> Sequence[float]:
         """Forces fed back (m,) [N] for the displacements x (m,) [m]."""
         ...
 
 
 class LinearController:
-    """[f; z+] = [C D; A B] [z; x], from rest. Allocates nothing per tick but the force that it returns."""
+    """[f; z+] = [C D; A B] [z; x], from rest."""
 
     def __init__(self, F: Lti) -> None:
         self.F, self.T = F, F.T
@@ -58,13 +58,13 @@ class LinearController:
         self._input, self._output = np.zeros(n + m), np.zeros(n + F.outputs)
         self._order = n
 
-    def step(self, x: Sequence[float]) -> Array:
+    def step(self, x: Sequence[float]) -> list[float]:
         """Forces (m,) [N] for the displacements x (m,) [m]; the state moves on by one tick."""
         n = self._order
         self._input[n:] = x
         np.dot(self._product, self._input, out=self._output)
         self._input[:n] = self._output[:n]
-        return self._output[n:].copy()
+        return self._output[n:].tolist()
 
 
 class _LimitedController:
@@ -76,13 +76,13 @@ class _LimitedController:
         self._tick = limiter.transition()
         self._input, self._output = (np.zeros((F.order + F.inputs, 1)) for _ in range(2))
 
-    def step(self, x: Sequence[float]) -> Array:
+    def step(self, x: Sequence[float]) -> list[float]:
         """Forces (m,) [N] within the limits for the displacements x (m,) [m]; the state moves on by one tick."""
         m, before, after = self._m, self._input, self._output
         before[-m:, 0] = x
         self._tick(before, after)
         before[:-m] = after[m:]
-        return after[:m, 0].copy()
+        return after[:m, 0].tolist()
 
 
 def host_controller(
@@ -190,7 +190,7 @@ class TraceRow(NamedTuple):
 
     tick: int  # modulo 2^16
     x: tuple[float, ...]  # (m,) [m]
-    asked: Array  # (m,) [N] by the controller
+    asked: Sequence[float]  # (m,) [N] by the controller
     gain: float
     sent: tuple[int, ...]  # [steps]
     state: State | None
@@ -239,13 +239,10 @@ class Drive:
         if self.x is None:
             ticks = 1  # what went before does not count
         self._clock.check(state, ticks, now)
-        absolute = self.units.positions(state.counts)
-        check_range(absolute, self.units.reach)
+        check_range(state.counts, self.units)
         if self.reference is None:
             self.reference = state.counts if self._rereference else (0,) * state.axes
-        x = absolute
-        if any(self.reference):
-            x = self.units.positions(tuple(map(sub, state.counts, self.reference)))
+        x = self.units.positions(map(sub, state.counts, self.reference))
         self._check_motion(x, ticks)
         self._counters.unlike += self._commands.unlike(state, ticks)
         self._encoders.check(state.counts, state.applied, ticks)
@@ -260,7 +257,7 @@ class Drive:
             self.gain.rise(ticks)
         elif direction < 0:
             self.gain.fall(ticks)
-        shaped = shape(asked.tolist(), self.force, self.gain.value, self.limits, self.T, test)
+        shaped = shape(asked, self.force, self.gain.value, self.limits, self.T, test)
         force, steps = shaped.force, self.units.steps(shaped.force, self.config.cap)
         if self._budget:
             whole = self._budget.limit(steps, x, np.array(self.units.forces(state.applied)), ticks - 1)

@@ -65,10 +65,10 @@ def _spoiled(force: float | None) -> _Call:
     """A controller that from now on asks for `force` [N]; one that raises where that is None."""
 
     def call(session: Session, now: int) -> Said:
-        def step(x: Sequence[float]) -> Array:
+        def step(x: Sequence[float]) -> Sequence[float]:
             if force is None:
                 raise ZeroDivisionError("division by zero")
-            return np.full(len(x), force)
+            return [force] * len(x)
 
         assert session.drive is not None
         session.drive.controller.step = step

@@ -7,9 +7,10 @@ max(-12, min(12, nan)) is +12.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 from hw.protocol import MAX_RELEASE_NS, MAX_THETA, PROTOCOL, Config, Force, Info, State, wire_bytes
 from models.device import require
@@ -78,8 +79,7 @@ class Limits:
             require(f"continuous[{i}]", most, 1e-3, cap, "N")
 
 
-@dataclass(frozen=True)
-class _Shaped:
+class _Shaped(NamedTuple):
     """A force that may be sent, and what had to be done to it."""
 
     force: tuple[float, ...]  # (m,) [N]
@@ -110,14 +110,17 @@ def shape(
     _require_finite(asked)
     if not 0.0 <= gain <= 1.0:
         raise Fault(f"the gain is {gain}, expected a number within [0, 1]")
+    wishes = [gain * one for one in asked]
+    if test:
+        wishes = [one + more for one, more in zip(wishes, test, strict=True)]
+        _require_finite(wishes)
     step, clipped, slowed, force = limits.slew * T, False, False, []
-    wishes = [gain * one + more for one, more in zip(asked, test or (0.0,) * len(asked), strict=True)]
-    _require_finite(wishes)
     for wanted, last, cap in zip(wishes, previous, limits.cap, strict=True):
-        capped = max(-cap, min(cap, wanted))
-        sent = max(last - step, min(last + step, capped))
-        clipped |= abs(wanted) >= cap
-        slowed |= sent != capped
+        sent = wanted
+        if not -cap < sent < cap:
+            clipped, sent = True, math.copysign(cap, sent)
+        if not last - step <= sent <= last + step:
+            slowed, sent = True, last + math.copysign(step, sent - last)
         force.append(sent)
     _require_finite(force)
     return _Shaped(tuple(force), clipped, slowed)
@@ -149,11 +152,12 @@ def check_speed(x: Sequence[float], before: Sequence[float], seconds: float, lim
             raise Fault(f"axis {i} moves at {speed:.3g} m/s, allowed are {limits.speed:g} m/s while forces act")
 
 
-def check_range(x: Sequence[float], reach: Sequence[float]) -> None:
-    """Raise Fault where a displacement x (m,) [m] is outside of what the device can reach: +-reach (m,) [m]."""
-    for i, (now, most) in enumerate(zip(x, reach, strict=True), start=1):
-        if not abs(now) <= most:
-            raise Fault(f"encoder {i} is at {1e3 * now:.4g} mm, its range is +-{1e3 * most:.4g} mm")
+def check_range(counts: Sequence[int], units: Units) -> None:
+    """Raise Fault where an encoder (m,) [counts] is outside of what the device can reach."""
+    for i, (now, most) in enumerate(zip(counts, units.range, strict=True)):
+        if not -most <= now <= most:
+            mm = 1e3 * units.encoder_step[i]
+            raise Fault(f"encoder {i + 1} is at {mm * now:.4g} mm, its range is +-{mm * most:.4g} mm")
 
 
 @dataclass
@@ -208,17 +212,16 @@ class Units:
 
     encoder_step: tuple[float, ...]  # (m,) [m]
     force_step: tuple[float, ...]  # (m,) [N]
-    reach: tuple[float, ...]  # (m,) [m]
+    range: tuple[int, ...]  # (m,) [counts] the workspace is +-range
 
     @classmethod
     def of(cls, info: Info) -> Units:
         encoder = tuple(1e-12 * step for step in info.encoder_step)
-        reach = tuple(step * counts for step, counts in zip(encoder, info.range, strict=True))
-        return cls(encoder, tuple(1e-6 * step for step in info.force_step), reach)
+        return cls(encoder, tuple(1e-6 * step for step in info.force_step), info.range)
 
-    def positions(self, counts: tuple[int, ...]) -> tuple[float, ...]:
+    def positions(self, counts: Iterable[int]) -> tuple[float, ...]:
         """Displacements (m,) [m]."""
-        return tuple(n * step for n, step in zip(counts, self.encoder_step, strict=True))
+        return tuple([n * step for n, step in zip(counts, self.encoder_step, strict=True)])
 
     def forces(self, steps: tuple[int, ...]) -> tuple[float, ...]:
         """Forces fed back f (m,) [N], from what the motors do."""
@@ -227,8 +230,10 @@ class Units:
     def steps(self, f: Sequence[float], cap: tuple[int, ...]) -> tuple[int, ...]:
         """What the motors are to do for the forces fed back f (m,) [N]: whole steps, at most `cap`."""
         return tuple(
-            max(-most, min(most, round(-force / step)))
-            for force, step, most in zip(f, self.force_step, cap, strict=True)
+            [
+                max(-most, min(most, round(-force / step)))
+                for force, step, most in zip(f, self.force_step, cap, strict=True)
+            ]
         )
 
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from hw.device import cap_after, limited
+from hw.device import limited
 from hw.limits import DRIVING, Fault, Limits, Stage
 from hw.protocol import NO_MARGIN, Config, Phase, State, distance
 
@@ -260,10 +260,12 @@ class ClockDrift:
         if self._last is not None:
             elapsed = (at_us - self._last + 2**31) % 2**32 - 2**31
             late = elapsed - ticks * self.T_us
-            self._behind += late
-            self._freeze = min(self.forgiven_us, max(self._freeze, late))
+            drift = self._behind = self._behind + late
+            if late > self._freeze:
+                self._freeze = min(self.forgiven_us, late)
             self._ticks += ticks
-            drift = self._behind - max(0.0, min(self._freeze, self._behind))
+            if drift > 0:
+                drift -= min(self._freeze, drift)
             if abs(drift) > self.tolerance * BLOCK * self.T_us:
                 lasts = self.T_us + drift / self._ticks
                 what = f"over {self._ticks} tick{'s' if self._ticks > 1 else ''}, T is {self.T_us:g} us"
@@ -295,12 +297,13 @@ class ClockMonitor:
 
 def check_state(state: State, config: Config, stage: Stage, gain: float) -> None:
     """Raise Fault where the device is where it may not be, or has a force that nobody can have asked for."""
-    strongest = max(abs(a) - c for a, c in zip(state.applied, config.cap, strict=True))
-    if strongest > 0:
-        raise Fault(f"the device applies {state.applied} steps, the cap is {config.cap}")
-    if state.phase in (Phase.STOPPED, Phase.RAMP, Phase.SILENT):
-        raise Fault(f"the device is in {state.phase.name.lower()}, cause {state.cause.name.lower()}")
-    armed = state.phase in (Phase.ARMED, Phase.HOLDING)
+    for force, cap in zip(state.applied, config.cap, strict=True):
+        if not -cap <= force <= cap:
+            raise Fault(f"the device applies {state.applied} steps, the cap is {config.cap}")
+    phase = state.phase
+    if phase in (Phase.STOPPED, Phase.RAMP, Phase.SILENT):
+        raise Fault(f"the device is in {phase.name.lower()}, cause {state.cause.name.lower()}")
+    armed = phase in (Phase.ARMED, Phase.HOLDING)
     if armed and stage not in DRIVING:
         raise Fault("the device is armed, and nobody asked it to")
     if not armed and (stage in (Stage.ARMED, Stage.DISARMING) or gain > 0):
@@ -330,22 +333,23 @@ class CommandMonitor:
 
         Raises Fault where that goes on.
         """
-        self._holding = self._holding + 1 if state.phase == Phase.HOLDING else 0
+        phase = state.phase
+        self._holding = self._holding + 1 if phase == Phase.HOLDING else 0
         if self._holding > self._config.hold:
             raise Fault(f"the device holds a force for {self._holding} ticks, {self._config.hold} are agreed")
         told, last = self._forces.pop(state.tick, None), self._last
         self._last = state
-        if last is None or state.phase == Phase.DISARMED:
+        if last is None or phase == Phase.DISARMED:
             return False
         if last.phase != Phase.DISARMED:
             fewest, most = self._run
-            self._run = (fewest + (state.phase == Phase.ARMED), most + ticks)
+            self._run = (fewest + (phase == Phase.ARMED), most + ticks)
         if ticks > 1:
             return False
         wrong = not self._could(state, last.applied, told)
         self._unlike = max(0, self._unlike + (_FORGETTING if wrong else -1))
         if self._unlike > _FORGETTING * (PATIENCE - 1):
-            what = f"told {told}" if state.phase == Phase.ARMED else f"to hold {last.applied}"
+            what = f"told {told}" if phase == Phase.ARMED else f"to hold {last.applied}"
             raise Fault(f"the device applies {state.applied} steps, it was {what}, and so for {PATIENCE} ticks")
         return wrong
 
@@ -354,16 +358,11 @@ class CommandMonitor:
             return state.applied == last
         if told is None:
             return False
-        config = self._config
-        fewest, most = self._run
-        for force, before, asked, cap, slew in zip(state.applied, last, told, config.cap, config.slew, strict=True):
-            low = high = limited(asked, before, cap_after(config, cap, most), slew)
-            if fewest < most and fewest < config.ramp_in:
-                other = limited(asked, before, cap_after(config, cap, fewest), slew)
-                low, high = min(low, other), max(high, other)
-            if not low - _ROUNDING <= force <= high + _ROUNDING:
-                return False
-        return True
+        could = [limited(self._config, run, last, told) for run in set(self._run)]
+        return state.applied in could or all(
+            min(either) - _ROUNDING <= force <= max(either) + _ROUNDING
+            for force, *either in zip(state.applied, *could, strict=True)
+        )
 
 
 # encoders: a hand that holds still looks like a cable that is off, but no hand is as stiff as a dead encoder

@@ -184,20 +184,20 @@ class Session:
 
     def met(self, info: wire.Info, now: int) -> Said:
         """Who the device is."""
-        return self._guarded(now, lambda: self._on_info(info))
+        return self._guarded(now, self._on_info, info)
 
     def configured(self, refused: int, now: int) -> Said:
         """The device runs as `config` says, or why not."""
-        return self._guarded(now, lambda: self._on_answer(refused))
+        return self._guarded(now, self._on_answer, refused)
 
     def take(self, state: wire.State, now: int) -> Said:
         """What answers a STATE."""
-        return self._guarded(now, lambda: self._on_state(state))
+        return self._guarded(now, self._on_state, state)
 
-    def _guarded(self, now: int, understand: Callable[[], Said]) -> Said:
+    def _guarded(self, now: int, understand: Callable[[Any], Said], heard: Any) -> Said:
         self.now = now
         try:
-            return understand()
+            return understand(heard)
         except Fault as fault:
             return self.fail(str(fault), now)
         except Exception as error:  # whatever it is: first the force to zero, then the explanation
