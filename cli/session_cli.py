@@ -76,7 +76,7 @@ def add_safety_options(parser: argparse.ArgumentParser) -> None:
 
 
 def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
-    """The Limits of the safety options, with `cap`. Raises InputError."""
+    """The limits of the safety options, with `cap`. Raises InputError."""
     cap = number(args, "force-cap", 0.05, 12.0)
     more: dict[str, Any] = {"cap": cap, "speed": number(args, "max-speed", 1e-3, 2.5)}
     more["thermal"] = number(args, "thermal-time", 0.1, 1000.0)

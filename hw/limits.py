@@ -45,12 +45,12 @@ ENDED = frozenset({Stage.FINISHED, Stage.REFUSED, Stage.STOPPED, Stage.LOST, Sta
 DRIVING = frozenset({Stage.ARMING, Stage.ARMED, Stage.DISARMING})
 
 
-class Fault(Exception):
+class SafetyStop(Exception):
     """A reason to stop, in the words of the log."""
 
 
 @dataclass(frozen=True)
-class Limits:
+class SafetyLimits:
     """The host's own limits; the device has the same ones in its firmware."""
 
     cap: tuple[float, ...]  # (m,) [N] largest force
@@ -88,16 +88,16 @@ class _Shaped(NamedTuple):
 
 
 def _require_finite(force: Sequence[float]) -> None:
-    """Raise Fault where a force is not a number or infinite."""
+    """Raise SafetyStop where a force is not a number or infinite."""
     if not all(map(math.isfinite, force)):
-        raise Fault(f"the controller asked for {', '.join(f'{f:g}' for f in force)} N, which is no force")
+        raise SafetyStop(f"the controller asked for {', '.join(f'{f:g}' for f in force)} N, which is no force")
 
 
 def shape(
     asked: Sequence[float],
     previous: Sequence[float],
     gain: float,
-    limits: Limits,
+    limits: SafetyLimits,
     T: float,
     test: Sequence[float] | None = None,
 ) -> _Shaped:
@@ -105,11 +105,11 @@ def shape(
 
     `test` (m,) [N] is added behind the gain: what an encoder is tested with.
 
-    Raises Fault where `asked` is not finite; that is looked at first, and the result is looked at again.
+    Raises SafetyStop where `asked` is not finite; that is looked at first, and the result is looked at again.
     """
     _require_finite(asked)
     if not 0.0 <= gain <= 1.0:
-        raise Fault(f"the gain is {gain}, expected a number within [0, 1]")
+        raise SafetyStop(f"the gain is {gain}, expected a number within [0, 1]")
     wishes = [gain * one for one in asked]
     if test:
         wishes = [one + more for one, more in zip(wishes, test, strict=True)]
@@ -126,38 +126,40 @@ def shape(
     return _Shaped(tuple(force), clipped, slowed)
 
 
-def check_jump(x: Sequence[float], previous: Sequence[float], ticks: int, limits: Limits) -> None:
-    """Raise Fault where an encoder moved further in `ticks` ticks than a hand can: x, previous (m,) [m]."""
+def check_jump(x: Sequence[float], previous: Sequence[float], ticks: int, limits: SafetyLimits) -> None:
+    """Raise SafetyStop where an encoder moved further in `ticks` ticks than a hand can: x, previous (m,) [m]."""
     for i, (now, before) in enumerate(zip(x, previous, strict=True), start=1):
         if not abs(now - before) <= limits.jump * ticks:
             allowed = f"{1e3 * limits.jump * ticks:g} mm in {ticks} tick{'s' if ticks > 1 else ''}"
-            raise Fault(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
+            raise SafetyStop(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
 
 
-def check_jolt(x: Sequence[float], previous: Sequence[float], before: Sequence[float], limits: Limits) -> None:
-    """Raise Fault where an encoder's speed changed within a tick by more than `limits.jump` per tick, as no mass can.
+def check_jolt(x: Sequence[float], previous: Sequence[float], before: Sequence[float], limits: SafetyLimits) -> None:
+    """Raise SafetyStop where a speed changed within a tick by more than `limits.jump` per tick, as no mass can.
 
     x, previous, before: (m,) [m], of three ticks in a row.
     """
     for i, (now, last, first) in enumerate(zip(x, previous, before, strict=True), start=1):
         if not (change := abs(now - 2 * last + first)) <= limits.jump:
             most = f"{1e3 * limits.jump:g} mm in a tick"
-            raise Fault(f"encoder {i} shakes: its speed changed by {1e3 * change:.3g} mm in a tick, allowed are {most}")
+            raise SafetyStop(
+                f"encoder {i} shakes: its speed changed by {1e3 * change:.3g} mm in a tick, allowed are {most}"
+            )
 
 
-def check_speed(x: Sequence[float], before: Sequence[float], seconds: float, limits: Limits) -> None:
-    """Raise Fault where an axis moved faster than allowed: x now, `before` so many `seconds` ago, (m,) [m]."""
+def check_speed(x: Sequence[float], before: Sequence[float], seconds: float, limits: SafetyLimits) -> None:
+    """Raise SafetyStop where an axis moved faster than allowed: x now, `before` so many `seconds` ago, (m,) [m]."""
     for i, (now, then) in enumerate(zip(x, before, strict=True), start=1):
         if not (speed := abs(now - then) / seconds) <= limits.speed:
-            raise Fault(f"axis {i} moves at {speed:.3g} m/s, allowed are {limits.speed:g} m/s while forces act")
+            raise SafetyStop(f"axis {i} moves at {speed:.3g} m/s, allowed are {limits.speed:g} m/s while forces act")
 
 
 def check_range(counts: Sequence[int], units: Units) -> None:
-    """Raise Fault where an encoder (m,) [counts] is outside of what the device can reach."""
+    """Raise SafetyStop where an encoder (m,) [counts] is outside of what the device can reach."""
     for i, (now, most) in enumerate(zip(counts, units.range, strict=True)):
         if not -most <= now <= most:
             mm = 1e3 * units.encoder_step[i]
-            raise Fault(f"encoder {i + 1} is at {mm * now:.4g} mm, its range is +-{mm * most:.4g} mm")
+            raise SafetyStop(f"encoder {i + 1} is at {mm * now:.4g} mm, its range is +-{mm * most:.4g} mm")
 
 
 @dataclass
@@ -167,7 +169,7 @@ class Gain:
     Any constant gain within [0, 1] keeps a certificate: He[g F/(z-1)] > -Delta_D/T holds for g F if it does for F.
     """
 
-    limits: Limits
+    limits: SafetyLimits
     T: float  # [s]
     value: float = 0.0
 
@@ -188,17 +190,17 @@ class Heat:
     At a constant force F it reaches the continuous force's square after -tau ln(1 - (F_continuous / F)^2).
     """
 
-    def __init__(self, limits: Limits, T: float) -> None:
+    def __init__(self, limits: SafetyLimits, T: float) -> None:
         self._limits, self._T = limits, T
         self._squares = [0.0] * len(limits.continuous)  # [N^2]
 
     def check(self, force: Sequence[float], ticks: int) -> None:
-        """Take in the force (m,) [N] that acts for so many ticks. Raise Fault where a motor gets too hot."""
+        """Take in the force (m,) [N] that acts for so many ticks. Raise SafetyStop where a motor gets too hot."""
         part = -math.expm1(-ticks * self._T / self._limits.thermal)
         for i, most in enumerate(self._limits.continuous):
             self._squares[i] += (force[i] ** 2 - self._squares[i]) * part
             if self._squares[i] > most**2:
-                raise Fault(
+                raise SafetyStop(
                     f"motor {i + 1} gets hot: {self._squares[i] ** 0.5:.3g} N rms, {most:g} N are allowed for long"
                 )
 
@@ -244,7 +246,7 @@ def _wire_time(baud: int, axes: int) -> tuple[float, str]:
     return seconds, f"({up} + {down}) bytes x {_BITS_PER_BYTE} bits / {baud} baud = {1e6 * seconds:.0f} us"
 
 
-def objections(info: Info, scenario: Scenario, limits: Limits, baud: int | None) -> list[str]:
+def objections(info: Info, scenario: Scenario, limits: SafetyLimits, baud: int | None) -> list[str]:
     """Why this device may not run this scenario over this line; empty where nothing is wrong. baud None: no UART."""
     if info.version != PROTOCOL:
         spoken = f"the device speaks version {info.version} of the protocol, this host version {PROTOCOL}"
@@ -286,7 +288,7 @@ def _impossible(i: int, info: Info) -> str | None:
     return None
 
 
-def _coarse(i: int, info: Info, limits: Limits, T: float) -> list[str]:
+def _coarse(i: int, info: Info, limits: SafetyLimits, T: float) -> list[str]:
     """What is too coarse on axis i for limits on forces and displacements to mean anything."""
     reasons, force, count = [], 1e-6 * info.force_step[i], 1e-12 * info.encoder_step[i]
     finest = min(limits.cap[i] / _FEWEST_STEPS, limits.slew * T)
@@ -320,7 +322,7 @@ def watchdog_for(T: float) -> int:
     return silence
 
 
-def configuration(info: Info, limits: Limits, theta: int) -> Config:
+def configuration(info: Info, limits: SafetyLimits, theta: int) -> Config:
     """What the device is told: never more than the host allows itself, nor than the device can do."""
     T_ns = info.period_ns
     ramp = max(1, min(0xFF, math.ceil(1000 * _RAMP_US / T_ns)))

@@ -26,7 +26,7 @@ from controller.loop import named_today
 from controller.lti import Array
 from design.files import read_arrays, write, write_json
 from hw.control import BudgetPlan, CertifiedCoupling, Controller, Program, SentBudget, TraceRow, host_controller
-from hw.limits import Fault, Limits, Units, shape
+from hw.limits import SafetyLimits, SafetyStop, Units, shape
 from hw.protocol import NO_MARGIN, Config
 from hw.session import Session
 from models.device import require
@@ -313,7 +313,7 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scenario: Scenario
     coupling: Form
     link_delay: int
-    limits: Limits
+    limits: SafetyLimits
     force_step: tuple[float, ...]
     cap: tuple[int, ...]
     energy_budget: BudgetPlan | None = None
@@ -380,8 +380,8 @@ def recipes_of(result: Trace) -> list[_Recipe]:
 
 
 def _require_limits(raw: object) -> None:
-    """Raise ValueError where a recipe has other limits than Limits: msgspec passes over those of a dataclass."""
-    names = {field.name for field in fields(Limits)}
+    """Raise ValueError where a recipe has other limits than SafetyLimits: msgspec passes over those of a dataclass."""
+    names = {field.name for field in fields(SafetyLimits)}
     needed = names - {"speed", "continuous", "thermal"}  # which older traces lack
     for recipe in raw if isinstance(raw, list) else []:
         limits = recipe.get("limits") if isinstance(recipe, dict) else None
@@ -425,7 +425,7 @@ def _again(
             gain = float(link["gain"][k])
             test = link["test"][k].tolist()
             force = shape(asked[k].tolist(), force, gain, recipe.limits, recipe.scenario.T, test).force
-        except Fault as fault:
+        except SafetyStop as fault:
             raise InputError(f"the trace cannot be replayed: tick {k}: {fault}") from None
         steps = units.steps(force, recipe.cap)
         if budget:
