@@ -421,7 +421,7 @@ def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
 def test_delays_that_vary_in_the_scenario_are_refused_by_name(module, scenario, tmp_path, monkeypatch):
     """The link has the delays that it has; a table that nothing reads would promise something else."""
     monkeypatch.setattr(
-        module, "scenario_from", lambda args: scenario.replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
+        module.options, "scenario_from", lambda args: scenario.replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
     )
     with pytest.raises(InputError, match=r"varying_delay: hw\.\w+ takes the delays that its link has"):
         module.main([] if module is emulator_command else ["--emulate", "--out", str(tmp_path)])

@@ -151,9 +151,8 @@ def test_a_first_session_is_gentle(scenario):
     ],
 )
 def test_impossible_limits_are_refused(scenario, options, words):
-    args = _parser().parse_args(["--emulate", *options])
     with pytest.raises(InputError) as error:
-        session_for(scenario, LinkSettings(), **limits_from(args, scenario))
+        session_for(scenario, LinkSettings(), **limits_from(_parser().parse_args(["--emulate", *options]), scenario))
     assert words in str(error.value)
 
 
