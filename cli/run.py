@@ -18,12 +18,20 @@ from design.result import listed
 from design.robustness import robustness_parts
 from design.transparency import BAND_HZ, transparency
 from sim import report
-from sim.accuracy import ForceError, credible_part, force_error, position_error
+from sim.accuracy import (
+    EngineChoice,
+    ForceError,
+    compare_engines,
+    credible_part,
+    cross_check,
+    force_error,
+    pick,
+    position_error,
+)
 from sim.alternatives import Alternative, alternatives
 from sim.couplings import NAMES, Chosen, choose
-from sim.engine_choice import EngineChoice, compare_engines, cross_check, pick
 from sim.engines import INTEGRATORS, default_integrator
-from sim.nets import BASELINES, Classic, EnergyNet, idle, netted
+from sim.passivity_layer import BASELINES, Classic, EnergyNet, idle, netted
 from sim.run import ENGINES, Simulation, assemble, beginnings, make_engine, run
 from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, stability_part
@@ -405,7 +413,11 @@ def _title(what: str, report: _Report) -> str:
     """Of the picture."""
     stability, kind = report.stability, report.judged.coupling["kind"]
     coupling = "no virtual coupling" if kind == "none" else f"{kind} coupling"
-    growth = f"growth {stability['exact_growth_rate_per_s']:+.3f} 1/s at {stability['exact_frequency_hz']:.1f} Hz"
+    if kind != "none" and report.judged.promise:
+        coupling += f" for {report.judged.promise}"
+    rate, hertz = stability["exact_growth_rate_per_s"], stability["exact_frequency_hz"]
+    grows, decays = f"grows by {rate:.3f} 1/s at {hertz:.1f} Hz", f"slowest motion decays by {-rate:.3f} 1/s"
+    growth = grows if rate > 0 else decays
     if report.varying_delay and report.unstable is not None:
         growth = f"{report.varying_delay['pattern']} delays, {stability['verdict']}"
     return f"{what.removesuffix(', no coupling').removesuffix(', case none')}, {coupling}: {growth}"
