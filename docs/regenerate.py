@@ -19,6 +19,7 @@ tests/project/test_docs.py runs the same steps and compares, but for what is mea
 
 from __future__ import annotations
 
+import argparse
 import ast
 import itertools
 import math
@@ -35,7 +36,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-_BLOCK = r"(<!-- {}(?:: (.+))? -->\n```{}\n\$ (python (?:-m|examples/).+)\n)((?:.*\n)*?)(?=```)"
+_BLOCK = r"(<!-- {}(?:: (.+))? -->\n```{}\n\$ (python (?:-m|examples/).+)\n)((?:(?!.*```).*\n)*)(?=```)"
 SHOWN = re.compile(_BLOCK.format("output", "console"))
 MEASURED = re.compile(_BLOCK.format("measured", "text"))
 BLOCK = re.compile(r"^```(sh|console|toml|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -91,8 +92,12 @@ def kept(output: str, pattern: str | None) -> str:
 
 def renewed(text: str, printed: dict[str, str]) -> str:
     """The page with what its commands have printed."""
+
+    def shown(block: re.Match[str]) -> str:
+        return block[1] + kept(printed[block[3]], block[2]) if block[3] in printed else block[0]
+
     for blocks in (SHOWN, MEASURED):
-        text = blocks.sub(lambda block: block[1] + kept(printed[block[3]], block[2]), text)
+        text = blocks.sub(shown, text)
     return text
 
 
@@ -146,16 +151,23 @@ def check() -> int:
 
 def main() -> int:
     """Run every page that shows output, and rewrite those whose output is another."""
-    if sys.argv[1:] == ["--check"]:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="run the slow commands and compare, and write nothing")
+    parser.add_argument(
+        "pages", nargs="*", type=Path, metavar="PAGE", help="renew these alone, without what is measured"
+    )
+    args = parser.parse_args()
+    if args.check:
         return check()
+    some = {page.resolve() for page in args.pages}
     printed: dict[str, str] = {}
     with TemporaryDirectory() as place:
         folder = Path(place)
         for page in PAGES:
             text = page.read_text(encoding="utf-8")
-            if not any(kind.search(text) for kind in (SHOWN, MEASURED, PICTURE)):
+            if (some and page not in some) or not any(kind.search(text) for kind in (SHOWN, MEASURED, PICTURE)):
                 continue
-            measured = [Step("command", block[3]) for block in MEASURED.finditer(text)]
+            measured = [] if some else [Step("command", block[3]) for block in MEASURED.finditer(text)]
             for step in [*steps(text), *measured]:
                 if step.kind == "file":
                     (folder / step.name).write_text(step.text, encoding="utf-8")

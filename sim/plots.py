@@ -164,7 +164,7 @@ def plot_run(
             style = STYLES[i % len(STYLES)]
             label = f"{around.name(i)}, force" if two or alike[i] else around.name(i)
             axis.plot(result.t[part], result.f[part, i], label=label + alike[i], linewidth=width, **style)
-    axes[0, 0].set_ylabel("displacement [mm]")
+    axes[0, 0].set_ylabel("displacement [mm]" if two else _one_point(result))
     axes[1, 0].set_ylabel("force fed back [N]")
     if ideal:
         _draw_ideal(axes[1], result, ideal, parts)
@@ -221,10 +221,17 @@ _SHARPER = 4.0  # times the run's mean: what is to be seen in a zoom
 
 def _stands_out(result: Trace, near: slice, ticks: int) -> bool:
     """Whether the forces turn more sharply in this part than in the whole of the first `ticks`."""
-    if near == slice(0, result.t.size):
-        return False
+    if 10 * (near.stop - near.start) > result.t.size:
+        return False  # nearly the whole is no zoom
     bend = np.square(np.diff(result.f[:ticks], n=2, axis=0)).sum(axis=1)
     return bool(bend[near.start : near.stop].mean() > _SHARPER * bend.mean())
+
+
+def _one_point(result: Trace) -> str:
+    """The axis of displacements where one curve stands for the handle, which the user holds, and for the encoder."""
+    apart = 1e3 * float(np.abs(result.x_handle - result.x).max(initial=0.0))
+    beside = f"within {apart:.1g} mm of the encoder" if apart > 1e-9 else "where the encoder is"
+    return f"displacement of the handle [mm],\n{beside}"
 
 
 def _draw_walls(axes: Array, result: Trace, around: Surroundings) -> None:
@@ -243,7 +250,7 @@ def _draw_walls(axes: Array, result: Trace, around: Surroundings) -> None:
 
 
 def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...], around: Surroundings) -> None:
-    """Handles over encoders, in millimetres; one curve where they are one point."""
+    """Handles over encoders, in millimetres; the handle alone where a picture shows them as one point."""
     two, alike = _two_points(result), _coinciding(result.x, around)
     for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
         for i in _calmest_last(result.x):
@@ -251,8 +258,8 @@ def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...], ar
             label = f"{around.name(i)}, encoder (thin)" if two else around.name(i)
             if alike[i] and not two:
                 label += f", displacement{alike[i]}"
-            thin = 0.5 * width if two else width
-            axis.plot(result.t[part], 1e3 * result.x[part, i], label=label, linewidth=thin, **style)
+            thin, x = (0.5 * width, result.x) if two else (width, result.x_handle)
+            axis.plot(result.t[part], 1e3 * x[part, i], label=label, linewidth=thin, **style)
         if two:
             for i in _calmest_last(result.x_handle):
                 style = STYLES[i % len(STYLES)]
@@ -310,9 +317,9 @@ def _amplitudes(result: Trace, hertz: float, ticks: int) -> tuple[Array, Array]:
 def _draw_ideal(axes: Array, result: Trace, ideal: tuple[Array, float | None], parts: tuple[slice, ...]) -> None:
     """The ideal forces, broad and pale in each device's colour; cut where they are more than three times as large."""
     forces, percent = ideal
-    label = "pale: ideal environment"
+    label = "pale: what the object itself gives for this motion"
     if percent is not None:  # of the force before the motors' limit, as in the report
-        label += " (the motors were asked for the same)" if percent < _SAME else f" (asked force {percent:.2g} % off)"
+        label += " (the motors were asked for the same)" if percent < _SAME else f" (force error {percent:.2g} %)"
     for axis, part in zip(axes, parts, strict=True):
         most = 3 * max(map(abs, axis.get_ylim()))
         for i, force in enumerate(forces[part].T):
@@ -354,7 +361,7 @@ class Panel:
 
 
 def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] = ()) -> Path:
-    """The forces of several couplings on the same axes, each over the force that should be felt (pale).
+    """The forces of several couplings on the same axes, each over what the object gives for the panel's motion (pale).
 
     The axes are those of the forces that should be felt, as far as they are credible; what oscillates leaves them.
     """
@@ -381,7 +388,8 @@ def plot_side_by_side(panels: Sequence[Panel], path: Path, names: Sequence[str] 
         axis.set_ylabel("force [N]")
     for axis in axes[-1]:
         axis.set_xlabel("time [s]")
-    axes[0, 0].plot([], [], color="#BBBBBB", linewidth=5, label="pale: the force that should be felt")
+    pale = "pale: what the object itself gives for this motion, as late"
+    axes[0, 0].plot([], [], color="#BBBBBB", linewidth=5, label=pale)
     _legend(figure, _ordered(_entries(axes[0, 0]), around), 6)
     return save(figure, path)
 
