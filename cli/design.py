@@ -16,7 +16,7 @@ from cli import options, render
 from cli.judged import Judged
 from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY
-from design.bound import bound
+from design.bound import MOST, NO_BOUND, bound
 from design.certificate import SAMPLES, RangesCheck, assess, check_ranges, lag, prove, switching_requirement
 from design.coverage import Limits, cost_part, covered_limits, price, ranges_rows, switching_part
 from design.designs import KINDS, NO_LONGER, design_by_kind, usual_condition
@@ -211,9 +211,6 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
 # What was designed: its figures, its file.
 
 
-_MOST_FOR_A_BOUND = 2  # devices: for more the bound takes minutes
-
-
 def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Judged:
     """What each condition asks of the coupling, by a sweep and an exact proof, and the limiter that it may have."""
     held, searched = design.certificate, design.searched if isinstance(design, Optimal) else None
@@ -273,12 +270,12 @@ def _comparison(loop: Loop) -> Sequence[Row]:
 def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[str, Any]:
     """What an optimal coupling is reported with: how it was found, and how it stands to what is possible."""
     limit: dict[str, Any] = {"rms_mismatch_db": None}
-    if loop.channels > _MOST_FOR_A_BOUND:
-        limit["reason"] = f"worked out for up to {_MOST_FOR_A_BOUND} devices"
+    if loop.channels > MOST:
+        limit["reason"] = NO_BOUND
     elif best.objective == 0:
         limit["reason"] = "the mismatch is zero: there is nothing to bound"
     else:
-        limit["rms_mismatch_db"] = bound(loop, args.band_hz or BAND_HZ).rms_db
+        limit["rms_mismatch_db"] = bound(loop, args.band_hz or BAND_HZ, near=best.coupling).rms_db
     return {
         "bound": limit,
         "rendered_stiffness": best.g,
