@@ -12,10 +12,11 @@ from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design.certificate import assess, verify
 from design.coverage import Limits, covered_limits
-from design.designs import KINDS, design_by_kind
+from design.designs import KINDS, design_by_kind, usual_condition
 from design.guarantees import switching_guarantee
 from design.result import COUPLING, PUBLISHED, Design, DesignFailed, Requirement, bare
 from design.stored import LimiterCertificate, Stored, load
+from sim import design_cache
 from sim.scenario import InputError, Scenario
 
 NAMES = ("none", "published", *KINDS)
@@ -61,8 +62,15 @@ def choose(
         return Chosen(name, PUBLISHED[case], condition or "any-environment")
     if name in KINDS:
         try:
+            loop = scenario.loop(case)
+            condition = condition or usual_condition(loop, name)
             asked: dict[str, Any] = {"limiter": limiter} if limiter is not None and name == "spring-damper" else {}
-            design = design_by_kind(scenario.loop(case), name, condition, progress, **asked)
+            question = (loop, name, condition, *asked.items())
+            if kept := design_cache.find(*question):
+                assert kept.certificate
+                return Chosen(name, kept.built(), condition, limiter=kept.certificate.limiter or None)
+            design = design_by_kind(loop, name, condition, progress, **asked)
+            design_cache.keep(design, *question)
         except DesignFailed:
             raise
         except ValueError as error:
