@@ -15,7 +15,7 @@ from design.coverage import Limits, covered_limits
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.guarantees import switching_guarantee
 from design.result import COUPLING, PUBLISHED, Design, DesignFailed, Requirement, bare
-from design.stored import LimiterCertificate, Stored, load
+from design.stored import Certificate, LimiterCertificate, Stored, load
 from sim import design_cache
 from sim.scenario import InputError, Scenario
 
@@ -33,6 +33,7 @@ class Chosen:
     notes: tuple[str, ...] = ()  # what a reader should know of its origin
     switching: DelayRange | None = None  # its file proves that any switching of the delays within it is safe here
     limiter: LimiterCertificate | None = None  # what it comes with for limited forces
+    known: Certificate | None = None  # proved in this process, and need not be again
 
 
 def choose(
@@ -68,7 +69,8 @@ def choose(
             question = (loop, name, condition, *asked.items())
             if kept := design_cache.find(*question):
                 assert kept.certificate
-                return Chosen(name, kept.built(), condition, limiter=kept.certificate.limiter or None)
+                proof = kept.certificate.limiter or None
+                return Chosen(name, kept.built(), condition, limiter=proof, known=kept.certificate)
             design = design_by_kind(loop, name, condition, progress, **asked)
             design_cache.keep(design, *question)
         except DesignFailed:
@@ -108,7 +110,7 @@ def limits_of(
         return Limits(None, "limiter: limited forces are proved for constant delays")
     loop = scenario.loop("I")  # the reference does not matter
     coupling, proof = chosen.coupling, chosen.limiter
-    return covered_limits(loop, coupling, requirements or assess(loop, coupling, chosen.phi), proof)
+    return covered_limits(loop, coupling, requirements or assess(loop, coupling, chosen.phi, chosen.known), proof)
 
 
 def read_coupling(path: str | Path) -> Stored:
