@@ -548,10 +548,11 @@ def assess(
     loop = loop.at(loop.environment).switching(None)
     asked = any_environment_of(loop, coupling, phi), multipliers.this_environment_of(loop, coupling)
     proved = known.condition if known and known.scenario == digest(loop, coupling.form()) else None
-    return {
-        each.condition: replace(each, proof="rational") if each.condition == proved else _proved(loop, coupling, each, phi)
-        for each in asked
-    }
+
+    def judged(each: Requirement) -> Requirement:
+        return replace(each, proof="rational") if each.condition == proved else _proved(loop, coupling, each, phi)
+
+    return {each.condition: judged(each) for each in asked}
 
 
 def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Requirement:

@@ -1,7 +1,7 @@
 """Designs kept on disk, since a run asks for the same couplings again and again and a design is a pure function.
 
-In $XDG_CACHE_HOME/haptic-loop (~/.cache/haptic-loop), a stored coupling file for each question. An entry is proved again
-whenever it is read; what is not proved is designed anew. HAPTIC_LOOP_CACHE=off keeps nothing.
+In $XDG_CACHE_HOME/haptic-loop (~/.cache/haptic-loop), a stored coupling file for each question. An entry is proved
+again whenever it is read; what is not proved is designed anew. HAPTIC_LOOP_CACHE=off keeps nothing.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import controller
 import design
 from controller.loop import Loop
 from design.certificate import prove, verify
-from design.files import InputError, one_command
+from design.files import one_command
 from design.result import Design
 from design.stored import Stored, digest, load, save
 
