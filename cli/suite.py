@@ -346,7 +346,7 @@ def guarantees(report: dict[str, Any]) -> list[_Part]:
         limited = max(row["limited"] for row in some)
         least = min(row["least_J"] for row in some)
         rows.append(
-            (name, f"{factor:g}", f"{took} of {motions}", f"{grew}" if hands else "-", f"{limited:.0%}", f"{least:.2g}")
+            (name, f"{factor:g}", f"{took} of {motions}", f"{grew}", f"{limited:.0%}", f"{least:.2g}")
         )
         if factor >= 1:
             taken.append(took + grew)
