@@ -13,7 +13,7 @@ from rich.table import Table
 from cli import options, render
 from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY
-from design.bound import bound
+from design.bound import MOST, NO_BOUND, bound
 from design.certificate import SAMPLES, RangesCheck, assess, check_ranges, lag, prove, switching_requirement
 from design.coverage import Limits, cost_part, covered_limits, price, ranges_part, ranges_rows, switching_part
 from design.designs import KINDS, NO_LONGER, design_by_kind, usual_condition
@@ -255,18 +255,15 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
 # What was designed: its figures, its file.
 
 
-_MOST_FOR_A_BOUND = 2  # devices: for more the bound takes minutes
-
-
 def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[str, Any]:
     """What an optimal coupling is reported with: how it was found, and how it stands to what is possible."""
     limit: dict[str, Any] = {"rms_mismatch_db": None}
-    if loop.channels > _MOST_FOR_A_BOUND:
-        limit["reason"] = f"worked out for up to {_MOST_FOR_A_BOUND} devices"
+    if loop.channels > MOST:
+        limit["reason"] = NO_BOUND
     elif best.objective == 0:
         limit["reason"] = "the mismatch is zero: there is nothing to bound"
     else:
-        limit["rms_mismatch_db"] = bound(loop, args.band_hz or BAND_HZ).rms_db
+        limit["rms_mismatch_db"] = bound(loop, args.band_hz or BAND_HZ, near=best.coupling).rms_db
     return {
         "bound": limit,
         "rendered_stiffness": finite(best.g),

@@ -83,7 +83,7 @@ def add_safety_options(parser: argparse.ArgumentParser) -> None:
 
 
 def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
-    """The Limits of the safety options, with `cap`. Raises InputError."""
+    """The limits of the safety options, with `cap`. Raises InputError."""
     more: dict[str, Any] = {"cap": args.force_cap, "speed": args.max_speed, "thermal": args.thermal_time}
     if args.continuous_force is not None:
         more["continuous"] = options.per_channel("--continuous-force", args.continuous_force, scenario.channels)

@@ -27,7 +27,7 @@ from cli.options import Parser
 from cli.session_cli import add_link_options, check_link
 from controller.delay import VaryingDelay
 from hw.control import certified_coupling, certified_couplings
-from hw.limits import ENDED, Limits, Stage
+from hw.limits import ENDED, SafetyLimits, Stage
 from hw.monitor import LinkSettings
 from hw.recording import IncidentLog
 from hw.seam import SerialDevice
@@ -85,7 +85,7 @@ def rungs(scenario):
 
 
 def run(emulator, scenario, plan, glance=lambda session: None, pace=PACE):
-    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=150))
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=150))
     with SerialPort(emulator.path, 921_600) as port:
         device = SerialDevice(port, lambda: pace * time.monotonic())
         live = Live(session, device, plan, True, seconds=60.0, glance=glance, pace=pace)
