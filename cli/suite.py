@@ -342,12 +342,10 @@ def guarantees(report: dict[str, Any]) -> list[_Part]:
     rows, taken = [], []
     for name, factor in dict.fromkeys((row["guarantee"], row["factor"]) for row in report["rows"]):
         some = [row for row in report["rows"] if (row["guarantee"], row["factor"]) == (name, factor)]
-        motions, took, hands, grew = (sum(row[of] for row in some) for of in ("motions", "took", "hands", "grew"))
+        motions, took, grew = (sum(row[of] for row in some) for of in ("motions", "took", "grew"))
         limited = max(row["limited"] for row in some)
         least = min(row["least_J"] for row in some)
-        rows.append(
-            (name, f"{factor:g}", f"{took} of {motions}", f"{grew}", f"{limited:.0%}", f"{least:.2g}")
-        )
+        rows.append((name, f"{factor:g}", f"{took} of {motions}", f"{grew}", f"{limited:.0%}", f"{least:.2g}"))
         if factor >= 1:
             taken.append(took + grew)
     columns = ("guarantee", "times what it asks", "motions that took energy", "hands that grew", "limited", "least J")

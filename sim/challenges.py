@@ -314,7 +314,8 @@ def _scenario(loop: Loop, delta: Array) -> Scenario:
     """The loop with rigid devices of this damping, held by somebody."""
     devices = tuple(RigidDevice(mass=0.1, damping=float(d)) for d in delta)
     people = tuple(Human((Link(0.5, 1.0, 100.0),)) for _ in devices)
-    return Scenario("drawn", loop.T, loop.theta, loop.psi, devices, people, loop.network)
+    loop_of = {"T": loop.T, "theta": loop.theta, "psi": loop.psi, "environment": loop.network}
+    return Scenario(name="drawn", device=devices, human=people, **loop_of)
 
 
 #: guarantee -> how a case of it is made, and how much is far too little of what it asks for
