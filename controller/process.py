@@ -124,7 +124,15 @@ class StepBuffer:
     contiguous slab of memory.
     """
 
-    def __init__(self, process: Process, ticks: int, plant_states: int, outside: int = 0, nsim: int = 1) -> None:
+    def __init__(
+        self,
+        process: Process,
+        ticks: int,
+        plant_states: int,
+        outside: int = 0,
+        nsim: int = 1,
+        transition: Callable[[Array, Array], object] | None = None,  # in place of the process's own
+    ) -> None:
         nz, m = process.F.order, process.channels
         if plant_states < m:
             raise ValueError(f"plant_states is {plant_states}, but the first {m} entries must be the positions")
@@ -139,7 +147,7 @@ class StepBuffer:
         shifted = self._memory[width - m :][: ticks * width].reshape(ticks, width, nsim)
         #: (ticks, m + order, nsim): [f; z+] of each tick
         self.after = shifted[:, : m + nz]
-        self._transition = process.transition()
+        self._transition = transition or process.transition()
         self._quantised = bool((process.encoder_step > 0).any())
         self._line = None if process.delays is None else HeldLine(process.delays, nsim)
         self.net = process.net(nsim) if process.net else None
