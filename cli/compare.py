@@ -18,7 +18,7 @@ import numpy as np
 from rich.table import Table
 
 from cli import options, render
-from cli.design import RETIRED_WITH_VALUE, add_optimal_options, optimal_options
+from cli.design import add_optimal_options, optimal_options
 from controller.loop import Loop
 from controller.lti import Array
 from design import compare
@@ -77,7 +77,6 @@ def _parser() -> options.Parser:
     curve.add_argument("--beside", type=_beside, default=CONDITIONS, metavar="NAME", help=beside)
     optimal = parser.add_argument_group("the optimal coupling of --over")
     add_optimal_options(optimal)
-    optimal.add_argument("--diagonal", action="store_true", help=argparse.SUPPRESS)
     options.add_output_options(parser, picture=True)
     return parser
 
@@ -93,7 +92,6 @@ _MODES = {
     "no_plot": ("", "--over", "--baselines"),
     "limiter": ("--baselines",),
     **dict.fromkeys(("points", "keep", "beside", "objective", "band_hz", "high_gain", "seconds"), ("--over",)),
-    **dict.fromkeys((*RETIRED_WITH_VALUE, "diagonal"), ("--over",)),
 }
 
 
@@ -465,7 +463,7 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
     lines = [f"beside the optimum: the designed spring-damper by {names}"] if names else []
     lines += [f"{name} {row.value:.4g}: {row.reason}" for name, row in points if row.reason]
     tables = [_limit_table(report, name, args.beside) for name in report.sweeps]
-    lines += [*report.gains, *optimal_options(args)[1], f"{report.wall_s:.1f} s"]
+    lines += [*report.gains, f"{report.wall_s:.1f} s"]
     render.publish(args, report, tables, lines, out, files)
     if interrupted:
         return options.INTERRUPTED
@@ -475,7 +473,7 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
 
 def _wish(args: argparse.Namespace) -> Options:
     try:
-        return Options(**optimal_options(args)[0])
+        return Options(**optimal_options(args))
     except ValueError as error:
         raise InputError(options.as_option(error, args)) from None
 
