@@ -60,7 +60,9 @@ class _Exported:
     file: Path = render.figure("file")
     channels: int = render.figure("block", "{} channels, {r.states} states, T = {r.T_s:g} s")
     certificate: _Proof = render.figure("certificate")
-    force_limit: Array | None = render.figure("force limits", lambda limit: f"{listed(limit)} N, by the limiter")
+    multiplications: int = render.figure("one tick", "{} multiplications")
+    force_limit: Array | None
+    forces: str | None = render.figure("forces")
     test: dict[str, Any] = render.figure("test vector", "{[ticks]} ticks, in the file")
 
 
@@ -88,7 +90,9 @@ def main(argv: list[str]) -> int:
         path,
         block.system.inputs,
         _Proof(verdict.proved, verdict.reason),
+        block.system.order**2 + 2 * block.system.order * block.system.inputs + block.system.inputs**2,
         block.limiter and block.limiter.limit,
+        _forces(block) if args.process else None,
         {"ticks": len(test.inputs), "seed": args.seed, "largest_output": np.abs(test.outputs).max()},
     )
     title = f"{block.name} as {args.format}"
@@ -118,6 +122,12 @@ def _verdict(stored: Stored) -> Verdict:
         return verify(stored)
     except (ValueError, ArithmeticError) as error:
         return Verdict(False, str(error))
+
+
+def _forces(block: Block) -> str:
+    if block.limiter:
+        return f"limited to {listed(block.limiter.limit)} N by the limiter"
+    return "not limited in this file: the proof holds below what the motors give (--force-limit for more)"
 
 
 def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> Block:

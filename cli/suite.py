@@ -37,9 +37,9 @@ from hw.monitor import LinkSettings
 from hw.rehearsal import Rehearsal
 from hw.session import session_for
 from sim.adversary import Attempt, attempts
+from sim.challenges import challenges
 from sim.couplings import choose
 from sim.crowds import Validation
-from sim.guarantees import challenges
 from sim.hard import cases, measure
 from sim.random_loops import proofs, traces
 from sim.scenario import InputError, load

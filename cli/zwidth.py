@@ -18,16 +18,15 @@ import numpy as np
 from rich.table import Table
 
 from cli import options, render
+from cli.judged import judge
 from controller.environment import RIGID_WALL
 from controller.loop import Loop
 from controller.lti import Array
-from design.certificate import CONDITIONS, assess, check_ranges
-from design.coverage import ranges_part
+from design.certificate import CONDITIONS
 from design.files import write
-from design.guarantees import CAVEATS, guarantee_of
+from design.guarantees import CAVEATS
 from design.result import certificate_part, finite
-from sim import report
-from sim.couplings import NAMES, Chosen, choose, limits_of
+from sim.couplings import NAMES, Chosen, choose
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
 from sim.scenario import InputError, Scenario, require_constant_delay
 from sim.stability import MARGINAL
@@ -446,23 +445,18 @@ def _environment_sweep(scenario: Scenario, chosen: Chosen) -> EnvironmentSweep:
 
 def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> dict[str, Any]:
     """The fixed coupling and what is guaranteed of it where it was designed, in the scenario's own environment."""
-    loop = scenario.loop(args.case)
-    with render.progress("searching the ranges") as move:
-        whole = check_ranges(loop, chosen.coupling, args.seed, progress=move)
-    requirements = assess(loop, chosen.coupling, chosen.phi)
-    limits = limits_of(scenario, chosen, requirements, args.limiter)
-    springs, ranges = contact_springs(loop.network), whole and ranges_part(whole)
+    judged, springs = judge(args, scenario, chosen), contact_springs(scenario.loop(args.case).network)
     return {
         "axes": "environment",
-        "coupling": report.coupling_part(chosen.kind, chosen.coupling, scenario.T),
+        "coupling": judged.coupling,
         "designed_for": {
             "contact_springs": [{"between": s.between, "K": s.stiffness, "B": s.damping} for s in springs],
-            "certificates": report.certificates_part(requirements),
-            "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
-            "ranges": ranges,
-            "set": ranges,  # its older name
+            "certificates": judged.certificates,
+            "promise": judged.promise,
+            "ranges": judged.ranges,
+            "set": judged.ranges,  # its older name
         },
-        "limiter": limits.part([device.force_limit for device in scenario.device]),
+        "limiter": judged.limiter,
         "remarks": list(chosen.notes),
     }
 

@@ -17,7 +17,7 @@ from models.device import CompliantDevice
 from models.human import Human, Link
 from models.scene import Crowd, Plant, plant, variants
 from sim import engines
-from sim.engine_choice import compare_engines, cross_check, pick
+from sim.accuracy import compare_engines, cross_check, pick
 from sim.engines import (
     EXPONENTIAL,
     INTEGRATORS,
