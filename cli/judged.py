@@ -71,6 +71,6 @@ def judge(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, met: Sce
     met, loop = met or scenario, scenario.loop(args.case)
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
         whole = check_ranges(loop, chosen.coupling, args.seed, progress=move)
-        requirements = assess(met.loop(args.case), chosen.coupling, chosen.phi)
+        requirements = assess(met.loop(args.case), chosen.coupling, chosen.phi, chosen.known)
         limits = limits_of(met, chosen, requirements, args.limiter)
     return Judged.of(chosen.kind, chosen.coupling, met.loop(args.case), requirements, whole, limits, met)

@@ -50,7 +50,8 @@ def main(argv: list[str]) -> int:
     chosen = _chosen(args, scenario)
     judged = judge(args, scenario, chosen, simulated)
     done = _run(args, simulated, chosen, judged.limits.rho)
-    others = _alternatives(args, scenario, done)
+    same = args.limiter is None and not scenario.ranges and args.case != "none"
+    others = _alternatives(args, scenario, done, (chosen, judged.requirements, judged.limits) if same else None)
     report = _reported(args, scenario, chosen, judged, done, environment, others)
     files = _save(args, out, done, report)
     if args.side_by_side:
@@ -199,11 +200,11 @@ def _compared(args: argparse.Namespace, simulation: Simulation) -> tuple[EngineC
         return compare_engines(simulation, args.error)
 
 
-def _alternatives(args: argparse.Namespace, scenario: Scenario, run: _Run) -> list[Alternative]:
+def _alternatives(args: argparse.Namespace, scenario: Scenario, run: _Run, own: Any) -> list[Alternative]:
     """What other couplings come to in the scenario's own environment. Raises InputError for a picture of nothing."""
     skipped = args.no_alternatives or run.trace.interrupted or args.vertex > 0
     with render.progress("other couplings") as move:
-        made = [] if skipped else alternatives(scenario, args.case, move)
+        made = [] if skipped else alternatives(scenario, args.case, move, own)
     if args.side_by_side and not any(other.trace is not None for other in made):
         raise InputError("--side-by-side is for runs without walls, friction, varying delays and --no-alternatives")
     return made
