@@ -23,10 +23,9 @@ from design.designs import KINDS, design_by_kind, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
 from design.guarantees import ANY, HERE, switching_guarantee
-from design.optimal import Optimal
+from design.optimal import Optimal, robustness_parts, widest_ranges
 from design.program import DEFAULT, OBJECTIVES, Options
 from design.result import METHODS, Design, DesignFailed, NotProved, Row, listed
-from design.robustness import robustness_parts, widest_ranges
 from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
 from sim import report as parts

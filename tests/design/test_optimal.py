@@ -22,9 +22,9 @@ from design.bound import bound
 from design.certificate import verify
 from design.conditions import this_environment
 from design.frequency import hermitian, on_circle
-from design.optimal import design
+from design.optimal import design, spread, widest_ranges
 from design.program import MARGIN, Case, Options, Span, span_of
-from design.robustness import ranges_around, robustness, spread, vertices, widest_ranges
+from design.robustness import ranges_around, robustness, vertices
 from design.stored import Stored, save
 from design.stored import load as load_file
 from design.transparency import transparency
