@@ -379,9 +379,8 @@ def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
     cells = [_rival(row) for row in rows]
     shown = [render.grid(f"on the same runs · {scenario.title(args.case)}", heads, cells, left=(0, 7))]
     lines = [f"* baseline {row.name}: {row.source}." for row in rows if row.source]
-    lines.append(
-        f"hands: of {baselines.PAIRS} lossless pairs, faster after {baselines.SECONDS:g} s than the {baselines.SLOW:g} m/s they began with."
-    )
+    began = f"{baselines.SLOW:g} m/s they began with"
+    lines.append(f"hands: of {baselines.PAIRS} lossless pairs, faster after {baselines.SECONDS:g} s than the {began}.")
     lines += sorted({f"error: {row.reason}." for row in rows if row.reason})
     render.publish(args, report, shown, [*lines, f"{report.wall_s:.1f} s"], out, files)
     return options.INTERRUPTED if interrupted else options.DONE
