@@ -1,6 +1,6 @@
 # make run    the paper's case I, from a fresh clone to a picture
 # make test   the whole test suite
-# make check  lint, and the tests of what your change touches, under a minute
+# make check  lint and the tests of what your change touches, under a minute
 # make lint   ruff and pyright, without a finding: to be run, with make test, before anything is committed
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
 # make validate  every check that a verdict rests on: a report in out/validate/report.md, about ten minutes
@@ -21,7 +21,10 @@ run: .venv/ready
 test: .venv/ready
 	$(PY) -m pytest $(PARALLEL)
 
-check: lint
+check: .venv/ready
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m pyright $$($(PY) tests/touched.py sources)
 	$(PY) -m pytest $(PARALLEL) $$($(PY) tests/touched.py)
 
 validate: .venv/ready
