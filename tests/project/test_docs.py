@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from forked import run
 
 ROOT = Path(__file__).parents[2]
 _spec = importlib.util.spec_from_file_location("regenerate", ROOT / "docs/regenerate.py")
@@ -56,7 +57,7 @@ def test_every_command_runs(command, place, printed):
     """0 or 1 (done, and it holds or does not): never bad input, never a traceback."""
     if SLOW.search(command):
         pytest.skip("most of a minute: python docs/regenerate.py runs it")
-    done = regenerate.run(command, place)
+    done = run(command, place)
     assert done.returncode in (0, 1), f"{COMMANDS[command]}: {done.stderr}"
     assert "Traceback" not in done.stderr
     printed[command] = done.stdout
@@ -67,7 +68,7 @@ def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown,
     """`python docs/regenerate.py` writes it anew."""
     if SLOW.search(command):
         pytest.skip("most of a minute: python docs/regenerate.py runs it")
-    output = printed.get(command) or regenerate.run(command, place).stdout
+    output = printed.get(command) or run(command, place).stdout
     fresh = regenerate.kept(output, pattern).splitlines()
     assert shown.splitlines()
     assert len(fresh) == len(shown.splitlines()), f"{page.name}: {output}"
@@ -76,7 +77,7 @@ def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown,
 
 @pytest.mark.parametrize("command", IN_TEXT)
 def test_a_design_that_a_sentence_names_can_be_had(command, place):
-    done = regenerate.run(command, place)
+    done = run(command, place)
     assert done.returncode == 0, done.stderr
 
 
