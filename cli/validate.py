@@ -23,6 +23,7 @@ from sim.crowds import ENGINES, MIXED, Findings, Validation
 from sim.run import assemble
 from sim.scenario import InputError, Scenario, require_linear, save_humans
 from sim.shards import Table, validate, validate_on_cluster
+from sim.stability import eigenvalue_part, unstable, worst_mode
 from sim.switching import certified_part
 
 _ENVIRONMENTS = ("nominal", "ranges", "box")  # the last is the older name of the second
@@ -59,6 +60,7 @@ def main(argv: list[str]) -> int:
         "limiter": limits.part([device.force_limit for device in scenario.device]),
         "remarks": list(chosen.notes),
     }
+    _add(outcome, "own_humans", _own_humans(args, scenario, chosen, certified))
     if scenario.varying_delay:
         covered = report.delay_range_part(scenario.varying_delay) | certified_part(scenario, chosen, certified)
         _add(outcome, "switching", report.varying_delays_part(findings, covered))
@@ -176,6 +178,16 @@ def _add(outcome: dict[str, Any], name: str, part: dict[str, Any]) -> None:
     outcome["holds"] = outcome["holds"] and part["holds"]
 
 
+def _own_humans(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, certified: bool) -> dict[str, Any]:
+    """What the exact loop does in the hands of the scenario, or of --human FILE."""
+    mode = worst_mode(assemble(scenario, chosen.coupling))
+    return {
+        "from": args.human or scenario.name,
+        **eigenvalue_part(mode),
+        "holds": not (certified and unstable(mode.growth)),
+    }
+
+
 def _attack(
     args: argparse.Namespace, scenario: Scenario, chosen: Chosen, outcome: dict[str, Any], drawn: bool = False
 ) -> Worst | None:
@@ -231,7 +243,7 @@ def _save(
 
 
 def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
-    bad, worst, traces = outcome["unstable"], outcome["worst"], outcome["traces"]
+    bad, worst, traces, own = (outcome[name] for name in ("unstable", "worst", "traces", "own_humans"))
     audit, adversary, switching = (outcome.get(name) for name in ("energy_audit", "adversary", "switching"))
     timing, drawn = outcome.get("timing"), outcome.get("adversary_population")
     mujoco = "" if bad["mujoco"] is None else f", {bad['mujoco']} MuJoCo"
@@ -243,6 +255,10 @@ def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
         ("unstable", f"{bad['exact']} exact{mujoco}"),
         ("disagreements", str(outcome["disagreements"])),
         ("worst human", worst and _worst(worst)),
+        (
+            f"hands of {own['from']}",
+            f"{own['exact_growth_rate_per_s']:+.4g} 1/s at {own['exact_frequency_hz']:.2f} Hz: {own['exact_verdict']}",
+        ),
         (
             "MuJoCo's growth rates",
             render.optional(outcome["largest_difference_per_s"], "within {:.1e} 1/s of the exact ones", "") or None,

@@ -18,10 +18,11 @@ from controller.coupling import (
 )
 from controller.environment import RIGID_WALL
 from controller.loop import DelayRange, Loop
-from design.certificate import RangesCheck, any_environment_of, switching_requirement, this_environment_of
+from design.certificate import RangesCheck, any_environment_of, switching_requirement
 from design.conditions import any_environment
 from design.coverage import ranges_part, switching_part
 from design.guarantees import ANY, CAVEATS, LATE, guarantee_of
+from design.multipliers import this_environment_of
 from design.result import Condition, Requirement, certificate_part, listed, refusal
 
 # ----------------------------------------------------------------------------------------------------

@@ -21,34 +21,11 @@ from controller.delay import delay
 from controller.environment import Member, inside
 from controller.loop import Loop
 from controller.lti import Array, Lti, SingularLoop, TooLong, rational, within
-from design.conditions import (
-    any_environment,
-    any_environment_delayed,
-    any_environment_demand,
-    any_environment_per_channel,
-    delayed_coupling_block,
-    delayed_environment_block,
-    this_environment,
-    this_environment_demand,
-)
+from design import conditions, multipliers
 from design.environments import Progress, Searched, in_each, search_ranges, worst
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large
 from design.frequency import frequencies, on_circle, rounding
 from design.guarantees import LATE, no_compliance, switching_guarantee
-from design.multipliers import (
-    BETA,
-    WALL_MULTIPLIER,
-    Lags,
-    SwitchingSweep,
-    limiter_demand,
-    limiter_lag,
-    limiter_refusal,
-    limiter_requirement,
-    swept,
-    switching_block,
-    walls_demand,
-    walls_of,
-)
 from design.result import Condition, NotProved, Requirement, refusal
 from design.stored import Certificate, Guarantee, LimiterCertificate, Stored, SwitchingProof, digest, sealed
 
@@ -80,7 +57,7 @@ def _in_time() -> Iterator[None]:
 
 def prove_switching(loop: Loop, coupling: Coupling) -> SwitchingProof | str:
     """An exact proof of any switching within the loop's range, or why there is none."""
-    found = swept(loop, coupling)
+    found = multipliers.swept(loop, coupling)
     requirement = found.requirement
     if not requirement.certified:
         return requirement.shortfall
@@ -113,7 +90,7 @@ def _refuted(loop: Loop, coupling: Coupling, proof: SwitchingProof) -> str | Non
         condition = condition_block(loop, coupling, proof.alpha)
     except (SingularLoop, ValueError) as error:
         return str(error)
-    other = _other_figures(proof, swept(loop, coupling, proof.alpha).requirement)
+    other = _other_figures(proof, multipliers.swept(loop, coupling, proof.alpha).requirement)
     return other or refuted_rows("P", condition, proof.P)
 
 
@@ -140,7 +117,7 @@ def condition_block(loop: Loop, coupling: Coupling, alpha: Sequence[float]) -> L
     G = loop.sent(coupling, exact=True)
     if reason := too_large(G.order + sum(span.hi)):  # splitting it takes long too
         raise ValueError(reason)
-    block, F1 = switching_block(G, span.lo, span.hi, loop.delta, alpha, loop.T_max)
+    block, F1 = multipliers.switching_block(G, span.lo, span.hi, loop.delta, alpha, loop.T_max)
     static = Matrix.of(F1)
     if not static.equals(static.T) or not definiteness(static).semidefinite:
         raise ValueError("G(1) is not exactly symmetric and positive semidefinite")
@@ -162,9 +139,11 @@ def lag(loop: Loop, certificate: Certificate | None) -> tuple[float, ...] | None
 
 
 @_in_time()
-def prove_limiter(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | None = None) -> LimiterCertificate:
+def prove_limiter(
+    loop: Loop, coupling: Coupling, beta: float = multipliers.BETA, c: multipliers.Lags | None = None
+) -> LimiterCertificate:
     """An exact proof with the multiplier `c` or the best one. Raises NotProved with the reason."""
-    found = limiter_requirement(loop, coupling, beta, c)
+    found = multipliers.limiter_requirement(loop, coupling, beta, c)
     requirement = found.requirement
     if not requirement.certified:
         raise NotProved(requirement.reason or f"limiter: {requirement.shortfall}", requirement)
@@ -174,12 +153,12 @@ def prove_limiter(loop: Loop, coupling: Coupling, beta: float = BETA, c: Lags | 
     return LimiterCertificate(beta, found.rho, found.c, requirement.required, _margin(requirement), rows_of(P))
 
 
-def _limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: Lags) -> Lti:
+def _limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: multipliers.Lags) -> Lti:
     """The exact block that must be strictly positive real. Raises NotProved."""
     try:
         G = loop.sent(coupling, exact=True)
         _require_size(G.order + 2 * loop.channels + sum(max(n, len(row)) for n, row in zip(loop.theta, c, strict=True)))
-        demand = limiter_demand(G, loop.theta, loop.delta, rho, c, loop.T_max)
+        demand = multipliers.limiter_demand(G, loop.theta, loop.delta, rho, c, loop.T_max)
     except (SingularLoop, ValueError) as error:
         raise NotProved(f"limiter: {error}") from None
     _require_static("F(1)", demand.static["F(1)"])
@@ -188,23 +167,23 @@ def _limiter_block(loop: Loop, coupling: Coupling, rho: Sequence[float], c: Lags
 
 def check_limiter(loop: Loop, coupling: Coupling, proof: LimiterCertificate) -> Requirement:
     """What the limiter on file asks of the devices, proved again. Raises NotProved where the file does not prove it."""
-    if reason := limiter_refusal(loop):
+    if reason := multipliers.limiter_refusal(loop):
         raise NotProved(reason)
     if any(not (0 <= v < math.inf) for v in (*proof.rho, *(v for row in proof.c for v in row))):
         raise NotProved("limiter: rho and c must be numbers >= 0")
-    if proof.rho != limiter_lag(loop.delta, loop.T, proof.beta) or len(proof.c) != loop.channels:
+    if proof.rho != multipliers.limiter_lag(loop.delta, loop.T, proof.beta) or len(proof.c) != loop.channels:
         expected = f"expected beta delta/T with beta = {proof.beta:g}, one row of c each"
         raise NotProved(f"limiter: rho is {list(proof.rho)}, {expected}")
-    found = limiter_requirement(loop, coupling, proof.beta, proof.c).requirement
+    found = multipliers.limiter_requirement(loop, coupling, proof.beta, proof.c).requirement
     reason = _other_figures(proof, found)
     if reason := reason or refuted_rows("P", _limiter_block(loop, coupling, proof.rho, proof.c), proof.P):
         raise NotProved(f"limiter: {reason}")
     return replace(found, proof="rational")
 
 
-def switching_requirement(loop: Loop, coupling: Coupling) -> SwitchingSweep:
+def switching_requirement(loop: Loop, coupling: Coupling) -> multipliers.SwitchingSweep:
     """The damping that switching in loop.varying_delay asks; `proof` is "rational" where it is proved exactly."""
-    found = swept(loop, coupling)
+    found = multipliers.swept(loop, coupling)
     if not found.requirement.certified or not isinstance(storage(loop, coupling, found.alpha), Matrix):
         return found
     return replace(found, requirement=replace(found.requirement, proof="rational"))
@@ -262,7 +241,7 @@ def prove(
     """
     _require_limits(loop, coupling, condition)
     if condition == "this-environment" and loop.environment.walls:
-        phi = walls_of(loop, coupling).g
+        phi = multipliers.walls_of(loop, coupling).g
     multiplier = None if phi is None else [rational(float(p)) for p in phi]
     requirement = swept or required_damping(loop, coupling, condition, multiplier)
     if not requirement.certified:
@@ -391,7 +370,7 @@ def required_damping(
     """
     if loop.environment.walls:
         if condition == "this-environment":
-            return walls_of(loop, coupling, phi).requirement
+            return multipliers.walls_of(loop, coupling, phi).requirement
         if any(loop.psi):
             raise NotProved(
                 "with delay in the environment the multiplier of any-environment is of a linear one: no walls"
@@ -405,11 +384,11 @@ def required_damping(
     if V is None:
         return refusal("any-environment", loop.delta, no_compliance(coupling))
     if not any(loop.psi):
-        return any_environment(V, loop.theta, loop.delta, loop.T_max)
+        return conditions.any_environment(V, loop.theta, loop.delta, loop.T_max)
     if phi is None or len(phi) != len(loop.delta):
         raise NotProved("any-environment with psi >= 1 needs a multiplier Phi, one entry per channel")
     values = np.array([float(p) for p in phi])
-    return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, values, loop.T_max)
+    return conditions.any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, values, loop.T_max)
 
 
 def _walls_block(loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Lti:
@@ -418,7 +397,7 @@ def _walls_block(loop: Loop, coupling: Coupling, g: Sequence[Fraction]) -> Lti:
         G = loop.walled(coupling, exact=True)
         _require_size(G.order)
         slopes = [wall.slope(G.T) for wall in loop.environment.walls]
-        demand = walls_demand(G, loop.delta, slopes, g, None, loop.T_max)
+        demand = multipliers.walls_demand(G, loop.delta, slopes, g, None, loop.T_max)
     except SingularLoop as error:
         raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
     for name, value in demand.static.items():
@@ -456,12 +435,14 @@ def _blocks(loop: Loop, coupling: Coupling, condition: Condition, phi: Sequence[
     _require_size(V.order + sum(loop.theta))
     try:
         if not any(loop.psi):
-            demand = any_environment_demand(V, loop.theta, loop.delta, loop.T_max)
+            demand = conditions.any_environment_demand(V, loop.theta, loop.delta, loop.T_max)
             _require_symmetric("H(1)", demand.static["V(1)"])
             return {"P": demand.gain + demand.free}
         assert phi is not None
-        E1, passive = delayed_environment_block(delay(loop.psi, T) @ loop.E(exact=True), phi)
-        H1, excess = delayed_coupling_block(V, loop.theta, phi, [rational(d) for d in loop.delta], loop.T_max)
+        E1, passive = conditions.delayed_environment_block(delay(loop.psi, T) @ loop.E(exact=True), phi)
+        H1, excess = conditions.delayed_coupling_block(
+            V, loop.theta, phi, [rational(d) for d in loop.delta], loop.T_max
+        )
     except (SingularLoop, ValueError) as error:
         raise NotProved(str(error)) from None
     _require_static("E(1)", E1)
@@ -474,7 +455,7 @@ def _this_environment(loop: Loop, coupling: Coupling) -> Lti:
     try:
         F = loop.F(coupling, exact=True)
         _require_size(F.order)
-        demand = this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
+        demand = conditions.this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
     except SingularLoop as error:
         raise NotProved(f"a pole at z = 1 or an algebraic loop without solution: {error}") from None
     _require_static("F(1)", demand.static["F(1)"])
@@ -518,10 +499,10 @@ def _refuted_claims(loop: Loop, coupling: Coupling, certificate: Certificate) ->
 def _refuted_proof(loop: Loop, coupling: Coupling, certificate: Certificate) -> str | None:
     """Why the matrices prove nothing, or None if they prove the condition."""
     phi, name = _multiplier(loop, certificate), _multiplier_name(loop, certificate.condition)
-    if name == WALL_MULTIPLIER and phi is None:
+    if name == multipliers.WALL_MULTIPLIER and phi is None:
         return f"no multiplier {name} of the walls is on file"
     blocks = _blocks(loop, coupling, certificate.condition, phi)
-    expected = {*blocks, *([name] if "P_E" in blocks or name == WALL_MULTIPLIER else [])}
+    expected = {*blocks, *([name] if "P_E" in blocks or name == multipliers.WALL_MULTIPLIER else [])}
     if set(certificate.matrices) != expected:
         found = ", ".join(certificate.matrices) or "none"
         return f"matrices are {found}, expected {', '.join(sorted(expected))}"
@@ -537,7 +518,7 @@ def _refuted_proof(loop: Loop, coupling: Coupling, certificate: Certificate) -> 
 
 def _multiplier_name(loop: Loop, condition: Condition) -> str:
     """What the matrices call it: Phi of any-environment with psi >= 1, or g of walls under this-environment."""
-    return WALL_MULTIPLIER if condition == "this-environment" and loop.environment.walls else "Phi"
+    return multipliers.WALL_MULTIPLIER if condition == "this-environment" and loop.environment.walls else "Phi"
 
 
 def _multiplier(loop: Loop, certificate: Certificate) -> list[Fraction] | None:
@@ -565,22 +546,12 @@ def assess(
     certificate just made, proves is not proved again.
     """
     loop = loop.at(loop.environment).switching(None)
-    here = this_environment_of(loop, coupling)
+    here = multipliers.this_environment_of(loop, coupling)
     proved = known and known.condition == "this-environment" and known.scenario == digest(loop, coupling.form())
     return {
         "any-environment": _proved(loop, coupling, any_environment_of(loop, coupling, phi), phi),
         "this-environment": replace(here, proof="rational") if proved else _proved(loop, coupling, here),
     }
-
-
-def this_environment_of(loop: Loop, coupling: Coupling) -> Requirement:
-    """What this-environment asks of the environment itself, its walls making and breaking contact."""
-    if loop.environment.walls:
-        try:
-            return walls_of(loop, coupling).requirement
-        except NotProved as error:
-            return refusal("this-environment", loop.delta, str(error))
-    return this_environment(loop.F(coupling), loop.delta, loop.T_max, loop.latency)
 
 
 def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Requirement:
@@ -591,12 +562,12 @@ def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None)
         reason = "with delay in the environment its multiplier is of a linear one: no walls"
         return refusal("any-environment", loop.delta, reason)
     if (channels := coupling.channels(loop.T)) and not any(loop.psi):
-        return any_environment_per_channel(channels, loop.theta, loop.delta, loop.T_max)
+        return conditions.any_environment_per_channel(channels, loop.theta, loop.delta, loop.T_max)
     V = coupling.compliance(loop.T)
     if V is None:
         return refusal("any-environment", loop.delta, no_compliance(coupling))
     if not any(loop.psi):
-        return any_environment(V, loop.theta, loop.delta, loop.T_max)
+        return conditions.any_environment(V, loop.theta, loop.delta, loop.T_max)
     if phi is None:
         from design.lmi import least_phi  # only an environment with delay inside needs the solver
 
@@ -605,7 +576,7 @@ def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None)
         except ValueError as error:
             return refusal("any-environment", loop.delta, str(error))
     assert phi is not None  # psi >= 1 has a multiplier or none is possible
-    return any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, phi, loop.T_max)
+    return conditions.any_environment_delayed(V, loop.E(), loop.theta, loop.psi, loop.delta, phi, loop.T_max)
 
 
 def _proved(loop: Loop, coupling: Coupling, requirement: Requirement, phi: Array | None = None) -> Requirement:

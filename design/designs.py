@@ -11,8 +11,8 @@ from typing import Any
 import msgspec
 
 from controller.loop import Loop
-from design.certificate import this_environment_of
 from design.guarantees import LATE
+from design.multipliers import this_environment_of
 from design.result import Design, DesignFailed
 
 #: name -> the conditions that it can be made for, its own first

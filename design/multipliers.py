@@ -644,3 +644,13 @@ def walls_of(loop: Loop, coupling: Coupling, g: Sequence[Fraction] | None = None
     if values is not None and (len(values) != len(walls) or min(values) < 0):
         raise NotProved(f"{WALL_MULTIPLIER} is {values}, expected a number >= 0 for each of {len(walls)} walls")
     return walls_proof(G, loop.delta, slopes, values, loop.T_max)
+
+
+def this_environment_of(loop: Loop, coupling: Coupling) -> Requirement:
+    """What this-environment asks of the environment itself, its walls making and breaking contact."""
+    if loop.environment.walls:
+        try:
+            return walls_of(loop, coupling).requirement
+        except NotProved as error:
+            return refusal("this-environment", loop.delta, str(error))
+    return this_environment(loop.F(coupling), loop.delta, loop.T_max, loop.latency)

@@ -20,6 +20,7 @@ from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design.certificate import prove, prove_limiter
 from design.conditions import this_environment as requirement_of
+from design.designs import design_by_kind
 from design.environments import Searched, in_each, search_ranges, worst
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.program import (
@@ -327,10 +328,8 @@ class _Climb:
         """The best spring-damper of this-environment, where nothing else is asked and one is found."""
         if len(self.cases) > 1 or self.constrained or self.loop.latency:
             return None
-        from design import spring_damper  # its solvers load slowly, and most designs end before
-
         try:
-            gains = spring_damper.design(self.loop, "this-environment").coupling
+            gains = design_by_kind(self.loop, "spring-damper", "this-environment", limiter=False).coupling
             return self._proved(self._assessed(gains, np.nan), None)
         except (DesignFailed, ValueError):
             return None

@@ -19,6 +19,7 @@ tests/project/test_docs.py runs the same steps and compares, but for what is mea
 
 from __future__ import annotations
 
+import argparse
 import ast
 import itertools
 import math
@@ -35,7 +36,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-_BLOCK = r"(<!-- {}(?:: (.+))? -->\n```{}\n\$ (python (?:-m|examples/).+)\n)((?:.*\n)*?)(?=```)"
+_BLOCK = r"(<!-- {}(?:: (.+))? -->\n```{}\n\$ (python (?:-m|examples/).+)\n)((?:(?!.*```).*\n)*)(?=```)"
 SHOWN = re.compile(_BLOCK.format("output", "console"))
 MEASURED = re.compile(_BLOCK.format("measured", "text"))
 BLOCK = re.compile(r"^```(sh|console|toml|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
@@ -146,7 +147,9 @@ def check() -> int:
 
 def main() -> int:
     """Run every page that shows output, and rewrite those whose output is another."""
-    if sys.argv[1:] == ["--check"]:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="run the slow commands and compare, and write nothing")
+    if parser.parse_args().check:
         return check()
     printed: dict[str, str] = {}
     with TemporaryDirectory() as place:

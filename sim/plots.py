@@ -164,7 +164,7 @@ def plot_run(
             style = STYLES[i % len(STYLES)]
             label = f"{around.name(i)}, force" if two or alike[i] else around.name(i)
             axis.plot(result.t[part], result.f[part, i], label=label + alike[i], linewidth=width, **style)
-    axes[0, 0].set_ylabel("displacement [mm]")
+    axes[0, 0].set_ylabel("displacement [mm]" if two else _one_point(result))
     axes[1, 0].set_ylabel("force fed back [N]")
     if ideal:
         _draw_ideal(axes[1], result, ideal, parts)
@@ -227,6 +227,13 @@ def _stands_out(result: Trace, near: slice, ticks: int) -> bool:
     return bool(bend[near.start : near.stop].mean() > _SHARPER * bend.mean())
 
 
+def _one_point(result: Trace) -> str:
+    """The axis of displacements where one curve stands for the handle, which the user holds, and for the encoder."""
+    apart = 1e3 * float(np.abs(result.x_handle - result.x).max(initial=0.0))
+    beside = f"within {apart:.1g} mm of the encoder" if apart > 1e-9 else "where the encoder is"
+    return f"displacement of the handle [mm],\n{beside}"
+
+
 def _draw_walls(axes: Array, result: Trace, around: Surroundings) -> None:
     """Where walls stand, in the panel of displacements, and when they were touched, in both."""
     for i, place, name in around.walls:
@@ -243,7 +250,7 @@ def _draw_walls(axes: Array, result: Trace, around: Surroundings) -> None:
 
 
 def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...], around: Surroundings) -> None:
-    """Handles over encoders, in millimetres; one curve where they are one point."""
+    """Handles over encoders, in millimetres; the handle alone where a picture shows them as one point."""
     two, alike = _two_points(result), _coinciding(result.x, around)
     for axis, part, width in zip(axes, parts, (0.9, 1.4), strict=False):
         for i in _calmest_last(result.x):
@@ -251,8 +258,8 @@ def _draw_displacements(axes: Array, result: Trace, parts: tuple[slice, ...], ar
             label = f"{around.name(i)}, encoder (thin)" if two else around.name(i)
             if alike[i] and not two:
                 label += f", displacement{alike[i]}"
-            thin = 0.5 * width if two else width
-            axis.plot(result.t[part], 1e3 * result.x[part, i], label=label, linewidth=thin, **style)
+            thin, x = (0.5 * width, result.x) if two else (width, result.x_handle)
+            axis.plot(result.t[part], 1e3 * x[part, i], label=label, linewidth=thin, **style)
         if two:
             for i in _calmest_last(result.x_handle):
                 style = STYLES[i % len(STYLES)]

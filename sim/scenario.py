@@ -54,15 +54,20 @@ class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         require("duration", self.duration, 0.0, 1e6, "s")
 
 
-class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+def _usual_hand(i: int) -> Human:
+    """Who holds device i where a scenario does not say it: .3 kg that swings 15 mm at .6 Hz, a quarter turn apart."""
+    return Human((Link(0.3, 3.0, 200.0),), Voluntary(0.015, 0.6, phase=0.5 * np.pi * i))
+
+
+class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Devices, humans, environment, delays and timing of one loop; every list has one entry per channel."""
 
     name: str
     T: float  # sampling period [s]
     theta: _Delays  # transmission delays [samples] (4)
-    psi: _Delays  # environment delays [samples] (5)
+    psi: _Delays = ()  # environment delays [samples] (5); none unless given
     device: tuple[Device, ...]
-    human: tuple[Human, ...]
+    human: tuple[Human, ...] = ()  # who holds the devices in a run; hands that move apart unless given
     environment: Network
     ranges: Ranges | None = None  # what else the environment may be
     lam: _Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
@@ -80,6 +85,10 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"name has {len(self.name)} characters, allowed are {_LONGEST_NAME}")
         require("T", self.T, 1e-6, 0.1, "s")
         require("duration", self.duration, self.T, 1e6, "s")
+        if not self.psi:
+            msgspec.structs.force_setattr(self, "psi", (0,) * self.channels)
+        if not self.human:
+            msgspec.structs.force_setattr(self, "human", tuple(map(_usual_hand, range(self.channels))))
         for name in ("theta", "psi", "device", "human", "lam"):
             value = getattr(self, name)
             if value is not None and len(value) != self.channels:
@@ -373,16 +382,27 @@ def save_humans(path: Path, humans: tuple[Any, ...], remark: str, persons: tuple
 # ---- strictness: what a file may hold, and how its errors are worded
 
 
+_NEEDED = ("name", "T", "theta", "device", "environment")
+
+
 def _converted(text: str, kind: Any, source: str) -> Any:
     """TOML text as `kind`. Raises InputError with the path of the field and the value that came."""
     raw = toml(text, source)
     try:
-        raw = named_today(raw) if kind is Scenario else raw
+        raw = _whole(named_today(raw)) if kind is Scenario else raw
         return msgspec.convert(_with_catalogue(raw), kind)
     except msgspec.ValidationError as error:
         raise InputError(f"{source}: {_located(str(error), raw)}") from None
     except ValueError as error:
         raise InputError(f"{source}: {error}") from None
+
+
+def _whole(raw: dict[str, Any]) -> dict[str, Any]:
+    """The file, if it has every key that a scenario needs; of an unknown key it is told first. Raises ValueError."""
+    missing = [name for name in _NEEDED if name not in raw]
+    if missing and set(raw) <= set(Scenario.__struct_fields__):
+        raise ValueError(f"missing {', '.join(missing)}; every scenario has {', '.join(_NEEDED)}")
+    return raw
 
 
 def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from controller.coupling import SpringDamper
 from controller.environment import GROUND, Network, Spring
 from controller.loop import Loop
 from controller.lti import Array, SingularLoop
-from design.certificate import this_environment_of
+from design.multipliers import this_environment_of
 from models.scene import Plant
 from sim.engines import at_the_latch, hold
 from sim.stability import close

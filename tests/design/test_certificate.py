@@ -464,6 +464,6 @@ def test_walls_without_a_solution_are_refused(monkeypatch):
     def singular(*_):
         raise SingularLoop("no solution")
 
-    monkeypatch.setattr(design_certificate, "walls_demand", singular)
+    monkeypatch.setattr(design_certificate.multipliers, "walls_demand", singular)
     with pytest.raises(NotProved, match="algebraic loop without solution"):
         design_certificate._walls_block(scenario("one-wall").loop("I"), SpringDamper((400.0,), (0.1,)), [Fraction(1)])

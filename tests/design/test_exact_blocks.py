@@ -274,7 +274,7 @@ def disarmed(monkeypatch):
         return SwitchingSweep(from_ratio("switching", 0.5, asked.delta, 1.0), alpha or ALPHA, 0.5)
 
     monkeypatch.setattr(certificate, "required_damping", content)
-    monkeypatch.setattr(certificate, "swept", switching)
+    monkeypatch.setattr(certificate.multipliers, "swept", switching)
 
 
 ALPHA = (500.0, 250.0)

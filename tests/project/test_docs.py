@@ -144,6 +144,16 @@ def test_measured_blocks_are_compared_but_for_times(monkeypatch, tmp_path, capsy
     assert "and there is    9 rows in 0.2 s" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_block_of_a_page_ends_before_the_next_begins(page):
+    fences = re.findall(r"^.*```.*$", TEXTS[page], re.MULTILINE)
+    assert len(fences) % 2 == 0
+    assert set(fences[1::2]) <= {"```"}, "a block's end is lost, and with it what follows"
+    assert all(fence.startswith("```") for fence in fences)
+    asked = re.findall(r"^<!-- (?:output|measured)\b", TEXTS[page], re.MULTILINE)
+    assert len(asked) == sum(block[0] == page for block in SHOWN + MEASURED)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test_links_and_pictures_exist(page):
     for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", TEXTS[page]):

@@ -1,5 +1,6 @@
 """What is drawn is what was reported: lines, marks and legends of every picture, looked at before it is written."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -71,7 +72,16 @@ def test_every_sample_of_a_run_is_on_the_picture(drawn):
         np.testing.assert_array_equal(whole[f"device {i + 1}"][:, 1], f[:, i])
         np.testing.assert_allclose(lines(figure.axes[0])[f"device {i + 1}"][:, 1], f[:, i])  # mm of 1e-3 m a newton
     assert [line.get_label() for line in figure.axes[2].lines][2] == "device 2"
+    assert figure.axes[0].get_ylabel() == "displacement of the handle [mm],\nwhere the encoder is"
     assert legend(figure) == ["device 1", "device 2", "device 3", "pale: ideal environment (asked force 12 % off)"]
+
+
+def test_a_handle_near_its_encoder_is_drawn_and_says_how_near(drawn):
+    x = np.sin(np.arange(3000) / 300)[:, None]
+    run = replace(trace(1e3 * x, x), x_handle=1.004 * x)  # 4 mm beside 1 m: one line in the picture
+    (axis, _) = drawn(plots.plot_run, run, title="t", frequency_hz=80.0).axes
+    assert axis.get_ylabel() == "displacement of the handle [mm],\nwithin 4 mm of the encoder"
+    np.testing.assert_allclose(lines(axis)["device 1"][:, 1], 1004 * x[:, 0])
 
 
 def test_names_walls_and_curves_that_coincide(drawn):

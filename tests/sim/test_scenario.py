@@ -46,6 +46,26 @@ def test_a_bad_scenario_gets_one_line_that_names_the_field(old, new, message):
     assert "\n" not in str(caught.value)
 
 
+def test_a_scenario_needs_no_hands_and_no_delay_inside_and_hears_of_all_that_it_lacks():
+    bare = """
+name = "bare"
+T = 1e-3
+theta = [3, 1]
+device = ["omega.3", "omega.3"]
+[environment]
+contacts = ["a", "b"]
+springs = [{ between = ["a", "b"], stiffness = 200.0 }]
+"""
+    made = parse(bare)
+    assert made.psi == (0, 0)
+    hands = [human.voluntary.phase for human in made.human]
+    assert hands == [0.0, np.pi / 2], "who moves apart feels the spring between"
+    assert made.digest == parse(bare.replace("theta", "psi = [0, 0]\ntheta")).digest
+    assert made.replace(theta=(1, 1)).human == made.human
+    with pytest.raises(InputError, match=r"^x: missing T, theta; every scenario has name, T, theta, device, environ"):
+        parse(bare.replace("T = 1e-3\ntheta = [3, 1]\n", ""), "x")
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [

@@ -223,6 +223,16 @@ def test_the_command_and_the_replay_of_its_worst_human(tmp_path):
     stability = json.loads(file.read_text())["stability"]
     assert stability["spectral_radius"] == pytest.approx(report["worst"]["spectral_radius"], abs=1e-12)
     assert stability["exact_verdict"] == "unstable"
+    # the hands of the scenario are judged beside those that are drawn, and those of a file in their place
+    own = report["own_humans"]
+    assert (own["from"], own["exact_verdict"], own["holds"]) == ("omega-pair", "unstable", True), (
+        "nothing was certified"
+    )
+    assert own["exact_growth_rate_per_s"] == pytest.approx(1.4812, abs=1e-4)
+    others = ["--human", str(out / "worst-human.toml"), "--humans", "1", "--engine", "exact", "--duration", "0"]
+    assert main(["--case", "none", *others, "--no-plot", "--out", str(out), "--json", str(file)]) == 0
+    own = json.loads(file.read_text())["own_humans"]
+    assert own["spectral_radius"] == pytest.approx(report["worst"]["spectral_radius"], abs=1e-12)
 
 
 def test_a_wrong_engine_is_found_out(tmp_path, monkeypatch):
