@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
@@ -103,6 +103,23 @@ class ReadOnly:
 
 
 _ROWS, _POINTS = 32, 1024  # of a response at once: what stays in the processor's cache
+
+
+_KEPT = 8  # matrices A whose factors are remembered: blocks that are made of each other have the same states
+
+
+@lru_cache(_KEPT)
+def _schur_of(A: bytes, n: int) -> tuple[Complex, Complex]:
+    """S, U with A = U S U* and S upper triangular."""
+    if not n:
+        return np.zeros((0, 0), dtype=np.complex128), np.zeros((0, 0), dtype=np.complex128)
+    S, U, *_ = scipy.linalg.schur(np.frombuffer(A).reshape(n, n), output="complex")
+    return S, U
+
+
+@lru_cache(_KEPT)
+def _poles_of(A: bytes, n: int) -> Complex:
+    return np.linalg.eigvals(np.frombuffer(A).reshape(n, n)).astype(np.complex128)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,12 +223,13 @@ class Lti(ReadOnly):
 
     def _resolved(self, points: Complex) -> Complex:
         """C (z I - A)^-1 B, shape (p, m, points): row by row from the last one up, _ROWS of them into those above."""
-        S, U = self._schur
-        at, X = np.tile(points, self.inputs), np.repeat(U.conj().T @ self.B, points.size, axis=1)
+        S, U = _schur_of(self.A.tobytes(), self.order)
+        X = np.repeat(U.conj().T @ self.B, points.size, axis=1)
         for end in range(self.order, 0, -_ROWS):
             first = max(end - _ROWS, 0)
             for i in reversed(range(first, end)):
-                X[i] = (X[i] + S[i, i + 1 : end] @ X[i + 1 : end]) / (at - S[i, i])
+                row = X[i] + S[i, i + 1 : end] @ X[i + 1 : end]
+                X[i] = (row.reshape(-1, points.size) * (1 / (points - S[i, i]))).ravel()
             X[:first] += S[:first, first:end] @ X[first:end]
         return (self.C @ U @ X).reshape(self.outputs, self.inputs, points.size)
 
@@ -223,21 +241,15 @@ class Lti(ReadOnly):
         z: Array = np.linalg.lstsq(np.eye(self.order) - self.A, self.B @ x, rcond=None)[0]
         return z
 
-    @cached_property
-    def _schur(self) -> tuple[Complex, Complex]:
-        """S, U with A = U S U* and S upper triangular: once per block, however often it is evaluated."""
-        if not self.order:
-            return np.zeros((0, 0), dtype=np.complex128), np.zeros((0, 0), dtype=np.complex128)
-        S, U, *_ = scipy.linalg.schur(self.A, output="complex")
-        return S, U
-
     def dc(self) -> Array:
         """G(1), shape (..., p, m)."""
         return self.C @ _solve(_identity(self) - self.A, self.B) + self.D
 
     def poles(self) -> Complex:
         """Eigenvalues of A, shape (..., n)."""
-        return np.linalg.eigvals(self.A).astype(np.complex128)
+        if self.A.ndim > 2:
+            return np.linalg.eigvals(self.A).astype(np.complex128)
+        return _poles_of(self.A.tobytes(), self.order).copy()
 
     def is_stable(self) -> bool:
         """Whether every pole lies strictly inside the unit circle."""

@@ -21,13 +21,12 @@ settings.load_profile("no-clock")
 @pytest.fixture(autouse=True, scope="session")
 def a_run_designs_once(tmp_path_factory):
     """Runs, maps and crowds ask for the same couplings again and again, seconds each: one design for all processes."""
-    from forked import designs_once
-    from sim import couplings
+    from forked import share_designs
 
     folder = tmp_path_factory.getbasetemp()
     folder = (folder.parent if os.environ.get("PYTEST_XDIST_WORKER") else folder) / "designs"
     folder.mkdir(exist_ok=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SHARED_DESIGNS", str(folder))
-        patch.setattr(couplings, "design_by_kind", designs_once(folder))
+        share_designs(folder, patch.setattr)
         yield

@@ -23,19 +23,34 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 
 
-def designs_once(folder: Path):
-    """What runs, maps and crowds design by, in place of sim.couplings': seconds each, and one design for all processes.
+def share_designs(folder: Path, patch=setattr) -> None:
+    """One design for all tests and processes that ask for the same one: seconds each, and the same at every time.
 
-    The designs' own tests (tests/design) and commands call what makes them, and are not served from here.
+    What makes them, design.designs and the modules behind it, is as it was.
     """
-    from design import designs
+    import cli.design
+    from design import api, bound, compare, designs
+    from sim import couplings
+
+    for module in (cli.design, api, compare, couplings):
+        patch(module, "design_by_kind", _remembering(folder, designs.design_by_kind))
+    for module in (cli.design, compare):
+        patch(module, "bound", _remembering(folder, bound.bound))
+
+
+def _remembering(folder: Path, make):
+    """The same function, with its results kept in the folder; failures and loops without a digest are not."""
     from design.stored import digest
 
-    def remembered(loop, kind, condition=None, progress=None, **asked):
-        asked_for = digest(loop), kind, condition, *sorted(asked.items())
-        file = folder / hashlib.sha256(repr(asked_for).encode()).hexdigest()
+    def remembered(loop, *asked, **named):
+        plain = [x for x in asked if not callable(x)], sorted((k, x) for k, x in named.items() if not callable(x))
+        try:
+            loop_and_asked = digest(loop), make.__name__, plain
+        except TypeError:  # an environment of a test's own class
+            return make(loop, *asked, **named)
+        file = folder / hashlib.sha256(repr(loop_and_asked).encode()).hexdigest()
         if not file.exists():
-            made = designs.design_by_kind(loop, kind, condition, *([progress] if progress else []), **asked)
+            made = make(loop, *asked, **named)
             part = file.with_suffix(f".{os.getpid()}")
             part.write_bytes(pickle.dumps(made))
             part.rename(file)
@@ -110,12 +125,11 @@ def _serve() -> None:
 
     mpl.use("Agg")
     from cli.main import COMMANDS
-    from sim import couplings
 
     for name in ["matplotlib.pyplot", "cvxpy", *(f"cli.{command}" for command in COMMANDS)]:
         import_module(name)
     if sys.argv[1]:
-        couplings.design_by_kind = designs_once(Path(sys.argv[1]))
+        share_designs(Path(sys.argv[1]))
     for line in sys.stdin:
         if (child := os.fork()) == 0:
             _child(json.loads(line))
