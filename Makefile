@@ -42,9 +42,8 @@ coverage: .venv/ready
 
 figures: .venv/ready
 	$(PY) -m sim.run --case none --out out/figure-5
-	$(PY) -m sim.run --case I --condition any-environment --out out/figure-6
-	$(PY) -m sim.run --case I --duration 10 --side-by-side --out out/side-by-side
-	cp out/side-by-side/couplings.png docs/pictures/side-by-side.png
+	$(PY) -m sim.run --case I --condition any-environment --side-by-side --out out/figure-6
+	cp out/figure-6/couplings.png docs/pictures/side-by-side.png
 	cp out/figure-5/figure.png docs/pictures/figure-5.png
 	cp out/figure-6/figure.png docs/pictures/figure-6.png
 	$(PY) -m design.compare --coupling published,spring-damper:any-environment,spring-damper --out out/couplings

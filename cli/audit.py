@@ -148,9 +148,9 @@ def _list_devices(args: argparse.Namespace) -> int:
         value = fact["least"] if field == "damping" else fact["value"]
         return f"{value * _UNITS[field]:g}[{numbered[fact['source']]}]"
 
-    heads = ("device", "N s/m", "g", "N", "um", "N", "N/m")
+    heads = ("device", "damping N s/m", "mass g", "force N", "encoder um", "friction N", "CHAI3D N/m")
     rows = [(name, *(cell(part, field) for field in _UNITS)) for name, part in parts.items()]
-    title = "damping, mass, force, encoder step, Coulomb friction, and the stiffness that CHAI3D allows"
+    title = "what is published: the last column is the stiffness that CHAI3D allows"
     lines = [f"[{i}] {source}" for source, i in numbered.items()]
     lines.append("What is unknown is given beside `device` in a scenario, or with --delta: hw.identify measures it.")
     render.publish(args, {"devices": parts}, [render.grid(title, heads, rows)], lines)

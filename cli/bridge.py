@@ -15,31 +15,9 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
-from cli.options import (
-    DOES_NOT_HOLD,
-    DONE,
-    INTERRUPTED,
-    Parser,
-    add_energy_budget_option,
-    add_limiter_option,
-    add_loop_options,
-    add_output_options,
-    out_folder,
-    scenario_from,
-    seed_from,
-)
-from cli.render import console
-from cli.session_cli import (
-    add_link_options,
-    add_safety_options,
-    check_link,
-    hold_session,
-    host_clocked,
-    limits_from,
-    number,
-)
+from cli import options, render
+from cli.session_cli import add_link_options, add_safety_options, check_link, hold_session, host_clocked, limits_from
 from design.certificate import CONDITIONS
 from design.files import write_json
 from design.guarantees import CAVEATS, LATE
@@ -58,11 +36,11 @@ _LONGEST = 3600.0  # [s] of a session: the trace is kept in memory
 def main(argv: list[str]) -> int:
     """One session. 0: it ended as planned, 1: refused, stopped, lost or e-stop, 130: interrupted, after a ramp."""
     args = _parser().parse_args(argv)
-    scenario, seed, settings = scenario_from(args), seed_from(args), check_link(args)
+    scenario, settings = options.scenario_from(args), check_link(args)
     require_linear(scenario, "hw.bridge")
     require_constant_delay(scenario, "hw.bridge")
     require_even_ticks(scenario, "hw.bridge")
-    seconds = number(args, "duration", 0.1, _LONGEST, scenario.duration)
+    seconds = scenario.duration if args.duration is None else args.duration
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
     at_once = args.latch == "arrival" or host_clocked(args)  # a host that is the clock writes a force when it has it
@@ -76,39 +54,39 @@ def main(argv: list[str]) -> int:
     settings = replace(settings, deadman=args.deadman == "device")
     session = session_for(scenario, settings, **limits_from(args, scenario))
     session.record = recorder = Recorder(scenario.channels)
-    out = out_folder(args, "bridge")
+    out = options.out_folder(args, "bridge")
 
     def plan(ages: Ages) -> Sequence[CertifiedCoupling]:
-        met, link = timed(scenario, ages, float(args.quantile), 1e6 * float(args.guard), at_once)
+        met, link = timed(scenario, ages, args.quantile, 1e6 * args.guard, at_once)
         asked = args.case, args.coupling, args.condition
         programs = certified_couplings(met, *asked, link, limiter=args.limiter)
-        print_certificate(ages, link, programs, session.limits.cap, console(args))
+        print_certificate(ages, link, programs, session.limits.cap, render.console(args))
         return programs
 
-    live = hold_session(args, session, plan, seconds, seed, out)
-    report = outcome(args.case, session, recorder, live.dropped, float(args.pace))
+    live = hold_session(args, session, plan, seconds, out)
+    report = outcome(args.case, session, recorder, live.dropped, args.pace)
     try:  # first, for a disk may be full
-        print_session(report, console(args))
+        print_session(report, render.console(args))
     except OSError:
         if signal.SIGHUP not in live.signals:
             raise
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 - the terminal is gone, and with it whoever would read this
     report["files"] = [str(p) for p in save(out, session, recorder, report, not args.no_plot)]
-    console(args).print("files: " + ", ".join(report["files"]), soft_wrap=True)
+    render.console(args).print("files: " + ", ".join(report["files"]), soft_wrap=True)
     if args.json:
         write_json(args.json, report)
     if set(live.signals) - {signal.SIGUSR1}:
-        return INTERRUPTED
-    return DONE if session.stage == Stage.FINISHED else DOES_NOT_HOLD
+        return options.INTERRUPTED
+    return options.DONE if session.stage == Stage.FINISHED else options.DOES_NOT_HOLD
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = Parser(
+    parser = options.Parser(
         "hw.bridge",
         "Drive a device over a serial port with a coupling that is certified for the delay measured.",
         "python -m hw.bridge --rehearse --case I --duration 2",
     )
-    add_loop_options(parser)
+    options.add_loop_options(parser)
     add_link_options(parser)
     add_safety_options(parser)
     names = ", ".join(NAMES)
@@ -116,11 +94,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
     latch = "when forces act: at whole ticks (default), or as soon as they arrive, certified for the latency measured"
     parser.add_argument("--latch", choices=("tick", "arrival"), default="tick", help=latch)
-    add_energy_budget_option(parser)
-    add_limiter_option(parser)
-    parser.add_argument("--duration", metavar="SECONDS", help="of forces at full gain (default: the scenario's)")
-    parser.add_argument("--no-plot", action="store_true", help="write no picture")
-    add_output_options(parser)
+    options.add_energy_budget_option(parser)
+    options.add_limiter_option(parser)
+    seconds, most = "of forces at full gain (default: the scenario's)", options.number(0.1, _LONGEST)
+    parser.add_argument("--duration", type=most, metavar="SECONDS", help=seconds)
+    options.add_output_options(parser, picture=True)
     return parser
 
 
@@ -134,27 +112,27 @@ def print_certificate(
         f"{len(ages.values) + ages.missing} never arrived: {_link(link, programs[0].scenario)}"
     )
     console.print(_ticks(ages, programs[0].scenario, caps), highlight=False)
-    table = Table(title="certified for the delay measured, and softer in reserve")
-    table.add_column("coupling", min_width=13)
-    for column in ("K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee"):
-        table.add_column(column)
-    for program in programs:
-        part = program.part(caps)
-        certificate = next(c for c in (part["certificate"], *part["certificates"].values()) if c["certified"])
-        coupling = part["coupling"]
-        table.add_row(
-            f"{coupling['kind']}, theta = {', '.join(map(str, part['theta']))}",
-            *(_list(coupling[name]) for name in "KB"),
-            f"{_list(certificate['required_damping'])} ({certificate['condition']}, {certificate['proof']})",
-            _list(certificate["available_damping"]),
-            part["promise"],
-        )
-    console.print(table)
+    heads = ("coupling", "K [N/m]", "B [N s/m]", "needs", "of [N s/m]", "guarantee")
+    title = "certified for the delay measured, and softer in reserve"
+    console.print(render.grid(title, heads, [_certified(program.part(caps)) for program in programs], left=range(6)))
     for program in programs:
         for remark in (program.limits.words(caps), *program.remarks()):
             console.print(f"[dim]·[/] theta = {list(program.scenario.theta)}: {remark}", highlight=False)
     if len(programs) == 1:
         console.print("no reserve: nothing softer is certified, so late answers end the session")
+
+
+def _certified(part: dict[str, Any]) -> tuple[str, ...]:
+    """A row: the coupling, and the first condition that certifies it."""
+    coupling = part["coupling"]
+    found = next(c for c in (part["certificate"], *part["certificates"].values()) if c["certified"])
+    return (
+        f"{coupling['kind']}, theta = {', '.join(map(str, part['theta']))}",
+        *(_list(coupling[name]) for name in "KB"),
+        f"{_list(found['required_damping'])} ({found['condition']}, {found['proof']})",
+        _list(found["available_damping"]),
+        part["promise"],
+    )
 
 
 def _link(link: int, scenario: Scenario) -> str:
@@ -177,12 +155,9 @@ def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
 
 def print_session(report: dict[str, Any], console: Console) -> None:
     """The log, then what the link did."""
-    table = Table(title=f"case {report['case']} · {report['scenario']}")
-    for column in ("after", "stage", "cause"):
-        table.add_column(column, justify="right" if column == "after" else "left")
-    for event in report["session"]["log"]:
-        table.add_row(f"{event['t_s']:.3f} s", _colour(event["stage"]), event["cause"])
-    console.print(table)
+    rows = [(f"{one['t_s']:.3f} s", _colour(one["stage"]), one["cause"]) for one in report["session"]["log"]]
+    title = f"case {report['case']} · {report['scenario']}"
+    console.print(render.grid(title, ("after", "stage", "cause"), rows, left=(1, 2)))
     link = report["link"]
     if link["age_us"]:
         ages = ", ".join(f"{name} {us / 1000:.2f} ms" for name, us in link["age_us"].items())

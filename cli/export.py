@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from cli import options, render
 from controller.coupling import SpringDamperForm
+from controller.lti import Array
 from design.certificate import Verdict, verify
 from design.export import (
     Block,
@@ -37,6 +38,34 @@ from sim.scenario import InputError
 _SUFFIX = {"c": ".c", "json": ".json", "npz": ".npz", "control": ".py"}
 
 
+@dataclass(frozen=True)
+class _Proof:
+    """Whether the certificate on file holds."""
+
+    proved: bool
+    reason: str | None
+
+    def __str__(self) -> str:
+        return "[green]proved[/]" if self.proved else f"[red]none[/]: {self.reason}"
+
+
+@dataclass(frozen=True)
+class _Exported:
+    """What was written."""
+
+    format: str
+    what: str
+    states: int
+    T_s: float
+    file: Path = render.figure("file")
+    channels: int = render.figure("block", "{} channels, {r.states} states, T = {r.T_s:g} s")
+    certificate: _Proof = render.figure("certificate")
+    multiplications: int = render.figure("one tick", "{} multiplications")
+    force_limit: Array | None
+    forces: str | None = render.figure("forces")
+    test: dict[str, Any] = render.figure("test vector", "{[ticks]} ticks, in the file")
+
+
 def main(argv: list[str]) -> int:
     """Export a stored coupling. 0: written, 1: written, but the certificate in its file does not hold."""
     args = _parser().parse_args(argv)
@@ -53,19 +82,21 @@ def main(argv: list[str]) -> int:
     test = trial(block, args.seed)
     write(path, _content(args.format, block, test, path.name))
 
-    outcome = {
-        "file": str(path),
-        "format": args.format,
-        "what": block.name,
-        "channels": block.system.inputs,
-        "states": block.system.order,
-        "T_s": block.system.T,
-        "force_limit": None if block.limiter is None else block.limiter.limit.tolist(),
-        "certificate": {"proved": verdict.proved, "reason": verdict.reason},
-        "test": {"ticks": len(test.inputs), "seed": args.seed, "largest_output": float(np.abs(test.outputs).max())},
-    }
-    title = f"{outcome['what']} as {outcome['format']}"
-    render.publish(args, outcome, [render.facts(title, _rows(outcome), left=True)])
+    exported = _Exported(
+        args.format,
+        block.name,
+        block.system.order,
+        block.system.T,
+        path,
+        block.system.inputs,
+        _Proof(verdict.proved, verdict.reason),
+        block.system.order**2 + 2 * block.system.order * block.system.inputs + block.system.inputs**2,
+        block.limiter and block.limiter.limit,
+        _forces(block) if args.process else None,
+        {"ticks": len(test.inputs), "seed": args.seed, "largest_output": np.abs(test.outputs).max()},
+    )
+    title = f"{block.name} as {args.format}"
+    render.publish(args, exported, [render.facts(title, render.rows_of(exported), left=True)])
     return options.DOES_NOT_HOLD if stored.certificate and not verdict.proved else options.DONE
 
 
@@ -91,6 +122,12 @@ def _verdict(stored: Stored) -> Verdict:
         return verify(stored)
     except (ValueError, ArithmeticError) as error:
         return Verdict(False, str(error))
+
+
+def _forces(block: Block) -> str:
+    if block.limiter:
+        return f"limited to {listed(block.limiter.limit)} N by the limiter"
+    return "not limited in this file: the proof holds below what the motors give (--force-limit for more)"
 
 
 def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> Block:
@@ -152,14 +189,3 @@ def _content(kind: str, block: Block, test: Trial, file: str) -> Any:
         np.savez(destination, **arrays)
 
     return archive
-
-
-def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
-    certificate = outcome["certificate"]
-    return [
-        ("file", outcome["file"]),
-        ("block", f"{outcome['channels']} channels, {outcome['states']} states, T = {outcome['T_s']:g} s"),
-        ("certificate", "[green]proved[/]" if certificate["proved"] else f"[red]none[/]: {certificate['reason']}"),
-        ("force limits", outcome["force_limit"] and f"{listed(outcome['force_limit'])} N, by the limiter"),
-        ("test vector", f"{outcome['test']['ticks']} ticks, in the file"),
-    ]

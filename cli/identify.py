@@ -15,20 +15,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from cli import render
-from cli.options import (
-    DOES_NOT_HOLD,
-    DONE,
-    INTERRUPTED,
-    Parser,
-    add_loop_options,
-    add_output_options,
-    numbers,
-    out_folder,
-    scenario_from,
-    seed_from,
-)
-from cli.session_cli import add_link_options, check_link, hold_session, measured_link, number
+from cli import options, render
+from cli.session_cli import add_link_options, check_link, hold_session, measured_link
 from design.files import write
 from hw.identify import Estimate, Excitation, capped, chirp, estimate, held
 from hw.limits import Stage
@@ -51,16 +39,14 @@ _LIMITS = (
 def main(argv: list[str]) -> int:
     """Identify every axis. 0: each has a bound above zero, 1: not, or the session did not end as planned."""
     args = _parser().parse_args(argv)
-    scenario, seed, settings = scenario_from(args), seed_from(args), check_link(args)
+    scenario, settings = options.scenario_from(args), check_link(args)
     require_linear(scenario, "hw.identify")
     require_constant_delay(scenario, "hw.identify")
     require_even_ticks(scenario, "hw.identify")
-    force, seconds = number(args, "force", 0.05, 6.0), number(args, "seconds", 0.5, 30.0)
-    low, high = numbers("--band", args.band, float, 2)
+    force, seconds, (low, high) = args.force, args.seconds, args.band
     if not 0.5 <= low < high <= 0.4 / scenario.T:
-        raise InputError(f"--band is {args.band}, expected LOW,HIGH within 0.5 to {0.4 / scenario.T:.0f} Hz")
-    coulomb = number(args, "coulomb", 0.0, 10.0)
-    out = out_folder(args, "identify")
+        raise InputError(f"--band is {low:g},{high:g}, expected LOW,HIGH within 0.5 to {0.4 / scenario.T:.0f} Hz")
+    out = options.out_folder(args, "identify")
     asks_nothing = scenario.replace(delta=(1e-6,) * scenario.channels)  # what the damping is, is the question
     session = session_for(asks_nothing, replace(settings, test_encoders=False), cap=force)
     session.record = recorder = Recorder(scenario.channels)
@@ -70,28 +56,31 @@ def main(argv: list[str]) -> int:
         return [chirp(scenario.channels, scenario.T, link, force, (low, high), seconds)]
 
     played = chirp(1, scenario.T, 1, force, (low, high), seconds).seconds - 0.2  # the lead has the ramp
-    live = hold_session(args, session, plan, played, seed, out, nobody=True, coulomb=coulomb)
-    report, estimates = _identified(session, recorder, scenario, live.dropped, float(args.pace))
+    live = hold_session(args, session, plan, played, out, nobody=True, coulomb=args.coulomb)
+    report, estimates = _identified(session, recorder, scenario, live.dropped, args.pace)
     files = _save(out, session, recorder, scenario, estimates, report)
     render.publish(args, report, [_figures(report)], _lines(report), out, files)
     if live.signals:
-        return INTERRUPTED
-    return DONE if session.stage == Stage.FINISHED and report["bounded"] else DOES_NOT_HOLD
+        return options.INTERRUPTED
+    return options.DONE if session.stage == Stage.FINISHED and report["bounded"] else options.DOES_NOT_HOLD
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = Parser(
+    parser = options.Parser(
         "hw.identify",
         "Estimate mass, friction and transmission of a device that nobody holds, and a lower bound of its damping.",
         "python -m hw.identify --rehearse",
     )
-    add_loop_options(parser)
+    options.add_loop_options(parser)
     add_link_options(parser)
-    parser.add_argument("--force", default="1", metavar="NEWTON", help="amplitude of the chirp (default 1)")
-    parser.add_argument("--band", default="3,200", metavar="LOW,HIGH", help="of the chirp [Hz] (default 3,200)")
-    parser.add_argument("--seconds", default="2.5", metavar="SECONDS", help="of the chirp (default 2.5)")
-    parser.add_argument("--coulomb", default="0", metavar="NEWTON", help="dry friction of an emulated device")
-    add_output_options(parser)
+    push, seconds = options.number(0.05, 6.0), options.number(0.5, 30.0)
+    parser.add_argument("--force", type=push, default=1.0, metavar="NEWTON", help="amplitude of the chirp (default 1)")
+    band = "of the chirp [Hz] (default 3,200)"
+    parser.add_argument("--band", type=options.pair, default=(3.0, 200.0), metavar="LOW,HIGH", help=band)
+    parser.add_argument("--seconds", type=seconds, default=2.5, metavar="SECONDS", help="of the chirp (default 2.5)")
+    rub = "dry friction of an emulated device"
+    parser.add_argument("--coulomb", type=options.number(0.0, 10.0), default=0.0, metavar="NEWTON", help=rub)
+    options.add_output_options(parser)
     return parser
 
 

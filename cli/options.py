@@ -73,9 +73,9 @@ def number(least: float = -math.inf, most: float = math.inf, unit: str = "") -> 
     return _one(float, least, most, unit)
 
 
-def whole(least: float = -math.inf, most: float = math.inf) -> Callable[[str], int]:
+def whole(least: float = -math.inf, most: float = math.inf, unit: str = "") -> Callable[[str], int]:
     """A whole number within these limits."""
-    return _one(int, least, most, "")
+    return _one(int, least, most, unit)
 
 
 def several(
@@ -168,7 +168,8 @@ def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
         return value
     shown, low, high = (str(n) if isinstance(n, int) else f"{n:g}" for n in (value, least, most))
     span = f"{low} to {high}" if most < math.inf else f"numbers from {low}" if least > -math.inf else "finite numbers"
-    raise argparse.ArgumentTypeError(f"is {shown}, allowed are {span}{unit and f' {unit}'}")
+    unit = f" {unit}" if unit and not unit.startswith(",") else unit
+    raise argparse.ArgumentTypeError(f"is {shown}, allowed are {span}{unit}")
 
 
 def per_channel(option: str, values: tuple[_Number, ...], channels: int) -> tuple[_Number, ...]:
@@ -324,11 +325,6 @@ def place(args: argparse.Namespace) -> str:
     if args.scenario == DEFAULT:
         return args.case
     return Path(args.scenario).stem + ("" if args.case == "I" else f"-{args.case}")
-
-
-def seed_from(args: argparse.Namespace) -> int:
-    """The seed of a command that reads its words itself. Raises InputError."""
-    return numbers("--seed", str(args.seed), int, 1)[0]
 
 
 def as_option(error: ValueError, args: argparse.Namespace) -> str:

@@ -1,8 +1,8 @@
 """Reports as tables on the terminal and as JSON: the one place where either is made.
 
-A report is a dictionary or a dataclass of plain figures, in SI units. Its table is made from rows, pairs of a name and
-a text; a row whose text is None is left out. The rows of a dataclass come from its fields, by the name and the format
-that `figure` gives them: a new figure is one field.
+A report is a dataclass of figures in SI units. Its fields are the keys of its JSON, and the rows of its table, pairs of
+a name and a text, come from them by the name and the format that `figure` gives: a new figure is one field. A row whose
+text is None is left out.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ import argparse
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, asdict, field, fields
+from dataclasses import MISSING, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
 from rich.console import Console
 from rich.errors import MarkupError
 from rich.progress import Progress
@@ -23,7 +24,7 @@ from rich.text import Text
 
 from controller.loop import Loop
 from design.files import nobody_reads, printable, write_json
-from design.result import DesignFailed, listed
+from design.result import DesignFailed, finite, listed
 
 # ----------------------------------------------------------------------------------------------------
 # The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
@@ -127,16 +128,17 @@ _OTHER_NAMES = {"ranges": "set", "varying_delay": "jitter", "promise": "guarante
 
 def publish(
     args: argparse.Namespace,
-    outcome: dict[str, Any],
+    report: Any,
     shown: Iterable[Table],
     lines: Iterable[str] = (),
     folder: Path | None = None,
     files: Iterable[Path] = (),
 ) -> None:
-    """Keep the outcome as report.json in the folder, print tables and lines, and write what --json asks for.
+    """Keep a report as report.json in the folder, print tables and lines, and write what --json asks for.
 
-    `files` are those written before; the outcome names them and its own. A part stands there by its older name, too.
+    `files` are those written before; the report names them and its own. A part stands there by its older name, too.
     """
+    outcome = plain(report)
     outcome |= {other: outcome[name] for name, other in _OTHER_NAMES.items() if name in outcome}
     if folder:
         kept = folder / "report.json"
@@ -153,9 +155,30 @@ def publish(
         write_json(args.json, outcome)
 
 
-def plain(report: Any) -> dict[str, Any]:
-    """A dataclass as JSON takes it."""
-    return asdict(report)
+def plain(report: Any) -> Any:
+    """A report as JSON takes it: dataclasses by their fields, null for what is infinite or no number."""
+    if is_dataclass(report) and not isinstance(report, type):
+        return _part(report)
+    if isinstance(report, Mapping):
+        return {name: plain(value) for name, value in report.items()}
+    if isinstance(report, np.ndarray | np.generic):
+        return plain(report.tolist())
+    if isinstance(report, list | tuple):
+        return [plain(value) for value in report]
+    if isinstance(report, float):
+        return finite(report)
+    return str(report) if isinstance(report, Path) else report
+
+
+def _part(report: Any) -> dict[str, Any]:
+    part: dict[str, Any] = {}
+    for one in fields(report):
+        value, how = getattr(report, one.name), one.metadata.get("json", "key")
+        if how == "beside":
+            part |= plain(value) or {}
+        elif how == "key" or (how == "given" and value is not None):
+            part[one.name] = plain(value)
+    return part
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -163,7 +186,7 @@ def plain(report: Any) -> dict[str, Any]:
 
 
 _Rows = Iterable[tuple[str, str | None]]
-_Form = str | Callable[[Any], str]
+_Form = str | Callable[[Any], str | None]
 
 
 def facts(title: str, rows: _Rows, heads: Sequence[str] = (), left: bool = False) -> Table:
@@ -187,24 +210,33 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
     return table
 
 
-def figure(name: str, form: _Form = "{}", default: Any = MISSING) -> Any:
-    """A field of a report that its table shows under this name, in this format."""
-    return field(default=default, metadata={"name": name, "form": form})
+def figure(name: str, form: _Form = "{}", default: Any = MISSING, json: str = "key") -> Any:
+    """A field that a report's table shows under this name, in this format: of the value, and of the whole report `r`.
+
+    In JSON it is a `key`, a key only where it is `given`, keys `beside` the report's own, or in the `table` alone.
+    """
+    return field(default=default, metadata={"name": name, "form": form, "json": json})
+
+
+def several(rows: Callable[[Any], _Rows], json: str = "key") -> Any:
+    """A field that a report's table shows as these rows."""
+    return field(metadata={"rows": rows, "json": json})
+
+
+def unseen(json: str = "key", default: Any = MISSING) -> Any:
+    """A field that no table shows."""
+    return field(default=default, metadata={"json": json})
 
 
 def rows_of(report: Any) -> _Rows:
-    """The figures of a dataclass as rows; those that are None are left out."""
-    for one in _figures(report):
-        value = getattr(report, one.name)
-        yield one.metadata["name"], None if value is None else _formed(value, one.metadata["form"])
-
-
-def _figures(report: Any) -> list[Any]:
-    return [one for one in fields(report) if "form" in one.metadata]
-
-
-def _formed(value: Any, form: _Form) -> str:
-    return form(value) if callable(form) else form.format(value)
+    """The figures of a report as rows; those that are None are left out."""
+    for one in fields(report):
+        value, form = getattr(report, one.name), one.metadata.get("form")
+        if form is not None:
+            text: Any = None if value is None else form(value) if callable(form) else form.format(value, r=report)
+            yield one.metadata["name"], text
+        elif "rows" in one.metadata and value is not None:
+            yield from one.metadata["rows"](value)
 
 
 # ----------------------------------------------------------------------------------------------------

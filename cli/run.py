@@ -361,7 +361,11 @@ def _title(what: str, outcome: dict[str, Any]) -> str:
     """Of the picture."""
     stability, kind = outcome["stability"], outcome["coupling"]["kind"]
     coupling = "no virtual coupling" if kind == "none" else f"{kind} coupling"
-    growth = f"growth {stability['exact_growth_rate_per_s']:+.3f} 1/s at {stability['exact_frequency_hz']:.1f} Hz"
+    if kind != "none" and outcome["promise"]:
+        coupling += f" for {outcome['promise']}"
+    rate, hertz = stability["exact_growth_rate_per_s"], stability["exact_frequency_hz"]
+    grows, decays = f"grows by {rate:.3f} 1/s at {hertz:.1f} Hz", f"slowest motion decays by {-rate:.3f} 1/s"
+    growth = grows if rate > 0 else decays
     if _unstable(outcome) is not None:
         growth = f"{outcome['varying_delay']['pattern']} delays, {stability['verdict']}"
     return f"{what.removesuffix(', no coupling').removesuffix(', case none')}, {coupling}: {growth}"

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from cli import options
 from cli.dashboard import Dashboard
-from cli.options import numbers, scenario_from
 from cli.render import console, progress
 from hw.control import Program, link_delay
 from hw.emulator import Emulator, FaultInjection, spawned
@@ -47,27 +47,34 @@ def add_link_options(parser: argparse.ArgumentParser) -> None:
     link.add_argument("--rehearse", action="store_true", help=rehearse)
     fault = "for --emulate and --rehearse, see hw.emulator"
     link.add_argument("--fault", action="append", default=[], metavar="FAULT", help=fault)
-    link.add_argument(
-        "--pace", default="1", metavar="P", help="slow motion of an emulator, for busy machines (default 1)"
-    )
+    add_pace_option(link, "slow motion of an emulator, for busy machines (default 1)")
     link.add_argument("--arm", action="store_true", help="arm without being asked; else press a")
     baud = "of a UART, checked against T; none: USB without one (default 921600; none for a pseudo-terminal)"
-    link.add_argument("--baud", metavar="N|none", help=baud)
-    link.add_argument("--quantile", default="0.99", metavar="Q", help="of the ages that theta covers (default 0.99)")
-    link.add_argument("--guard", default="1e-4", metavar="SECONDS", help="added to it (default 1e-4)")
-    link.add_argument("--measure", default="800", metavar="N", help="answers that are timed (default 800)")
+    link.add_argument("--baud", type=_baud_or_none, metavar="N|none", help=baud)
+    share, ages = options.number(0.5, 1.0), "of the ages that theta covers (default 0.99)"
+    link.add_argument("--quantile", type=share, default=0.99, metavar="Q", help=ages)
+    spare = "added to it (default 1e-4)"
+    link.add_argument("--guard", type=options.number(0.0, 0.1), default=1e-4, metavar="SECONDS", help=spare)
+    count = "answers that are timed (default 800)"
+    link.add_argument("--measure", type=options.whole(50, 100_000), default=800, metavar="N", help=count)
+
+
+def add_pace_option(parser: argparse._ActionsContainer, what: str) -> None:
+    """--pace: seconds of the device's clock per second."""
+    parser.add_argument("--pace", type=options.number(0.01, 1), default=1.0, metavar="P", help=what)
 
 
 def add_safety_options(parser: argparse.ArgumentParser) -> None:
     """What the bridge never does, and who has to be there."""
     safety = parser.add_argument_group("safety")
-    safety.add_argument(
-        "--force-cap", default="2", metavar="NEWTON", help="largest force (default 2, for first sessions)"
-    )
-    safety.add_argument("--max-speed", default="1", metavar="M/S", help="of a handle while forces act (default 1)")
+    cap = "largest force (default 2, for first sessions)"
+    safety.add_argument("--force-cap", type=options.number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
+    speed = "of a handle while forces act (default 1)"
+    safety.add_argument("--max-speed", type=options.number(1e-3, 2.5), default=1.0, metavar="M/S", help=speed)
     heat = "force that each motor stands for ever, one is for all; above it, I2t (default: not looked at)"
-    safety.add_argument("--continuous-force", metavar="N,N,..", help=heat)
-    safety.add_argument("--thermal-time", default="10", metavar="SECONDS", help="of the motors' heating (default 10)")
+    safety.add_argument("--continuous-force", type=options.several(float), metavar="N,N,..", help=heat)
+    seconds = "of the motors' heating (default 10)"
+    safety.add_argument("--thermal-time", type=options.number(0.1, 1000), default=10.0, metavar="SECONDS", help=seconds)
     absolute = "count positions from the encoders' zero, not from where the handles are at arming"
     safety.add_argument("--no-rereference", action="store_true", help=absolute)
     who = "forces act only while a key is pressed, or FILE is touched, once a second, or the device's own one is held"
@@ -76,12 +83,10 @@ def add_safety_options(parser: argparse.ArgumentParser) -> None:
 
 
 def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
-    """The Limits of the safety options, with `cap`. Raises InputError."""
-    cap = number(args, "force-cap", 0.05, 12.0)
-    more: dict[str, Any] = {"cap": cap, "speed": number(args, "max-speed", 1e-3, 2.5)}
-    more["thermal"] = number(args, "thermal-time", 0.1, 1000.0)
+    """The limits of the safety options, with `cap`. Raises InputError."""
+    more: dict[str, Any] = {"cap": args.force_cap, "speed": args.max_speed, "thermal": args.thermal_time}
     if args.continuous_force is not None:
-        more["continuous"] = numbers("--continuous-force", args.continuous_force, float, scenario.channels)
+        more["continuous"] = options.per_channel("--continuous-force", args.continuous_force, scenario.channels)
     if args.deadman == "key" and not sys.stdin.isatty():
         raise InputError("--deadman key needs a terminal; without one give it a file to be touched")
     return more
@@ -112,31 +117,24 @@ def check_link(args: argparse.Namespace) -> LinkSettings:
         raise InputError("give either --port PATH or --emulate or --rehearse")
     if args.fault and args.port:
         raise InputError("--fault is for --emulate and --rehearse; a device behind --port has its own")
-    pace_from(args)
     if args.port and not args.arm and not sys.stdin.isatty():
         raise InputError("no keyboard to arm with: give --arm, if nobody can get hurt")
-    number(args, "quantile", 0.5, 1.0)
-    number(args, "guard", 0.0, 0.1)
-    measure = numbers("--measure", args.measure, int, 1)[0]
-    if not 50 <= measure <= 100_000:
-        raise InputError(f"--measure is {measure}, allowed are 50 to 100000")
-    return LinkSettings(baud=_baud(args), measure=measure)
+    return LinkSettings(baud=_baud(args), measure=args.measure)
 
 
 def _baud(args: argparse.Namespace) -> int | None:
-    """Of the UART in the line, None where there is none. Raises InputError.
+    """Of the UART in the line, None where there is none.
 
     A pseudo-terminal has none. Of /dev/ttyACM0 nobody can tell: native USB, or a chip with a UART behind it.
     """
     if args.baud is None:
         pseudo = not args.port or host_clocked(args) or os.path.realpath(args.port).startswith("/dev/pts/")
         return None if pseudo else _USUAL_BAUD
-    if args.baud == "none":
-        return None
-    (baud,) = numbers("--baud", args.baud, int, 1)
-    if not 1200 <= baud <= 20_000_000:
-        raise InputError(f"--baud is {baud}, allowed are 1200 to 20000000, or none for a link without UART")
-    return baud
+    return args.baud or None
+
+
+def _baud_or_none(text: str) -> int:
+    return 0 if text == "none" else options.whole(1200, 20_000_000, ", or none for a link without UART")(text)
 
 
 def host_clocked(args: argparse.Namespace) -> bool:
@@ -144,27 +142,9 @@ def host_clocked(args: argparse.Namespace) -> bool:
     return (args.port or "").split(":")[0] == FORCE_DIMENSION
 
 
-def number(args: argparse.Namespace, name: str, low: float, high: float, default: float | None = None) -> float:
-    """One option as a number within its range. Raises InputError."""
-    text = getattr(args, name.replace("-", "_"))
-    value = default if text is None else numbers(f"--{name}", text, float, 1)[0]
-    assert value is not None
-    if not low <= value <= high:
-        raise InputError(f"--{name} is {value:g}, allowed are {low:g} to {high:g}")
-    return value
-
-
-def pace_from(args: argparse.Namespace) -> float:
-    """Seconds of the device's clock per second. Raises InputError."""
-    pace = numbers("--pace", args.pace, float, 1)[0]
-    if not 0.01 <= pace <= 1:
-        raise InputError(f"--pace is {pace:g}, allowed are 0.01 to 1")
-    return pace
-
-
 def measured_link(args: argparse.Namespace, ages: Ages, T: float) -> int:
     """Ticks of delay for the ages that were measured, by --quantile and --guard."""
-    return link_delay(ages, 1e6 * T, float(args.quantile), 1e6 * float(args.guard))
+    return link_delay(ages, 1e6 * T, args.quantile, 1e6 * args.guard)
 
 
 @dataclass(frozen=True)
@@ -180,7 +160,6 @@ def hold_session(
     session: Session,
     plan: Callable[[Ages], Sequence[Program]],
     seconds: float,
-    seed: int,
     out: Path,
     nobody: bool = False,
     coulomb: float = 0.0,
@@ -194,7 +173,7 @@ def hold_session(
         stack.callback(incidents.close)
         incidents.attach(session)
         if args.rehearse:
-            return _rehearsed(args, session, plan, seconds, seed, incidents, nobody, coulomb)
+            return _rehearsed(args, session, plan, seconds, incidents, nobody, coulomb)
         device: HapticDevice
         serial: SerialDevice | None = None
         if host_clocked(args):
@@ -205,10 +184,10 @@ def hold_session(
                     "the device has no watchdog of its own: were this program killed, its force would stay"
                 )
         else:
-            options = [*_emulator_options(args, seed, seconds), *["--nobody"][:nobody], f"--coulomb={coulomb}"]
+            words = [*_emulator_options(args, seconds), *["--nobody"][:nobody], f"--coulomb={coulomb}"]
             with progress("starting the emulator" if args.emulate else "opening the port"):
-                path = args.port or stack.enter_context(spawned(options))
-            port, pace = stack.enter_context(SerialPort(path, session.settings.baud)), float(args.pace)
+                path = args.port or stack.enter_context(spawned(words))
+            port, pace = stack.enter_context(SerialPort(path, session.settings.baud)), args.pace
             device = serial = SerialDevice(port, lambda: pace * time.monotonic())
         if args.port and not getattr(args, "no_preflight", True):
             with progress("looking at this machine"):
@@ -232,7 +211,7 @@ def hold_session(
             seconds,
             keyboard,
             glance,
-            float(args.pace),
+            args.pace,
             deadman,
         )
         live.run()
@@ -244,7 +223,6 @@ def _rehearsed(
     session: Session,
     plan: Callable[[Ages], Sequence[Program]],
     seconds: float,
-    seed: int,
     incidents: IncidentLog,
     nobody: bool,
     coulomb: float,
@@ -252,7 +230,7 @@ def _rehearsed(
     """The session in virtual time; whoever would be there arms once, and holds the deadman."""
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
     try:
-        scenario = without_hands(scenario_from(args)) if nobody else scenario_from(args)
+        scenario = without_hands(options.scenario_from(args)) if nobody else options.scenario_from(args)
         emulator = Emulator(scenario, faults, coulomb=coulomb)
     except ValueError as error:
         raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
@@ -269,16 +247,17 @@ def _rehearsed(
 
         operator = Operator(True, seconds)
         Rehearsal(
-            session, emulator, planned, faults, seed, operator=operator, keep=False, glance=glance
+            session, emulator, planned, faults, args.seed, operator=operator, keep=False, glance=glance
         ).run_to_the_end(seconds + _SPARE)
     return _Held()
 
 
-def _emulator_options(args: argparse.Namespace, seed: int, seconds: float) -> list[str]:
+def _emulator_options(args: argparse.Namespace, seconds: float) -> list[str]:
     """The same loop, the faults of --fault, and an end."""
-    options = [f"--{name}={getattr(args, name)}" for name in _PASSED_ON if getattr(args, name) is not None]
-    options += [f"--fault={fault}" for fault in args.fault]
-    return [*options, f"--seed={seed}", f"--pace={args.pace}", f"--duration={seconds + _SPARE:g}"]
+    given = {name: getattr(args, name) for name in _PASSED_ON if getattr(args, name) is not None}
+    words = [f"--{name}={','.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in given.items()]
+    words += [f"--fault={fault}" for fault in args.fault]
+    return [*words, f"--seed={args.seed}", f"--pace={args.pace}", f"--duration={seconds + _SPARE:g}"]
 
 
 def _view(stack: ExitStack) -> Callable[[Session], None]:

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import lru_cache
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
@@ -103,23 +103,6 @@ class ReadOnly:
 
 
 _ROWS, _POINTS = 32, 1024  # of a response at once: what stays in the processor's cache
-
-
-_KEPT = 8  # matrices A whose factors are remembered: blocks that are made of each other have the same states
-
-
-@lru_cache(_KEPT)
-def _schur_of(A: bytes, n: int) -> tuple[Complex, Complex]:
-    """S, U with A = U S U* and S upper triangular."""
-    if not n:
-        return np.zeros((0, 0), dtype=np.complex128), np.zeros((0, 0), dtype=np.complex128)
-    S, U, *_ = scipy.linalg.schur(np.frombuffer(A).reshape(n, n), output="complex")
-    return S, U
-
-
-@lru_cache(_KEPT)
-def _poles_of(A: bytes, n: int) -> Complex:
-    return np.linalg.eigvals(np.frombuffer(A).reshape(n, n)).astype(np.complex128)
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,16 +205,25 @@ class Lti(ReadOnly):
         return np.moveaxis(G, -1, 0).reshape(*z.shape, self.outputs, self.inputs)
 
     def _resolved(self, points: Complex) -> Complex:
-        """C (z I - A)^-1 B, shape (p, m, points): row by row from the last one up, _ROWS of them into those above."""
-        S, U = _schur_of(self.A.tobytes(), self.order)
-        X = np.repeat(U.conj().T @ self.B, points.size, axis=1)
-        for end in range(self.order, 0, -_ROWS):
+        """C (z I - A)^-1 B, shape (p, m, points): row by row from the last one up, _ROWS of them into those above.
+
+        What only repeats another state later is no row: it is that state times a power of z.
+        """
+        S, U = self._schur
+        core, lines = self._lines
+        at, X = np.tile(points, self.inputs), np.repeat(U.conj().T @ self.B[core], points.size, axis=1)
+        for end in range(core.size, 0, -_ROWS):
             first = max(end - _ROWS, 0)
             for i in reversed(range(first, end)):
-                row = X[i] + S[i, i + 1 : end] @ X[i + 1 : end]
-                X[i] = (row.reshape(-1, points.size) * (1 / (points - S[i, i]))).ravel()
+                X[i] = (X[i] + S[i, i + 1 : end] @ X[i + 1 : end]) / (at - S[i, i])
             X[:first] += S[:first, first:end] @ X[first:end]
-        return (self.C @ U @ X).reshape(self.outputs, self.inputs, points.size)
+        G = (self.C[:, core] @ U @ X).reshape(self.outputs, self.inputs, points.size)
+        heads = (U[[head for head, *_ in lines]] @ X).reshape(len(lines), self.inputs, points.size)
+        for (_, states, late), repeated in zip(lines, heads, strict=True):
+            read = np.flatnonzero(self.C[:, states].any(axis=1))
+            powers = np.cumprod(np.broadcast_to(1 / points, (late.max(), points.size)), axis=0)[late - 1]
+            G[read] += (self.C[np.ix_(read, states)] @ powers)[:, None] * repeated
+        return G
 
     def at_rest(self, x: Array) -> Array:
         """The state z = A z + B x in which it rests with the inputs x held.
@@ -241,15 +233,47 @@ class Lti(ReadOnly):
         z: Array = np.linalg.lstsq(np.eye(self.order) - self.A, self.B @ x, rcond=None)[0]
         return z
 
+    @cached_property
+    def _lines(self) -> tuple[NDArray[np.intp], list[tuple[int, NDArray[np.intp], NDArray[np.intp]]]]:
+        """The states without those that delays at the outputs add; and those: (place among the first, states, delays).
+
+        A state of the second kind is one of the first kind some samples before, and only the output reads it.
+        """
+        reads = self.A != 0
+        repeats = (reads.sum(axis=1) == 1) & (self.A.sum(axis=1) == 1) & ~self.B.any(axis=1)
+        while (elsewhere := repeats & reads[~repeats].any(axis=0)).any():
+            repeats &= ~elsewhere
+        followers: dict[int, list[int]] = {}
+        for i in np.flatnonzero(repeats):
+            followers.setdefault(int(reads[i].argmax()), []).append(int(i))
+        lines = {head: [(head, 0)] for head in followers if not repeats[head]}
+        for line in lines.values():
+            for i, late in line:  # which grows
+                line += [(follower, late + 1) for follower in followers.get(i, ())]
+        core = np.setdiff1d(np.arange(self.order), [i for line in lines.values() for i, _ in line[1:]])
+        places = np.searchsorted(core, list(lines))
+        parts = [np.array(line[1:], dtype=np.intp).T for line in lines.values()]
+        return core, [(int(head), states, late) for head, (states, late) in zip(places, parts, strict=True)]
+
+    @cached_property
+    def _schur(self) -> tuple[Complex, Complex]:
+        """S, U with A = U S U* and S upper triangular, without delays at the outputs: once per block."""
+        core = self._lines[0]
+        if not core.size:
+            return np.zeros((0, 0), dtype=np.complex128), np.zeros((0, 0), dtype=np.complex128)
+        S, U, *_ = scipy.linalg.schur(self.A[np.ix_(core, core)], output="complex")
+        return S, U
+
     def dc(self) -> Array:
         """G(1), shape (..., p, m)."""
         return self.C @ _solve(_identity(self) - self.A, self.B) + self.D
 
     def poles(self) -> Complex:
-        """Eigenvalues of A, shape (..., n)."""
+        """Eigenvalues of A, shape (..., n); delays at the outputs have theirs at zero, exactly."""
         if self.A.ndim > 2:
             return np.linalg.eigvals(self.A).astype(np.complex128)
-        return _poles_of(self.A.tobytes(), self.order).copy()
+        core = self._lines[0]
+        return np.append(np.linalg.eigvals(self.A[np.ix_(core, core)]), np.zeros(self.order - core.size, np.complex128))
 
     def is_stable(self) -> bool:
         """Whether every pole lies strictly inside the unit circle."""

@@ -143,6 +143,7 @@ class StepBuffer:
         self._line = None if process.delays is None else HeldLine(process.delays, nsim)
         self.net = process.net(nsim) if process.net else None
         self.first = 0  # the tick of row 0
+        self._shortest = self._without_calls()
 
     def tick(self, k: int) -> None:
         """Steps 1, 2, 3 and 5 for row k, whose plant state has been written: f[k] and z[k + 1]."""
@@ -157,24 +158,27 @@ class StepBuffer:
 
     def ticking(self) -> Callable[[int], object]:
         """`tick` by the shortest way that does it here."""
+        return self._shortest or self.tick
+
+    def _without_calls(self) -> Callable[[int], object] | None:
+        """`tick` where it is one product, and one look at the forces that a limiter may limit."""
         if self._quantised or self._line is not None or self.net is not None:
-            return self.tick
+            return None
         transition, seen, after = self._transition, self._input, self._output
         limiter = self.process.limiter
         if limiter is None or limiter.walls or self._memory.shape[1] > 1:
             return lambda k: transition(seen[k], after[k])
-        # a single simulation spends its time in calls: its forces are looked at without numpy
-        linear, number, width = self.process.linear, self._memory[:, 0].data, self._width
-        first = width - self.process.channels
-        sent = [(first + i, most) for i, most in zip(limiter.sent_rows.tolist(), limiter.limit.tolist(), strict=True)]
+        # a single simulation spends its time in calls: its forces are looked at without numpy, of two channels by name
+        linear, first = self.process.linear, self._width - self.process.channels
+        forces = [self._memory[first + i :: self._width, 0].data for i in limiter.sent_rows]
+        sent = list(zip(forces, (-limiter.limit).tolist(), limiter.limit.tolist(), strict=True))
+        (one, low, high), (other, lowest, highest), *others = sent if len(sent) > 1 else 2 * sent
 
         def tick(k: int) -> None:
             linear(seen[k], after[k])
-            row = width * k
-            for place, most in sent:
-                if not -most <= number[row + place] <= most:
-                    transition(seen[k], after[k])
-                    return
+            within = low <= one[k] <= high and lowest <= other[k] <= highest
+            if not within or (others and not all(least <= force[k] <= most for force, least, most in others)):
+                transition(seen[k], after[k])
 
         return tick
 

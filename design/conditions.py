@@ -308,7 +308,8 @@ def _scale_beside_zeros(V: Lti, demand: Demand[Any], w: Array) -> Array:
     """
     z = on_circle(w)
     free, gain = hermitian(demand.free.at(z)), hermitian(demand.gain.at(z))
-    _, sizes, right = np.linalg.svd(V.at(z))
+    response = V.at(z)
+    _, sizes, right = np.linalg.svd(response) if V.inputs > 1 else (1, np.abs(response[..., 0]), np.ones((1, 1)))
     static = float(np.abs(demand.static["V(1)"]).max())
     idle = (sizes <= _VANISHES * static) * (_SOFTENED * static)
     return least_multiple(free, gain + np.conj(np.swapaxes(right, -1, -2)) @ (idle[..., None] * right))

@@ -491,7 +491,7 @@ class _LimiterSearch:
     def requirement(self, ratio: float, w: float) -> Requirement:
         T = self._loop[0].T
         if np.isinf(ratio):
-            reason = f"no damping is enough for the limiter at {w / (2 * np.pi * T):.4g} Hz with this multiplier"
+            reason = f"no proof found with the limiter, for {w / (2 * np.pi * T):.4g} Hz"
             return refusal("limiter", self._delta, reason)
         return from_ratio("limiter", max(ratio, 0.0), self._delta, w / (2 * np.pi * T))
 

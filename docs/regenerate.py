@@ -92,8 +92,12 @@ def kept(output: str, pattern: str | None) -> str:
 
 def renewed(text: str, printed: dict[str, str]) -> str:
     """The page with what its commands have printed."""
+
+    def shown(block: re.Match[str]) -> str:
+        return block[1] + kept(printed[block[3]], block[2]) if block[3] in printed else block[0]
+
     for blocks in (SHOWN, MEASURED):
-        text = blocks.sub(lambda block: block[1] + kept(printed[block[3]], block[2]), text)
+        text = blocks.sub(shown, text)
     return text
 
 
@@ -149,16 +153,21 @@ def main() -> int:
     """Run every page that shows output, and rewrite those whose output is another."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="run the slow commands and compare, and write nothing")
-    if parser.parse_args().check:
+    parser.add_argument(
+        "pages", nargs="*", type=Path, metavar="PAGE", help="renew these alone, without what is measured"
+    )
+    args = parser.parse_args()
+    if args.check:
         return check()
+    some = {page.resolve() for page in args.pages}
     printed: dict[str, str] = {}
     with TemporaryDirectory() as place:
         folder = Path(place)
         for page in PAGES:
             text = page.read_text(encoding="utf-8")
-            if not any(kind.search(text) for kind in (SHOWN, MEASURED, PICTURE)):
+            if (some and page not in some) or not any(kind.search(text) for kind in (SHOWN, MEASURED, PICTURE)):
                 continue
-            measured = [Step("command", block[3]) for block in MEASURED.finditer(text)]
+            measured = [] if some else [Step("command", block[3]) for block in MEASURED.finditer(text)]
             for step in [*steps(text), *measured]:
                 if step.kind == "file":
                     (folder / step.name).write_text(step.text, encoding="utf-8")

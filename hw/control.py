@@ -24,10 +24,21 @@ from controller.environment import environment
 from controller.loop import force_map
 from controller.lti import Array, Lti
 from design.certificate import assess
-from design.coverage import Limits as ForceLimits
+from design.coverage import Limits
 from design.guarantees import guarantee_of
 from design.result import Design, DesignFailed, Requirement, certificate_part
-from hw.limits import Fault, Gain, Heat, Limits, Units, check_jolt, check_jump, check_range, check_speed, shape
+from hw.limits import (
+    Gain,
+    Heat,
+    SafetyLimits,
+    SafetyStop,
+    Units,
+    check_jolt,
+    check_jump,
+    check_range,
+    check_speed,
+    shape,
+)
 from hw.monitor import Ages, ClockMonitor, CommandMonitor, Counters, EncoderMonitor, EncoderTest, LinkSettings
 from hw.protocol import MAX_THETA, Config, State
 from sim.couplings import Chosen, choose, given, limits_of
@@ -43,13 +54,13 @@ class Controller(Protocol):
 
     T: float  # [s]
 
-    def step(self, x: Sequence[float]) -> Array:
+    def step(self, x: Sequence[float]) -> Sequence[float]:
         """Forces fed back (m,) [N] for the displacements x (m,) [m]."""
         ...
 
 
 class LinearController:
-    """[f; z+] = [C D; A B] [z; x], from rest. Allocates nothing per tick but the force that it returns."""
+    """[f; z+] = [C D; A B] [z; x], from rest."""
 
     def __init__(self, F: Lti) -> None:
         self.F, self.T = F, F.T
@@ -58,13 +69,13 @@ class LinearController:
         self._input, self._output = np.zeros(n + m), np.zeros(n + F.outputs)
         self._order = n
 
-    def step(self, x: Sequence[float]) -> Array:
+    def step(self, x: Sequence[float]) -> list[float]:
         """Forces (m,) [N] for the displacements x (m,) [m]; the state moves on by one tick."""
         n = self._order
         self._input[n:] = x
         np.dot(self._product, self._input, out=self._output)
         self._input[:n] = self._output[:n]
-        return self._output[n:].copy()
+        return self._output[n:].tolist()
 
 
 class _LimitedController:
@@ -76,13 +87,13 @@ class _LimitedController:
         self._tick = limiter.transition()
         self._input, self._output = (np.zeros((F.order + F.inputs, 1)) for _ in range(2))
 
-    def step(self, x: Sequence[float]) -> Array:
+    def step(self, x: Sequence[float]) -> list[float]:
         """Forces (m,) [N] within the limits for the displacements x (m,) [m]; the state moves on by one tick."""
         m, before, after = self._m, self._input, self._output
         before[-m:, 0] = x
         self._tick(before, after)
         before[:-m] = after[m:]
-        return after[:m, 0].copy()
+        return after[:m, 0].tolist()
 
 
 def host_controller(
@@ -190,7 +201,7 @@ class TraceRow(NamedTuple):
 
     tick: int  # modulo 2^16
     x: tuple[float, ...]  # (m,) [m]
-    asked: Array  # (m,) [N] by the controller
+    asked: Sequence[float]  # (m,) [N] by the controller
     gain: float
     sent: tuple[int, ...]  # [steps]
     state: State | None
@@ -206,7 +217,7 @@ class Drive:
         controller: Controller,
         units: Units,
         config: Config,
-        limits: Limits,
+        limits: SafetyLimits,
         settings: LinkSettings,
         counters: Counters,
         record: Callable[[TraceRow], None],
@@ -234,18 +245,15 @@ class Drive:
         """The force [steps] that answers `state`, which came at `now` [us], `ticks` after the one before.
 
         The gain rises (direction 1), falls (-1) or stays (0); it rises once every encoder has answered its test.
-        Raises Fault where the device, an encoder or the controller is out of bounds.
+        Raises SafetyStop where the device, an encoder or the controller is out of bounds.
         """
         if self.x is None:
             ticks = 1  # what went before does not count
         self._clock.check(state, ticks, now)
-        absolute = self.units.positions(state.counts)
-        check_range(absolute, self.units.reach)
+        check_range(state.counts, self.units)
         if self.reference is None:
             self.reference = state.counts if self._rereference else (0,) * state.axes
-        x = absolute
-        if any(self.reference):
-            x = self.units.positions(tuple(map(sub, state.counts, self.reference)))
+        x = self.units.positions(map(sub, state.counts, self.reference))
         self._check_motion(x, ticks)
         self._counters.unlike += self._commands.unlike(state, ticks)
         self._encoders.check(state.counts, state.applied, ticks)
@@ -260,7 +268,7 @@ class Drive:
             self.gain.rise(ticks)
         elif direction < 0:
             self.gain.fall(ticks)
-        shaped = shape(asked.tolist(), self.force, self.gain.value, self.limits, self.T, test)
+        shaped = shape(asked, self.force, self.gain.value, self.limits, self.T, test)
         force, steps = shaped.force, self.units.steps(shaped.force, self.config.cap)
         if self._budget:
             whole = self._budget.limit(steps, x, np.array(self.units.forces(state.applied)), ticks - 1)
@@ -275,7 +283,7 @@ class Drive:
         return steps
 
     def _check_motion(self, x: tuple[float, ...], ticks: int) -> None:
-        """Raise Fault where no hand moves to x (m,) [m] within so many ticks."""
+        """Raise SafetyStop where no hand moves to x (m,) [m] within so many ticks."""
         if self.x is not None:
             check_jump(x, self.x, ticks, self.limits)
             if ticks == 1 and self._before is not None:
@@ -311,7 +319,7 @@ def timed(
 
     T_max is the length that a fraction `quantile` of the device's ticks keeps, where it exceeds T. `at_once`: forces
     latch as they come, link 0, between the least age and the one that a fraction keeps, both with the guard. Raises
-    Fault where those are a period or longer.
+    SafetyStop where those are a period or longer.
     """
     T_us = 1e6 * scenario.T
     longest, known = ages.longest_tick(T_us, quantile), scenario.T_max or scenario.T
@@ -321,7 +329,7 @@ def timed(
         return scenario, link_delay(ages, T_us, quantile, guard_us)
     least, most = max(0.0, min(ages.values) - guard_us), ages.quantile(quantile) + guard_us
     if most >= min((T_us, *ages.ticks)):
-        raise Fault(f"answers come up to {most:.0f} us after their tick, T is {T_us:g} us: latch at ticks")
+        raise SafetyStop(f"answers come up to {most:.0f} us after their tick, T is {T_us:g} us: latch at ticks")
     return scenario.replace(latency=((1e-6 * least, 1e-6 * most),) * scenario.channels), 0
 
 
@@ -367,7 +375,7 @@ class CertifiedCoupling:
     case: str
     chosen: Chosen
     requirements: dict[str, Requirement]
-    limits: ForceLimits  # whether that holds for forces at the cap too
+    limits: Limits  # whether that holds for forces at the cap too
 
     @property
     def certified(self) -> bool:
@@ -434,10 +442,10 @@ def certified_coupling(
 
     Forces leave through the limiter that these cover, unless `limiter` is False.
 
-    Raises Fault where no coupling is certified for it, InputError where the request contradicts itself.
+    Raises SafetyStop where no coupling is certified for it, InputError where the request contradicts itself.
     """
     if link > MAX_THETA:
-        raise Fault(f"the link takes {link} ticks, the protocol carries at most theta = {MAX_THETA}")
+        raise SafetyStop(f"the link takes {link} ticks, the protocol carries at most theta = {MAX_THETA}")
     delays = tuple(max(n, link) for n in scenario.theta)
     slower = scenario.replace(theta=delays, latency=None if link else scenario.latency)
     try:
@@ -445,13 +453,13 @@ def certified_coupling(
         wanted = condition or ("this-environment" if slower.latency else None)
         chosen = choose(slower, case, name, wanted, limiter) if own is None else given(own)
     except DesignFailed as error:
-        raise Fault(f"no coupling for a link of {link} ticks: {error}") from None
+        raise SafetyStop(f"no coupling for a link of {link} ticks: {error}") from None
     requirements = assess(slower.loop(case), chosen.coupling, chosen.phi)
     limits = limits_of(slower, chosen, requirements, limiter)
     made = CertifiedCoupling(min(slower.theta) if link else 0, slower, case, chosen, requirements, limits)
     if not made.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"
-        raise Fault(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(made)}")
+        raise SafetyStop(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(made)}")
     return made
 
 
@@ -467,8 +475,8 @@ def certified_couplings(
     """The coupling for the measured delay and up to `spare` softer ones, each for one tick more.
 
     A softer one is of the same kind or from the same file; where that is not certified for the longer delay, it is
-    the spring-damper by Theorem 4, which guarantees the most. Raises Fault where the first coupling is not certified;
-    where no softer one is, the ladder ends.
+    the spring-damper by Theorem 4, which guarantees the most. Where no softer one is, the ladder ends. Raises
+    SafetyStop where the first coupling is not certified.
     """
     found = [certified_coupling(scenario, case, name, condition, link, limiter=limiter)]
     wanted = [(name, condition), _FALLBACK]
@@ -476,7 +484,7 @@ def certified_couplings(
         kind, by = wanted[0]
         try:
             found.append(certified_coupling(scenario, case, kind, by, found[-1].link + 1, limiter=limiter))
-        except (Fault, InputError):
+        except (SafetyStop, InputError):
             wanted.pop(0)
     return tuple(found)
 

@@ -14,10 +14,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from controller.lti import Array
 from hw.control import CertifiedCoupling, certified_couplings, link_delay
 from hw.emulator import Emulator, FaultInjection, info_of
-from hw.limits import ENDED, Limits, Stage
+from hw.limits import ENDED, SafetyLimits, Stage
 from hw.monitor import Ages, LinkSettings
 from hw.protocol import Info
 from hw.rehearsal import Plan, Rehearsal
@@ -65,10 +64,10 @@ def _spoiled(force: float | None) -> _Call:
     """A controller that from now on asks for `force` [N]; one that raises where that is None."""
 
     def call(session: Session, now: int) -> Said:
-        def step(x: Sequence[float]) -> Array:
+        def step(x: Sequence[float]) -> Sequence[float]:
             if force is None:
                 raise ZeroDivisionError("division by zero")
-            return np.full(len(x), force)
+            return [force] * len(x)
 
         assert session.drive is not None
         session.drive.controller.step = step
@@ -280,7 +279,7 @@ def rehearse_case(
     cap = tuple(d.force_limit for d in scenario.device)
     session = Session(
         scenario,
-        Limits(cap, continuous=case.continuous, thermal=1.0),
+        SafetyLimits(cap, continuous=case.continuous, thermal=1.0),
         LinkSettings(case.baud, _MEASURED, deadman=case.deadman),
     )
     faults = tuple(FaultInjection.parse(text) for text in case.faults)

@@ -90,11 +90,10 @@ class _Player:
 
     def __init__(self, excitation: Excitation) -> None:
         self.T = excitation.T
-        self._signal, self._k = excitation.signal, 0
+        self._forces = iter(excitation.signal.tolist())
 
-    def step(self, x: Sequence[float]) -> Array:
-        k, self._k = self._k, self._k + 1
-        return self._signal[k] if k < len(self._signal) else np.zeros(len(x))
+    def step(self, x: Sequence[float]) -> Sequence[float]:
+        return next(self._forces, [0.0] * len(x))
 
 
 def chirp(

@@ -7,9 +7,10 @@ max(-12, min(12, nan)) is +12.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 from hw.protocol import MAX_RELEASE_NS, MAX_THETA, PROTOCOL, Config, Force, Info, State, wire_bytes
 from models.device import require
@@ -44,12 +45,12 @@ ENDED = frozenset({Stage.FINISHED, Stage.REFUSED, Stage.STOPPED, Stage.LOST, Sta
 DRIVING = frozenset({Stage.ARMING, Stage.ARMED, Stage.DISARMING})
 
 
-class Fault(Exception):
+class SafetyStop(Exception):
     """A reason to stop, in the words of the log."""
 
 
 @dataclass(frozen=True)
-class Limits:
+class SafetyLimits:
     """The host's own limits; the device has the same ones in its firmware."""
 
     cap: tuple[float, ...]  # (m,) [N] largest force
@@ -78,8 +79,7 @@ class Limits:
             require(f"continuous[{i}]", most, 1e-3, cap, "N")
 
 
-@dataclass(frozen=True)
-class _Shaped:
+class _Shaped(NamedTuple):
     """A force that may be sent, and what had to be done to it."""
 
     force: tuple[float, ...]  # (m,) [N]
@@ -88,16 +88,16 @@ class _Shaped:
 
 
 def _require_finite(force: Sequence[float]) -> None:
-    """Raise Fault where a force is not a number or infinite."""
+    """Raise SafetyStop where a force is not a number or infinite."""
     if not all(map(math.isfinite, force)):
-        raise Fault(f"the controller asked for {', '.join(f'{f:g}' for f in force)} N, which is no force")
+        raise SafetyStop(f"the controller asked for {', '.join(f'{f:g}' for f in force)} N, which is no force")
 
 
 def shape(
     asked: Sequence[float],
     previous: Sequence[float],
     gain: float,
-    limits: Limits,
+    limits: SafetyLimits,
     T: float,
     test: Sequence[float] | None = None,
 ) -> _Shaped:
@@ -105,55 +105,61 @@ def shape(
 
     `test` (m,) [N] is added behind the gain: what an encoder is tested with.
 
-    Raises Fault where `asked` is not finite; that is looked at first, and the result is looked at again.
+    Raises SafetyStop where `asked` is not finite; that is looked at first, and the result is looked at again.
     """
     _require_finite(asked)
     if not 0.0 <= gain <= 1.0:
-        raise Fault(f"the gain is {gain}, expected a number within [0, 1]")
+        raise SafetyStop(f"the gain is {gain}, expected a number within [0, 1]")
+    wishes = [gain * one for one in asked]
+    if test:
+        wishes = [one + more for one, more in zip(wishes, test, strict=True)]
+        _require_finite(wishes)
     step, clipped, slowed, force = limits.slew * T, False, False, []
-    wishes = [gain * one + more for one, more in zip(asked, test or (0.0,) * len(asked), strict=True)]
-    _require_finite(wishes)
     for wanted, last, cap in zip(wishes, previous, limits.cap, strict=True):
-        capped = max(-cap, min(cap, wanted))
-        sent = max(last - step, min(last + step, capped))
-        clipped |= abs(wanted) >= cap
-        slowed |= sent != capped
+        sent = wanted
+        if not -cap < sent < cap:
+            clipped, sent = True, math.copysign(cap, sent)
+        if not last - step <= sent <= last + step:
+            slowed, sent = True, last + math.copysign(step, sent - last)
         force.append(sent)
     _require_finite(force)
     return _Shaped(tuple(force), clipped, slowed)
 
 
-def check_jump(x: Sequence[float], previous: Sequence[float], ticks: int, limits: Limits) -> None:
-    """Raise Fault where an encoder moved further in `ticks` ticks than a hand can: x, previous (m,) [m]."""
+def check_jump(x: Sequence[float], previous: Sequence[float], ticks: int, limits: SafetyLimits) -> None:
+    """Raise SafetyStop where an encoder moved further in `ticks` ticks than a hand can: x, previous (m,) [m]."""
     for i, (now, before) in enumerate(zip(x, previous, strict=True), start=1):
         if not abs(now - before) <= limits.jump * ticks:
             allowed = f"{1e3 * limits.jump * ticks:g} mm in {ticks} tick{'s' if ticks > 1 else ''}"
-            raise Fault(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
+            raise SafetyStop(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
 
 
-def check_jolt(x: Sequence[float], previous: Sequence[float], before: Sequence[float], limits: Limits) -> None:
-    """Raise Fault where an encoder's speed changed within a tick by more than `limits.jump` per tick, as no mass can.
+def check_jolt(x: Sequence[float], previous: Sequence[float], before: Sequence[float], limits: SafetyLimits) -> None:
+    """Raise SafetyStop where a speed changed within a tick by more than `limits.jump` per tick, as no mass can.
 
     x, previous, before: (m,) [m], of three ticks in a row.
     """
     for i, (now, last, first) in enumerate(zip(x, previous, before, strict=True), start=1):
         if not (change := abs(now - 2 * last + first)) <= limits.jump:
             most = f"{1e3 * limits.jump:g} mm in a tick"
-            raise Fault(f"encoder {i} shakes: its speed changed by {1e3 * change:.3g} mm in a tick, allowed are {most}")
+            raise SafetyStop(
+                f"encoder {i} shakes: its speed changed by {1e3 * change:.3g} mm in a tick, allowed are {most}"
+            )
 
 
-def check_speed(x: Sequence[float], before: Sequence[float], seconds: float, limits: Limits) -> None:
-    """Raise Fault where an axis moved faster than allowed: x now, `before` so many `seconds` ago, (m,) [m]."""
+def check_speed(x: Sequence[float], before: Sequence[float], seconds: float, limits: SafetyLimits) -> None:
+    """Raise SafetyStop where an axis moved faster than allowed: x now, `before` so many `seconds` ago, (m,) [m]."""
     for i, (now, then) in enumerate(zip(x, before, strict=True), start=1):
         if not (speed := abs(now - then) / seconds) <= limits.speed:
-            raise Fault(f"axis {i} moves at {speed:.3g} m/s, allowed are {limits.speed:g} m/s while forces act")
+            raise SafetyStop(f"axis {i} moves at {speed:.3g} m/s, allowed are {limits.speed:g} m/s while forces act")
 
 
-def check_range(x: Sequence[float], reach: Sequence[float]) -> None:
-    """Raise Fault where a displacement x (m,) [m] is outside of what the device can reach: +-reach (m,) [m]."""
-    for i, (now, most) in enumerate(zip(x, reach, strict=True), start=1):
-        if not abs(now) <= most:
-            raise Fault(f"encoder {i} is at {1e3 * now:.4g} mm, its range is +-{1e3 * most:.4g} mm")
+def check_range(counts: Sequence[int], units: Units) -> None:
+    """Raise SafetyStop where an encoder (m,) [counts] is outside of what the device can reach."""
+    for i, (now, most) in enumerate(zip(counts, units.range, strict=True)):
+        if not -most <= now <= most:
+            mm = 1e3 * units.encoder_step[i]
+            raise SafetyStop(f"encoder {i + 1} is at {mm * now:.4g} mm, its range is +-{mm * most:.4g} mm")
 
 
 @dataclass
@@ -163,7 +169,7 @@ class Gain:
     Any constant gain within [0, 1] keeps a certificate: He[g F/(z-1)] > -Delta_D/T holds for g F if it does for F.
     """
 
-    limits: Limits
+    limits: SafetyLimits
     T: float  # [s]
     value: float = 0.0
 
@@ -184,17 +190,17 @@ class Heat:
     At a constant force F it reaches the continuous force's square after -tau ln(1 - (F_continuous / F)^2).
     """
 
-    def __init__(self, limits: Limits, T: float) -> None:
+    def __init__(self, limits: SafetyLimits, T: float) -> None:
         self._limits, self._T = limits, T
         self._squares = [0.0] * len(limits.continuous)  # [N^2]
 
     def check(self, force: Sequence[float], ticks: int) -> None:
-        """Take in the force (m,) [N] that acts for so many ticks. Raise Fault where a motor gets too hot."""
+        """Take in the force (m,) [N] that acts for so many ticks. Raise SafetyStop where a motor gets too hot."""
         part = -math.expm1(-ticks * self._T / self._limits.thermal)
         for i, most in enumerate(self._limits.continuous):
             self._squares[i] += (force[i] ** 2 - self._squares[i]) * part
             if self._squares[i] > most**2:
-                raise Fault(
+                raise SafetyStop(
                     f"motor {i + 1} gets hot: {self._squares[i] ** 0.5:.3g} N rms, {most:g} N are allowed for long"
                 )
 
@@ -208,17 +214,16 @@ class Units:
 
     encoder_step: tuple[float, ...]  # (m,) [m]
     force_step: tuple[float, ...]  # (m,) [N]
-    reach: tuple[float, ...]  # (m,) [m]
+    range: tuple[int, ...]  # (m,) [counts] the workspace is +-range
 
     @classmethod
     def of(cls, info: Info) -> Units:
         encoder = tuple(1e-12 * step for step in info.encoder_step)
-        reach = tuple(step * counts for step, counts in zip(encoder, info.range, strict=True))
-        return cls(encoder, tuple(1e-6 * step for step in info.force_step), reach)
+        return cls(encoder, tuple(1e-6 * step for step in info.force_step), info.range)
 
-    def positions(self, counts: tuple[int, ...]) -> tuple[float, ...]:
+    def positions(self, counts: Iterable[int]) -> tuple[float, ...]:
         """Displacements (m,) [m]."""
-        return tuple(n * step for n, step in zip(counts, self.encoder_step, strict=True))
+        return tuple([n * step for n, step in zip(counts, self.encoder_step, strict=True)])
 
     def forces(self, steps: tuple[int, ...]) -> tuple[float, ...]:
         """Forces fed back f (m,) [N], from what the motors do."""
@@ -227,8 +232,10 @@ class Units:
     def steps(self, f: Sequence[float], cap: tuple[int, ...]) -> tuple[int, ...]:
         """What the motors are to do for the forces fed back f (m,) [N]: whole steps, at most `cap`."""
         return tuple(
-            max(-most, min(most, round(-force / step)))
-            for force, step, most in zip(f, self.force_step, cap, strict=True)
+            [
+                max(-most, min(most, round(-force / step)))
+                for force, step, most in zip(f, self.force_step, cap, strict=True)
+            ]
         )
 
 
@@ -239,7 +246,7 @@ def _wire_time(baud: int, axes: int) -> tuple[float, str]:
     return seconds, f"({up} + {down}) bytes x {_BITS_PER_BYTE} bits / {baud} baud = {1e6 * seconds:.0f} us"
 
 
-def objections(info: Info, scenario: Scenario, limits: Limits, baud: int | None) -> list[str]:
+def objections(info: Info, scenario: Scenario, limits: SafetyLimits, baud: int | None) -> list[str]:
     """Why this device may not run this scenario over this line; empty where nothing is wrong. baud None: no UART."""
     if info.version != PROTOCOL:
         spoken = f"the device speaks version {info.version} of the protocol, this host version {PROTOCOL}"
@@ -281,7 +288,7 @@ def _impossible(i: int, info: Info) -> str | None:
     return None
 
 
-def _coarse(i: int, info: Info, limits: Limits, T: float) -> list[str]:
+def _coarse(i: int, info: Info, limits: SafetyLimits, T: float) -> list[str]:
     """What is too coarse on axis i for limits on forces and displacements to mean anything."""
     reasons, force, count = [], 1e-6 * info.force_step[i], 1e-12 * info.encoder_step[i]
     finest = min(limits.cap[i] / _FEWEST_STEPS, limits.slew * T)
@@ -315,7 +322,7 @@ def watchdog_for(T: float) -> int:
     return silence
 
 
-def configuration(info: Info, limits: Limits, theta: int) -> Config:
+def configuration(info: Info, limits: SafetyLimits, theta: int) -> Config:
     """What the device is told: never more than the host allows itself, nor than the device can do."""
     T_ns = info.period_ns
     ramp = max(1, min(0xFF, math.ceil(1000 * _RAMP_US / T_ns)))

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from hw.device import cap_after, limited
-from hw.limits import DRIVING, Fault, Limits, Stage
+from hw.device import limited
+from hw.limits import DRIVING, SafetyLimits, SafetyStop, Stage
 from hw.protocol import NO_MARGIN, Config, Phase, State, distance
 
 _STATES_PER_ANSWER = 8  # at most: a USB frame of 1 ms may bring several FORCEs, of which one margin is told
@@ -67,12 +67,12 @@ class Ages:
         return float(longest) if longest > T_us + _CLOCK_US else T_us
 
     def quantile(self, q: float) -> int:
-        """The least age that a fraction q of all forces does not exceed. Raises Fault where so many never arrive."""
+        """The least age that a fraction q of forces does not exceed. Raises SafetyStop where so many never arrive."""
         ordered, everything = sorted(self.values), len(self.values) + self.missing
         place = min(everything - 1, int(q * everything))
         if place >= len(ordered):
             part = 100 * self.missing / everything
-            raise Fault(f"{part:.2g} % of the answers never arrived: no delay keeps {100 * q:g} % (--quantile)")
+            raise SafetyStop(f"{part:.2g} % of the answers never arrived: no delay keeps {100 * q:g} % (--quantile)")
         return ordered[place]
 
     @property
@@ -94,7 +94,7 @@ class Measurement:
         self._states = 0
 
     def note(self, state: State, margin: int | None, missed: int) -> bool:
-        """Take in a STATE; whether that was the last one. Raises Fault where the link cannot be used."""
+        """Take in a STATE; whether that was the last one. Raises SafetyStop where the link cannot be used."""
         self._first = self._first or state
         if self._last and distance(state.tick, self._last.tick) == 1:
             self._ticks.append((state.t_us - self._last.t_us) & 0xFFFFFFFF)
@@ -112,7 +112,7 @@ class Measurement:
             return False
         part = 1 - len(self.ages) / (everything if everything >= self._needed else counted)
         if part > self._most_missing:
-            raise Fault(f"{100 * part:.0f} % of the answers never reached the device, {self._states} STATEs came")
+            raise SafetyStop(f"{100 * part:.0f} % of the answers never reached the device, {self._states} STATEs came")
         self._check_clock(state)
         return True
 
@@ -131,7 +131,7 @@ class Measurement:
         ticks = distance(state.tick, self._first.tick)
         if ticks > 0 and abs(elapsed / (ticks * self._T_us) - 1) > _MEASURED_TOLERANCE:
             each = elapsed / ticks
-            raise Fault(f"a tick of the device lasts {each:.1f} us by its own clock, T is {self._T_us:g} us")
+            raise SafetyStop(f"a tick of the device lasts {each:.1f} us by its own clock, T is {self._T_us:g} us")
 
 
 # lateness
@@ -211,17 +211,17 @@ class LinkMonitor:
     def too_late(self) -> str | None:
         """Whether the link has become slower than the coupling was certified for, in words.
 
-        Parts are of a whole window, however few ticks there were yet. Raises Fault where too little arrives at all.
+        Parts are of a whole window, however few ticks there were yet. Raises SafetyStop where too little arrives.
         """
         window, most = self.settings.window, self.settings.missed
         late, missed = self._late / window, min(1.0, self._missed / window)
         if missed > most + late:
-            raise Fault(f"{100 * missed:.0f} % of the last {window} ticks had no answer in time")
+            raise SafetyStop(f"{100 * missed:.0f} % of the last {window} ticks had no answer in time")
         if self._gaps / window > most:
             part = f"{100 * self._gaps / window:.0f} % of {window} ticks"
-            raise Fault(f"no STATE came of {part}: nobody can say what the device did")
+            raise SafetyStop(f"no STATE came of {part}: nobody can say what the device did")
         if self._untold / window > _UNTOLD:
-            raise Fault(
+            raise SafetyStop(
                 f"{100 * _UNTOLD:g} % of the last {window} STATEs told no margin: nobody can say how late answers are"
             )
         if late > self.settings.late:
@@ -256,18 +256,20 @@ class ClockDrift:
     _freeze: float = 0.0  # [us] the longest single part of it
 
     def note(self, at_us: int, ticks: int) -> None:
-        """The clock shows `at_us` (modulo 2^32), `ticks` after the call before. Raises Fault where it drifts."""
+        """The clock shows `at_us` (modulo 2^32), `ticks` after the call before. Raises SafetyStop where it drifts."""
         if self._last is not None:
             elapsed = (at_us - self._last + 2**31) % 2**32 - 2**31
             late = elapsed - ticks * self.T_us
-            self._behind += late
-            self._freeze = min(self.forgiven_us, max(self._freeze, late))
+            drift = self._behind = self._behind + late
+            if late > self._freeze:
+                self._freeze = min(self.forgiven_us, late)
             self._ticks += ticks
-            drift = self._behind - max(0.0, min(self._freeze, self._behind))
+            if drift > 0:
+                drift -= min(self._freeze, drift)
             if abs(drift) > self.tolerance * BLOCK * self.T_us:
                 lasts = self.T_us + drift / self._ticks
                 what = f"over {self._ticks} tick{'s' if self._ticks > 1 else ''}, T is {self.T_us:g} us"
-                raise Fault(f"a tick of the device lasts {lasts:.4g} us by {self.whose} clock {what}")
+                raise SafetyStop(f"a tick of the device lasts {lasts:.4g} us by {self.whose} clock {what}")
             if self._ticks >= BLOCK:
                 self._ticks, self._behind, self._freeze = 0, 0.0, 0.0
         self._last = at_us
@@ -276,16 +278,16 @@ class ClockDrift:
 class ClockMonitor:
     """Both clocks, and the number of the tick, while forces act."""
 
-    def __init__(self, limits: Limits, T: float) -> None:
+    def __init__(self, limits: SafetyLimits, T: float) -> None:
         T_us = 1e6 * T
         self.most = max(1, int(limits.watchdog_us / T_us))  # [ticks] that may be missing at once
         self._device = ClockDrift("its own", T_us, _DEVICE_TOLERANCE, limits.watchdog_us)
         self._host = ClockDrift("the host's", T_us, _HOST_TOLERANCE, limits.watchdog_us)
 
     def check(self, state: State, ticks: int, now: int) -> None:
-        """Raise Fault where the STATE that came at `now` [us] cannot be `ticks` after the one before."""
+        """Raise SafetyStop where the STATE that came at `now` [us] cannot be `ticks` after the one before."""
         if ticks > self.most:
-            raise Fault(f"the tick number leapt by {ticks}, the watchdog allows {self.most}")
+            raise SafetyStop(f"the tick number leapt by {ticks}, the watchdog allows {self.most}")
         self._device.note(state.t_us, ticks)
         self._host.note(now, ticks)
 
@@ -294,19 +296,20 @@ class ClockMonitor:
 
 
 def check_state(state: State, config: Config, stage: Stage, gain: float) -> None:
-    """Raise Fault where the device is where it may not be, or has a force that nobody can have asked for."""
-    strongest = max(abs(a) - c for a, c in zip(state.applied, config.cap, strict=True))
-    if strongest > 0:
-        raise Fault(f"the device applies {state.applied} steps, the cap is {config.cap}")
-    if state.phase in (Phase.STOPPED, Phase.RAMP, Phase.SILENT):
-        raise Fault(f"the device is in {state.phase.name.lower()}, cause {state.cause.name.lower()}")
-    armed = state.phase in (Phase.ARMED, Phase.HOLDING)
+    """Raise SafetyStop where the device is where it may not be, or has a force that nobody can have asked for."""
+    for force, cap in zip(state.applied, config.cap, strict=True):
+        if not -cap <= force <= cap:
+            raise SafetyStop(f"the device applies {state.applied} steps, the cap is {config.cap}")
+    phase = state.phase
+    if phase in (Phase.STOPPED, Phase.RAMP, Phase.SILENT):
+        raise SafetyStop(f"the device is in {phase.name.lower()}, cause {state.cause.name.lower()}")
+    armed = phase in (Phase.ARMED, Phase.HOLDING)
     if armed and stage not in DRIVING:
-        raise Fault("the device is armed, and nobody asked it to")
+        raise SafetyStop("the device is armed, and nobody asked it to")
     if not armed and (stage in (Stage.ARMED, Stage.DISARMING) or gain > 0):
-        raise Fault("the device has disarmed itself")
+        raise SafetyStop("the device has disarmed itself")
     if not armed and any(state.applied):
-        raise Fault(f"the device is disarmed and applies {state.applied} steps")
+        raise SafetyStop(f"the device is disarmed and applies {state.applied} steps")
 
 
 class CommandMonitor:
@@ -328,25 +331,26 @@ class CommandMonitor:
     def unlike(self, state: State, ticks: int) -> bool:
         """Whether the device applies what it cannot have been told; a STATE after a gap is not judged.
 
-        Raises Fault where that goes on.
+        Raises SafetyStop where that goes on.
         """
-        self._holding = self._holding + 1 if state.phase == Phase.HOLDING else 0
+        phase = state.phase
+        self._holding = self._holding + 1 if phase == Phase.HOLDING else 0
         if self._holding > self._config.hold:
-            raise Fault(f"the device holds a force for {self._holding} ticks, {self._config.hold} are agreed")
+            raise SafetyStop(f"the device holds a force for {self._holding} ticks, {self._config.hold} are agreed")
         told, last = self._forces.pop(state.tick, None), self._last
         self._last = state
-        if last is None or state.phase == Phase.DISARMED:
+        if last is None or phase == Phase.DISARMED:
             return False
         if last.phase != Phase.DISARMED:
             fewest, most = self._run
-            self._run = (fewest + (state.phase == Phase.ARMED), most + ticks)
+            self._run = (fewest + (phase == Phase.ARMED), most + ticks)
         if ticks > 1:
             return False
         wrong = not self._could(state, last.applied, told)
         self._unlike = max(0, self._unlike + (_FORGETTING if wrong else -1))
         if self._unlike > _FORGETTING * (PATIENCE - 1):
-            what = f"told {told}" if state.phase == Phase.ARMED else f"to hold {last.applied}"
-            raise Fault(f"the device applies {state.applied} steps, it was {what}, and so for {PATIENCE} ticks")
+            what = f"told {told}" if phase == Phase.ARMED else f"to hold {last.applied}"
+            raise SafetyStop(f"the device applies {state.applied} steps, it was {what}, and so for {PATIENCE} ticks")
         return wrong
 
     def _could(self, state: State, last: tuple[int, ...], told: tuple[int, ...] | None) -> bool:
@@ -354,16 +358,11 @@ class CommandMonitor:
             return state.applied == last
         if told is None:
             return False
-        config = self._config
-        fewest, most = self._run
-        for force, before, asked, cap, slew in zip(state.applied, last, told, config.cap, config.slew, strict=True):
-            low = high = limited(asked, before, cap_after(config, cap, most), slew)
-            if fewest < most and fewest < config.ramp_in:
-                other = limited(asked, before, cap_after(config, cap, fewest), slew)
-                low, high = min(low, other), max(high, other)
-            if not low - _ROUNDING <= force <= high + _ROUNDING:
-                return False
-        return True
+        could = [limited(self._config, run, last, told) for run in set(self._run)]
+        return state.applied in could or all(
+            min(either) - _ROUNDING <= force <= max(either) + _ROUNDING
+            for force, *either in zip(state.applied, *could, strict=True)
+        )
 
 
 # encoders: a hand that holds still looks like a cable that is off, but no hand is as stiff as a dead encoder
@@ -372,8 +371,8 @@ class CommandMonitor:
 class EncoderTest:
     """A small force on every axis, up and down by turns and growing, until its encoder has moved by more than a count.
 
-    A free handle of 0.25 kg answers an encoder of 10 um within 25 ms, at 0.1 N. Raises Fault, naming the axis, where
-    1 N, or as much as is allowed, was answered by nothing.
+    A free handle of 0.25 kg answers an encoder of 10 um within 25 ms, at 0.1 N. Raises SafetyStop, naming the axis,
+    where 1 N, or as much as is allowed, was answered by nothing.
     """
 
     def __init__(self, cap: Sequence[float], T: float) -> None:
@@ -393,7 +392,7 @@ class EncoderTest:
         if t > _TEST_SECONDS:
             strongest = min(_TEST_FORCE, self._cap[dead[0]])
             what = f"it moved by {self._band[dead[0]][1] - self._band[dead[0]][0]} counts at a test force of"
-            raise Fault(f"encoder of axis {dead[0] + 1} does not follow: {what} up to {strongest:g} N")
+            raise SafetyStop(f"encoder of axis {dead[0] + 1} does not follow: {what} up to {strongest:g} N")
         size = _TEST_FORCE * t / _TEST_SECONDS * (-1 if int(t / _TEST_HALF) % 2 else 1)
         self._ticks += ticks
         return tuple(
@@ -418,7 +417,7 @@ class EncoderMonitor:
         self._impulse = [0.0] * len(force_step)  # [N s] since then
 
     def check(self, counts: Sequence[int], applied: Sequence[int], ticks: int) -> None:
-        """Raise Fault where an encoder has not moved. `applied` (m,) [steps] acts from these `counts` (m,) on."""
+        """Raise SafetyStop where an encoder has not moved. `applied` (m,) [steps] acts from these `counts` (m,) on."""
         if self._band is None:
             self._band = [[n, n] for n in counts]
         for i, (n, steps) in enumerate(zip(counts, applied, strict=True)):
@@ -436,4 +435,4 @@ class EncoderMonitor:
                 self._impulse[i] += change * ticks * self._T
             if self._impulse[i] > max(_IMPULSE, 8.0 * (self._encoder_step[i] * _HEAVIEST * change) ** 0.5):
                 still = f"it stands still while the force changes by {change:.3g} N"
-                raise Fault(f"encoder of axis {i + 1} does not follow: {still}")
+                raise SafetyStop(f"encoder of axis {i + 1} does not follow: {still}")

@@ -10,11 +10,11 @@ import hashlib
 import json
 import os
 import time
-from array import array
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
+from struct import Struct
 from typing import Annotated, Any, BinaryIO
 
 import msgspec
@@ -26,7 +26,7 @@ from controller.loop import named_today
 from controller.lti import Array
 from design.files import read_arrays, write, write_json
 from hw.control import BudgetPlan, CertifiedCoupling, Controller, Program, SentBudget, TraceRow, host_controller
-from hw.limits import Fault, Limits, Units, shape
+from hw.limits import SafetyLimits, SafetyStop, Units, shape
 from hw.protocol import NO_MARGIN, Config
 from hw.session import Session
 from models.device import require
@@ -39,48 +39,37 @@ _LATER = {"test": 2}  # that older traces lack
 _FLOATS, _WHOLE = ("asked", "gain", "test"), ("tick", "arming", "sent", "margin_us", "status")
 #: link array -> least and most that a session writes
 _RANGES = {"gain": (0.0, 1.0), "tick": (0, 0xFFFF), "sent": (-0x7FFF, 0x7FFF), "margin_us": (-0x8000, 0x7FFF)}
+_ONCE = ("tick", "arming", "margin_us", "status")  # whole numbers of which a row of the record has one
 _PERCENTILES = (50, 90, 99, 100)
 
 
 class Recorder:
-    """Collects rows in compact arrays: about 100 bytes a tick."""
+    """Collects rows as bytes: about 100 a tick."""
 
     def __init__(self, channels: int) -> None:
-        self.channels = channels
-        self._floats = array("d")  # x, asked, gain
-        self._whole = array("i")  # tick, arming, received, sent, applied, margin, status
+        m = self.channels = channels
+        floats = [("x", "<f8", m), ("asked", "<f8", m), ("test", "<f8", m), ("gain", "<f8")]
+        whole = [("sent", "<i4", m), ("applied", "<i4", m), *((name, "<i4") for name in _ONCE), ("received", "?")]
+        self._row, self._form = np.dtype([*floats, *whole]), Struct(f"<{3 * m + 1}d{2 * m + len(_ONCE)}i?")
+        self._rows, self._zero = bytearray(), (0,) * m
 
     def __call__(self, row: TraceRow) -> None:
         """Take in one tick."""
-        m, state = self.channels, row.state
-        self._floats.extend((*row.x, *row.asked, row.gain, *(row.test or (0.0,) * m)))
+        state, zero = row.state, self._zero
         if state is None:
-            self._whole.extend((row.tick, row.arming, 0, *(0,) * (2 * m), NO_MARGIN, 0))
+            sent, applied, margin, status = zero, zero, NO_MARGIN, 0
         else:
-            self._whole.extend((row.tick, row.arming, 1, *row.sent, *state.applied, state.margin_us, state.status))
+            sent, applied, margin, status = row.sent, state.applied, state.margin_us, state.status
+        floats, whole = (*row.x, *row.asked, *(row.test or zero), row.gain), (row.tick, row.arming, margin, status)
+        self._rows += self._form.pack(*floats, *sent, *applied, *whole, state is not None)
 
     def __len__(self) -> int:
-        return len(self._floats) // (3 * self.channels + 1)
+        return len(self._rows) // self._form.size
 
     def link(self) -> dict[str, NDArray[Any]]:
         """Arrays by the names of _LINK, with `x` (N, m) [m] and `applied` (N, m) [steps] beside them."""
-        m, n = self.channels, len(self)
-        floats = np.array(self._floats).reshape(n, 3 * m + 1)
-        whole = np.array(self._whole).reshape(n, 2 * m + 5)
-        tick, arming, received, sent, applied, rest = np.split(whole, [1, 2, 3, 3 + m, 3 + 2 * m], axis=1)
-        return {
-            "x": floats[:, :m],
-            "asked": floats[:, m : 2 * m],
-            "gain": floats[:, 2 * m],
-            "test": floats[:, 2 * m + 1 :],
-            "tick": tick[:, 0],
-            "arming": arming[:, 0],
-            "received": received[:, 0].astype(bool),
-            "sent": sent,
-            "applied": applied,
-            "margin_us": rest[:, 0],
-            "status": rest[:, 1],
-        }
+        rows = np.frombuffer(bytes(self._rows), self._row)
+        return {name: rows[name] for name in rows.dtype.names or ()}
 
 
 def steady_ticks(recorder: Recorder, force_step: Sequence[float], cap: Sequence[float]) -> list[list[int]]:
@@ -324,7 +313,7 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scenario: Scenario
     coupling: Form
     link_delay: int
-    limits: Limits
+    limits: SafetyLimits
     force_step: tuple[float, ...]
     cap: tuple[int, ...]
     energy_budget: BudgetPlan | None = None
@@ -391,8 +380,8 @@ def recipes_of(result: Trace) -> list[_Recipe]:
 
 
 def _require_limits(raw: object) -> None:
-    """Raise ValueError where a recipe has other limits than Limits: msgspec passes over those of a dataclass."""
-    names = {field.name for field in fields(Limits)}
+    """Raise ValueError where a recipe has other limits than SafetyLimits: msgspec passes over those of a dataclass."""
+    names = {field.name for field in fields(SafetyLimits)}
     needed = names - {"speed", "continuous", "thermal"}  # which older traces lack
     for recipe in raw if isinstance(raw, list) else []:
         limits = recipe.get("limits") if isinstance(recipe, dict) else None
@@ -422,7 +411,7 @@ def _again(
     """The `ticks` of one arming: forces asked for and steps sent, written to `into`."""
     controller, units = (
         recipe.controller(),
-        Units((1.0,) * len(recipe.cap), recipe.force_step, (1.0,) * len(recipe.cap)),
+        Units((1.0,) * len(recipe.cap), recipe.force_step, (1,) * len(recipe.cap)),
     )
     force: Sequence[float] = (0.0,) * len(recipe.cap)
     asked, sent = into
@@ -436,7 +425,7 @@ def _again(
             gain = float(link["gain"][k])
             test = link["test"][k].tolist()
             force = shape(asked[k].tolist(), force, gain, recipe.limits, recipe.scenario.T, test).force
-        except Fault as fault:
+        except SafetyStop as fault:
             raise InputError(f"the trace cannot be replayed: tick {k}: {fault}") from None
         steps = units.steps(force, recipe.cap)
         if budget:

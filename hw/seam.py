@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from hw import protocol as wire
 from hw.control import Program
-from hw.limits import Fault, Stage
+from hw.limits import SafetyStop, Stage
 from hw.monitor import Ages
 from hw.session import Said, Session
 
@@ -87,7 +87,7 @@ class SerialDevice:
         return answer if isinstance(answer, wire.Info) else None
 
     def configure(self, config: wire.Config) -> int | None:
-        """Asked again while the device is still on its way to zero force. Raises Fault where it drives by itself."""
+        """Asked again while the device is on its way to zero force. Raises SafetyStop where it drives by itself."""
         answer = self._answer(config)
         if (
             not isinstance(answer, wire.Ack)
@@ -121,7 +121,7 @@ class SerialDevice:
         if isinstance(message, wire.State) and message.drives:
             self.stop(wire.Reason.FAULT)
             if isinstance(question, wire.Config) and now - self._begun > _STOPPING:
-                raise Fault("the device drives, and nobody asked it to")
+                raise SafetyStop("the device drives, and nobody asked it to")
         return message
 
     def _next(self) -> wire.Message | None:
@@ -177,7 +177,7 @@ class Driver:
             assert session.config
             try:
                 answer = self.device.configure(session.config)
-            except Fault as fault:
+            except SafetyStop as fault:
                 return self.do(session.fail(str(fault), self.clock()))
             if answer is not None:
                 self.do(session.configured(answer, self.clock()))
@@ -192,6 +192,6 @@ class Driver:
         session = self.session
         try:
             programs = self.plan(session.measurement.result)
-        except Fault as fault:
+        except SafetyStop as fault:
             return self.do(session.refuse(str(fault), self.clock()))
         return self.do(session.load(programs, self.clock()))

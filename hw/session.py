@@ -18,8 +18,8 @@ from hw.control import BudgetPlan, Drive, Program, SentBudget, TraceRow
 from hw.limits import (
     DRIVING,
     ENDED,
-    Fault,
-    Limits,
+    SafetyLimits,
+    SafetyStop,
     Stage,
     Units,
     configuration,
@@ -54,7 +54,7 @@ class _Event(NamedTuple):
 class Session:
     """The host's side of the link."""
 
-    def __init__(self, scenario: Scenario, limits: Limits, settings: LinkSettings | None = None) -> None:
+    def __init__(self, scenario: Scenario, limits: SafetyLimits, settings: LinkSettings | None = None) -> None:
         if len(limits.cap) != scenario.channels:
             raise ValueError(f"cap has {len(limits.cap)} entries for {scenario.channels} channels")
         self.scenario, self.limits, self.settings = scenario, limits, settings or LinkSettings()
@@ -184,21 +184,21 @@ class Session:
 
     def met(self, info: wire.Info, now: int) -> Said:
         """Who the device is."""
-        return self._guarded(now, lambda: self._on_info(info))
+        return self._guarded(now, self._on_info, info)
 
     def configured(self, refused: int, now: int) -> Said:
         """The device runs as `config` says, or why not."""
-        return self._guarded(now, lambda: self._on_answer(refused))
+        return self._guarded(now, self._on_answer, refused)
 
     def take(self, state: wire.State, now: int) -> Said:
         """What answers a STATE."""
-        return self._guarded(now, lambda: self._on_state(state))
+        return self._guarded(now, self._on_state, state)
 
-    def _guarded(self, now: int, understand: Callable[[], Said]) -> Said:
+    def _guarded(self, now: int, understand: Callable[[Any], Said], heard: Any) -> Said:
         self.now = now
         try:
-            return understand()
-        except Fault as fault:
+            return understand(heard)
+        except SafetyStop as fault:
             return self.fail(str(fault), now)
         except Exception as error:  # whatever it is: first the force to zero, then the explanation
             return self.fail(f"{type(error).__name__} in the bridge: {error}", now)
@@ -311,7 +311,7 @@ class Session:
         try:
             if not self.measurement.note(state, self.link.margin, self.link.missed):
                 return self._answer(state, wire.Command.IDLE)
-        except Fault as fault:
+        except SafetyStop as fault:
             return self._end(Stage.REFUSED, str(fault))
         ages = self.measurement.result
         self._enter(Stage.MEASURED, f"{len(ages.values)} answers, median age {ages.median} us")
@@ -351,14 +351,14 @@ class Session:
         return (wire.Stop(reason),)
 
 
-def _limits_for(scenario: Scenario, cap: float = _STRONGEST, **more: Any) -> Limits:
+def _limits_for(scenario: Scenario, cap: float = _STRONGEST, **more: Any) -> SafetyLimits:
     """Limits for the scenario's devices, of at most `cap` [N]. Raises ValueError where T is none for a serial link."""
     watchdog = watchdog_for(scenario.T)
-    return Limits(tuple(min(cap, d.force_limit) for d in scenario.device), watchdog_us=watchdog, **more)
+    return SafetyLimits(tuple(min(cap, d.force_limit) for d in scenario.device), watchdog_us=watchdog, **more)
 
 
 def session_for(scenario: Scenario, settings: LinkSettings, cap: float = _STRONGEST, **more: Any) -> Session:
-    """A session that never asks for more than `cap` [N], with `more` Limits. Raises InputError for what cannot be."""
+    """A session that never asks for more than `cap` [N], with `more` limits. Raises InputError for what cannot be."""
     try:
         return Session(scenario, _limits_for(scenario, cap, **more), settings)
     except ValueError as error:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Self
 
 from hw.control import Program
-from hw.limits import ENDED, Fault, Stage
+from hw.limits import ENDED, SafetyStop, Stage
 from hw.monitor import Ages
 from hw.seam import Driver, HapticDevice, PortLost
 from hw.session import Operator, Session
@@ -229,7 +229,7 @@ class Live(Driver):
         try:
             with _interruptible():
                 programs = self.plan(self.session.measurement.result)
-        except Fault as fault:
+        except SafetyStop as fault:
             return self.do(self.session.refuse(str(fault), self.clock()))
         except KeyboardInterrupt:
             self.signals.append(signal.SIGINT)

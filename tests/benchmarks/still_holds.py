@@ -10,7 +10,7 @@ import sys
 
 import numpy as np
 
-from hw.limits import Fault
+from hw.limits import SafetyStop
 from hw.monitor import EncoderMonitor
 
 T, TICKS, SUBSTEPS = 1.2e-3, 1000, 8
@@ -54,7 +54,7 @@ def _stopped(counts: list[int], applied: list[int], step: float) -> bool:
     try:
         for n, force in zip(counts, applied, strict=True):
             monitor.check((n,), (force,), 1)
-    except Fault:
+    except SafetyStop:
         return True
     return False
 

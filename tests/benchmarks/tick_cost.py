@@ -1,20 +1,21 @@
 """PYTHONPATH=. python tests/benchmarks/tick_cost.py [TICKS]: what a tick costs the host, beside the bare loop.
 
-Blocks of 200 ticks by turns. Bare: a STATE is decoded, one matrix product, a FORCE encoded. Whole: the bridge's own
-loop over a pseudo-terminal, from the STATE that waits there to the FORCE that was written, with every check and record.
-Times are those of the processor, without what others have of it.
-The device at the other end is the emulated one, ticked between two measurements.
+Whole: the bridge's own loop at full gain over a pseudo-terminal, from the STATE that waits there, through every check
+and record, to the FORCE that was written and the next wait. Bare: a STATE is decoded, the controller steps, a FORCE is
+encoded. Blocks of 200 ticks by turns. Times are those of the processor, in Python and in the system's calls (the last
+line has those apart), without what other processes have of it. The device is the emulated one: it ticks while the host
+waits, and so leaves the caches to it as cold as another process would.
 """
 
 from __future__ import annotations
 
 import gc
 import os
+import select
 import statistics
 import sys
 import time
-
-import numpy as np
+from collections import defaultdict
 
 from hw.control import certified_couplings
 from hw.emulator import Emulator, Terminal
@@ -29,61 +30,82 @@ from hw.transport import Live, SerialPort
 from sim.scenario import load
 
 BLOCK = 200
+PATIENCE = 5.0  # [s] for bytes on their way through the terminal, which a thread of the kernel's moves
 
 
-def tick_cost(ticks: int) -> tuple[list[float], list[float]]:
-    """Times [us] of bare and of whole ticks at full gain."""
-    scenario = lively(load())
-    made = certified_couplings(scenario, "I", None, None, 1, spare=0)
-    session, terminal, emulator = session_for(scenario, LinkSettings(measure=60)), Terminal(), Emulator(scenario)
-    session.record = Recorder(scenario.channels)
-    port = SerialPort(terminal.path, None)
-    live = Live(session, SerialDevice(port), lambda ages: made, True, 3600.0)
-    clock = [0]
-    live.clock = lambda: clock[0]  # the clock of the ticks: what is measured here takes longer than they do
-    controller, decoder = made[0].controller(session.limits.cap), Decoder()
-    bare, whole = [], []
-    wait = port.wait
-    patience = [1e-3]
-    port.wait = lambda seconds: wait(patience[0])
-    session.start(0)
-    live.turn()
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    period = round(1e6 * scenario.T)
-    number = 0
-    while len(whole) < ticks:
-        clock[0] += period
-        emulator.receive(terminal.read(), clock[0] - 1000)
-        data = emulator.tick(clock[0] - 1000)
-        emulator.advance()
-        if number % (2 * BLOCK) >= BLOCK and session.stage == Stage.ARMED:
+class _Bench(SerialPort):
+    """A port at whose other end a device ticks whenever the host waits."""
+
+    def __init__(self) -> None:
+        self.scenario = lively(load())
+        self.far, self._emulator = Terminal(), Emulator(self.scenario)
+        super().__init__(self.far.path, None)
+        self.made = certified_couplings(self.scenario, "I", None, None, 1, spare=0)
+        self.session = session_for(self.scenario, LinkSettings(measure=60))
+        self.session.record = Recorder(self.scenario.channels)
+        self.law, self._decoder = self.made[0].controller(self.session.limits.cap), Decoder()
+        self.clock, self._period = 0, round(1e6 * self.scenario.T)  # [us]
+        self._begun, self._told, self._number = 0, False, 0
+        self.times = defaultdict[str, list[float]](list)  # [us]
+
+    def wait(self, seconds: float) -> bool:
+        spent = time.thread_time_ns() - self._begun
+        armed, whole = self.session.stage == Stage.ARMED, self._number % (2 * BLOCK) < BLOCK
+        if armed and self._told and whole:
+            self.times["whole"].append(1e-3 * spent)
+        if self._told:
+            select.select([self.far.master], [], [], PATIENCE)
+        self._emulator.receive(self.far.read(), self.clock + 200)
+        self.clock += self._period
+        self._number += 1
+        data = self._emulator.tick(self.clock)
+        self._emulator.advance()
+        if armed and not whole:
             begun = time.thread_time_ns()
-            (state,) = decoder.feed(data)
+            (state,) = self._decoder.feed(data)
             assert isinstance(state, State)
-            force = np.clip(-controller.step(session.units.positions(state.counts)) / 4e-4, -1, 1).astype(int).tolist()
-            encode(Force(Command.RUN, (state.tick + 1) & 0xFFFF, state.tick, tuple(force)))
-            bare.append(1e-3 * (time.thread_time_ns() - begun))
+            units, cap = self.session.units, (1,) * state.axes
+            steps = units.steps(self.law.step(units.positions(state.counts)), cap)
+            encode(Force(Command.RUN, (state.tick + 1) & 0xFFFF, state.tick, steps))
+            self.times["bare"].append(1e-3 * (time.thread_time_ns() - begun))
         if data:
-            terminal.write(data)
+            self.far.write(data)
+            select.select([self._fd], [], [], PATIENCE)
+        self._begun = time.thread_time_ns()
+        self._told = super().wait(0.0)
+        return self._told
+
+    def write(self, data: bytes) -> int:
+        if self._number % (2 * BLOCK) < BLOCK:
+            return super().write(data)
         begun = time.thread_time_ns()
-        live.turn()  # takes the STATE
-        patience[0] = 0.0
-        live.turn()  # gives the FORCE, and finds no other
-        patience[0] = 1e-3
-        if session.stage in ENDED:
-            raise RuntimeError(f"the session ended: {session.cause}")
-        if session.stage == Stage.ARMED and number % (2 * BLOCK) < BLOCK:
-            whole.append(1e-3 * (time.thread_time_ns() - begun))
-        number += 1
-    port.__exit__()
-    terminal.unplug()
-    return bare, whole
+        sent = super().write(data)
+        self.times["write"].append(1e-3 * (time.thread_time_ns() - begun))
+        return sent
+
+
+def tick_cost(ticks: int) -> dict[str, list[float]]:
+    """Times [us] of `ticks` whole ticks at full gain, of as many bare ones, and of writing a FORCE."""
+    with _Bench() as port:
+        session = port.session
+        live = Live(session, SerialDevice(port), lambda ages: port.made, True, 3600.0)
+        live.clock = lambda: port.clock  # that of the ticks: what is measured here takes longer than they do
+        session.start(0)
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        while len(port.times["bare"]) < ticks:
+            live.turn()
+            if session.stage in ENDED:
+                raise RuntimeError(f"the session ended: {session.cause}")
+    port.far.unplug()
+    return port.times
 
 
 if __name__ == "__main__":
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    for name, times in zip(("bare", "whole"), tick_cost(int(sys.argv[1]) if sys.argv[1:] else 4000), strict=True):
-        late = sorted(times)[len(times) * 99 // 100]
-        print(f"{name}: median {statistics.median(times):.1f} us, 99th percentile {late:.0f} us")
+    times = tick_cost(int(sys.argv[1]) if sys.argv[1:] else 4000)
+    for name in ("bare", "whole", "write"):
+        late = sorted(times[name])[len(times[name]) * 99 // 100]
+        print(f"{name}: median {statistics.median(times[name]):.1f} us, 99th percentile {late:.0f} us")
+    print(f"whole over bare: {statistics.median(times['whole']) / statistics.median(times['bare']):.2f}")

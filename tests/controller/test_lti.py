@@ -89,6 +89,22 @@ def test_a_delay_line_is_a_power_of_z(steps):
     close(D.at(Z), np.array([np.diag([z ** -float(n) for n in steps]) for z in Z]))
 
 
+def test_delays_at_the_outputs_are_powers_of_z_wherever_they_stand(blocks):
+    """Behind a block, before it, in a loop, branching, and in a ring of delays that no input reaches."""
+    G = blocks[0]
+    T, loop = G.T, delay((3, 0), G.T) @ G @ delay((1, 4), G.T)
+    ring = np.zeros((8, 8))
+    for i, j in ((1, 0), (2, 1), (3, 1), (4, 3), (5, 6), (6, 5), (7, 6)):
+        ring[i, j] = 1
+    ring[0, 0] = 0.5
+    branches = Lti(ring, np.eye(8, 1), np.arange(16.0).reshape(2, 8), np.zeros((2, 1)), T)
+    for block in (loop, loop.quotient_at_one(), delay((2, 3), T) @ G.feedback(0.01 * loop), branches):
+        z = 1.1 * Z[:, None, None]
+        close(block.at(1.1 * Z), block.C @ np.linalg.solve(z * np.eye(block.order) - block.A, block.B + 0j) + block.D)
+        assert block.poles().size == block.order
+    assert loop._lines[0].size == G.order + 5 + 1  # of three samples behind it two are powers of z
+
+
 @pytest.mark.parametrize("steps", [(-1,), (1.5,)])
 def test_a_delay_is_a_whole_number(steps):
     with pytest.raises(ValueError, match="whole number of samples"):

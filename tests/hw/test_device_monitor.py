@@ -12,7 +12,7 @@ from hw.device import Device
 from hw.emulator import Emulator, FaultInjection, info_of, nobody
 from hw.faults import lively
 from hw.identify import chirp
-from hw.limits import Fault, Limits, Stage
+from hw.limits import SafetyLimits, SafetyStop, Stage
 from hw.monitor import (
     BLOCK,
     PATIENCE,
@@ -75,7 +75,9 @@ def test_a_force_that_nobody_asked_for_is_a_fault_after_a_few_ticks(phase, force
     told.unlike(state(0), 1)
     for tick in range(1, PATIENCE):
         assert told.unlike(state(tick, (force[0] * tick, force[1]), phase), 1)
-    with pytest.raises(Fault, match=r"it was told None, and so for 5 ticks|holds a force for 5 ticks, 4 are agreed"):
+    with pytest.raises(
+        SafetyStop, match=r"it was told None, and so for 5 ticks|holds a force for 5 ticks, 4 are agreed"
+    ):
         told.unlike(state(PATIENCE, (force[0] * PATIENCE, force[1]), phase), 1)
 
 
@@ -86,12 +88,12 @@ def test_a_device_that_is_wrong_every_other_tick_is_found_out_later():
         told.tell(tick - CONFIG.theta, (0, 0))
         assert told.unlike(state(tick, (300 * (tick % 2), 0)), 1) == bool(tick % 2)
     told.tell(9 - CONFIG.theta, (0, 0))
-    with pytest.raises(Fault, match="the device applies"):
+    with pytest.raises(SafetyStop, match="the device applies"):
         told.unlike(state(9, (300, 0)), 1)
 
 
 def test_a_disarmed_device_has_no_force():
-    with pytest.raises(Fault, match=r"is disarmed and applies \(1, 0\) steps"):
+    with pytest.raises(SafetyStop, match=r"is disarmed and applies \(1, 0\) steps"):
         check_state(state(0, (1, 0), Phase.DISARMED), CONFIG, Stage.DISARMED, 0.0)
     check_state(state(0, (0, 0), Phase.DISARMED), CONFIG, Stage.DISARMED, 0.0)
 
@@ -107,7 +109,7 @@ def rungs(scenario):
 
 
 def test_a_session_stops_where_a_disarmed_device_pushes(scenario, rungs):
-    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60))
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
     Rehearsal(session, Emulator(scenario), lambda ages: rungs, arm=False).run(0.5)
     assert session.stage == Stage.DISARMED
     last = session.link.last
@@ -123,7 +125,7 @@ def test_an_obedient_device_on_a_bad_line_is_left_alone(scenario, rungs):
     faults = tuple(
         map(FaultInjection.parse, ("up:drop=0.05@0", "down:flip=0.05@0", "reorder=0.03@0", "duplicate=0.1@0"))
     )
-    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60))
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
     Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults).run_until_armed(1.5)
     assert session.stage == Stage.ARMED
     assert session.counters.misses > 50
@@ -132,7 +134,7 @@ def test_an_obedient_device_on_a_bad_line_is_left_alone(scenario, rungs):
 
 def hand_driven(scenario, rungs):
     """A session at the first STATEs after arming, and what sends it one: `lie` is what the device's clock says."""
-    session, t, k = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=50, test_encoders=False)), 0, 0
+    session, t, k = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=50, test_encoders=False)), 0, 0
     session.start(t)
     session.met(info_of(scenario), t)
     session.configured(Refused.ACCEPTED, t)
@@ -222,7 +224,7 @@ def test_an_emergency_stop_is_told_until_the_device_has_latched_it(scenario, run
 @pytest.mark.parametrize("status", [Phase.ARMED, Phase.DISARMED])
 def test_a_device_that_drives_before_anybody_asked_is_told_to_stop(scenario, configuring, status):
     """Whatever its status says; one that goes on for 50 ms once it was asked to be configured is a fault."""
-    session, port = Session(scenario, Limits((12.0, 12.0))), FakePort()
+    session, port = Session(scenario, SafetyLimits((12.0, 12.0))), FakePort()
     driver = Driver(session, SerialDevice(port, lambda: 1e-6 * port.now), lambda ages: (), lambda: port.now)
     session.start(0)
     if configuring:
@@ -263,31 +265,31 @@ def run_clock(ticks):
 
 @pytest.mark.parametrize(("factor", "found"), [(1.005, False), (0.995, False), (1.012, True), (0.988, True)])
 def test_a_percent_of_a_block_is_told_apart(factor, found):
-    with pytest.raises(Fault, match="by its own clock") if found else nullcontext():
+    with pytest.raises(SafetyStop, match="by its own clock") if found else nullcontext():
         run_clock([factor * T_US] * 3 * BLOCK)
 
 
 def test_one_freeze_is_no_drift_and_many_are():
     once = [T_US + 4000 * (n == 50) for n in range(BLOCK)]
     run_clock(once)
-    with pytest.raises(Fault, match="by its own clock"):
+    with pytest.raises(SafetyStop, match="by its own clock"):
         run_clock([T_US + 4000 * (n in (50, 60)) for n in range(BLOCK)])
-    with pytest.raises(Fault, match="by its own clock"):
+    with pytest.raises(SafetyStop, match="by its own clock"):
         run_clock([T_US, -5000, T_US])  # a clock that goes back
 
 
 def test_gaps_within_the_watchdog_are_allowed():
-    clock = ClockMonitor(Limits((12.0,)), 1e-6 * T_US)
+    clock = ClockMonitor(SafetyLimits((12.0,)), 1e-6 * T_US)
     for n in (0, 5, 6, 11, 12):
         clock.check(state(n, t_us=n * T_US), 5 if n in (5, 11) else 1, n * T_US)
-    with pytest.raises(Fault, match="leapt by 6"):
+    with pytest.raises(SafetyStop, match="leapt by 6"):
         clock.check(state(18, t_us=18 * T_US), 6, 18 * T_US)
 
 
 @pytest.mark.parametrize("misses", [0, 1])
 def test_a_measurement_without_answers_ends(scenario, misses):
     """Whether or not the device counts what it does not hear."""
-    session, most = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=50)), 8 * 50 + 2 * 15
+    session, most = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=50)), 8 * 50 + 2 * 15
     session.start(0)
     session.met(info_of(scenario), 0)
     session.configured(Refused.ACCEPTED, 0)
@@ -302,7 +304,7 @@ def test_answers_that_never_arrive_count_in_the_quantile():
     ages = Ages(tuple(range(100, 190)), missing=10)
     assert ages.quantile(0.5) == 150
     assert ages.quantile(0.89) == 189
-    with pytest.raises(Fault, match=r"10 % of the answers never arrived: no delay keeps 95 %"):
+    with pytest.raises(SafetyStop, match=r"10 % of the answers never arrived: no delay keeps 95 %"):
         ages.quantile(0.95)
 
 
@@ -319,7 +321,7 @@ def test_a_link_that_brings_several_forces_at_once_is_measured():
 
 def test_an_identification_closes_no_loop_that_could_grow(scenario):
     recorder = Recorder(2)
-    session = Session(scenario, Limits((1.0, 1.0)), LinkSettings(measure=50))
+    session = Session(scenario, SafetyLimits((1.0, 1.0)), LinkSettings(measure=50))
     session.record = recorder
     tune = chirp(2, scenario.T, 1, 1.0, (3, 200), 0.5)
     Rehearsal(session, Emulator(nobody(scenario)), lambda ages: [tune]).run_until_armed(0.6)
@@ -331,7 +333,7 @@ def test_an_identification_closes_no_loop_that_could_grow(scenario):
 
 def test_an_estop_is_repeated_where_nobody_says_that_it_was_heard(scenario):
     """The first STOP may be lost, and the STATEs that would show it too."""
-    session = Session(scenario, Limits((12.0, 12.0)))
+    session = Session(scenario, SafetyLimits((12.0, 12.0)))
     session.start(0)
     stop = (Stop(Reason.ESTOP),)
     assert session.estop("pressed", 1000) == stop

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from hw.control import certified_couplings
 from hw.emulator import Emulator, FaultInjection, nobody
 from hw.faults import lively
-from hw.limits import Fault, Limits, Stage
+from hw.limits import SafetyLimits, SafetyStop, Stage
 from hw.monitor import EncoderMonitor, EncoderTest, LinkSettings
 from hw.rehearsal import Rehearsal
 from hw.session import Session
@@ -36,7 +36,7 @@ def session_with(scenario, rungs, *faults, seconds=1.0, place=None, encoder_step
         devices = tuple(replace(d, encoder_step=encoder_step) for d in scenario.device)
         scenario = scenario.replace(device=devices)
     faults = tuple(map(FaultInjection.parse, faults))
-    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60, **settings))
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, **settings))
     emulator = Emulator(scenario, faults)
     if place is not None:  # where the handles are before anything begins
         emulator.plant.s[: emulator.plant.scene.model.nq] = place
@@ -69,7 +69,7 @@ def test_live_encoders_answer_a_force_that_one_hardly_feels(scenario, rungs, ste
     """Newtons until encoders of 1 to 100 um have answered, held by the scenario's hands and free."""
     still = scenario if held else nobody(scenario)
     forces = []
-    session = Session(still, Limits((12.0, 12.0)), LinkSettings(measure=60))
+    session = Session(still, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
     devices = tuple(replace(d, encoder_step=step) for d in still.device)
     session.record = lambda row: forces.append(row.test or (0.0, 0.0))
     Rehearsal(session, Emulator(still.replace(device=devices)), lambda ages: rungs).run_until_armed(0.5)
@@ -87,7 +87,7 @@ def test_the_test_force_alternates_grows_and_stays_within_the_cap(cap):
         for k in ticks:
             forces.append(test.force((k, k % 2), 1))
 
-    with pytest.raises(Fault, match=told):
+    with pytest.raises(SafetyStop, match=told):
         play()
     moved, still = np.array(forces[2:]).T
     assert not moved.any()
@@ -137,7 +137,7 @@ def test_the_impulse_decides(axis, sign, newton, after):
     if after is None:
         return stand_still(1000)
     stand_still(round(0.9 * after / T))
-    with pytest.raises(Fault, match=f"axis {axis + 1} does not follow"):
+    with pytest.raises(SafetyStop, match=f"axis {axis + 1} does not follow"):
         stand_still(round(0.2 * after / T) + 1)
     return None
 
@@ -152,7 +152,7 @@ def test_a_coarse_encoder_gets_the_time_that_a_heavy_hand_needs_to_turn():
             monitor.check((0,), (12_500,), 1)
 
     stand_still(47)
-    with pytest.raises(Fault, match="axis 1 does not follow"):
+    with pytest.raises(SafetyStop, match="axis 1 does not follow"):
         stand_still(1)
 
 

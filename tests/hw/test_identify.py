@@ -13,7 +13,7 @@ import pytest
 from cli.identify import main as identify_command
 from hw.emulator import Emulator, FaultInjection, nobody
 from hw.identify import capped, chirp, estimate, held, identify, worth
-from hw.limits import Limits, Stage
+from hw.limits import SafetyLimits, Stage
 from hw.monitor import LinkSettings
 from hw.recording import Recorder
 from hw.rehearsal import Rehearsal
@@ -29,7 +29,7 @@ def record_of(scenario, *faults, seconds=1.5):
     """A chirp of 1 N and a release, recorded through the whole link."""
     recorder = Recorder(scenario.channels)
     session = Session(
-        scenario.replace(delta=(1e-6,) * scenario.channels), Limits((1.0, 1.0)), LinkSettings(measure=100)
+        scenario.replace(delta=(1e-6,) * scenario.channels), SafetyLimits((1.0, 1.0)), LinkSettings(measure=100)
     )
     session.record = recorder
     excitation = chirp(scenario.channels, scenario.T, 1, 1.0, (3.0, 200.0), seconds)
@@ -170,7 +170,7 @@ def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):
 def test_more_damping_than_declared_asks_who_holds_it(viscous, suspicious):
     """A hand that damps looks like the device: only the declared 1.37 N s/m can say so, with 10 % allowed."""
     scenario = load()
-    session = Session(scenario, Limits((1.0, 1.0)), LinkSettings())
+    session = Session(scenario, SafetyLimits((1.0, 1.0)), LinkSettings())
     estimate = SimpleNamespace(viscous=viscous)
     warnings = held([estimate], scenario, session)
     assert len(warnings) == suspicious
@@ -212,7 +212,7 @@ def test_a_bound_never_exceeds_what_is_declared(coarse):
     scenario = load("omega-pair-rigid")
     little = msgspec.structs.replace(scenario.device[0], damping=0.48, delta=None)
     scenario = scenario.replace(device=(little, little), delta=(0.48, 0.48))
-    session = Session(scenario, Limits((1.0, 1.0)), LinkSettings())
+    session = Session(scenario, SafetyLimits((1.0, 1.0)), LinkSettings())
     assert held([found], scenario, session) == []  # 4 % more than declared is not yet a hand
     assert found.delta > 0.48
     assert [e.delta for e in capped([found], scenario, session)] == [0.48]

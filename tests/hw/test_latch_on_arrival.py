@@ -11,7 +11,7 @@ from cli.bridge import main as bridge
 from cli.replay import main as replay
 from hw.control import certified_couplings, overlong_tick, timed
 from hw.emulator import Emulator
-from hw.limits import Fault
+from hw.limits import SafetyStop
 from hw.monitor import Ages, LinkSettings
 from hw.recording import Recorder
 from hw.rehearsal import Rehearsal
@@ -66,7 +66,7 @@ def test_the_plant_feels_the_last_force_until_the_answer_comes():
 
 
 def test_a_link_slower_than_a_period_is_refused():
-    with pytest.raises(Fault, match="answers come up to 1250 us after their tick, T is 1200 us: latch at ticks"):
+    with pytest.raises(SafetyStop, match="answers come up to 1250 us after their tick, T is 1200 us: latch at ticks"):
         timed(LAB, Ages((1150,) * 100), 0.99, 100.0, at_once=True)
 
 

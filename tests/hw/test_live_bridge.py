@@ -27,7 +27,7 @@ from cli.options import Parser
 from cli.session_cli import add_link_options, check_link
 from controller.delay import VaryingDelay
 from hw.control import certified_coupling, certified_couplings
-from hw.limits import ENDED, Limits, Stage
+from hw.limits import ENDED, SafetyLimits, Stage
 from hw.monitor import LinkSettings
 from hw.recording import IncidentLog
 from hw.seam import SerialDevice
@@ -85,7 +85,7 @@ def rungs(scenario):
 
 
 def run(emulator, scenario, plan, glance=lambda session: None, pace=PACE):
-    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=150))
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=150))
     with SerialPort(emulator.path, 921_600) as port:
         device = SerialDevice(port, lambda: pace * time.monotonic())
         live = Live(session, device, plan, True, seconds=60.0, glance=glance, pace=pace)
@@ -421,7 +421,7 @@ def test_a_pseudo_terminal_needs_no_baud_rate(tmp_path):
 def test_delays_that_vary_in_the_scenario_are_refused_by_name(module, scenario, tmp_path, monkeypatch):
     """The link has the delays that it has; a table that nothing reads would promise something else."""
     monkeypatch.setattr(
-        module, "scenario_from", lambda args: scenario.replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
+        module.options, "scenario_from", lambda args: scenario.replace(varying_delay=VaryingDelay((1, 1), (2, 2)))
     )
     with pytest.raises(InputError, match=r"varying_delay: hw\.\w+ takes the delays that its link has"):
         module.main([] if module is emulator_command else ["--emulate", "--out", str(tmp_path)])

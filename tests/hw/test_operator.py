@@ -5,7 +5,7 @@ import pytest
 from hw.control import certified_couplings
 from hw.emulator import Emulator, FaultInjection
 from hw.faults import lively
-from hw.limits import Limits, Stage
+from hw.limits import SafetyLimits, Stage
 from hw.monitor import LinkSettings
 from hw.rehearsal import Rehearsal
 from hw.session import Operator, Session
@@ -24,7 +24,7 @@ def rungs(scenario):
 
 
 def rehearsal_of(scenario, rungs, operator, *faults):
-    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=100))
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=100))
     faults = tuple(map(FaultInjection.parse, faults))
     return Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, operator=operator)
 

@@ -19,7 +19,7 @@ from cli.session_cli import limits_from, touched
 from hw.control import certified_couplings
 from hw.emulator import Emulator, FaultInjection
 from hw.faults import lively
-from hw.limits import Limits, Stage
+from hw.limits import SafetyLimits, Stage
 from hw.monitor import LinkSettings
 from hw.recording import IncidentLog
 from hw.rehearsal import Rehearsal
@@ -43,7 +43,7 @@ def rungs(scenario):
 
 
 def rehearsal_of(scenario, rungs, operator):
-    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60))
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
     return Rehearsal(session, Emulator(scenario), lambda ages: rungs, operator=operator)
 
 
@@ -79,7 +79,7 @@ def test_a_deadman_that_is_held_lets_the_session_go_on(scenario, rungs):
 def test_the_deadman_at_the_device(scenario, rungs):
     """It arms while the switch is held only, and ramps out at the first STATE that says it is not."""
     faults = (FaultInjection.parse("letgo@0.5"),)
-    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60, deadman=True))
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, deadman=True))
     rehearsal = Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults, operator=Operator(True, 9.0))
     rehearsal.emulator.device.deadman = False
     rehearsal.run(1.0)
@@ -95,7 +95,7 @@ def test_the_deadman_at_the_device(scenario, rungs):
 
 
 def test_a_deadman_let_go_before_the_gain_rises_ends_at_once(scenario, rungs):
-    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60, deadman=True))
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60, deadman=True))
     faults = (FaultInjection.parse("letgo@0"),)
     rehearsal = Rehearsal(session, Emulator(scenario, faults), lambda ages: rungs, faults)
     rehearsal.run_until_armed(0.5)
@@ -151,9 +151,8 @@ def test_a_first_session_is_gentle(scenario):
     ],
 )
 def test_impossible_limits_are_refused(scenario, options, words):
-    args = _parser().parse_args(["--emulate", *options])
     with pytest.raises(InputError) as error:
-        session_for(scenario, LinkSettings(), **limits_from(args, scenario))
+        session_for(scenario, LinkSettings(), **limits_from(_parser().parse_args(["--emulate", *options]), scenario))
     assert words in str(error.value)
 
 
@@ -164,9 +163,9 @@ def test_the_incident_log_survives_sigkill(tmp_path):
     """A session in a process of its own, killed while forces act: every stage up to then is on the disk."""
     code = (
         "import time; from pathlib import Path\n"
-        "from hw.recording import IncidentLog; from hw.limits import Limits; from hw.session import Session\n"
+        "from hw.recording import IncidentLog; from hw.limits import SafetyLimits; from hw.session import Session\n"
         "from sim.scenario import load\n"
-        f"session, log = Session(load(), Limits((2.0, 2.0))), IncidentLog(Path({str(tmp_path / 'log')!r}))\n"
+        f"session, log = Session(load(), SafetyLimits((2.0, 2.0))), IncidentLog(Path({str(tmp_path / 'log')!r}))\n"
         "log.attach(session); session.start(0); session.now = 1_500_000; log.glance(session)\n"
         "print('written', flush=True); time.sleep(600)"
     )
@@ -196,7 +195,7 @@ def test_the_incident_log_tells_every_stage_and_every_second(scenario, rungs, tm
     assert len(standing) >= 2
     assert 2 in [len(line["x_m"]) for line in standing]
     again = IncidentLog(tmp_path / "log")  # appended to, never begun anew
-    again.attach(Session(scenario, Limits((2.0, 2.0))))
+    again.attach(Session(scenario, SafetyLimits((2.0, 2.0))))
     assert len((tmp_path / "log").read_text().splitlines()) == len(lines) + 1
     with pytest.raises(InputError, match="cannot write"):
         IncidentLog(tmp_path)
@@ -274,7 +273,7 @@ def test_a_device_is_identified_in_virtual_time(tmp_path):
 
 
 def test_unreadable_frames_ask_about_the_baud_rate(scenario):
-    session, port = Session(scenario, Limits((2.0, 2.0))), FakePort()
+    session, port = Session(scenario, SafetyLimits((2.0, 2.0))), FakePort()
     driver = Driver(session, SerialDevice(port, lambda: 1e-6 * port.now), lambda ages: (), lambda: port.now)
     session.start(0)
     for _ in range(401):

@@ -15,7 +15,7 @@ from hw.control import certified_coupling, certified_couplings, timed
 from hw.device import Device
 from hw.emulator import info_of
 from hw.force_dimension import ForceDimension, library
-from hw.limits import Limits, Stage
+from hw.limits import SafetyLimits, Stage
 from hw.monitor import Ages, LinkSettings
 from hw.protocol import Command, Config, Decoder, Force, Hello, Phase, Reason, Refused, State, encode
 from hw.recording import Recorder, save
@@ -119,7 +119,7 @@ class StandIn:
 
 def held_session(scenario, sdk, seconds=0.5, cap=12.0, glance=lambda session: None):
     """A session of Live with the stand-in, from the handshake to the end."""
-    session = Session(scenario, Limits((cap,) * 2), LinkSettings(measure=150))
+    session = Session(scenario, SafetyLimits((cap,) * 2), LinkSettings(measure=150))
     session.record = recorder = Recorder(2)
     with ForceDimension(scenario, None, sdk, sdk.clock, sdk.sleep) as device:
         made = []
@@ -267,7 +267,7 @@ def test_the_emergency_stop_is_at_once(scenario):
             live.do(session.estop("asked to", session.now))
             assert sdk.force.tolist() == [0.0, 0.0]
 
-    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=150))
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=150))
     with ForceDimension(scenario, "1x,0x", sdk, sdk.clock, sdk.sleep) as device:
 
         def plan(ages):

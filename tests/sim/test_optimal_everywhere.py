@@ -23,7 +23,7 @@ from design.stored import Stored, save
 from design.stored import load as load_file
 from hw.control import certified_couplings
 from hw.emulator import Emulator
-from hw.limits import Limits, Stage
+from hw.limits import SafetyLimits, Stage
 from hw.monitor import LinkSettings
 from hw.rehearsal import Rehearsal
 from hw.session import Session
@@ -141,7 +141,7 @@ def test_the_live_window_runs_it_as_the_simulator_does(files, form):
 def test_the_bridge_rehearses_it(files, form):
     scenario, _, path = files[form]
     rungs = certified_couplings(scenario, "I", str(path), None, 1, spare=0)
-    session = Session(scenario, Limits((12.0, 12.0)), LinkSettings(measure=60))
+    session = Session(scenario, SafetyLimits((12.0, 12.0)), LinkSettings(measure=60))
     rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: rungs)
     assert rehearsal.run_until_armed(0.4).stage == Stage.ARMED
     assert any(np.any(moment.applied) for moment in rehearsal.moments[-100:])

@@ -62,10 +62,10 @@ def test_a_run_is_drawn_whole_and_where_it_turns():
 
 
 def test_every_sample_of_a_run_is_on_the_picture(drawn):
-    steps = np.random.default_rng(0).normal(size=(400, 3))
+    steps = np.random.default_rng(0).normal(size=(1200, 3))
     steps[60:] *= 1e-3
     f = steps.cumsum(axis=0)  # turns sharply in its first ticks only: there is something to zoom into
-    f[:, 1] = 0.01 * np.arange(400)  # calm: drawn last, so that it stays visible
+    f[:, 1] = 0.01 * np.arange(1200)  # calm: drawn last, so that it stays visible
     figure = drawn(plots.plot_run, trace(f), title="t", frequency_hz=80.0, ideal=(2 * f, 12.34))
     whole = lines(figure.axes[2])
     for i in range(3):
@@ -73,7 +73,12 @@ def test_every_sample_of_a_run_is_on_the_picture(drawn):
         np.testing.assert_allclose(lines(figure.axes[0])[f"device {i + 1}"][:, 1], f[:, i])  # mm of 1e-3 m a newton
     assert [line.get_label() for line in figure.axes[2].lines][2] == "device 2"
     assert figure.axes[0].get_ylabel() == "displacement of the handle [mm],\nwhere the encoder is"
-    assert legend(figure) == ["device 1", "device 2", "device 3", "pale: ideal environment (asked force 12 % off)"]
+    assert legend(figure) == [
+        "device 1",
+        "device 2",
+        "device 3",
+        "pale: what the object itself gives for this motion (force error 12 %)",
+    ]
 
 
 def test_a_handle_near_its_encoder_is_drawn_and_says_how_near(drawn):
