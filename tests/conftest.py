@@ -18,6 +18,14 @@ settings.register_profile("no-clock", deadline=None, suppress_health_check=[Heal
 settings.load_profile("no-clock")
 
 
+#: files of the most seconds: begun first, so that no worker is alone with one at the end
+LONGEST = ("test_docs.py", "test_hostile.py", "test_live_bridge.py", "test_limits.py", "test_session.py", "test_run.py")
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
+
+
 @pytest.fixture(autouse=True, scope="session")
 def a_run_designs_once(tmp_path_factory):
     """Runs, maps and crowds ask for the same couplings again and again, seconds each: one design for all processes."""

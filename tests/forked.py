@@ -1,6 +1,6 @@
 """Commands as a user runs them, without their second of imports: one process has imported all and forks for each.
 
-    python tests/forked.py FOLDER     designs that runs ask for are kept in FOLDER; a request a line, its answer a line
+python tests/forked.py FOLDER     designs that runs ask for are kept in FOLDER; a request a line, its answer a line
 """
 
 from __future__ import annotations

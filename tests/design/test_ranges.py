@@ -334,7 +334,18 @@ def test_design_check_run_audit_and_validate_speak_of_the_ranges(scenario_file, 
 
     out = ["--out", str(tmp_path / "out"), *common]
     code, run = told(
-        run_main, "--coupling", str(file), "--vertex", "3", "--engine", "exact", "--duration", "1", "--no-plot", *out
+        run_main,
+        "--coupling",
+        str(file),
+        "--vertex",
+        "3",
+        "--engine",
+        "exact",
+        "--duration",
+        "1",
+        "--no-plot",
+        "--no-alternatives",
+        *out,
     )
     assert (code, run["promise"]) == (0, "these ranges")
     assert run["run"]["environment"].startswith("vertex 3 (mass-contact 1 absent")
