@@ -26,6 +26,7 @@ from design.certificate import CONDITIONS
 from design.compare import AXES, FEEL_HZ, LADDERS, Judged, Limit, Perceived, Setting, optimum, settings
 from design.program import Options
 from design.result import OLDER_NAMES, DesignFailed, certificate_part, finite
+from design.robustness import robustness_part
 from design.transparency import transparency
 from sim import report
 from sim.baselines import PAIRS, SECONDS, SLOW, Rival, rivals
@@ -180,6 +181,7 @@ def _data(loop: Loop, chosen: dict[str, Chosen]) -> dict[str, Any]:
         at = judged[name]
         shown = {"name": Path(name).name, **report.coupling_part(c.kind, c.coupling, loop.T), "states": at.F.order}
         shown["transparency"] = report.transparency_part(transparency(at.F, E, loop.lam))
+        shown["robustness"] = robustness_part(loop, c.coupling)
         parts.append(shown | _curves(at, compare.curves(loop, at, hz)))
     return {
         "T_s": loop.T,
@@ -237,12 +239,13 @@ def _guarantees(outcome: dict[str, Any]) -> Table:
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
     title = f"{damping} of {_list(available)} N s/m · {outcome['scenario']}, case {outcome['case']}"
-    heads = ("coupling", "this-env.", "at Hz", "any-env.", "at Hz", "sup dB", "rms dB")  # render.ORDER
+    heads = ("coupling", "this-env.", "at Hz", "at 10 %", "any-env.", "at Hz", "sup dB", "rms dB")  # render.ORDER
     rows = []
     for coupling in outcome["couplings"]:
         parts = [coupling[condition] for condition in render.ORDER]
         needs = [(_needs(p, available[0] if alike else 1.0), p["binding_frequency_hz"]) for p in parts]
         asked = [cell for need, hz in needs for cell in (need, render.optional(hz, "{:.4g}"))]
+        asked.insert(2, _robust(coupling["robustness"], available[0] if alike else 1.0))
         errors = [coupling["transparency"][f"{which}_mismatch_db"] for which in ("relative", "rms")]
         rows.append([coupling["name"], *asked, *(render.optional(e, "{:.2f}", "-inf") for e in errors)])
     return render.grid(title, heads, rows)
@@ -253,6 +256,14 @@ def _needs(part: dict[str, Any], scale: float) -> str:
     if part["ratio"] is None:
         return "[red]infinite[/]"
     return f"[{'green' if part['certified'] else 'red'}]{scale * part['ratio']:.5g}[/]"
+
+
+def _robust(part: dict[str, Any] | None, scale: float = 1.0) -> str:
+    """The need at the worst stiffness or mass within ten percent."""
+    if part is None:
+        return "-"
+    need = part["required_over_available"]
+    return "infinite" if need is None else f"{scale * need:.4g}"
 
 
 def _feel(outcome: dict[str, Any]) -> Table:
@@ -288,7 +299,7 @@ def _ladder(args: argparse.Namespace, scenario: Scenario) -> int:
         rows, interrupted = compare.compare_designs(loops, LADDERS[args.ladder], move)
     outcome: dict[str, Any] = {"scenario": scenario.name, "seed": args.seed, "rows": [asdict(row) for row in rows]}
     outcome |= {"wall_s": time.perf_counter() - begin, "interrupted": interrupted}
-    heads = ("design", "needs N s/m", "sup dB", "rms dB", "proof", "s")
+    heads = ("design", "needs N s/m", "at 10 %", "sup dB", "rms dB", "proof", "s")
     shown = []
     for case in loops:
         cells = [_rung(row) for row in outcome["rows"] if row["case"] == case]
@@ -304,7 +315,7 @@ def _rung(row: dict[str, Any]) -> tuple[str, ...]:
     errors = [render.optional(row[f"{which}_mismatch_db"], "{:.2f}", "exact") for which in ("relative", "rms")]
     if row["required_damping"] is None:
         need, errors = ("-", ["-", "-"]) if row["reason"] else ("-", ["-", errors[1]])
-    return row["design"], need, *errors, row["proof"] or "-", f"{row['wall_s']:.2f}"
+    return row["design"], need, _robust(row["robustness"]), *errors, row["proof"] or "-", f"{row['wall_s']:.2f}"
 
 
 # ----------------------------------------------------------------------------------------------------

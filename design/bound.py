@@ -18,28 +18,37 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import scipy  # its parts load when they are used
 from numpy.typing import NDArray
 
+from controller.coupling import Coupling
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Complex, Lti
 from design.barrier import Block, Program, centre, towards
 from design.frequency import frequencies, hermitian, on_circle
+from design.optimal import design
+from design.program import LADDER, Options
 from design.transparency import BAND_HZ, decibels
 
 _Indices = NDArray[np.intp]  # of points of the transform
 
 _POINTS = 65536  # of the transform
-_KNOTS = {1: 60, 2: 40, 3: 24}  # of h, by channels; fewer for more
-_FEWEST = 16
+_KNOTS = {1: 60, 2: 50}  # of h, by channels; fewer for more
+_FEWEST = 24
+_EVERY = 3  # channels up to which h is any matrix
+MOST = 4  # channels for which there is a bound
+NO_BOUND = f"no bound for more than {MOST} devices: it takes minutes, and what it gives then is decibels too low"
 _NEAR_END = (0.22, 0.5)  # of a step between knots: h falls to zero at the upper end of the band
 _DEGREE = 3  # of the splines that h is made of
-_GAP = 0.01  # of the bound, relatively, that the barrier leaves
+_GAP = 0.003  # of the bound, relatively, that the barrier leaves
 _SWEEPS = 6
 _QUADRATURE = 3e-6  # of the mean square: what the sums over transform and band may differ from their integrals
+_SHORT = Options(ladder=LADDER[:2])
+_LEFT_OUT = 0.0005  # of the mean square mismatch of a coupling: what the shapes of h lack
 _LARGEST_CHARGE = 0.003  # of the bound, for what D lacks between the frequencies where it is imposed
 _STEEPER = 4.0
 
@@ -56,10 +65,19 @@ class _Bound:
         return decibels(self.rms)
 
 
-def bound(loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None) -> _Bound:
-    """The least rms mismatch over the band that any coupling certified this-environment can have."""
+def bound(
+    loop: Loop, band_hz: tuple[float, float] = BAND_HZ, knots: int | None = None, near: Coupling | None = None
+) -> _Bound:
+    """The least rms mismatch over the band that any coupling certified this-environment can have.
+
+    `near` is a good one, or one is designed: with more than EVERY channels h is made of what makes up its mismatch.
+    """
     started = time.perf_counter()
-    dual = _Dual.of(loop, band_hz, knots or _KNOTS.get(loop.channels, _FEWEST))
+    if loop.channels <= _EVERY:
+        shapes = np.eye(loop.channels**2)
+    else:
+        shapes = _shapes(loop, loop.F(near or design(loop, _SHORT).coupling), band_hz)
+    dual = _Dual.of(loop, band_hz, knots or _KNOTS.get(loop.channels, _FEWEST), shapes)
     square = dual.best()
     return _Bound(float(np.sqrt(max(square - _QUADRATURE, 0.0))), time.perf_counter() - started)
 
@@ -72,6 +90,7 @@ class _Dual:
     A: Array  # (rows, n) h over the band, weighted
     b: Array  # (rows,) -Lambda E/|E|, weighted
     c: Array  # (n,) tr C_0
+    shapes: Array  # (shapes, m, m) orthonormal: h is a sum of them, each times a scalar function
     parts: Complex  # (scalars, POINTS/2 + 1): what each real scalar function of h contributes to one entry of D
     forbidden: tuple[
         tuple[int, Array], ...
@@ -79,7 +98,7 @@ class _Dual:
     root: Array  # (m,) sqrt(delta)
 
     @classmethod
-    def of(cls, loop: Loop, band_hz: tuple[float, float], count: int) -> _Dual:
+    def of(cls, loop: Loop, band_hz: tuple[float, float], count: int, shapes: Array) -> _Dual:
         E, m = loop.E(), loop.channels
         low, high = 2 * np.pi * band_hz[0] * loop.T, min(2 * np.pi * band_hz[1] * loop.T, 0.999 * np.pi)
         span = np.log(high / low)
@@ -112,18 +131,16 @@ class _Dual:
         target = (z[:, None] ** -np.asarray(loop.lam))[:, :, None] * response / size[:, None, None]
         shape = np.sqrt(weight) * hats(w)  # (inner, k)
         target = np.sqrt(weight)[:, None, None] * target
-        sizes = (2 * inner * m * m, m * (m + 1) // 2)
+        sizes = (2 * inner * len(shapes), m * (m + 1) // 2)
         forbidden = _forbidden(loop, E)
         n = sum(sizes) + len(forbidden)
-        rows, ends = [], []
-        for i in range(m):
-            for j in range(m):
-                for part in range(2):
-                    row = np.zeros((w.size, n))
-                    at = ((i * m + j) * 2 + part) * inner
-                    row[:, at : at + inner] = shape.T
-                    rows.append(row)
-                    ends.append(-(target[:, i, j].imag if part else target[:, i, j].real))
+        along = target.reshape(w.size, -1) @ shapes.T  # (k, shapes)
+        rows, ends = [np.zeros((1, n))], [[np.sqrt(max((np.abs(target) ** 2).sum() - (np.abs(along) ** 2).sum(), 0))]]
+        for at, part in product(range(len(shapes)), (np.real, np.imag)):
+            row = np.zeros((w.size, n))
+            row[:, inner * (len(rows) - 1) :][:, :inner] = shape.T
+            rows.append(row)
+            ends.append(-part(along[:, at]))
         A, b = np.vstack(rows), np.concatenate(ends)
         c = np.zeros(n)
         c[sizes[0] : sizes[0] + sizes[1]] = [1.0 if i == j else 0.0 for i, j in _triangle(m)]
@@ -140,7 +157,7 @@ class _Dual:
             2 / loop.T
         )
         root = np.sqrt(np.asarray(loop.delta))
-        return cls(m, A, b, c, parts, forbidden, root)
+        return cls(m, A, b, c, shapes.reshape(-1, m, m), parts, forbidden, root)
 
     @property
     def inner(self) -> int:
@@ -151,14 +168,9 @@ class _Dual:
         m, inner = self.m, self.inner
         z = np.exp(2j * np.pi * points / _POINTS)
         slope = np.zeros((points.size, self.c.size, m, m), dtype=complex)
-        at = 0
-        for i in range(m):
-            for j in range(m):
-                scale = self.root[i] * self.root[j]
-                for part in range(2):
-                    values = self.parts[part * inner : (part + 1) * inner, points].T * (2 * scale)
-                    slope[:, at : at + inner, i, j] = values
-                    at += inner
+        at, parts = 2 * inner * len(self.shapes), 2 * self.parts[:, points].T
+        scaled = self.shapes * np.outer(self.root, self.root)
+        slope[:, :at] = np.einsum("kh,sij->kshij", parts, scaled).reshape(points.size, at, m, m)
         for i, j in _triangle(m):
             slope[:, at, i, j] = 1.0 if i == j else 2.0
             at += 1
@@ -170,7 +182,9 @@ class _Dual:
     def start(self) -> Array:
         """h = 0 and C_0 = I/delta: D = I."""
         x = np.zeros(self.c.size)
-        x[2 * self.inner * self.m**2 :][: self.m * (self.m + 1) // 2] = [float(i == j) for i, j in _triangle(self.m)]
+        x[2 * self.inner * len(self.shapes) :][: self.m * (self.m + 1) // 2] = [
+            float(i == j) for i, j in _triangle(self.m)
+        ]
         return x
 
     def lacking(self, x: Array) -> Array:
@@ -183,8 +197,8 @@ class _Dual:
         m, inner = self.m, self.inner
         z = np.exp(2j * np.pi * points / _POINTS)
         D = np.zeros((points.size, m, m), dtype=complex)
-        h = x[: 2 * inner * m * m].reshape(m, m, 2 * inner)
-        D += 2 * np.einsum("ijh,hk->kij", h, self.parts[:, points]) * np.outer(self.root, self.root)
+        h = x[: 2 * inner * len(self.shapes)].reshape(-1, 2 * inner)
+        D += 2 * np.tensordot(self.parts[:, points].T @ h.T, self.shapes, axes=1) * np.outer(self.root, self.root)
         at = h.size
         for i, j in _triangle(m):
             D[:, i, j] += x[at] * (1.0 if i == j else 2.0)
@@ -226,6 +240,20 @@ class _Dual:
                 break
             points = np.union1d(points, _worst(lacking))
         return found
+
+
+def _shapes(loop: Loop, near: Lti, band_hz: tuple[float, float]) -> Array:
+    """(shapes, m m): the real matrices that make up all but _LEFT_OUT of the mean square mismatch of this force map."""
+    E, per_hz = loop.E(), 2 * np.pi * loop.T
+    w = frequencies(E, low=per_hz * band_hz[0], high=min(per_hz * band_hz[1], 0.999 * np.pi), points=200)
+    z = on_circle(w)
+    ideal = E.at(z)
+    M = near.at(z) - z[:, None, None] ** -np.asarray(loop.lam)[:, None] * ideal
+    M *= (np.sqrt(np.gradient(np.log(w))) / np.linalg.norm(ideal, axis=(1, 2)))[:, None, None]
+    M = M.reshape(w.size, -1)
+    _, size, shapes = np.linalg.svd(np.vstack([M.real, M.imag]), full_matrices=False)
+    left = 1 - np.cumsum(size**2) / (size**2).sum()
+    return shapes[: int(np.argmax(left < _LEFT_OUT)) + 1]
 
 
 def _triangle(m: int) -> list[tuple[int, int]]:

@@ -17,7 +17,7 @@ from controller.coupling import Coupling, NoCoupling
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
-from design.bound import bound
+from design.bound import MOST, NO_BOUND, bound
 from design.certificate import any_environment_of, prove
 from design.conditions import (
     any_environment_demand,
@@ -31,6 +31,7 @@ from design.designs import design_by_kind
 from design.frequency import Response, frequencies, on_circle
 from design.program import LADDER, Options
 from design.result import PUBLISHED, Condition, Design, DesignFailed, NotProved, Requirement, finite
+from design.robustness import robustness_part
 from design.stored import digest
 from design.transparency import decibels, transparency
 
@@ -379,6 +380,7 @@ class _LadderRow:
     wall_s: float  # of the design, with its check
     proof_s: float
     reason: str | None = None
+    robustness: dict[str, Any] | None = None  # the worst need within ten percent of every spring and mass
 
 
 SHORT = (
@@ -441,19 +443,18 @@ def ladder_row(case: str, loop: Loop, entry: _Entry) -> _LadderRow:
             reason = str(error)
     required = None if requirement.reason else requirement.required
     mismatch = finite(decibels(figures.relative_mismatch)), finite(decibels(figures.rms_mismatch))
-    proof_s = time.perf_counter() - begin
-    certified = requirement.certified
-    return _LadderRow(
-        _name(entry, case), case, required, certified, entry.condition, *mismatch, proof, wall, proof_s, reason
-    )
+    proof_s, certified = time.perf_counter() - begin, requirement.certified
+    place = _name(entry, case), case, required, certified, entry.condition
+    return _LadderRow(*place, *mismatch, proof, wall, proof_s, reason, robustness_part(loop, coupling))
 
 
 def _bound_row(case: str, loop: Loop, entry: _Entry) -> _LadderRow:
     """What no linear coupling can be better than: no design, and of the rms mismatch only."""
+    row = _LadderRow(entry.name, case, None, False, entry.condition, None, None, None, 0.0, 0.0)
+    if loop.channels > MOST:
+        return replace(row, reason=NO_BOUND)
     found = bound(loop)
-    return _LadderRow(
-        entry.name, case, None, False, entry.condition, None, finite(found.rms_db), None, found.seconds, 0.0
-    )
+    return replace(row, rms_mismatch_db=finite(found.rms_db), wall_s=found.seconds)
 
 
 def _name(entry: _Entry, case: str) -> str:

@@ -40,6 +40,10 @@ FULL = 4  # channels up to which every force has a filter to every device
 _STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weight of g - 1 beside the relative mismatch; for more than RICH channels
 HIGH_HZ = 100.0  # above it the force is kept low by a soft row, or capped
 SOFT = 0.05, 0.3  # the soft row's weight: the first number times the mismatch so far, which counts up to the second
+_EVEN, _LEAST_FORCE = (
+    0.003,
+    0.01,
+)  # weight of the error relative to the force of each motion; the least such force, of |E|
 _SMALL = 1e-5  # weight of the coefficients themselves: some have no effect where the environment has no inverse
 _DECIMALS = 10
 _GAPS = (0.05, 0.01)  # of the objective, or of what it gains over no force: gaps at which the inequalities are swept
@@ -373,16 +377,17 @@ class Problem:
     def _force_rows(
         self, case: Case, w: Array, weight: Array, lam: Sequence[int] | None, rows: list[Array], right: list[Array]
     ) -> None:
-        """Rows of weight |F - Lambda E|/|E|, without Lambda E where lam is None."""
+        """Rows of weight |F - Lambda E|/|E| with a little of `_evened`, and of weight |F|/|E| where lam is None."""
         z = on_circle(w)
         E = case.E.at(z)
-        weight = weight / np.linalg.norm(E, axis=(1, 2))
+        size = np.linalg.norm(E, axis=(1, 2))
+        right_of = (weight / size)[:, None, None] * (np.eye(case.E.inputs) if lam is None else _evened(E, size))
         turn = z[:, None] ** -np.asarray(case.loop.theta)
         slope: Complex = np.zeros((self.unknowns, E.size), dtype=complex)
-        slope[: self.span.unknowns] = (self._slopes(case, z).G * (weight[:, None] * turn)[..., None]).reshape(
-            -1, E.size
-        )
-        target = np.zeros_like(E) if lam is None else (weight[:, None] * z[:, None] ** -np.asarray(lam))[..., None] * E
+        moved = self._slopes(case, z).G * turn[..., None] @ right_of
+        slope[: self.span.unknowns] = moved.reshape(-1, E.size)
+        ideal = np.zeros_like(E) if lam is None else (z[:, None] ** -np.asarray(lam))[..., None] * E
+        target = ideal @ right_of
         rows.extend([np.ascontiguousarray(part(slope).T) for part in (np.real, np.imag)])
         right.extend([part(target).ravel() for part in (np.real, np.imag)])
 
@@ -504,6 +509,17 @@ class Problem:
             if (room := self.room(base, dense=True)) > 0:
                 return base + max(0.0, 1 - 1.01 * worst / (worst + room)) * (x - base)
         return start
+
+
+def _evened(E: Complex, size: Array) -> Complex:
+    """L with |M L|^2/|E|^2 = |M|^2/|E|^2 + EVEN mean over motions |M x|^2/(|E x|^2 + LEAST_FORCE^2 |E|^2 |x|^2).
+
+    The mismatch is relative to the largest force. Many couplings have nearly the same, and differ in motions that the
+    environment hardly answers: of these the one is taken that errs little of their forces, too.
+    """
+    unit, one = E / size[:, None, None], np.eye(E.shape[-1], dtype=np.complex128)
+    faint = np.linalg.inv(np.conj(np.swapaxes(unit, 1, 2)) @ unit + _LEAST_FORCE**2 * one).astype(np.complex128)
+    return np.linalg.cholesky(one + _EVEN / len(one) * hermitian(faint)).astype(np.complex128)
 
 
 def static_weight(loop: Loop) -> float:

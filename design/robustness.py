@@ -102,13 +102,19 @@ def spread(loop: Loop, options: Options = DEFAULT, percent: float = 10.0) -> _Sp
 def robustness_parts(loop: Loop, coupling: Coupling, options: Options = DEFAULT) -> dict[str, Any]:
     """A report's `robustness` of a coupling for this environment, and what a design for that range would cost.
 
-    Both are null with walls, the latter also with ranges, and for a coupling that is no force filter.
+    The latter is null with walls, with ranges, and for a coupling that is no force filter.
     """
-    if loop.environment.walls:
-        return {"robustness": None, "designed_for_it": None}
-    price = spread(loop, options) if isinstance(coupling, ForceFilter) and not loop.ranges else None
+    alone = isinstance(coupling, ForceFilter) and not (loop.ranges or loop.environment.walls)
+    price = spread(loop, options) if alone else None
     parts = price and {name: finite(value) for name, value in asdict(price).items()}
-    return {"robustness": robustness(loop, coupling).part(), "designed_for_it": parts}
+    return {"robustness": robustness_part(loop, coupling), "designed_for_it": parts}
+
+
+def robustness_part(loop: Loop, coupling: Coupling) -> dict[str, Any] | None:
+    """The worst need within ten percent as plain data; None with walls, and for an environment that is no network."""
+    if loop.environment.walls or not isinstance(loop.environment, Network):
+        return None
+    return robustness(loop, coupling).part()
 
 
 _MOST_RANGES = 6  # whose 64 vertices can all be proved
