@@ -10,8 +10,9 @@
 # make figures  the pictures that README and docs show, and the output in their blocks
 PYTHON ?= python3
 PY := .venv/bin/python
-# a file of tests stays on one core: its tests share fixtures, and those of the documentation files
-PARALLEL := -n auto --dist loadfile
+# a file of tests stays with one worker: its tests share fixtures, and those of the documentation files; one worker more
+# than cores, since sessions in real time mostly wait; tests/conftest.py has the longest files first
+PARALLEL := -n $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1) --dist loadfile --no-loadscope-reorder
 
 .PHONY: run test check validate lint coverage bench mutate oldest installed figures clean
 
