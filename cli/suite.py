@@ -36,7 +36,7 @@ from hw.limits import Stage
 from hw.monitor import LinkSettings
 from hw.rehearsal import Rehearsal
 from hw.session import session_for
-from sim.adversary import Attempt, attempts
+from sim.adversary import Attack, attempts
 from sim.challenges import challenges
 from sim.couplings import choose
 from sim.crowds import Validation
@@ -73,7 +73,7 @@ def shortages(couplings: Sequence[str], short: Sequence[float], generations: int
     return rows
 
 
-def _shortage(attempt: Attempt) -> _Row:
+def _shortage(attempt: Attack) -> _Row:
     worst = attempt.worst
     return {
         "loop": attempt.name,
@@ -321,9 +321,9 @@ def _edges(report: dict[str, Any]) -> list[_Part]:
     rows, taken = [], []
     for name, factor in dict.fromkeys((row["guarantee"], row["factor"]) for row in report["rows"]):
         some = [row for row in report["rows"] if (row["guarantee"], row["factor"]) == (name, factor)]
-        motions, took, hands, grew = (sum(row[of] for row in some) for of in ("motions", "took", "hands", "grew"))
+        motions, took, grew = (sum(row[of] for row in some) for of in ("motions", "took", "grew"))
         limited, least = max(row["limited"] for row in some), min(row["least_J"] for row in some)
-        met = f"{took} of {motions}", f"{grew}" if hands else "-"
+        met = f"{took} of {motions}", f"{grew}"
         rows.append((name, f"{factor:g}", *met, f"{limited:.0%}", f"{least:.2g}"))
         if factor >= 1:
             taken.append(took + grew)

@@ -171,7 +171,7 @@ NUMERIC = {
     "export": "seed",
     "bridge": "pace quantile guard measure force-cap max-speed continuous-force thermal-time duration seed baud",
     "emulator": "duration coulomb pace parent seed",
-    "identify": "force band seconds coulomb",
+    "identify": "force band seconds coulomb sittings hand",
 }
 
 
@@ -930,6 +930,9 @@ def main() -> int:
     for command in COMMANDS:
         import_module(f"cli.{command}")
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    if folder := os.environ.get("SHARED_DESIGNS"):
+        sys.path.append(str(Path(__file__).parents[1]))
+        import_module("forked").share_designs(Path(folder))
     bad, number, begin = 0, 0, time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         model = Path(folder) / "model"
