@@ -32,6 +32,7 @@ validate: .venv/ready
 	$(PY) -m sim.suite --out out/validate
 	$(PY) tests/cli/hostile.py --signals
 	$(PY) docs/regenerate.py --check
+	$(MAKE) installed
 
 mutate: .venv/ready
 	$(PY) tests/mutate.py
