@@ -1,6 +1,7 @@
 """The limit curve and the ladder as a user meets them, and what varies along each axis."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -266,6 +267,6 @@ def test_a_point_says_what_is_proved_of_it(monkeypatch):
     monkeypatch.setattr(limit_curve, "prove", hopeless)
     limit = measured(setting, "spring-damper", "any-environment", {})
     assert (limit.proof, limit.proof_reason) == ("sampled", "too many states")
-    row = {"optimal": {"proof": "rational"}, "any-environment": {"proof": limit.proof}, "this-environment": None}
+    row = {"optimal": replace(limit, proof="rational"), "any-environment": limit, "this-environment": None}
     assert command._proofs(row) == "sampled: any-environment"
-    assert command._proofs({"optimal": {"proof": None}}) == "-"
+    assert command._proofs({"optimal": replace(limit, proof=None)}) == "-"
