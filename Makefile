@@ -32,6 +32,7 @@ validate: .venv/ready
 	$(PY) -m sim.suite --out out/validate
 	$(PY) tests/cli/hostile.py --signals
 	$(PY) docs/regenerate.py --check
+	$(MAKE) installed
 
 mutate: .venv/ready
 	$(PY) tests/mutate.py
@@ -68,7 +69,7 @@ bench: .venv/ready
 installed:
 	$(PYTHON) -m venv .venv-installed
 	.venv-installed/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt .
-	cd out && ../.venv-installed/bin/haptic-loop audit --rigid --K 1000 --B 0 --T 1e-3 --theta 0 --delta 1.37
+	mkdir -p out && cd out && ../.venv-installed/bin/haptic-loop audit --rigid --K 1000 --B 0 --T 1e-3 --theta 0 --delta 1.37
 
 oldest:
 	$(PYTHON) -m venv .venv-oldest

@@ -61,7 +61,7 @@ class Demands:
 
 
 @dataclass(frozen=True, eq=False)
-class Curves:
+class _Curves:
     """One coupling at the frequencies `hz` of its picture."""
 
     sigma_F: Array  # (k, m) singular values of F [N/m], largest first
@@ -107,7 +107,7 @@ def grid(loop: Loop, couplings: Sequence[Demands], low_hz: float = _LOWEST_HZ) -
     return np.unique([*even, *(hz for hz in wanted if low_hz <= hz <= even[-1])])
 
 
-def curves(loop: Loop, judged: Demands, hz: Array) -> Curves:
+def curves(loop: Loop, judged: Demands, hz: Array) -> _Curves:
     """The curves of one coupling at `hz` (k,)."""
     w = 2 * np.pi * hz * loop.T
     z = on_circle(w)
@@ -115,7 +115,7 @@ def curves(loop: Loop, judged: Demands, hz: Array) -> Curves:
     target = (delay(loop.lam, loop.T) @ E).at(z)
     F = judged.F.at(z)
     demands = {name: None if demand is None else demand(w) for name, demand in judged.demands.items()}
-    return Curves(_singular_values(F), _singular_values(F - target), perceived(F, hz), demands)
+    return _Curves(_singular_values(F), _singular_values(F - target), perceived(F, hz), demands)
 
 
 def ideal(loop: Loop, hz: Array) -> tuple[Array, Perceived]:
