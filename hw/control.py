@@ -453,10 +453,11 @@ def certified_coupling(
         wanted = condition or ("this-environment" if slower.latency else None)
         chosen = choose(slower, case, name, wanted, limiter) if own is None else given(own)
     except DesignFailed as error:
-        raise SafetyStop(f"no coupling for a link of {link} ticks: {error}") from None
+        raise SafetyStop(f"no coupling for a link of {link} tick{'s' if link > 1 else ''}: {error}") from None
     requirements = assess(slower.loop(case), chosen.coupling, chosen.phi)
     limits = limits_of(slower, chosen, requirements, limiter)
-    made = CertifiedCoupling(min(slower.theta) if link else 0, slower, case, chosen, requirements, limits)
+    waits = min(MAX_THETA, *slower.theta) if link else 0  # what is longer, the host waits for
+    made = CertifiedCoupling(waits, slower, case, chosen, requirements, limits)
     if not made.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"
         raise SafetyStop(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(made)}")
