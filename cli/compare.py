@@ -18,18 +18,17 @@ import numpy as np
 from rich.table import Table
 
 from cli import options, render
-from cli.design import RETIRED_WITH_VALUE, add_optimal_options, optimal_options
+from cli.design import add_optimal_options, optimal_options
 from controller.loop import Loop
 from controller.lti import Array
 from design import compare
 from design.certificate import CONDITIONS
-from design.compare import AXES, FEEL_HZ, LADDERS, Judged, LadderRow, Limit, Perceived, Setting, optimum, settings
+from design.compare import AXES, FEEL_HZ, LADDERS, Demands, LadderRow, Limit, Perceived, Setting, optimum, settings
 from design.program import Options
 from design.result import OLDER_NAMES, DesignFailed, certificate_part, finite
 from design.robustness import robustness_part
 from design.transparency import transparency
-from sim import report
-from sim.baselines import PAIRS, SECONDS, SLOW, Rival, rivals
+from sim import baselines, report
 from sim.couplings import NAMES, Chosen, choose
 from sim.scenario import InputError, Scenario, require_even_ticks
 
@@ -77,7 +76,6 @@ def _parser() -> options.Parser:
     curve.add_argument("--beside", type=_beside, default=CONDITIONS, metavar="NAME", help=beside)
     optimal = parser.add_argument_group("the optimal coupling of --over")
     add_optimal_options(optimal)
-    optimal.add_argument("--diagonal", action="store_true", help=argparse.SUPPRESS)
     options.add_output_options(parser, picture=True)
     return parser
 
@@ -93,7 +91,6 @@ _MODES = {
     "no_plot": ("", "--over", "--baselines"),
     "limiter": ("--baselines",),
     **dict.fromkeys(("points", "keep", "beside", "objective", "band_hz", "high_gain", "seconds"), ("--over",)),
-    **dict.fromkeys((*RETIRED_WITH_VALUE, "diagonal"), ("--over",)),
 }
 
 
@@ -209,7 +206,7 @@ def _named(name: str) -> tuple[str, str | None]:
         return name, None  # a file may have a colon in its name
 
 
-def _shown(loop: Loop, name: str, chosen: Chosen, judged: Judged, hz: Array) -> _Shown:
+def _shown(loop: Loop, name: str, chosen: Chosen, judged: Demands, hz: Array) -> _Shown:
     lines, conditions = compare.curves(loop, judged, hz), {}
     for key, requirement in judged.requirements.items():
         demand = lines.demands[key]
@@ -350,12 +347,12 @@ class _Baselines:
     scenario: str
     case: str
     seed: int
-    rows: Sequence[Rival]
+    rows: Sequence[baselines.Rival]
     wall_s: float
     interrupted: bool
-    hands: int = PAIRS
-    hands_s: float = SECONDS
-    start_m_s: float = SLOW
+    hands: int = baselines.PAIRS
+    hands_s: float = baselines.SECONDS
+    start_m_s: float = baselines.SLOW
 
 
 def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
@@ -369,7 +366,7 @@ def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
     begin = time.perf_counter()
     with render.progress("comparing") as move:
         try:
-            rows.extend(rivals(scenario, args.case, move, args.limiter))
+            rows.extend(baselines.rivals(scenario, args.case, move, args.limiter))
         except KeyboardInterrupt:
             interrupted = True
     report = _Baselines(scenario.name, args.case, args.seed, rows, time.perf_counter() - begin, interrupted)
@@ -382,13 +379,14 @@ def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
     cells = [_rival(row) for row in rows]
     shown = [render.grid(f"on the same runs · {scenario.title(args.case)}", heads, cells, left=(0, 7))]
     lines = [f"* baseline {row.name}: {row.source}." for row in rows if row.source]
-    lines.append(f"hands: of {PAIRS} lossless pairs, faster after {SECONDS:g} s than the {SLOW:g} m/s they began with.")
+    began = f"{baselines.SLOW:g} m/s they began with"
+    lines.append(f"hands: of {baselines.PAIRS} lossless pairs, faster after {baselines.SECONDS:g} s than the {began}.")
     lines += sorted({f"error: {row.reason}." for row in rows if row.reason})
     render.publish(args, report, shown, [*lines, f"{report.wall_s:.1f} s"], out, files)
     return options.INTERRUPTED if interrupted else options.DONE
 
 
-def _rival(row: Rival) -> tuple[str, ...]:
+def _rival(row: baselines.Rival) -> tuple[str, ...]:
     error = render.optional(row.error_percent, "{:.2f}")
     figures = f"{row.fast_n:.3f}", f"{row.peak_n:.1f}", f"{row.acted_percent:.0f}", str(row.moving)
     short = "energy" if row.name == "energy budget" else row.guarantee or "none"
@@ -465,7 +463,7 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
     lines = [f"beside the optimum: the designed spring-damper by {names}"] if names else []
     lines += [f"{name} {row.value:.4g}: {row.reason}" for name, row in points if row.reason]
     tables = [_limit_table(report, name, args.beside) for name in report.sweeps]
-    lines += [*report.gains, *optimal_options(args)[1], f"{report.wall_s:.1f} s"]
+    lines += [*report.gains, f"{report.wall_s:.1f} s"]
     render.publish(args, report, tables, lines, out, files)
     if interrupted:
         return options.INTERRUPTED
@@ -475,7 +473,7 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
 
 def _wish(args: argparse.Namespace) -> Options:
     try:
-        return Options(**optimal_options(args)[0])
+        return Options(**optimal_options(args))
     except ValueError as error:
         raise InputError(options.as_option(error, args)) from None
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -15,18 +14,17 @@ from rich.table import Table
 from cli import options, render
 from cli.judged import Judged
 from controller.loop import DelayRange, Loop
+from design import coverage
 from design.audit import LONGEST_DELAY
 from design.bound import MOST, NO_BOUND, bound
 from design.certificate import SAMPLES, RangesCheck, assess, check_ranges, lag, prove, switching_requirement
-from design.coverage import Limits, cost_part, covered_limits, price, ranges_rows, switching_part
-from design.designs import KINDS, NO_LONGER, design_by_kind, usual_condition
+from design.designs import KINDS, design_by_kind, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
 from design.guarantees import ANY, HERE, switching_guarantee
-from design.optimal import Optimal
+from design.optimal import Optimal, robustness_parts, widest_ranges
 from design.program import DEFAULT, OBJECTIVES, Options
-from design.result import METHODS, Design, DesignFailed, NotProved, Row, listed
-from design.robustness import robustness_parts, widest_ranges
+from design.result import METHODS, Design, DesignFailed, NotProved, listed
 from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
 from sim import report as parts
@@ -73,7 +71,6 @@ def _parser() -> options.Parser:
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
     ccl.add_argument("--method", choices=METHODS, help="complementarity is as printed (default inner)")
-    ccl.add_argument("--compare", action="store_true", help="run every method, one state per channel (a minute)")
     optimal = parser.add_argument_group("optimal: the best filter of the environment's forces")
     add_optimal_options(optimal)
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"
@@ -92,23 +89,17 @@ def add_optimal_options(group: argparse._ActionsContainer) -> None:
     group.add_argument("--high-gain", type=_number_or_none, metavar="G", help=gain)
     limit = "begin no larger basis after this time [s] (default 60)"
     group.add_argument("--seconds", type=options.number(0), metavar="S", help=limit)
-    for name in RETIRED_WITH_VALUE:
-        group.add_argument(f"--{name}", help=argparse.SUPPRESS)
 
 
-RETIRED_WITH_VALUE = ("functions", "filter", "margin")
-
-
-def optimal_options(args: argparse.Namespace) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """What is asked of an optimal coupling, and a note where an option is given that it no longer has."""
+def optimal_options(args: argparse.Namespace) -> dict[str, Any]:
+    """What is asked of an optimal coupling."""
     given = {name: getattr(args, name) for name in ("objective", "band_hz", "high_gain", "seconds")}
     given = {name: value for name, value in given.items() if value is not None}
     if getattr(args, "limiter", False):
         given["limiter"] = True
     if given.get("high_gain") == "none":
         given.pop("high_gain")
-    retired = [f"--{name}" for name in (*RETIRED_WITH_VALUE, "full", "diagonal") if getattr(args, name, None)]
-    return given, (NO_LONGER.format(", ".join(retired)),) if retired else ()
+    return given
 
 
 def _percent(text: str) -> float:
@@ -128,13 +119,11 @@ _OPTIONS = {
     "limiter": ("spring-damper", "optimal"),
     "order": ("ccl",),
     "method": ("ccl",),
-    "compare": ("ccl",),
-    "full": ("ccl", "optimal"),
+    "full": ("ccl",),
     "objective": ("optimal",),
     "band_hz": ("optimal", "spring-damper"),
     "high_gain": ("optimal",),
     "seconds": ("optimal",),
-    **dict.fromkeys(RETIRED_WITH_VALUE, ("optimal",)),
 }
 
 
@@ -186,8 +175,7 @@ def _asked(args: argparse.Namespace, loop: Loop) -> dict[str, Any]:
             shown = name.removesuffix("_hz").replace("_", "-")
             raise InputError(f"--{shown} is for --coupling {allowed}, not {args.coupling}")
     if args.coupling == "optimal":
-        return optimal_options(args)[0]
-    given.pop("compare", None)
+        return optimal_options(args)
     if given.pop("full", False):
         given["diagonal"] = False
     return given
@@ -218,9 +206,9 @@ def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: De
     samples = SAMPLES if args.samples is None else args.samples
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
         whole = check_ranges(loop, design.coupling, args.seed, samples, move, searched, held)
-    limits = Limits(None, "as asked")
+    limits = coverage.Limits(None, "as asked")
     if args.limiter is not False:
-        limits = covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None)
+        limits = coverage.covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None)
     return Judged.of(args.coupling, design.coupling, loop, requirements, whole, limits, scenario)
 
 
@@ -246,7 +234,6 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         *_worth(args, loop, design),
         design.sdps,
         stored,
-        _comparison(loop) if args.compare else None,
     )
 
 
@@ -255,16 +242,9 @@ def _worth(args: argparse.Namespace, loop: Loop, design: Design) -> tuple[dict[s
     robust, best = {"robustness": None}, design if isinstance(design, Optimal) else None
     with render.progress("working out robustness and its price, and the bound"):
         if design.condition == "this-environment":
-            asked = Options(**optimal_options(args)[0]) if best else DEFAULT
+            asked = Options(**optimal_options(args)) if best else DEFAULT
             robust = robustness_parts(loop, design.coupling, asked)
         return robust, best and _best_figures(args, loop, best)
-
-
-def _comparison(loop: Loop) -> Sequence[Row]:
-    from design import fixed_order  # cvxpy takes a second to import
-
-    with render.progress("comparing the methods"):
-        return fixed_order.compare(loop)
 
 
 def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[str, Any]:
@@ -280,7 +260,7 @@ def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[s
         "bound": limit,
         "rendered_stiffness": best.g,
         "ladder": [asdict(rung) for rung in best.ladder],
-        "notes": [*args.notes, *optimal_options(args)[1]],
+        "notes": args.notes,
     }
 
 
@@ -289,7 +269,7 @@ def _switching_figures(loop: Loop, design: Design) -> dict[str, Any] | None:
     if loop.varying_delay is None:
         return None
     found, sent = switching_requirement(loop, design.coupling), loop.sent(design.coupling)
-    return switching_part(found, sent, loop.varying_delay, loop.T_max)
+    return coverage.switching_part(found, sent, loop.varying_delay, loop.T_max)
 
 
 def _robustness_loss(args: argparse.Namespace, loop: Loop, design: Design) -> list[dict[str, Any]]:
@@ -302,7 +282,7 @@ def _robustness_loss(args: argparse.Namespace, loop: Loop, design: Design) -> li
             couplings = {"nominal only": alone.coupling, **couplings}
         except DesignFailed:  # ranges are given another basis by default
             pass
-    return [cost_part(row) for row in price(loop, couplings)]
+    return [coverage.cost_part(row) for row in coverage.price(loop, couplings)]
 
 
 def _store(
@@ -403,7 +383,7 @@ class _Report:
     coupling: dict[str, Any] = render.several(_coupling_rows)
     certificates: dict[str, Any] = render.several(partial(render.certificate_rows, proof=False))
     switching: dict[str, Any] | None = render.figure("damping, any switching", _switching_words)
-    ranges: dict[str, Any] | None = render.several(ranges_rows)
+    ranges: dict[str, Any] | None = render.several(coverage.ranges_rows)
     promise: str | None = render.figure("guarantee", absent="none")
     limiter: dict[str, Any] = render.figure("guarantee, forces", "{[words]}")
     delays: str | None = render.figure("guarantee, delays", json="table")
@@ -413,7 +393,6 @@ class _Report:
     best: dict[str, Any] | None = render.several(_best_rows, "beside")
     sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
     stored: dict[str, Any] = render.several(_stored_rows)
-    comparison: Sequence[Row] | None = render.unseen("given")
 
     @property
     def aim(self) -> str:
@@ -426,13 +405,6 @@ def _tables(scenario: Scenario, report: _Report) -> list[Table]:
     shown = [render.facts(title, rows)]
     if report.price:
         shown.append(_over_the_ranges(report.price))
-    if report.comparison:
-        cells = [
-            (row.method, render.optional(row.norm, "{:.4g}"), str(row.sdps), f"{row.wall_s:.1f}")
-            for row in report.comparison
-        ]
-        heads = ("method", "||W1 L W2||", "SDPs", "seconds")
-        shown.append(render.grid("one state per channel, diagonal", heads, cells, left=range(4)))
     return shown
 
 

@@ -17,15 +17,14 @@ from controller.coupling import ForceFilter, NoCoupling, basis
 from controller.environment import Network, Spring
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled
-from design.api import design_coupling
 from design.barrier import Block, Program, centre
 from design.bound import bound
 from design.certificate import verify
 from design.conditions import this_environment
 from design.frequency import hermitian, on_circle
-from design.optimal import design
+from design.optimal import design, spread, widest_ranges
 from design.program import MARGIN, Case, Options, Span, span_of
-from design.robustness import ranges_around, robustness, spread, vertices, widest_ranges
+from design.robustness import ranges_around, robustness, vertices
 from design.stored import Stored, save
 from design.stored import load as load_file
 from design.transparency import transparency
@@ -419,15 +418,9 @@ def test_a_basis_has_more_for_few_than_for_many():
     assert five.used[:, :, 5].all()
 
 
-def test_options_of_old_have_no_effect_and_say_so():
-    loop, same = loop_of("o02"), {"functions": 16, "filter": "mixed", "margin": 0.01}
-    with pytest.warns(DeprecationWarning, match="without effect: functions, filter, margin"):
-        assert isinstance(design_coupling(loop, "optimal", **same).coupling, NoCoupling)
-
-
 def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
     scenario, report = next(LOOPS.glob("n3*.toml")), tmp_path / "r.json"
-    options = ["--best", "--scenario", str(scenario), "--margin", "0.01", "--out", str(tmp_path / "c.json")]
+    options = ["--best", "--scenario", str(scenario), "--out", str(tmp_path / "c.json")]
     assert main([*options, "--json", str(report)]) == 0
     found, text = json.loads(report.read_text()), " ".join(capsys.readouterr().out.split())
     assert found["bound"]["rms_mismatch_db"] < found["transparency"]["rms_mismatch_db"]
@@ -435,7 +428,6 @@ def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
     assert found["robustness"]["required_over_available"] > 1
     assert found["ladder"][-1]["mismatch_db"] <= found["ladder"][0]["mismatch_db"]
     assert "no linear coupling can be better than" in text
-    assert "without effect: --margin" in text
     assert verify(load_file(tmp_path / "c.json")).proved
 
 
