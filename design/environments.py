@@ -8,11 +8,12 @@ from itertools import product
 
 import numpy as np
 
-from controller.coupling import Coupling
+from controller.coupling import Coupling, ForceFilter
 from controller.environment import Member, Region, regions
 from controller.loop import Loop
 from controller.lti import Array, SingularLoop
 from design.conditions import this_environment
+from design.program import need
 from design.result import Requirement, refusal
 
 
@@ -158,4 +159,11 @@ def search_ranges(loop: Loop, coupling: Coupling, progress: Progress = lambda do
     """The worst environments of the loop's ranges that the search of design.environments finds."""
     assert loop.ranges
     parts = regions(loop.network, loop.ranges)
-    return search(parts, lambda member: in_each(loop, coupling, [member])[0].ratio, progress)
+    return search(parts, lambda member: ratio_in(loop.at(member.network), coupling), progress)
+
+
+def ratio_in(loop: Loop, coupling: Coupling) -> float:
+    """What this-environment asks in units of what there is, as fast as it can be had."""
+    if isinstance(coupling, ForceFilter):
+        return need(loop, coupling)
+    return _required(loop, coupling, Member("", loop.network)).ratio

@@ -37,6 +37,7 @@ from design.program import (
     Span,
     limiter,
     most_gain,
+    need,
     span_of,
     static_weight,
     switching,
@@ -196,8 +197,8 @@ class _Climb:
         if options.limiter and (reason := limiter_refusal(loop)):
             raise ValueError(reason)
         needs = in_each(loop, NoCoupling(), loop.members())
-        if not np.isfinite(bare := max(need.ratio for need in needs)):
-            raise ValueError(f"no coupling is safe here: {next(n.reason for n in needs if n.reason)}")
+        if not np.isfinite(bare := max(each.ratio for each in needs)):
+            raise ValueError(f"no coupling is safe here: {next(each.reason for each in needs if each.reason)}")
         return cls(loop, options, tuple(cases), bare, started)
 
     @property
@@ -280,7 +281,7 @@ class _Climb:
             chosen = tuple(cases[i] for i in active)
             problem = Problem(span, chosen, self.options, SOFT[0] * min(share, SOFT[1]))
             coupling = span.filter(problem.solve(self._start(problem)))
-            needs = [case.need(coupling) for case in cases]
+            needs = [need(case.loop, coupling) for case in cases]
             missed = [int(i) for i in np.argsort(needs)[::-1] if needs[i] > 1 + _TOLERATED and i not in active]
             if not missed:
                 break

@@ -306,19 +306,22 @@ class Case:
         """Psi E at z (k,)."""
         return Sampled.of(delay(self.loop.psi, self.loop.T) @ self.E, z[None])
 
-    def need(self, coupling: ForceFilter) -> float:
-        """The damping that this-environment asks, on a refined sweep, in units of what there is.
 
-        The responses of environment and filter are multiplied: their series has defective poles, which cost digits.
-        """
+def need(loop: Loop, coupling: ForceFilter) -> float:
+    """The damping that this-environment asks, on a refined sweep, in units of what there is.
 
-        def needed(w: Array) -> Array:
-            F = _late(self.loop, coupling.around(self.delayed(on_circle(w))))
-            demand = _demand(self.loop, F)
-            return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
+    The responses of environment and filter are multiplied: the poles of their series are defective and cost digits.
+    """
+    E = loop.E()
+    delayed = delay(loop.psi, loop.T) @ E
 
-        chain = Span(coupling.poles, coupling.pairs, np.ones((len(coupling.R) - 1, 1, 1), dtype=bool)).chain(self.E.T)
-        return supremum(needed, frequencies(self.E, chain, low=SMALLEST / 10))[0]
+    def needed(w: Array) -> Array:
+        F = _late(loop, coupling.around(Sampled.of(delayed, on_circle(w)[None])))
+        demand = _demand(loop, F)
+        return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
+
+    chain = Span(coupling.poles, coupling.pairs, np.ones((len(coupling.R) - 1, 1, 1), dtype=bool)).chain(E.T)
+    return supremum(needed, frequencies(E, chain, low=SMALLEST / 10))[0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,10 +11,9 @@ import msgspec
 from controller.coupling import Coupling, ForceFilter
 from controller.environment import Network, Ranges, UncertainSpring
 from controller.loop import Loop
-from design.conditions import this_environment
-from design.environments import in_each
+from design.environments import in_each, ratio_in
 from design.optimal import at, compromise, design
-from design.program import DEFAULT, Case, Options
+from design.program import DEFAULT, Options
 from design.result import DesignFailed, finite
 from design.transparency import decibels
 
@@ -69,11 +68,7 @@ def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> _Robust
     """The worst need of a coupling over `vertices`, by the refined sweep."""
     worst, where = 0.0, "nominal"
     for name, network in {"nominal": loop.environment, **vertices(loop.network, percent)}.items():
-        there = at(loop, network)
-        if isinstance(coupling, ForceFilter):
-            ratio = Case(there, there.E()).need(coupling)
-        else:
-            ratio = this_environment(there.F(coupling), loop.delta, loop.T_max, loop.latency).ratio
+        ratio = ratio_in(at(loop, network), coupling)
         if ratio > worst:
             worst, where = ratio, name
     return _Robustness(percent, worst, where, worst < 1)
@@ -117,7 +112,7 @@ def robustness_part(loop: Loop, coupling: Coupling) -> dict[str, Any] | None:
     return robustness(loop, coupling).part()
 
 
-_MOST_RANGES = 6  # whose 64 vertices can all be proved
+_MOST_RANGES = 7  # whose 128 vertices can all be proved
 
 
 def widest_ranges(loop: Loop, percent: float) -> tuple[Ranges, str | None]:
@@ -133,17 +128,17 @@ def widest_ranges(loop: Loop, percent: float) -> tuple[Ranges, str | None]:
         return whole, None
     small = design(loop.at(loop.network), replace(DEFAULT, ladder=DEFAULT.ladder[:1])).coupling
 
-    def need(box: Ranges) -> float:
+    def most(box: Ranges) -> float:
         there = msgspec.structs.replace(loop, ranges=box)
         return max(found.ratio for found in in_each(there, small, there.members()))
 
-    ranked = sorted(single, key=need, reverse=True)
+    ranked = sorted(single, key=most, reverse=True)
     kept, known = ranked[:_MOST_RANGES], ranked[_MOST_RANGES:]
     names = [f"stiffness {' and '.join(spring.between)}" for box in known for spring in box.springs]
     names += [f"mass {node}" for box in known for node in box.masses]
     note = (
         f"{len(single)} ranges have {2 ** len(single)} vertices, {2**_MOST_RANGES} can be proved: those that matter "
-        f"most are kept, taken as known: {', '.join(names)}"
+        f"most are kept; nothing is proved of the others, which are taken as known: {', '.join(names)}"
     )
     springs = tuple(spring for box in kept for spring in box.springs)
     return Ranges(springs, {node: span for box in kept for node, span in box.masses.items()}), note
