@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,22 +13,23 @@ import msgspec
 from rich.table import Table
 
 from cli import options, render
+from cli.judged import Judged
 from controller.loop import DelayRange, Loop
 from design.audit import LONGEST_DELAY
 from design.bound import MOST, NO_BOUND, bound
 from design.certificate import SAMPLES, RangesCheck, assess, check_ranges, lag, prove, switching_requirement
-from design.coverage import Limits, cost_part, covered_limits, price, ranges_part, ranges_rows, switching_part
+from design.coverage import Limits, cost_part, covered_limits, price, ranges_rows, switching_part
 from design.designs import KINDS, NO_LONGER, design_by_kind, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
-from design.guarantees import ANY, HERE, guarantee_of, switching_guarantee
+from design.guarantees import ANY, HERE, switching_guarantee
 from design.optimal import Optimal
 from design.program import DEFAULT, OBJECTIVES, Options
-from design.result import METHODS, Design, DesignFailed, NotProved, finite, listed
+from design.result import METHODS, Design, DesignFailed, NotProved, Row, listed
 from design.robustness import robustness_parts, widest_ranges
 from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
-from sim import report
+from sim import report as parts
 from sim.scenario import InputError, Scenario
 
 
@@ -42,59 +45,12 @@ def main(argv: list[str]) -> int:
     if args.samples is not None and loop.ranges is None:
         raise InputError("--samples without ranges: give --ranges, or a scenario with [ranges]")
     design = _design(args, loop)
-    best = design if isinstance(design, Optimal) else None
-    held = design.certificate
-    requirements = assess(loop, design.coupling, design.phi, held)
-    with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
-        whole = check_ranges(
-            loop,
-            design.coupling,
-            args.seed,
-            SAMPLES if args.samples is None else args.samples,
-            move,
-            best and best.searched,
-            held,
-        )
-    certificates = report.certificates_part(requirements)
-    if args.limiter is False:
-        limits = Limits(None, "as asked")
-    else:
-        limits = covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None)
-    outcome = {
-        "case": args.case,
-        "seed": args.seed,
-        "coupling": report.coupling_part(args.coupling, design.coupling, loop.T),
-        "certificate": certificates[design.condition],
-        "certificates": certificates,
-        "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
-        "ranges": whole and ranges_part(whole),
-        "price": _robustness_loss(args, loop, design) if whole else None,
-        "transparency": report.transparency_part(
-            transparency(loop.F(design.coupling), loop.E(), loop.lam, args.band_hz or BAND_HZ)
-        ),
-        "objective": design.objective,
-        "objective_name": design.figure,
-        "sdps": design.sdps,
-        "wall_s": design.wall_s,
-        "stored": _store(loop, design, whole, out, limits.certificate),
-        "limiter": limits.part([device.force_limit for device in scenario.device]),
-        "switching": _switching_figures(loop, design),
-        "robustness": None,
-    }
-    with render.progress("working out robustness and its price, and the bound"):
-        if design.condition == "this-environment":
-            outcome |= robustness_parts(loop, design.coupling, Options(**optimal_options(args)[0]) if best else DEFAULT)
-        if best:
-            outcome |= _best_figures(args, loop, best)
-    if args.compare:
-        from design import fixed_order  # cvxpy takes a second to import
-
-        with render.progress("comparing the methods"):
-            outcome["comparison"] = [asdict(row) for row in fixed_order.compare(loop)]
-    render.publish(args, outcome, _tables(scenario, outcome), outcome.get("notes", args.notes))
-    holds = outcome["certificate"]["certified"] and (outcome["promise"] == ANY or not whole or whole.proved)
-    switching = outcome["jitter_proof"] = outcome["switching"]  # and by its older name
-    return options.DONE if holds and (switching is None or switching["certified"]) else options.DOES_NOT_HOLD
+    judged = _judged(args, scenario, loop, design)
+    stored = _store(loop, design, judged.whole, out, judged.limits.certificate)
+    report = _reported(args, loop, design, judged, stored)
+    render.publish(args, report, _tables(scenario, report), (report.best or {}).get("notes", args.notes))
+    holds = report.certificate["certified"] and (judged.promise == ANY or not judged.whole or judged.proved)
+    return options.DONE if holds and (report.switching or report.certificate)["certified"] else options.DOES_NOT_HOLD
 
 
 def _parser() -> options.Parser:
@@ -255,6 +211,62 @@ def _design(args: argparse.Namespace, loop: Loop) -> Design:
 # What was designed: its figures, its file.
 
 
+def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: Design) -> Judged:
+    """What each condition asks of the coupling, by a sweep and an exact proof, and the limiter that it may have."""
+    held, searched = design.certificate, design.searched if isinstance(design, Optimal) else None
+    requirements = assess(loop, design.coupling, design.phi, held)
+    samples = SAMPLES if args.samples is None else args.samples
+    with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
+        whole = check_ranges(loop, design.coupling, args.seed, samples, move, searched, held)
+    limits = Limits(None, "as asked")
+    if args.limiter is not False:
+        limits = covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None)
+    return Judged.of(args.coupling, design.coupling, loop, requirements, whole, limits, scenario)
+
+
+def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judged, stored: dict[str, Any]) -> _Report:
+    figures = transparency(loop.F(design.coupling), loop.E(), loop.lam, args.band_hz or BAND_HZ)
+    delays = stored["switching"]
+    return _Report(
+        args.case,
+        args.seed,
+        design.objective,
+        design.wall_s,
+        judged.certificates[design.condition],
+        _robustness_loss(args, loop, design) if judged.whole else None,
+        judged.coupling,
+        judged.certificates,
+        _switching_figures(loop, design),
+        judged.ranges,
+        judged.promise,
+        judged.limiter,
+        delays["promise"] if delays and delays["proof"] else None,
+        design.figure,
+        parts.transparency_part(figures),
+        *_worth(args, loop, design),
+        design.sdps,
+        stored,
+        _comparison(loop) if args.compare else None,
+    )
+
+
+def _worth(args: argparse.Namespace, loop: Loop, design: Design) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """What a wrong model of the environment costs, and what only an optimal coupling is reported with."""
+    robust, best = {"robustness": None}, design if isinstance(design, Optimal) else None
+    with render.progress("working out robustness and its price, and the bound"):
+        if design.condition == "this-environment":
+            asked = Options(**optimal_options(args)[0]) if best else DEFAULT
+            robust = robustness_parts(loop, design.coupling, asked)
+        return robust, best and _best_figures(args, loop, best)
+
+
+def _comparison(loop: Loop) -> Sequence[Row]:
+    from design import fixed_order  # cvxpy takes a second to import
+
+    with render.progress("comparing the methods"):
+        return fixed_order.compare(loop)
+
+
 def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[str, Any]:
     """What an optimal coupling is reported with: how it was found, and how it stands to what is possible."""
     limit: dict[str, Any] = {"rms_mismatch_db": None}
@@ -266,7 +278,7 @@ def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[s
         limit["rms_mismatch_db"] = bound(loop, args.band_hz or BAND_HZ, near=best.coupling).rms_db
     return {
         "bound": limit,
-        "rendered_stiffness": finite(best.g),
+        "rendered_stiffness": best.g,
         "ladder": [asdict(rung) for rung in best.ladder],
         "notes": [*args.notes, *optimal_options(args)[1]],
     }
@@ -339,45 +351,12 @@ def _proved(loop: Loop, design: Design, limiter: LimiterCertificate | None) -> t
 # The report as tables.
 
 
-def _tables(scenario: Scenario, outcome: dict[str, Any]) -> list[Table]:
-    condition = outcome["certificate"]["condition"]
-    title = f"{scenario.title(outcome['case'])}: {outcome['coupling']['kind']} for {condition}"
-    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *_rows(outcome)])]
-    if outcome["price"]:
-        shown.append(_over_the_ranges(outcome["price"]))
-    if "comparison" in outcome:
-        rows = [
-            (row["method"], render.optional(row["norm"], "{:.4g}"), str(row["sdps"]), f"{row['wall_s']:.1f}")
-            for row in outcome["comparison"]
-        ]
-        heads = ("method", "||W1 L W2||", "SDPs", "seconds")
-        shown.append(render.grid("one state per channel, diagonal", heads, rows, left=range(4)))
-    return shown
-
-
-def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
-    coupling, stored, transparent = outcome["coupling"], outcome["stored"], outcome["transparency"]
-    switching, proof = stored["switching"] or {}, outcome["switching"]
+def _coupling_rows(coupling: dict[str, Any]) -> render.Rows:
     end = f"{STIFFEST:g} N/m is where the search ends, no optimum of its own"
-    return [
-        ("K [N/m]", coupling["K"] and listed(coupling["K"])),
-        ("", end if max(coupling["K"] or [0]) > 0.999 * STIFFEST else None),
-        ("B [N s/m]", coupling["K"] and listed(coupling["B"])),
-        ("stiffness, static [N/m]", coupling.get("stiffness") and listed(coupling["stiffness"])),
-        *render.certificate_rows(outcome["certificates"], proof=False),
-        ("damping, any switching", proof and _switching_words(proof)),
-        *(ranges_rows(outcome["ranges"]) if outcome["ranges"] else []),
-        ("guarantee", outcome["promise"] or "none"),
-        ("guarantee, forces", outcome["limiter"]["words"]),
-        ("guarantee, delays", switching["promise"] if switching.get("proof") else None),
-        ("designed for", f"{_OBJECTIVE_WORDS[outcome['objective_name']]}: {outcome['objective']:.5g}"),
-        ("transparency error", render.transparency_error(transparent)),
-        *render.robustness_rows(outcome),
-        *_best_rows(outcome),
-        ("convex problems", f"{outcome['sdps']} in {outcome['wall_s']:.2f} s"),
-        ("stored", f"{stored['file']} (proof: {stored['proof'] or stored['reason']})"),
-        ("", f"for constant delays only: {switching['reason']}" if switching and not switching["proof"] else None),
-    ]
+    yield "K [N/m]", coupling["K"] and listed(coupling["K"])
+    yield "", end if max(coupling["K"] or [0]) > 0.999 * STIFFEST else None
+    yield "B [N s/m]", coupling["K"] and listed(coupling["B"])
+    yield "stiffness, static [N/m]", coupling.get("stiffness") and listed(coupling["stiffness"])
 
 
 #: what a design minimised or maximised -> in words
@@ -389,24 +368,72 @@ _OBJECTIVE_WORDS = {
 }
 
 
-def _best_rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
+def _best_rows(part: dict[str, Any]) -> render.Rows:
     """What only an optimal coupling has."""
-    if "bound" not in outcome:
-        return []
-    limit = outcome["bound"]
-    words = limit.get("reason") or f"no linear coupling can be better than {limit['rms_mismatch_db']:.2f} dB rms"
-    climbed = ", ".join(f"{rung['mismatch_db']:.2f}" for rung in outcome["ladder"])
-    return [
-        ("bound", words),
-        ("rendered stiffness", render.optional(outcome["rendered_stiffness"], "{:.3f} of the environment's")),
-        ("ladder [dB]", climbed or None),
-    ]
+    limit = part["bound"]
+    climbed = ", ".join(f"{rung['mismatch_db']:.2f}" for rung in part["ladder"])
+    bounded = f"no linear coupling can be better than {limit['rms_mismatch_db'] or 0:.2f} dB rms"
+    yield "bound", limit.get("reason") or bounded
+    yield "rendered stiffness", render.optional(part["rendered_stiffness"], "{:.3f} of the environment's")
+    yield "ladder [dB]", climbed or None
 
 
 def _switching_words(proof: dict[str, Any]) -> str:
     span = ", ".join(f"{lo} to {hi}" for lo, hi in zip(proof["lo"], proof["hi"], strict=True))
     word = "certified" if proof["certified"] else "not certified"
     return f"{span} samples: needs {listed(proof['required_damping'])}: {word} (proof: {proof['proof']})"
+
+
+def _stored_rows(part: dict[str, Any]) -> render.Rows:
+    switching = part["switching"] or {"proof": True}
+    yield "stored", f"{part['file']} (proof: {part['proof'] or part['reason']})"
+    yield "", None if switching["proof"] else f"for constant delays only: {switching['reason']}"
+
+
+@dataclass(frozen=True, eq=False)
+class _Report:
+    """What was designed; parts are null where there is none of it."""
+
+    case: str
+    seed: int
+    objective: float
+    wall_s: float
+    certificate: dict[str, Any]
+    price: list[dict[str, Any]] | None
+    coupling: dict[str, Any] = render.several(_coupling_rows)
+    certificates: dict[str, Any] = render.several(partial(render.certificate_rows, proof=False))
+    switching: dict[str, Any] | None = render.figure("damping, any switching", _switching_words)
+    ranges: dict[str, Any] | None = render.several(ranges_rows)
+    promise: str | None = render.figure("guarantee", absent="none")
+    limiter: dict[str, Any] = render.figure("guarantee, forces", "{[words]}")
+    delays: str | None = render.figure("guarantee, delays", json="table")
+    objective_name: str = render.figure("designed for", "{r.aim}: {r.objective:.5g}")
+    transparency: dict[str, Any] = render.figure("transparency error", render.transparency_error)
+    robust: dict[str, Any] = render.several(render.robustness_rows, "beside")
+    best: dict[str, Any] | None = render.several(_best_rows, "beside")
+    sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
+    stored: dict[str, Any] = render.several(_stored_rows)
+    comparison: Sequence[Row] | None = render.unseen("given")
+
+    @property
+    def aim(self) -> str:
+        return _OBJECTIVE_WORDS[self.objective_name]
+
+
+def _tables(scenario: Scenario, report: _Report) -> list[Table]:
+    title = f"{scenario.title(report.case)}: {report.coupling['kind']} for {report.certificate['condition']}"
+    rows = [render.channel_row(scenario.environment.contacts), *render.rows_of(report)]
+    shown = [render.facts(title, rows)]
+    if report.price:
+        shown.append(_over_the_ranges(report.price))
+    if report.comparison:
+        cells = [
+            (row.method, render.optional(row.norm, "{:.4g}"), str(row.sdps), f"{row.wall_s:.1f}")
+            for row in report.comparison
+        ]
+        heads = ("method", "||W1 L W2||", "SDPs", "seconds")
+        shown.append(render.grid("one state per channel, diagonal", heads, cells, left=range(4)))
+    return shown
 
 
 def _over_the_ranges(rows: list[dict[str, Any]]) -> Table:

@@ -185,11 +185,11 @@ def _part(report: Any) -> dict[str, Any]:
 # Tables.
 
 
-_Rows = Iterable[tuple[str, str | None]]
+Rows = Iterable[tuple[str, str | None]]
 _Form = str | Callable[[Any], str | None]
 
 
-def facts(title: str, rows: _Rows, heads: Sequence[str] = (), left: bool = False) -> Table:
+def facts(title: str, rows: Rows, heads: Sequence[str] = (), left: bool = False) -> Table:
     """A table of names and texts; a text of None is left out."""
     table = Table(*heads, title=title, title_justify="left" if left else "center", show_header=bool(heads))
     for name, text in rows:
@@ -210,15 +210,16 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
     return table
 
 
-def figure(name: str, form: _Form = "{}", default: Any = MISSING, json: str = "key") -> Any:
+def figure(name: str, form: _Form = "{}", default: Any = MISSING, json: str = "key", absent: str | None = None) -> Any:
     """A field that a report's table shows under this name, in this format: of the value, and of the whole report `r`.
 
-    In JSON it is a `key`, a key only where it is `given`, keys `beside` the report's own, or in the `table` alone.
+    None is shown as `absent`, or not at all. In JSON it is a `key`, a key only where it is `given`, keys `beside` the
+    report's own, or in the `table` alone.
     """
-    return field(default=default, metadata={"name": name, "form": form, "json": json})
+    return field(default=default, metadata={"name": name, "form": form, "json": json, "absent": absent})
 
 
-def several(rows: Callable[[Any], _Rows], json: str = "key") -> Any:
+def several(rows: Callable[[Any], Rows], json: str = "key") -> Any:
     """A field that a report's table shows as these rows."""
     return field(metadata={"rows": rows, "json": json})
 
@@ -228,12 +229,18 @@ def unseen(json: str = "key", default: Any = MISSING) -> Any:
     return field(default=default, metadata={"json": json})
 
 
-def rows_of(report: Any) -> _Rows:
+def rows_of(report: Any) -> Rows:
     """The figures of a report as rows; those that are None are left out."""
     for one in fields(report):
         value, form = getattr(report, one.name), one.metadata.get("form")
         if form is not None:
-            text: Any = None if value is None else form(value) if callable(form) else form.format(value, r=report)
+            text: Any = (
+                one.metadata["absent"]
+                if value is None
+                else form(value)
+                if callable(form)
+                else form.format(value, r=report)
+            )
             yield one.metadata["name"], text
         elif "rows" in one.metadata and value is not None:
             yield from one.metadata["rows"](value)
@@ -259,7 +266,7 @@ def needs(part: Mapping[str, Any], digits: int = 6) -> str:
     return f"{required} of {available} N s/m"
 
 
-def certificate_rows(certificates: Mapping[str, dict[str, Any]], digits: int = 6, proof: bool = True) -> _Rows:
+def certificate_rows(certificates: Mapping[str, dict[str, Any]], digits: int = 6, proof: bool = True) -> Rows:
     """What each condition needs, and whether that is proved exactly, where no other row says it."""
     for name, part in certificates.items():
         if name in ORDER:
@@ -283,7 +290,7 @@ def transparency_error(part: Mapping[str, Any]) -> str:
     return f"{sup} at most, {rms} rms (0 dB: as wrong as no force)"
 
 
-def robustness_rows(outcome: Mapping[str, Any]) -> _Rows:
+def robustness_rows(outcome: Mapping[str, Any]) -> Rows:
     """What a wrong model of the environment costs, and what a design that allows for it would."""
     there, price = outcome.get("robustness"), outcome.get("designed_for_it")
     if there is None:
@@ -313,7 +320,7 @@ def timing_row(part: Mapping[str, Any] | None) -> tuple[str, str | None]:
     return "ticks", "; ".join(words)
 
 
-def delay_rows(part: Mapping[str, Any]) -> _Rows:
+def delay_rows(part: Mapping[str, Any]) -> Rows:
     """Delays that vary, of a run or of a validation."""
     spans = ", ".join(f"{lo} to {hi}" for lo, hi in zip(part["lo"], part["hi"], strict=True))
     played = ", played out at the largest" if part["playout"] else ""

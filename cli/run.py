@@ -9,22 +9,29 @@ from pathlib import Path
 from typing import Any
 
 from cli import options, render
+from cli.judged import Judged, judge
 from controller.environment import GROUND
 from controller.loop import Loop
-from design.certificate import RangesCheck, assess, check_ranges
-from design.coverage import ranges_part, ranges_rows
 from design.files import write
-from design.guarantees import ANY, guarantee_of
+from design.guarantees import ANY
 from design.result import listed
 from design.robustness import robustness_parts
 from design.transparency import BAND_HZ, transparency
 from sim import report
-from sim.accuracy import ForceError, credible_part, force_error, position_error
+from sim.accuracy import (
+    EngineChoice,
+    ForceError,
+    compare_engines,
+    credible_part,
+    cross_check,
+    force_error,
+    pick,
+    position_error,
+)
 from sim.alternatives import Alternative, alternatives
-from sim.couplings import NAMES, Chosen, choose, limits_of
-from sim.engine_choice import EngineChoice, compare_engines, cross_check, pick
+from sim.couplings import NAMES, Chosen, choose
 from sim.engines import INTEGRATORS, default_integrator
-from sim.nets import BASELINES, Classic, EnergyNet, idle, netted
+from sim.passivity_layer import BASELINES, Classic, EnergyNet, idle, netted
 from sim.run import ENGINES, Simulation, assemble, beginnings, make_engine, run
 from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, stability_part
@@ -39,41 +46,17 @@ def main(argv: list[str]) -> int:
     if args.error is not None and (args.engine == "exact" or args.integrator or args.substeps):
         raise InputError("--error chooses integrator and substeps of MuJoCo: give no --engine exact, --integrator, ..")
     scenario, out = _scenario(args), options.out_folder(args, "run")
-    loop = scenario.loop(args.case)
     environment, simulated = _environment(args, scenario)
     chosen = _chosen(args, scenario)
-    with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
-        whole = check_ranges(loop, chosen.coupling, args.seed, progress=move)
-        requirements = assess(simulated.loop(args.case), chosen.coupling, chosen.phi)
-        limits = limits_of(simulated, chosen, requirements, args.limiter)
-    done = _run(args, simulated, chosen, limits.rho)
-    outcome = {
-        "case": args.case,
-        "scenario": scenario.name,
-        "coupling": report.coupling_part(chosen.kind, chosen.coupling, scenario.T),
-        **_certified(chosen, requirements, done.loop(args.case), whole),
-        "encoder": report.encoder_steps(scenario, args.case, chosen.coupling),
-        "transparency": report.transparency_part(
-            transparency(done.simulation.felt, done.simulation.E, loop.lam, args.band_hz or BAND_HZ)
-        ),
-        **_stability(chosen, done, any(requirement.certified for requirement in requirements.values())),
-        "run": _settings(args, done, loop.lam) | {"environment": environment},
-        "limiter": limits.part([device.force_limit for device in simulated.device]),
-    }
-    outcome["error"] = position_error(done.trace, done.exact, done.simulation, _unstable(outcome))
-    outcome["reproducibility"] = report.beside_the_paper(done.simulation.scenario, args.case, outcome)
-    outcome["credible"] = credible_part(done.simulation, done.trace)
-    alike = force_error(done.ran, done.trace, loop.lam)
-    outcome["ideal_force"] = alike.part()
-    outcome |= _net(done, requirements)
-    outcome |= _robustness(chosen, loop, outcome)
-    others = _alternatives(args, scenario, done)
-    outcome["alternatives"] = [other.part() for other in others]
-    outcome["remarks"] = [*done.warnings, *chosen.notes, *report.remarks(outcome)]
-    files = _save(args, out, done, alike, outcome)
+    judged = judge(args, scenario, chosen, simulated)
+    done = _run(args, simulated, chosen, judged.limits.rho)
+    same = args.limiter is None and not scenario.ranges and args.case != "none"
+    others = _alternatives(args, scenario, done, (chosen, judged.requirements, judged.limits) if same else None)
+    report = _reported(args, scenario, chosen, judged, done, environment, others)
+    files = _save(args, out, done, report)
     if args.side_by_side:
         files.append(_side_by_side(others, out / "couplings.png", scenario.environment.contacts))
-    render.publish(args, outcome, _tables(scenario, outcome, others), outcome["remarks"], out, files)
+    render.publish(args, report, _tables(scenario, report, others), report.remarks, out, files)
     return options.INTERRUPTED if done.trace.interrupted else options.DONE
 
 
@@ -156,10 +139,6 @@ class _Run:
     exact: Trace | None  # None where friction makes the loop another one than the linear
     wall_s: float
 
-    def loop(self, case: str) -> Loop:
-        """What was simulated, as a design knows it."""
-        return self.simulation.scenario.loop(case)
-
 
 def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tuple[float, ...] | None) -> _Run:
     """Close the loop. Raises InputError for settings that cannot be."""
@@ -198,17 +177,6 @@ def _budgeted(simulation: Simulation, chosen: Chosen, start: float, cap: float) 
         raise InputError(f"--energy-budget: {error}") from None
 
 
-def _net(run: _Run, requirements: dict[str, Any]) -> dict[str, Any]:
-    """What the net under the controller did; the part is null where there is none."""
-    part = run.trace.net.part() if run.trace.net else None
-    if part is None or part["guarantee"] is None:
-        return {"energy_budget": None, "baseline": part}
-    return {
-        "energy_budget": part | {"idle": idle(run.simulation, requirements["any-environment"], part)},
-        "baseline": None,
-    }
-
-
 def _steps(args: argparse.Namespace, simulation: Simulation) -> tuple[str | None, int | None, list[str]]:
     """Integrator and substeps of this run, with remarks on a number that was asked for."""
     if args.engine == "exact":
@@ -232,11 +200,11 @@ def _compared(args: argparse.Namespace, simulation: Simulation) -> tuple[EngineC
         return compare_engines(simulation, args.error)
 
 
-def _alternatives(args: argparse.Namespace, scenario: Scenario, run: _Run) -> list[Alternative]:
+def _alternatives(args: argparse.Namespace, scenario: Scenario, run: _Run, own: Any) -> list[Alternative]:
     """What other couplings come to in the scenario's own environment. Raises InputError for a picture of nothing."""
     skipped = args.no_alternatives or run.trace.interrupted or args.vertex > 0
     with render.progress("other couplings") as move:
-        made = [] if skipped else alternatives(scenario, args.case, move)
+        made = [] if skipped else alternatives(scenario, args.case, move, own)
     if args.side_by_side and not any(other.trace is not None for other in made):
         raise InputError("--side-by-side is for runs without walls, friction, varying delays and --no-alternatives")
     return made
@@ -263,38 +231,123 @@ def _panel_title(other: Alternative) -> str:
     return f"{'no coupling' if other.kind == 'none' else other.name + kind}\n{felt}; {guarantee}"
 
 
-def _certified(chosen: Chosen, requirements: dict[str, Any], loop: Loop, whole: RangesCheck | None) -> dict[str, Any]:
-    certificates = report.certificates_part(requirements)
-    return {
-        "certificate": certificates[chosen.condition],
-        "certificates": certificates,
-        "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
-        "ranges": whole and ranges_part(whole),
-    }
+@dataclass(frozen=True, eq=False)
+class _Report:
+    """What a run came to; parts are null where the run has none of it."""
+
+    case: str
+    scenario: str
+    certificate: dict[str, Any]
+    judged: Judged = render.unseen("beside")
+    encoder: dict[str, Any] | None = render.unseen()
+    transparency: dict[str, Any] = render.unseen()
+    stability: dict[str, Any] = render.unseen()
+    varying_delay: dict[str, Any] | None = render.unseen()
+    run: dict[str, Any] = render.unseen()
+    error: dict[str, Any] = render.unseen()
+    credible: dict[str, Any] = render.unseen()
+    alike: ForceError = render.unseen("table")
+    ideal_force: dict[str, Any] = render.unseen()
+    energy_budget: dict[str, Any] | None = render.unseen()
+    baseline: dict[str, Any] | None = render.unseen()
+    robustness: dict[str, Any] = render.unseen("beside")
+    alternatives: list[dict[str, Any]] = render.unseen()
+    reproducibility: list[dict[str, str]] = render.unseen(default=())
+    remarks: tuple[str, ...] = render.unseen(default=())
+
+    @property
+    def unstable(self) -> bool | None:
+        """Whether switching makes the loop grow; None where the eigenvalues say whether it does."""
+        return _switched(self.varying_delay) and self.stability["verdict"] == "unstable"
+
+    def rows(self) -> render.Rows:
+        """Of its table."""
+        coupling, stability, run, transparent = self.judged.coupling, self.stability, self.run, self.transparency
+        contact, apart = stability.get("contact"), self.error["position_relative_rms"]
+        gains = coupling["K"] and f"{listed(coupling['K'], 5)} N/m / {listed(coupling['B'], 5)} N s/m"
+        how = "growth, switching" if self.unstable is not None else "growth, simulated trace"
+        if run["timing"] and "impulse" in stability.get("reason", ""):
+            how = "growth, uneven ticks"
+        measured = render.optional(stability["growth_rate_per_s"], "{:+.4f} 1/s")
+        position = "-" if apart is None else f"{apart:.1e} relative rms, {self.error['position_max_m']:.1e} m at most"
+        return [
+            ("coupling K / B", gains or None),
+            ("coupling, static", coupling.get("stiffness") and f"{listed(coupling['stiffness'], 5)} N/m"),
+            *self.judged.rows(),
+            ("transparency error", render.transparency_error(transparent)),
+            *render.robustness_rows(self.robustness),
+            ("force error", _force_error(self.ideal_force)),
+            ("rendered stiffness", f"{100 * transparent['dc_ratio']:.1f} %" if transparent["dc_ratio"] else "-"),
+            *_net_rows(self.energy_budget, self.baseline),
+            ("growth, eigenvalues", _growth(stability)),
+            (how, f"{measured}: {render.verdict(stability['verdict'])}"),
+            render.timing_row(run["timing"]),
+            *(render.delay_rows(self.varying_delay) if self.varying_delay else []),
+            *(_contact_rows(contact, run["samples"]) if contact else []),
+            ("simulated in", run["environment"] if self.judged.ranges else None),
+            ("force limits", self.judged.limiter["words"]),
+            ("limited ticks", f"{stability['clipped_ticks']} of {run['samples']}"),
+            ("speed", _speed(run)),
+            ("position error", position),
+            ("cross-check", _crossed(run["cross_check"]) if run["cross_check"] else None),
+        ]
 
 
-def _robustness(chosen: Chosen, loop: Loop, outcome: dict[str, Any]) -> dict[str, Any]:
+def _switched(delays: dict[str, Any] | None) -> bool | None:
+    return True if "verdict" in (delays or {}) else None
+
+
+def _reported(
+    args: argparse.Namespace,
+    scenario: Scenario,
+    chosen: Chosen,
+    judged: Judged,
+    run: _Run,
+    environment: str,
+    others: list[Alternative],
+) -> _Report:
+    """Everything that the run came to."""
+    simulation, lam = run.simulation, scenario.loop(args.case).lam
+    covered = any(requirement.certified for requirement in judged.requirements.values())
+    delays = report.delays_part(simulation, chosen, run.period, run.trace.t.size, covered)
+    if delays and simulation.scenario.switches:
+        stability = report.switched_stability_part(simulation, run.trace, delays)
+    else:
+        stability = stability_part(simulation, run.trace)
+    alike, net = force_error(run.ran, run.trace, lam), run.trace.net.part() if run.trace.net else None
+    budget = net if net and net["guarantee"] is not None else None
+    unstable = _switched(delays) and stability["verdict"] == "unstable"
+    found = _Report(
+        args.case,
+        scenario.name,
+        judged.certificates[chosen.condition],
+        judged,
+        report.encoder_steps(scenario, args.case, chosen.coupling),
+        report.transparency_part(transparency(simulation.felt, simulation.E, lam, args.band_hz or BAND_HZ)),
+        stability,
+        delays,
+        _settings(args, run, lam) | {"environment": environment},
+        position_error(run.trace, run.exact, simulation, unstable),
+        credible_part(simulation, run.trace),
+        alike,
+        alike.part(),
+        budget and budget | {"idle": idle(simulation, judged.requirements["any-environment"], budget)},
+        None if budget else net,
+        _robustness(chosen, scenario.loop(args.case), judged),
+        [other.part() for other in others],
+    )
+    paper = report.beside_the_paper(simulation.scenario, args.case, stability, judged.coupling)
+    remarks = (*run.warnings, *chosen.notes, *report.remarks(render.plain(found)))
+    return replace(found, reproducibility=paper, remarks=remarks)
+
+
+def _robustness(chosen: Chosen, loop: Loop, judged: Judged) -> dict[str, Any]:
     """What a wrong model of the environment costs a guarantee for this environment alone."""
-    alone = chosen.condition == "this-environment" and outcome["certificate"]["certified"]
-    if not alone or outcome["promise"] == ANY:
+    alone = chosen.condition == "this-environment" and judged.certificates[chosen.condition]["certified"]
+    if not alone or judged.promise == ANY:
         return {"robustness": None, "designed_for_it": None}
     with render.progress("working out robustness and its price"):
         return robustness_parts(loop, chosen.coupling)
-
-
-def _stability(chosen: Chosen, run: _Run, certified: bool) -> dict[str, Any]:
-    delays = report.delays_part(run.simulation, chosen, run.period, run.trace.t.size, certified)
-    if delays and run.simulation.scenario.switches:
-        stability = report.switched_stability_part(run.simulation, run.trace, delays)
-    else:
-        stability = stability_part(run.simulation, run.trace)
-    return {"stability": stability, "varying_delay": delays}
-
-
-def _unstable(outcome: dict[str, Any]) -> bool | None:
-    """Whether switching makes the loop grow; None where the eigenvalues say whether it does."""
-    switched = "verdict" in (outcome["varying_delay"] or {})
-    return outcome["stability"]["verdict"] == "unstable" if switched else None
 
 
 def _settings(args: argparse.Namespace, run: _Run, lam: tuple[int, ...]) -> dict[str, Any]:
@@ -308,9 +361,9 @@ def _settings(args: argparse.Namespace, run: _Run, lam: tuple[int, ...]) -> dict
         "samples": samples,
         "wall_s": run.wall_s,
         "real_time_factor": duration / run.wall_s,
-        "theta": list(scenario.theta),
-        "psi": list(scenario.psi),
-        "lam": list(lam),
+        "theta": scenario.theta,
+        "psi": scenario.psi,
+        "lam": lam,
         "T_s": scenario.T,
         "timing": report.timing_part(run.simulation.timing, scenario),
         "seed": args.seed,
@@ -318,25 +371,25 @@ def _settings(args: argparse.Namespace, run: _Run, lam: tuple[int, ...]) -> dict
         "cross_check": cross_check(run.ran, run.trace, run.integrator, run.substeps) if args.cross_check else None,
         "interrupted": run.trace.interrupted,
         "scenario_digest": scenario.digest,
-        "encoder_step_m": process.encoder_step.tolist(),
+        "encoder_step_m": process.encoder_step,
         "steady_ticks": [[0, run.trace.ticks_before_clipping(process.force_limit)]],
     }
 
 
-def _save(args: argparse.Namespace, out: Path, run: _Run, alike: ForceError, outcome: dict[str, Any]) -> list[Path]:
-    result = replace(run.trace, meta=outcome)
+def _save(args: argparse.Namespace, out: Path, run: _Run, report: _Report) -> list[Path]:
+    result, stability = replace(run.trace, meta=render.plain(report)), report.stability
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
     files.append(write(out / "scene.xml", run.simulation.scene.xml))
     if not args.no_plot and result.t.size:
         from sim.plots import Onset, Surroundings, plot_run
 
-        apart, hertz = outcome["ideal_force"]["error_percent"], outcome["stability"]["exact_frequency_hz"]
-        ideal = None if apart is None else (alike.ideal, apart)
-        grows = outcome["stability"]["exact_verdict"] == "unstable" and run.exact is not None
-        growth = outcome["stability"]["exact_growth_rate_per_s"] if grows and _unstable(outcome) is None else None
-        onset = Onset(growth, outcome["run"]["steady_ticks"][0][1], outcome["credible"]["until_s"])
+        apart, hertz = report.ideal_force["error_percent"], stability["exact_frequency_hz"]
+        ideal = None if apart is None else (report.alike.ideal, apart)
+        grows = stability["exact_verdict"] == "unstable" and run.exact is not None
+        growth = stability["exact_growth_rate_per_s"] if grows and report.unstable is None else None
+        onset = Onset(growth, report.run["steady_ticks"][0][1], report.credible["until_s"])
         around = Surroundings(run.simulation.scenario.environment.contacts, *_walls(run))
-        title = _title(run.simulation.scenario.title(args.case), outcome)
+        title = _title(run.simulation.scenario.title(args.case), report)
         files.append(plot_run(result, out / "figure.png", title, hertz, ideal, onset, around))
     return files
 
@@ -357,17 +410,17 @@ def _walls(run: _Run) -> tuple[list[tuple[int, float, str]], Any]:
     return found, (contact.depths(run.trace.z)[:, : len(network.walls)] > 0).any(axis=1)
 
 
-def _title(what: str, outcome: dict[str, Any]) -> str:
+def _title(what: str, report: _Report) -> str:
     """Of the picture."""
-    stability, kind = outcome["stability"], outcome["coupling"]["kind"]
+    stability, kind = report.stability, report.judged.coupling["kind"]
     coupling = "no virtual coupling" if kind == "none" else f"{kind} coupling"
-    if kind != "none" and outcome["promise"]:
-        coupling += f" for {outcome['promise']}"
+    if kind != "none" and report.judged.promise:
+        coupling += f" for {report.judged.promise}"
     rate, hertz = stability["exact_growth_rate_per_s"], stability["exact_frequency_hz"]
     grows, decays = f"grows by {rate:.3f} 1/s at {hertz:.1f} Hz", f"slowest motion decays by {-rate:.3f} 1/s"
     growth = grows if rate > 0 else decays
-    if _unstable(outcome) is not None:
-        growth = f"{outcome['varying_delay']['pattern']} delays, {stability['verdict']}"
+    if report.varying_delay and report.unstable is not None:
+        growth = f"{report.varying_delay['pattern']} delays, {stability['verdict']}"
     return f"{what.removesuffix(', no coupling').removesuffix(', case none')}, {coupling}: {growth}"
 
 
@@ -375,17 +428,16 @@ def _title(what: str, outcome: dict[str, Any]) -> str:
 # The report as tables.
 
 
-def _tables(scenario: Scenario, outcome: dict[str, Any], others: list[Alternative]) -> list[Any]:
-    title = f"{scenario.title(outcome['case'])}: coupling {outcome['coupling']['kind']}"
-    rows = [render.channel_row(scenario.environment.contacts), *_rows(outcome)]
-    shown = [render.facts(title, rows, ("", ""))]
-    if outcome["run"]["engines"]:
-        shown.append(_speed_against_error(outcome["run"]))
+def _tables(scenario: Scenario, report: _Report, others: list[Alternative]) -> list[Any]:
+    title = f"{scenario.title(report.case)}: coupling {report.judged.coupling['kind']}"
+    shown = [render.facts(title, [render.channel_row(scenario.environment.contacts), *report.rows()], ("", ""))]
+    if report.run["engines"]:
+        shown.append(_speed_against_error(report.run))
     if others:
-        shown.append(_beside(others, outcome))
-    if rows := outcome["reproducibility"]:
+        shown.append(_beside(others, report))
+    if report.reproducibility:
         columns = ("what", "paper", "here", "why")
-        cells = [[row[column] for column in columns] for row in rows]
+        cells = [[row[column] for column in columns] for row in report.reproducibility]
         shown.append(render.grid("beside the paper", ("", *columns[1:]), cells, range(4)))
     return shown
 
@@ -403,9 +455,9 @@ def _speed_against_error(run: dict[str, Any]) -> Any:
     return render.grid("speed against error on this scene (*: the cheapest that keeps --error, this run)", heads, cells)
 
 
-def _beside(others: list[Alternative], outcome: dict[str, Any]) -> Any:
+def _beside(others: list[Alternative], report: _Report) -> Any:
     """The price of each guarantee; the run's own coupling is marked where it is one of them."""
-    own = outcome["coupling"]["kind"], outcome["certificate"]["condition"]
+    own = report.judged.coupling["kind"], report.certificate["condition"]
     cells = []
     for other in others:
         mark = "*" if own == (other.kind, other.condition) or own[0] == other.kind != "spring-damper" else ""
@@ -426,43 +478,9 @@ def _share(value: float | None, absent: str) -> str:
     return absent if value is None else f"{100 * value:.3g} %" if value < 10 else f"{100 * value:.0f} %"
 
 
-def _rows(outcome: dict[str, Any]) -> list[tuple[str, str | None]]:
-    names = ("coupling", "stability", "run", "varying_delay")
-    coupling, stability, run, delays = (outcome[name] for name in names)
-    transparent, error, contact = outcome["transparency"], outcome["error"], stability.get("contact")
-    gains = coupling["K"] and f"{listed(coupling['K'], 5)} N/m / {listed(coupling['B'], 5)} N s/m"
-    rendered = transparent["dc_ratio"] and f"{100 * transparent['dc_ratio']:.1f} %"
-    how = "growth, switching" if _unstable(outcome) is not None else "growth, simulated trace"
-    if run["timing"] and "impulse" in stability.get("reason", ""):
-        how = "growth, uneven ticks"
-    measured = render.optional(stability["growth_rate_per_s"], "{:+.4f} 1/s")
+def _speed(run: dict[str, Any]) -> str:
     engine = run["engine"] + (f" {run['integrator']} x {run['substeps']}" if run["integrator"] else "")
-    speed = f"{run['wall_s']:.2f} s for {run['duration_s']:g} s: {run['real_time_factor']:.2g} x real time ({engine})"
-    apart = error["position_relative_rms"]
-    position = "-" if apart is None else f"{apart:.1e} relative rms, {error['position_max_m']:.1e} m at most"
-    return [
-        ("coupling K / B", gains or None),
-        ("coupling, static", coupling.get("stiffness") and f"{listed(coupling['stiffness'], 5)} N/m"),
-        *render.certificate_rows(outcome["certificates"], 5),
-        *(ranges_rows(outcome["ranges"]) if outcome["ranges"] else []),
-        ("guarantee", f"holds for {outcome['promise']}" if outcome["promise"] else "none"),
-        ("transparency error", render.transparency_error(transparent)),
-        *render.robustness_rows(outcome),
-        ("force error", _force_error(outcome["ideal_force"])),
-        ("rendered stiffness", rendered or "-"),
-        *_net_rows(outcome),
-        ("growth, eigenvalues", _growth(stability)),
-        (how, f"{measured}: {render.verdict(stability['verdict'])}"),
-        render.timing_row(run["timing"]),
-        *(render.delay_rows(delays) if delays else []),
-        *(_contact_rows(contact, run["samples"]) if contact else []),
-        ("simulated in", run["environment"] if outcome["ranges"] else None),
-        ("force limits", outcome["limiter"]["words"]),
-        ("limited ticks", f"{stability['clipped_ticks']} of {run['samples']}"),
-        ("speed", speed),
-        ("position error", position),
-        ("cross-check", run["cross_check"] and _crossed(run["cross_check"])),
-    ]
+    return f"{run['wall_s']:.2f} s for {run['duration_s']:g} s: {run['real_time_factor']:.2g} x real time ({engine})"
 
 
 def _crossed(part: dict[str, Any]) -> str:
@@ -472,15 +490,14 @@ def _crossed(part: dict[str, Any]) -> str:
     return f"{part['integrator']} x {part['substeps']}: {apart}, {growth}: {verdict}"
 
 
-def _net_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
-    part = outcome["energy_budget"] or outcome["baseline"]
-    if not part:
-        return []
-    acted = f"limited {part['limited_ticks']} of {part['ticks']} ticks"
-    if outcome["baseline"]:
-        return [("baseline", f"{part['name']}, {acted.replace('limited', 'acted in')}; no guarantee")]
-    why = f" ({part['idle']})" if part["idle"] else ""
-    return [("energy budget", f"{acted}{why}"), ("", part["guarantee"])]
+def _net_rows(budget: dict[str, Any] | None, baseline: dict[str, Any] | None) -> render.Rows:
+    if baseline:
+        acted = f"acted in {baseline['limited_ticks']} of {baseline['ticks']} ticks"
+        yield "baseline", f"{baseline['name']}, {acted}; no guarantee"
+    if budget:
+        why = f" ({budget['idle']})" if budget["idle"] else ""
+        yield "energy budget", f"limited {budget['limited_ticks']} of {budget['ticks']} ticks{why}"
+        yield "", budget["guarantee"]
 
 
 def _force_error(part: dict[str, Any]) -> str:

@@ -13,9 +13,9 @@ import resource
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import redirect_stdout
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import import_module
 from io import StringIO
 from multiprocessing.connection import Connection
@@ -37,9 +37,9 @@ from hw.monitor import LinkSettings
 from hw.rehearsal import Rehearsal
 from hw.session import session_for
 from sim.adversary import Attempt, attempts
+from sim.challenges import challenges
 from sim.couplings import choose
 from sim.crowds import Validation
-from sim.guarantees import challenges
 from sim.hard import cases, measure
 from sim.random_loops import proofs, traces
 from sim.scenario import InputError, load
@@ -52,12 +52,6 @@ from sim.uneven import HANDS, uneven_ticks
 
 
 _Row = dict[str, Any]
-
-
-def hard_loops(seed: int) -> Iterator[_Row]:
-    """Numerically hard loops, each with a setting that fails and the one that holds."""
-    for case in cases():
-        yield asdict(measure(case))
 
 
 def shortages(couplings: Sequence[str], short: Sequence[float], generations: int, **changes: Any) -> Callable[..., Any]:
@@ -97,18 +91,6 @@ def rates(rows: Sequence[_Row]) -> list[_Row]:
     """Share of the loops that the adversary destabilises, by shortage."""
     parts = {short: [row["found"] for row in rows if row["short"] == short] for short in {r["short"] for r in rows}}
     return [{"short": s, "attempts": len(found), "rate": sum(found) / len(found)} for s, found in sorted(parts.items())]
-
-
-def edges(seed: int) -> Iterator[_Row]:
-    """Guarantees beyond the linear loop, at 1.02 times what they ask for and at far too little."""
-    for row in challenges(seed):
-        yield asdict(row)
-
-
-def faults(seed: int) -> Iterator[_Row]:
-    """Faults of a link, a device, a controller or a person, in virtual time."""
-    for outcome in rehearse_faults():
-        yield asdict(outcome) | {"holds": outcome.holds}
 
 
 _Mark = Callable[[float], None]  # is told what share of the work is done
@@ -191,26 +173,8 @@ def _peak() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
 
 
-def proved(seed: int) -> Iterator[_Row]:
-    """Whether random networks are proved where the sweep says so, and only there."""
-    for row in proofs(seed):
-        yield asdict(row) | {"required": finite(row.required), "holds": row.holds}
-
-
-def told(seed: int) -> Iterator[_Row]:
-    """What traces of random scenarios tell of their stability."""
-    for row in traces(seed):
-        yield asdict(row)
-
-
-def uneven(seed: int) -> Iterator[_Row]:
-    """Periods that vary and forces that latch late, drawn and chosen by an enemy."""
-    for row in uneven_ticks(seed):
-        yield asdict(row) | {"holds": row.holds}
-
-
 # ----------------------------------------------------------------------------------------------------
-# How each report reads as figures.
+# How each answer reads: the gist of what a command prints, the table of rows of our own.
 
 
 @dataclass(frozen=True)
@@ -223,110 +187,46 @@ class _Part:
     answer: str = ""
 
 
+_Figures = Callable[[dict[str, Any]], list[_Part]]
+
+
 def verdicts(report: dict[str, Any]) -> list[_Part]:
     """Of sim.validate."""
-    bad, worst, energy = report["unstable"], report["worst"], report.get("energy_audit")
-    humans, adversary, traces = report["humans"], report.get("adversary"), report["traces"]
-    rows = [
-        ("certified", "yes" if report["certified"] else "no"),
-        *_damping(report["certificates"]),
-        ("random hands", f"{humans}, half of them with an arm"),
-        ("unstable with", f"{bad['exact']} (exact), {'-' if bad['mujoco'] is None else bad['mujoco']} (MuJoCo)"),
-        ("the engines disagree about", str(report["disagreements"])),
-    ]
-    if report["largest_difference_per_s"] is not None:
-        rows.append(("largest difference in growth", f"{report['largest_difference_per_s']:.1e} 1/s"))
-    if worst:
-        rows.append(("worst random hand", _growing(worst)))
-    if adversary:
-        found = _growing(adversary) if adversary["found"] else "no human makes the loop grow"
-        rows.append(("the adversary's worst", f"{found}, of {adversary['evaluated']} tried"))
-    if traces:
-        settled = f"{traces['stable_and_settling']} of {traces['stable']} stable loops"
-        rows.append((f"slower at the end of {traces['duration_s']:g} s than before", settled))
-        rows.append(("runs that reached a force limit", str(traces["clipped_runs"])))
-    if energy:
-        rows.append(
-            ("energy balance never negative", f"{energy['audited'] - energy['violated']} of {energy['audited']}")
-        )
-    gist = f"{'certified' if report['certified'] else 'not certified'}; {bad['exact']} of {humans} hands unstable"
-    if adversary:
+    gist = f"{'certified' if report['certified'] else 'not certified'}; "
+    gist += f"{report['unstable']['exact']} of {report['humans']} hands unstable"
+    if adversary := report.get("adversary"):
         gist += f", adversary {'succeeds' if adversary['found'] else 'fails'}"
-    gist += f", {report['disagreements']} disagreements"
-    return [_Part("", ("figure", "value"), tuple(rows), gist)]
-
-
-def tightness(report: dict[str, Any]) -> list[_Part]:
-    """Of loops that lack damping."""
-    found = rates(report["rows"])
-    rows = tuple((f"{r['short']:.1%}", str(r["attempts"]), f"{r['rate']:.0%}") for r in found)
-    first = next((r["short"] for r in found if r["rate"] == 1), None)
-    gist = "at no shortage that was tried does a human destabilise every loop"
-    if first is not None:
-        gist = f"a human destabilises every loop whose devices lack {first:.1%} of the damping required"
-    single = tuple(
-        (r["loop"], f"{r['short']:.1%}", _by_whom(r), f"{r['growth_rate_per_s']:+.3g}" if r["found"] else "-")
-        for r in report["rows"]
-    )
-    return [
-        _Part("Success rate of the adversary", ("damping missing", "loops", "destabilised"), rows, gist),
-        _Part("Each loop", ("loop", "damping missing", "destabilised by", "growth [1/s], first found"), single),
-    ]
+    return [_Part("", (), (), f"{gist}, {report['disagreements']} disagreements")]
 
 
 def accuracy(report: dict[str, Any]) -> list[_Part]:
     """Of sim.accuracy."""
     default = report["default_substeps"]
-    rows = []
-    for row in report["rows"]:
-        name = f"{row['integrator']} x {row['substeps']}" if row["integrator"] else "exact"
-        mark = " (default)" if (row["integrator"], row["substeps"]) == ("RK4", default) else ""
-        growth, speed = f"{row['growth_rate_error']:+.1e}", f"{1 / row['wall_s_per_simulated_s']:.0f}"
-        position = row["position_relative_rms"]
-        right = "right" if row["verdict_correct"] else "wrong"
-        rows.append((name + mark, "-" if position is None else f"{position:.1e}", growth, right, speed))
     ours = next((r for r in report["rows"] if (r["integrator"], r["substeps"]) == ("RK4", default)), None)
     gist = f"default RK4 x {default}: growth off by {ours['growth_rate_error']:+.0e} 1/s" if ours else ""
-    columns = ("setting", "position error, relative rms", "growth error [1/s]", "verdict", "times real time")
-    return [_Part("", columns, tuple(rows), gist)]
+    return [_Part("", (), (), gist)]
 
 
 def _gain_map(report: dict[str, Any]) -> list[_Part]:
     """Of sim.zwidth."""
-    cells = len(report["grid"]["K"]) * len(report["grid"]["B"])
-    population, simulation = report["population"], report["simulation"]
-    rows = [
-        (
-            f"certified, {name}",
-            f"{report[name]['certified_cells']} of {cells} cells, {report[name]['contradicted_cells']} contradicted",
-        )
-        for name in render.ORDER
-    ]
-    stable = f"{population['stable_cells']} of {population['decided_cells']} cells"
-    rows.append((f"stable with all of {population['humans']} random hands", stable))
-    odd = f"{simulation['oscillate']} oscillate, {simulation['differ_from_linear']} unlike the linear loop"
-    rows.append((f"{len(simulation['points'])} points simulated in MuJoCo", odd))
-    edge = max(report["error"][name]["edge_relative_in_K"] for name in render.ORDER)
-    rows.append(("edge of the map, error in K", f"{edge:.0e}"))
     contradicted = sum(report[name]["contradicted_cells"] for name in render.ORDER)
-    return [_Part("", ("figure", "value"), tuple(rows), f"{contradicted} certified cells that a hand destabilises")]
+    return [_Part("", (), (), f"{contradicted} certified cells that a hand destabilises")]
 
 
-def hard(report: dict[str, Any]) -> list[_Part]:
-    """Of hard loops."""
-    rows = tuple(
-        (
-            row["name"],
-            f"{row['exact']:+.4f}",
-            _failing(row),
-            f"RK4 x {row['substeps']}",
-            f"{row['error']:+.1e}",
-        )
-        for row in report["rows"]
-    )
-    good = sum(row["holds"] for row in report["rows"])
-    columns = ("loop", "exact growth [1/s]", "fails", "holds", "growth error [1/s]")
-    return [_Part("", columns, rows, f"{good} of {len(rows)} verdicts right under the substep rule")]
+def _table(gist: str, columns: dict[str, str | Callable[[_Row], str]]) -> _Figures:
+    """A row for each row: its cells as formats of its figures."""
+
+    def figures(report: dict[str, Any]) -> list[_Part]:
+        rows, cells = report["rows"], columns.values()
+        good = sum(row["holds"] for row in rows)
+        shown = tuple(tuple(c(row) if callable(c) else c.format(**row) for c in cells) for row in rows)
+        return [_Part("", tuple(columns), shown, gist.format(good=good, count=len(rows)))]
+
+    return figures
+
+
+def _optional(name: str, form: str) -> Callable[[_Row], str]:
+    return lambda row: render.optional(row[name], form)
 
 
 def _failing(row: _Row) -> str:
@@ -337,95 +237,66 @@ def _failing(row: _Row) -> str:
     return f"{' x '.join(map(str, row['fails']))}: {row['fault'] or '-'}{off}"
 
 
-def guarantees(report: dict[str, Any]) -> list[_Part]:
-    """Of guarantees at their edge: a row for each and each share of what it asks."""
-    rows, taken = [], []
-    for name, factor in dict.fromkeys((row["guarantee"], row["factor"]) for row in report["rows"]):
-        some = [row for row in report["rows"] if (row["guarantee"], row["factor"]) == (name, factor)]
-        motions, took, hands, grew = (sum(row[of] for row in some) for of in ("motions", "took", "hands", "grew"))
-        limited = max(row["limited"] for row in some)
-        least = min(row["least_J"] for row in some)
-        rows.append(
-            (name, f"{factor:g}", f"{took} of {motions}", f"{grew}" if hands else "-", f"{limited:.0%}", f"{least:.2g}")
-        )
-        if factor >= 1:
-            taken.append(took + grew)
-    columns = ("guarantee", "times what it asks", "motions that took energy", "hands that grew", "limited", "least J")
-    return [_Part("", columns, tuple(rows), f"{sum(taken)} violations at 1.02 times what {len(taken)} guarantees ask")]
+hard = _table(
+    "{good} of {count} verdicts right under the substep rule",
+    {
+        "loop": "{name}",
+        "exact growth [1/s]": "{exact:+.4f}",
+        "fails": _failing,
+        "holds": "RK4 x {substeps}",
+        "growth error [1/s]": "{error:+.1e}",
+    },
+)
+_faults = _table(
+    "{good} of {count} faults end as they must",
+    {
+        "fault": "{fault}",
+        "ends in": "{stage}",
+        "cause": lambda row: "; ".join(row["wrong"]) or row["cause"],
+        "zero force after": _optional("zero_force_ms", "{:.1f} ms"),
+        "allowed": _optional("allowed_ms", "{:.1f} ms"),
+    },
+)
+memory_table = _table(
+    "{good} of {count} end as they must, with flat memory",
+    {
+        "work": "{what}",
+        "result": "{result}",
+        "peak after a tenth": _optional("tenth_mib", "{:.0f} MiB"),
+        "peak at the end": _optional("end_mib", "{:.0f} MiB"),
+    },
+)
+_uneven_rows = _table(
+    "no hand gains energy in {good} of {count} runs at 1.02 times the requirement",
+    {
+        "loop": "{loop}",
+        "ticks": lambda row: f"{row['ticks']}, {'drawn' if row['drawn'] else 'the worst'}",
+        "needs": "{required:.4g} N s/m",
+        "most energy, of the start's": "{energy:.6g}",
+        "balance below 0": lambda row: "never" if row["balance"] >= 0 else f"to {row['balance']:.1e} of what it sums",
+        "grow with half": f"{{grow}} of {HANDS}",
+    },
+)
 
 
-def _fault_table(report: dict[str, Any]) -> list[_Part]:
-    """Of faults."""
-    rows = []
-    for row in report["rows"]:
-        zero, allowed = (render.optional(row[name], "{:.1f} ms") for name in ("zero_force_ms", "allowed_ms"))
-        rows.append((row["fault"], row["stage"], "; ".join(row["wrong"]) or row["cause"], zero, allowed))
-    good = sum(row["holds"] for row in report["rows"])
-    columns = ("fault", "ends in", "cause", "zero force after", "allowed")
-    return [_Part("", columns, tuple(rows), f"{good} of {len(rows)} faults end as they must")]
-
-
-def _proof_table(report: dict[str, Any]) -> list[_Part]:
-    """Of proofs of random networks: by what the sweep says."""
-    rows, good = [], sum(row["holds"] for row in report["rows"])
-    for says, enough in (("there is enough damping", True), ("there is too little", False)):
-        some = [row for row in report["rows"] if (row["required"] is not None and row["required"] < 1) == enough]
-        rows.append((says, str(len(some)), str(sum(row["proved"] for row in some))))
-    columns = ("the sweep says that", "networks", "proved")
-    return [_Part("", columns, tuple(rows), f"proof and sweep agree about {good} of {len(report['rows'])} networks")]
-
-
-def _told_table(report: dict[str, Any]) -> list[_Part]:
-    """Of traces of random scenarios: by what their eigenvalues say."""
-    rows, good = [], sum(row["holds"] for row in report["rows"])
-    for says, grows in (("stable", False), ("unstable", True)):
-        some = [row for row in report["rows"] if bool(unstable(row["exact_per_s"])) == grows]
-        read = [row for row in some if row["trace_per_s"] is not None]
-        same = sum(bool(unstable(row["trace_per_s"])) == grows for row in read)
-        quiet = sum(row["not_excited"] for row in some)
-        rows.append((says, *map(str, (len(some), same, len(read) - same, quiet, len(some) - len(read) - quiet))))
-    columns = (
-        "by the eigenvalues",
-        "runs",
-        "the trace agrees",
-        "says the opposite",
-        "not excited",
-        "no rate, for another reason",
-    )
-    return [
-        _Part("", columns, tuple(rows), f"{good} of {len(report['rows'])} traces tell no other than the eigenvalues")
-    ]
-
-
-def memory_table(report: dict[str, Any]) -> list[_Part]:
-    """Of work that goes on for long."""
-    rows = [
-        (row["what"], row["result"], *(render.optional(row[n], "{:.0f} MiB") for n in ("tenth_mib", "end_mib")))
-        for row in report["rows"]
-    ]
-    good = sum(row["holds"] for row in report["rows"])
-    columns = ("work", "result", "peak after a tenth", "peak at the end")
-    return [_Part("", columns, tuple(rows), f"{good} of {len(rows)} end as they must, with flat memory")]
-
-
-def _uneven_table(report: dict[str, Any]) -> list[_Part]:
+def _uneven(report: dict[str, Any]) -> list[_Part]:
     """Of uneven ticks."""
-    rows = tuple(
-        (
-            row["loop"],
-            f"{row['ticks']}, {'drawn' if row['drawn'] else 'the worst'}",
-            f"{row['required']:.4g} N s/m",
-            f"{row['energy']:.6g}",
-            "never" if row["balance"] >= 0 else f"to {row['balance']:.1e} of what it sums",
-            f"{row['grow']} of {HANDS}",
-        )
-        for row in report["rows"]
-    )
-    good, found = sum(row["holds"] for row in report["rows"]), sum(row["grow"] > 0 for row in report["rows"])
+    (part,) = _uneven_rows(report)
+    found = sum(row["grow"] > 0 for row in report["rows"])
     below = f"hands grow in {found} of them" if found else "no hand was found that grows"
-    gist = f"no hand gains energy in {good} of {len(rows)} runs at 1.02 times the requirement; at half of it {below}"
-    columns = ("loop", "ticks", "needs", "most energy, of the start's", "balance below 0", "grow with half")
-    return [_Part("", columns, rows, gist)]
+    return [replace(part, answer=f"{part.answer}; at half of it {below}")]
+
+
+def tightness(report: dict[str, Any]) -> list[_Part]:
+    """Of loops that lack damping."""
+    found = rates(report["rows"])
+    rows = tuple((f"{r['short']:.1%}", str(r["attempts"]), f"{r['rate']:.0%}") for r in found)
+    first = next((r["short"] for r in found if r["rate"] == 1), None)
+    gist = "at no shortage that was tried does a human destabilise every loop"
+    if first is not None:
+        gist = f"a human destabilises every loop whose devices lack {first:.1%} of the damping required"
+    whole = _Part("Success rate of the adversary", ("damping missing", "loops", "destabilised"), rows, gist)
+    return [whole, *(replace(part, title="Each loop") for part in _each_loop(report))]
 
 
 def _by_whom(row: _Row) -> str:
@@ -434,19 +305,54 @@ def _by_whom(row: _Row) -> str:
     return "one person" if row["held_together"] else "one hand each"
 
 
-def _damping(certificates: dict[str, Any]) -> list[tuple[str, str]]:
-    rows = []
-    for name in render.ORDER:
-        part = certificates[name]
-        needed = [f"{value:.4g}" if value is not None else "infinite" for value in part["required_damping"]]
-        available = [f"{value:.4g}" for value in part["available_damping"]]
-        rows.append((f"damping needed, {name}", f"{', '.join(needed)} of {', '.join(available)} N s/m"))
-    return rows
+_each_loop = _table(
+    "",
+    {
+        "loop": "{loop}",
+        "damping missing": "{short:.1%}",
+        "destabilised by": _by_whom,
+        "growth [1/s], first found": lambda row: f"{row['growth_rate_per_s']:+.3g}" if row["found"] else "-",
+    },
+)
 
 
-def _growing(part: dict[str, Any]) -> str:
-    growth = part["growth_rate_per_s"]
-    return "none" if growth is None else f"{growth:+.4g} 1/s at {part['frequency_hz']:.1f} Hz"
+def _edges(report: dict[str, Any]) -> list[_Part]:
+    """Of guarantees at their edge: a row for each and each share of what it asks."""
+    rows, taken = [], []
+    for name, factor in dict.fromkeys((row["guarantee"], row["factor"]) for row in report["rows"]):
+        some = [row for row in report["rows"] if (row["guarantee"], row["factor"]) == (name, factor)]
+        motions, took, hands, grew = (sum(row[of] for row in some) for of in ("motions", "took", "hands", "grew"))
+        limited, least = max(row["limited"] for row in some), min(row["least_J"] for row in some)
+        met = f"{took} of {motions}", f"{grew}" if hands else "-"
+        rows.append((name, f"{factor:g}", *met, f"{limited:.0%}", f"{least:.2g}"))
+        if factor >= 1:
+            taken.append(took + grew)
+    columns = ("guarantee", "times what it asks", "motions that took energy", "hands that grew", "limited", "least J")
+    return [_Part("", columns, tuple(rows), f"{sum(taken)} violations at 1.02 times what {len(taken)} guarantees ask")]
+
+
+def _proved(report: dict[str, Any]) -> list[_Part]:
+    """Of proofs of random networks: by what the sweep says."""
+    rows, good = [], sum(row["holds"] for row in report["rows"])
+    for says, enough in (("there is enough damping", True), ("there is too little", False)):
+        some = [row for row in report["rows"] if (row["required"] is not None and row["required"] < 1) == enough]
+        rows.append((says, str(len(some)), str(sum(row["proved"] for row in some))))
+    gist = f"proof and sweep agree about {good} of {len(report['rows'])} networks"
+    return [_Part("", ("the sweep says that", "networks", "proved"), tuple(rows), gist)]
+
+
+def _told(report: dict[str, Any]) -> list[_Part]:
+    """Of traces of random scenarios: by what their eigenvalues say."""
+    rows, good = [], sum(row["holds"] for row in report["rows"])
+    for says, grows in (("stable", False), ("unstable", True)):
+        some = [row for row in report["rows"] if bool(unstable(row["exact_per_s"])) == grows]
+        read = [row for row in some if row["trace_per_s"] is not None]
+        same = sum(bool(unstable(row["trace_per_s"])) == grows for row in read)
+        quiet = sum(row["not_excited"] for row in some)
+        rows.append((says, *map(str, (len(some), same, len(read) - same, quiet, len(some) - len(read) - quiet))))
+    answers = ("the trace agrees", "says the opposite", "not excited", "no rate, for another reason")
+    gist = f"{good} of {len(report['rows'])} traces tell no other than the eigenvalues"
+    return [_Part("", ("by the eigenvalues", "runs", *answers), tuple(rows), gist)]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -455,12 +361,12 @@ def _growing(part: dict[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Check:
-    """A question, what answers it, and how its JSON report reads as figures."""
+    """A question, what answers it, and how the answer's JSON report reads."""
 
     name: str  # of its folder, too
     asks: str
-    answer: str | Callable[[int], Iterator[_Row]]  # a command ({humans}, {seed} are filled in), or rows by the seed
-    figures: Callable[[dict[str, Any]], list[_Part]]
+    answer: str | Callable[[int], Iterable[Any]]  # a command ({humans}, {seed} are filled in), or rows by the seed
+    figures: _Figures
     picture: str | None = None  # of rows: the function of sim.plots that draws them
 
     def command(self, humans: int, seed: int) -> str:
@@ -491,12 +397,12 @@ CHECKS = (
     Check("delayed", "How tight is it with long delays?", _DELAYED, tightness, "plot_tightness"),
     Check("map", "Which springs and dampers may a device render against a wall?", _MAP, _gain_map),
     Check("accuracy", "Is MuJoCo right, and at what cost?", "sim.accuracy --duration 6", accuracy),
-    Check("hard", "Numerically hard loops", hard_loops, hard),
-    Check("proofs", "Are random networks proved where the sweep says so?", proved, _proof_table),
-    Check("traces", "Does a trace ever say the opposite of the eigenvalues?", told, _told_table),
-    Check("uneven", "Do uneven periods and late forces keep the guarantee?", uneven, _uneven_table),
-    Check("guarantees", "Do limits, budgets, walls and friction hold at what they ask?", edges, guarantees),
-    Check("faults", "Does every fault of a link end as it must?", faults, _fault_table),
+    Check("hard", "Numerically hard loops", lambda seed: (measure(case) for case in cases()), hard),
+    Check("proofs", "Are random networks proved where the sweep says so?", proofs, _proved),
+    Check("traces", "Does a trace ever say the opposite of the eigenvalues?", traces, _told),
+    Check("uneven", "Do uneven periods and late forces keep the guarantee?", uneven_ticks, _uneven),
+    Check("guarantees", "Do limits, budgets, walls and friction hold at what they ask?", challenges, _edges),
+    Check("faults", "Does every fault of a link end as it must?", lambda seed: rehearse_faults(), _faults),
     Check("endurance", "Does memory stay flat over an hour and 100,000 hands?", endurance, memory_table),
 )
 
@@ -513,6 +419,7 @@ class _Answer:
     trouble: str | None
     wall_s: float
     parts: tuple[_Part, ...]
+    printed: str  # by a command
     pictures: tuple[str, ...]  # paths from the report's folder
     report: dict[str, Any]
 
@@ -520,11 +427,11 @@ class _Answer:
 def ask(check: Check, out: Path, humans: int, seed: int) -> _Answer:
     """Run one check with its files in `out`/name; bad input and impossible designs are its trouble."""
     command, place = check.command(humans, seed), folder(out / check.name)
-    begin, trouble, code = time.perf_counter(), None, None
+    begin, trouble, code, printed = time.perf_counter(), None, None, StringIO()
     for old in (place / "report.json", *place.glob("*.png")):  # of an earlier run: never shown as this one's
         old.unlink(missing_ok=True)
     try:
-        code = _measured(check, place, seed) if callable(check.answer) else _called(command, place)
+        code = _measured(check, place, seed) if callable(check.answer) else _called(command, place, printed)
     except (InputError, SingularLoop, DesignFailed) as error:
         trouble = " ".join(str(error).split())
     wall = time.perf_counter() - begin
@@ -532,14 +439,16 @@ def ask(check: Check, out: Path, humans: int, seed: int) -> _Answer:
     report = json.loads(written.read_text()) if written.exists() else {}
     parts = tuple(check.figures(report)) if report else ()
     pictures = tuple(path.relative_to(out).as_posix() for path in sorted(place.glob("*.png")))
-    holds = code == options.DONE
-    return _Answer(check.name, check.asks, f"python -m {command}", code, holds, trouble, wall, parts, pictures, report)
+    text, holds = printed.getvalue(), code == options.DONE
+    return _Answer(
+        check.name, check.asks, f"python -m {command}", code, holds, trouble, wall, parts, text, pictures, report
+    )
 
 
-def _called(command: str, place: Path) -> int:
+def _called(command: str, place: Path, printed: StringIO) -> int:
     """Another command, as `python -m` runs it."""
     module, *words = shlex.split(command)
-    with redirect_stdout(StringIO()):
+    with redirect_stdout(printed):
         return import_module(f"cli.{module.rpartition('.')[2]}").main([*words, "--out", str(place)])
 
 
@@ -549,7 +458,7 @@ def _measured(check: Check, place: Path, seed: int) -> int:
     assert callable(check.answer)
     try:
         for row in check.answer(seed):
-            rows.append(row)
+            rows.append(row if isinstance(row, dict) else render.plain(row) | {"holds": row.holds})
     except KeyboardInterrupt:
         interrupted = True
     if check.picture and rows:
@@ -639,5 +548,7 @@ def _verdict(answer: _Answer) -> str:
 
 def _show(answer: _Answer, screen: render.Screen) -> None:
     """The figures of a check that was asked for alone."""
-    for part in answer.parts:
+    if answer.printed:
+        screen.print(answer.printed, markup=False, soft_wrap=True)
+    for part in answer.parts if not answer.printed else ():
         screen.print(render.grid(part.title, part.columns, part.rows, left=range(len(part.columns))))

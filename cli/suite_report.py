@@ -76,7 +76,9 @@ def _section(check: dict[str, Any]) -> list[str]:
         f"{verdict} (exit code {check['exit_code']}, {check['wall_s']:.1f} s). {check['trouble'] or ''}".rstrip(),
         "",
     ]
-    for part in check["parts"]:
+    if check["printed"]:
+        lines += ["```text", check["printed"].rstrip(), "```", ""]
+    for part in check["parts"] if not check["printed"] else ():
         lines += [f"### {part['title']}", ""] if part["title"] else []
         lines += [*_table(part["columns"], part["rows"]), ""]
     for picture in check["pictures"]:

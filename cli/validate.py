@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from cli import options, render
+from cli.judged import judge
 from controller.environment import Member
-from design.certificate import RangesCheck, assess, check_ranges
+from design.certificate import RangesCheck
 from design.conditions import this_environment
-from design.coverage import ranges_part
-from design.guarantees import ANY, guarantee_of
+from design.guarantees import ANY
 from models.human import Human, Population
 from sim import report
 from sim.adversary import Worst, search, search_population
-from sim.couplings import NAMES, Chosen, choose, limits_of
+from sim.couplings import NAMES, Chosen, choose
 from sim.crowds import ENGINES, MIXED, Findings, Validation
 from sim.run import assemble
 from sim.scenario import InputError, Scenario, require_linear, save_humans
@@ -36,28 +36,18 @@ def main(argv: list[str]) -> int:
     scenario, out = _scenario(args), options.out_folder(args, "validate")
     with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
         chosen = choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
-    loop = scenario.loop(args.case)
-    with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
-        whole = check_ranges(loop, chosen.coupling, args.seed, progress=move)
-        requirements = assess(loop, chosen.coupling, chosen.phi)
-    environments = _environments(args, whole)
-    proved = bool(whole and whole.proved)
-    guarantee = guarantee_of(requirements, loop, proved)
-    certified = guarantee is not None and (not environments or guarantee == ANY or proved)
+    judged = judge(args, scenario, chosen)
+    environments, guarantee = _environments(args, judged.whole), judged.promise
+    certified = guarantee is not None and (not environments or guarantee == ANY or judged.proved)
 
-    limits = limits_of(scenario, chosen, requirements, args.limiter)
-    question = _question(args, scenario, chosen, environments, limits.rho)
+    question = _question(args, scenario, chosen, environments, judged.limits.rho)
     findings, wall = _findings(args, question, Table(question, out, args.resume))
     outcome = {
         "case": args.case,
         "scenario": scenario.name,
         "scenario_digest": scenario.digest,
-        "coupling": report.coupling_part(chosen.kind, chosen.coupling, scenario.T),
-        "certificates": report.certificates_part(requirements),
         **report.validation_part(question, findings, certified, wall),
-        "promise": guarantee,
-        "ranges": whole and ranges_part(whole),
-        "limiter": limits.part([device.force_limit for device in scenario.device]),
+        **render.plain(judged),
         "remarks": list(chosen.notes),
     }
     _add(outcome, "own_humans", _own_humans(args, scenario, chosen, certified))
@@ -69,9 +59,9 @@ def main(argv: list[str]) -> int:
         _add(outcome, "timing", report.varying_delays_part(findings, met | {"covered": certified}))
     worst = None
     if args.adversary and not (findings.interrupted or findings.lost):
-        attacked, ratio = scenario, requirements["this-environment"].ratio
-        if environments and whole:
-            member, requirement = whole.worst_found
+        attacked, ratio = scenario, judged.requirements["this-environment"].ratio
+        if environments and judged.whole:
+            member, requirement = judged.whole.worst_found
             attacked, ratio = scenario.replace(environment=member.network, ranges=None), requirement.ratio
         worst = _attack(args, attacked, chosen, outcome)
         if worst:

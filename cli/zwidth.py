@@ -9,25 +9,24 @@ import argparse
 import csv
 import io
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 from rich.table import Table
 
 from cli import options, render
+from cli.judged import judge
 from controller.environment import RIGID_WALL
 from controller.loop import Loop
-from controller.lti import Array
-from design.certificate import CONDITIONS, assess, check_ranges
-from design.coverage import ranges_part
+from design.certificate import CONDITIONS
 from design.files import write
-from design.guarantees import CAVEATS, guarantee_of
-from design.result import certificate_part, finite
-from sim import report
-from sim.couplings import NAMES, Chosen, choose, limits_of
+from design.guarantees import CAVEATS
+from design.result import certificate_part
+from sim.couplings import NAMES, Chosen, choose
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
 from sim.scenario import InputError, Scenario, require_constant_delay
 from sim.stability import MARGINAL
@@ -38,7 +37,6 @@ from sim.zwidth import (
     EnvironmentSweep,
     Grid,
     Map,
-    MapError,
     Mark,
     Range,
     Sweep,
@@ -54,28 +52,15 @@ from sim.zwidth import (
 # What a Z-width map says, in a few lines on the terminal.
 
 
-def _table(outcome: dict[str, Any]) -> Table:
-    K, B = outcome["grid"]["K"], outcome["grid"]["B"]
-    cells, crowd, simulation = len(K) * len(B), outcome["population"], outcome["simulation"]
-    title = f"K {K[0]:.4g} to {K[-1]:.4g} N/m, B {B[0]:.4g} to {B[-1]:.4g} N s/m, {cells} couplings"
-    rows = _designed_rows(outcome) if outcome["axes"] == "environment" else []
-    for name in outcome["conditions"]:
-        error = outcome.get("error", {}).get(name)
-        near = f"; edge within {100 * error['edge_relative_in_K']:.2g} % of the condition's own sweep" if error else ""
-        rows.append((f"certified, {name}", f"{_share(outcome[name]['certified_cells'], cells)}{near}"))
-    stable = f"{_share(crowd['stable_cells'], cells)} ({crowd['decided_cells']} decided)"
-    rows.append((f"stable with all of {crowd['humans']} random humans", stable))
-    if simulation["points"]:
-        beside = f"{simulation['undecided']} {UNDECIDED}, {simulation['differ_from_linear']} unlike the linear loop"
-        ends = f"{simulation['oscillate']} of {len(simulation['points'])} oscillate, {beside}"
-        rows.append((f"simulated{_effects(simulation)}", ends))
-    seconds = ", ".join(f"{stage} {wall:.1f}" for stage, wall in outcome["wall_s"].items()) or "-"
-    return render.facts(title, [*rows, ("seconds", seconds)], left=True)
+def _table(report: _Report) -> Table:
+    K, B = report.grid["K"], report.grid["B"]
+    title = f"K {K[0]:.4g} to {K[-1]:.4g} N/m, B {B[0]:.4g} to {B[-1]:.4g} N s/m, {report.cells} couplings"
+    return render.facts(title, report.rows(), left=True)
 
 
-def _designed_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
+def _designed_rows(fixed: dict[str, Any], limited: list[float] | None) -> render.Rows:
     """The fixed coupling in the environment that it was designed for."""
-    designed, limited = outcome["designed_for"], outcome["simulation"]["effects"]["force_limit_n"]
+    designed = fixed["designed_for"]
     each = (f"{' - '.join(s['between'])} {s['K']:g} N/m, {s['B']:g} N s/m" for s in designed["contact_springs"])
     needs = "; ".join(
         f"{name} needs {100 / designed['certificates'][name]['margin']:.4g} % of the damping "
@@ -83,18 +68,16 @@ def _designed_rows(outcome: dict[str, Any]) -> list[tuple[str, str]]:
         for name in render.ORDER
         if designed["certificates"][name]["margin"]
     )
-    return [
-        ("coupling", f"{outcome['coupling']['kind']}, fixed"),
-        ("designed for", ", ".join(each)),
-        ("there", f"guarantee: {designed['promise'] or 'none'}; {needs or 'no damping is enough'}"),
-        *([("force limits there", outcome["limiter"]["words"])] if limited else []),
-    ]
+    yield "coupling", f"{fixed['coupling']['kind']}, fixed"
+    yield "designed for", ", ".join(each)
+    yield "there", f"guarantee: {designed['promise'] or 'none'}; {needs or 'no damping is enough'}"
+    yield "force limits there", fixed["limiter"]["words"] if limited else None
 
 
-def _about(outcome: dict[str, Any]) -> str:
+def _about(conditions: Sequence[str]) -> str:
     """What the axes are, and what a certified cell guarantees."""
     line = "K and B are those of every spring at a contact; each is certified for its environment alone, by a sweep"
-    if MODEL_KEPT not in outcome["conditions"]:
+    if MODEL_KEPT not in conditions:
         return f"{line}."
     return (
         f"{line}: this-environment, the population and MuJoCo with the coupling's model set to the cell's environment, "
@@ -131,21 +114,23 @@ def _effects(simulation: dict[str, Any]) -> str:
     return f" with {', '.join(names)}" if names else ", linear loop"
 
 
-def _remarks(outcome: dict[str, Any]) -> list[str]:
+def _remarks(report: _Report) -> list[str]:
     lines = []
-    simulation = outcome["simulation"]
-    if outcome["axes"] == "environment":
-        lines += [*outcome["remarks"], _about(outcome)]
-    for name in outcome["conditions"]:
-        if outcome[name].get("reason"):
-            lines.append(f"{name}: {outcome[name]['reason']}.")
-        if outcome[name].get("contradicted_cells"):
-            lines.append(f"[red]CONTRADICTION[/]: {outcome[name]['contradicted_cells']} certified cells are unstable.")
+    simulation = report.simulation
+    if report.fixed["axes"] == "environment":
+        lines += [*report.fixed["remarks"], _about(report.conditions)]
+    for name in report.conditions:
+        if report.ratios[name].get("reason"):
+            lines.append(f"{name}: {report.ratios[name]['reason']}.")
+        if report.ratios[name].get("contradicted_cells"):
+            lines.append(
+                f"[red]CONTRADICTION[/]: {report.ratios[name]['contradicted_cells']} certified cells are unstable."
+            )
     if not simulation["nonlinear"] and simulation["differ_from_linear"]:
         lines.append(f"[red]DISAGREEMENT[/]: MuJoCo and the linear loop at {simulation['differ_from_linear']} points.")
-    if outcome["velocity_filter_hz"]:
+    if report.velocity_filter_hz:
         lines.append("The velocity filter is in all maps: it is linear, and part of the coupling.")
-    if outcome["one_sided"]:
+    if report.one_sided:
         lines.append(
             "One-sided contact: this-environment and the population are about each frozen contact state, "
             "any-environment (psi = 0) and the simulated points about contact made and broken."
@@ -156,7 +141,7 @@ def _remarks(outcome: dict[str, Any]) -> list[str]:
             f"{simulation['from_hz']:.3g} Hz keeps {100 * SUSTAINED:g} % of its amplitude, over "
             f"{simulation['threshold_m']:g} m; {UNDECIDED} where the linear loop is within {DECIDED:g} 1/s of the edge."
         )
-    if outcome["interrupted"]:
+    if report.interrupted:
         lines.append("Interrupted: the map has what was finished.")
     return lines
 
@@ -172,44 +157,121 @@ def _share(count: int, cells: int) -> str:
 _NOT_REACHED = "not reached before the interruption"
 
 
-def _summary(sweep: Sweep, drawn: Map, plan: Plan, population: dict[str, Any]) -> dict[str, Any]:
+@dataclass(frozen=True, eq=False)
+class _Report:
     """The whole map. Rows are stiffnesses; null is infinite, or not reached before an interruption."""
-    known, loop = np.isfinite(drawn.growth), sweep.loop
+
+    rigid: bool
+    scenario: str | None
+    scenario_digest: str
+    T: float
+    theta: tuple[int, ...]
+    psi: tuple[int, ...]
+    delta: tuple[float, ...]
+    velocity_filter_hz: float | None
+    one_sided: bool
+    conditions: list[str]
+    grid: dict[str, Any]
+    population: dict[str, Any]
+    simulation: dict[str, Any]
+    holds: bool
+    interrupted: bool
+    wall_s: dict[str, float]
+    ratios: dict[str, dict[str, Any]] = render.unseen("beside")
+    fixed: dict[str, Any] = render.unseen("beside")  # of a map over environments: the coupling
+    error: dict[str, Any] | None = render.unseen("given")
+    marks: list[dict[str, Any]] | None = render.unseen("given")
+    not_covered: str = CAVEATS
+
+    @property
+    def cells(self) -> int:
+        return len(self.grid["K"]) * len(self.grid["B"])
+
+    def rows(self) -> render.Rows:
+        """Of its table."""
+        crowd, simulation = self.population, self.simulation
+        if self.fixed["axes"] == "environment":
+            yield from _designed_rows(self.fixed, simulation["effects"]["force_limit_n"])
+        for name in self.conditions:
+            error = (self.error or {}).get(name)
+            near = f"; edge within {100 * error.edge_relative_in_K:.2g} % of the condition's own sweep" if error else ""
+            yield f"certified, {name}", f"{_share(self.ratios[name]['certified_cells'], self.cells)}{near}"
+        stable = f"{_share(crowd['stable_cells'], self.cells)} ({crowd['decided_cells']} decided)"
+        yield f"stable with all of {crowd['humans']} random humans", stable
+        if simulation["points"]:
+            beside = f"{simulation['undecided']} {UNDECIDED}, {simulation['differ_from_linear']} unlike the linear loop"
+            ends = f"{simulation['oscillate']} of {len(simulation['points'])} oscillate, {beside}"
+            yield f"simulated{_effects(simulation)}", ends
+        yield "seconds", ", ".join(f"{stage} {wall:.1f}" for stage, wall in self.wall_s.items()) or "-"
+
+
+def _reported(
+    args: argparse.Namespace,
+    scenario: Scenario,
+    sweep: Sweep,
+    drawn: Map,
+    plan: Plan,
+    fixed: dict[str, Any],
+    marks: Sequence[Mark],
+) -> _Report:
+    known, loop, whole = np.isfinite(drawn.growth), sweep.loop, not drawn.interrupted
     unsafe = known & (drawn.growth > MARGINAL)
-    part: dict[str, Any] = {
-        "rigid": loop.environment is RIGID_WALL,
-        "T": loop.T,
-        "theta": list(loop.theta),
-        "psi": list(loop.psi),
-        "delta": list(loop.delta),
-        "velocity_filter_hz": sweep.cutoff,
-        "one_sided": sweep.walled is not None,
-        "conditions": list(drawn.ratio),
-        "grid": {"K": drawn.grid.K.tolist(), "B": drawn.grid.B.tolist(), "scale": drawn.grid.scale},
-    }
-    for name, ratio in drawn.ratio.items():
-        reason = _nulls(sweep, drawn, name)
-        part[name] = ({"reason": reason} if reason else {}) | {
-            "required_over_available": _rows(drawn, ratio),
-            "certified_cells": int((ratio < 1).sum()),
-        }
-        if name in CONDITIONS:  # the population meets the loop that they are about
-            part[name]["contradicted_cells"] = int(((ratio < 1) & unsafe).sum())
-    part["population"] = {
-        **population,
-        "growth_rate_per_s": _rows(drawn, drawn.growth),
-        "unstable_humans_at_least": _rows(drawn, drawn.unstable),
+    ratios = {name: _ratio(sweep, drawn, name, unsafe) for name in drawn.ratio}
+    population = {
+        "humans": args.humans,
+        "seed": args.seed,
+        "growth_rate_per_s": drawn.growth.reshape(drawn.grid.shape),
+        "unstable_humans_at_least": drawn.unstable.reshape(drawn.grid.shape),
         "stable_cells": int((known & ~unsafe).sum()),
         "decided_cells": int(known.sum()),
     } | ({"reason": f"null: {_NOT_REACHED}"} if np.isnan(drawn.growth).any() else {})
-    part["simulation"] = _simulation(sweep, drawn, plan)
-    contradicted = sum(part[name]["contradicted_cells"] for name in CONDITIONS)
-    disagree = 0 if part["simulation"]["nonlinear"] else part["simulation"]["differ_from_linear"]
-    part["holds"] = contradicted == 0 and disagree == 0
-    part["interrupted"] = drawn.interrupted
-    part["wall_s"] = drawn.seconds
-    part["not_covered"] = CAVEATS
-    return part
+    simulation = _simulation(sweep, drawn, plan)
+    differ = 0 if simulation["nonlinear"] else simulation["differ_from_linear"]
+    certified = all(mark.requirement["this-environment"].certified for mark in marks)
+    return _Report(
+        loop.environment is RIGID_WALL,
+        None if args.rigid else scenario.name,
+        scenario.digest,
+        loop.T,
+        loop.theta,
+        loop.psi,
+        loop.delta,
+        sweep.cutoff,
+        sweep.walled is not None,
+        list(drawn.ratio),
+        {"K": drawn.grid.K, "B": drawn.grid.B, "scale": drawn.grid.scale},
+        population,
+        simulation,
+        certified and differ == 0 and not any(ratios[name]["contradicted_cells"] for name in CONDITIONS),
+        drawn.interrupted,
+        drawn.seconds,
+        ratios,
+        fixed,
+        {name: map_error(sweep, drawn, name) for name in drawn.ratio} if whole else None,
+        [_mark(mark) for mark in marks] if whole else None,
+    )
+
+
+def _ratio(sweep: Sweep, drawn: Map, name: str, unsafe: NDArray[np.bool_]) -> dict[str, Any]:
+    ratio, reason = drawn.ratio[name], _nulls(sweep, drawn, name)
+    part = {"required_over_available": ratio.reshape(drawn.grid.shape), "certified_cells": int((ratio < 1).sum())}
+    if name in CONDITIONS:  # the population meets the loop that they are about
+        part["contradicted_cells"] = int(((ratio < 1) & unsafe).sum())
+    return part | ({"reason": reason} if reason else {})
+
+
+def _mark(mark: Mark) -> dict[str, Any]:
+    """What is asked about a single coupling."""
+    return {
+        "K": mark.K,
+        "B": mark.B,
+        **{name: certificate_part(requirement) for name, requirement in mark.requirement.items()},
+        "growth_rate_per_s": mark.growth,
+        "unstable_humans": mark.unstable,
+        "stiffest_K_at_this_B": {
+            name: "beyond the map" if K is not None and np.isinf(K) else K for name, K in mark.stiffest.items()
+        },
+    }
 
 
 def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
@@ -228,19 +290,10 @@ def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
 
 
 def _simulation(sweep: Sweep, drawn: Map, plan: Plan) -> dict[str, Any]:
-    points, (K, B) = drawn.points, drawn.grid.flat
-    rows = [
-        {
-            "K": float(K[cell]),
-            "B": float(B[cell]),
-            "verdict": points.verdicts[i],
-            "amplitude_m": finite(points.amplitude[i]),
-            "frequency_hz": finite(points.frequency_hz[i]),
-            "linear_growth_rate_per_s": finite(points.growth[i]),
-            "differs_from_linear": bool(points.differ[i]),
-        }
-        for i, cell in enumerate(points.cell.tolist())
-    ]
+    points, (K, B) = drawn.points, (axis[drawn.points.cell] for axis in drawn.grid.flat)
+    figures = (K, B, points.verdicts, points.amplitude, points.frequency_hz, points.growth, points.differ)
+    names = ("K", "B", "verdict", "amplitude_m", "frequency_hz", "linear_growth_rate_per_s", "differs_from_linear")
+    rows = [dict(zip(names, row, strict=True)) for row in zip(*figures, strict=True)]
     devices = plan.effects.on(sweep.devices)
     return {
         "effects": {
@@ -263,32 +316,6 @@ def _simulation(sweep: Sweep, drawn: Map, plan: Plan) -> dict[str, Any]:
     }
 
 
-def _add_errors(outcome: dict[str, Any], found: dict[str, MapError | None]) -> None:
-    """How far the map is from design.conditions."""
-    outcome["error"] = {
-        name: error
-        and {"figure_relative": error.ratio, "edge_relative_in_K": error.edge, "columns_compared": error.columns}
-        for name, error in found.items()
-    }
-
-
-def _add_marks(outcome: dict[str, Any], marks: Sequence[Mark]) -> None:
-    """What is asked about single couplings; the whole holds only if this-environment certifies them all."""
-    outcome["marks"] = [
-        {
-            "K": mark.K,
-            "B": mark.B,
-            **{name: certificate_part(requirement) for name, requirement in mark.requirement.items()},
-            "growth_rate_per_s": finite(mark.growth),
-            "unstable_humans": mark.unstable,
-            "stiffest_K_at_this_B": {name: _beyond(K) for name, K in mark.stiffest.items()},
-        }
-        for mark in marks
-    ]
-    certified = all(mark.requirement["this-environment"].certified for mark in marks)
-    outcome["holds"] = outcome["holds"] and certified
-
-
 def _save_csv(drawn: Map, path: Path) -> Path:
     """One line per cell, SI units in the header; empty where nothing is known."""
     text = io.StringIO()
@@ -300,22 +327,9 @@ def _save_csv(drawn: Map, path: Path) -> Path:
         values = [K, B, *(ratio[cell] for ratio in drawn.ratio.values()), drawn.growth[cell], drawn.unstable[cell]]
         row = ["" if np.isnan(value) else f"{value:.9g}" for value in values]
         i = point.get(cell)
-        row += ["", ""] if i is None else _simulated(drawn, i)
+        row += ["", ""] if i is None else [drawn.points.verdicts[i], f"{drawn.points.amplitude[i]:.4g}"]
         table.writerow(row)
     return write(path, text.getvalue())
-
-
-def _simulated(drawn: Map, i: int) -> list[str]:
-    points = drawn.points
-    return [points.verdicts[i], f"{points.amplitude[i]:.4g}"]
-
-
-def _beyond(K: float | None) -> float | str | None:
-    return "beyond the map" if K is not None and np.isinf(K) else K
-
-
-def _rows(drawn: Map, values: Array) -> list[list[float | None]]:
-    return [[finite(value) for value in row] for row in values.reshape(drawn.grid.shape).tolist()]
 
 
 _EXAMPLE = """python -m sim.zwidth --theta 1 --grid 30
@@ -351,17 +365,14 @@ def main(argv: list[str]) -> int:
     )
     with render.progress("certificates") as move:
         drawn = draw_map(sweep, grid, crowd, plan, lambda stage, k, of: move(k, of, stage))
-    outcome = _summary(sweep, drawn, plan, {"humans": args.humans, "seed": args.seed})
-    outcome |= {"scenario": None if args.rigid else scenario.name, "scenario_digest": scenario.digest}
-    outcome |= designed
-    if not drawn.interrupted:
-        _add_errors(outcome, {name: map_error(sweep, drawn, name) for name in drawn.ratio})
-        _add_marks(outcome, [evaluate_point(sweep, crowd, *mark, grid.K) for mark in marks])
-    files, lines = _save(args, drawn, outcome, out), [_mark_line(m, args.humans) for m in outcome.get("marks", ())]
-    render.publish(args, outcome, [_table(outcome)], [*lines, *_remarks(outcome)], out, files)
+    found = [] if drawn.interrupted else [evaluate_point(sweep, crowd, *mark, grid.K) for mark in marks]
+    report = _reported(args, scenario, sweep, drawn, plan, designed, found)
+    lines = [_mark_line(mark, args.humans) for mark in report.marks or ()]
+    files = _save(args, drawn, render.plain(report), out)
+    render.publish(args, report, [_table(report)], [*lines, *_remarks(report)], out, files)
     if drawn.interrupted:
         return options.INTERRUPTED
-    return options.DONE if outcome["holds"] else options.DOES_NOT_HOLD
+    return options.DONE if report.holds else options.DOES_NOT_HOLD
 
 
 def _parser() -> options.Parser:
@@ -446,23 +457,18 @@ def _environment_sweep(scenario: Scenario, chosen: Chosen) -> EnvironmentSweep:
 
 def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> dict[str, Any]:
     """The fixed coupling and what is guaranteed of it where it was designed, in the scenario's own environment."""
-    loop = scenario.loop(args.case)
-    with render.progress("searching the ranges") as move:
-        whole = check_ranges(loop, chosen.coupling, args.seed, progress=move)
-    requirements = assess(loop, chosen.coupling, chosen.phi)
-    limits = limits_of(scenario, chosen, requirements, args.limiter)
-    springs, ranges = contact_springs(loop.network), whole and ranges_part(whole)
+    judged, springs = judge(args, scenario, chosen), contact_springs(scenario.loop(args.case).network)
     return {
         "axes": "environment",
-        "coupling": report.coupling_part(chosen.kind, chosen.coupling, scenario.T),
+        "coupling": judged.coupling,
         "designed_for": {
             "contact_springs": [{"between": s.between, "K": s.stiffness, "B": s.damping} for s in springs],
-            "certificates": report.certificates_part(requirements),
-            "promise": guarantee_of(requirements, loop, bool(whole and whole.proved)),
-            "ranges": ranges,
-            "set": ranges,  # its older name
+            "certificates": judged.certificates,
+            "promise": judged.promise,
+            "ranges": judged.ranges,
+            "set": judged.ranges,  # its older name
         },
-        "limiter": limits.part([device.force_limit for device in scenario.device]),
+        "limiter": judged.limiter,
         "remarks": list(chosen.notes),
     }
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -26,6 +27,8 @@ from controller.contact import Contact, Limiter, State
 from controller.delay import HeldLine, Ticks, packet_delays
 from controller.environment import Wall
 from controller.lti import Array, Lti, ReadOnly, frozen
+
+_CALM = 1 - 1e-9  # of the limiter's forces: above that they are being limited
 
 
 class Net(Protocol):
@@ -103,13 +106,13 @@ class Process(ReadOnly):
         return self.contact.frozen() if self.contact else {(): self.F}
 
     @property
-    def linear(self) -> Callable[[Array, Array], object]:
-        """Writes [f; z+] of a tick while no wall touches and no force is limited."""
-        return np.block([[self.F.C, self.F.D], [self.F.A, self.F.B]]).dot
+    def linear(self) -> Array:
+        """[f; z+] of a tick by its [z; x], (m + order, order + m), while no wall touches and no force is limited."""
+        return np.block([[self.F.C, self.F.D], [self.F.A, self.F.B]])
 
     def transition(self) -> Callable[[Array, Array], object]:
         """Writes [f; z+] of a tick, (m + order, nsim), given its [z; x], (order + m, nsim)."""
-        return self.contact.transition() if self.contact else self.linear
+        return self.contact.transition() if self.contact else self.linear.dot
 
 
 class StepBuffer:
@@ -121,7 +124,15 @@ class StepBuffer:
     contiguous slab of memory.
     """
 
-    def __init__(self, process: Process, ticks: int, plant_states: int, outside: int = 0, nsim: int = 1) -> None:
+    def __init__(
+        self,
+        process: Process,
+        ticks: int,
+        plant_states: int,
+        outside: int = 0,
+        nsim: int = 1,
+        transition: Callable[[Array, Array], object] | None = None,  # in place of the process's own
+    ) -> None:
         nz, m = process.F.order, process.channels
         if plant_states < m:
             raise ValueError(f"plant_states is {plant_states}, but the first {m} entries must be the positions")
@@ -133,22 +144,70 @@ class StepBuffer:
         self.rows = rows = self._memory.reshape(ticks + 1, width, nsim)
         self.z, self.s, self.w, self.f = np.split(rows, np.cumsum([nz, plant_states, outside]), axis=1)
         self.x = self.s[:, :m]
-        # views are made once: making one costs as much as a small product
-        self.plant_state, self.plant_input = list(self.s), list(rows[:, nz + plant_states :])
-        self.force, self.plant_row, self._input = list(self.f), list(rows[:, nz:]), list(rows[:, : nz + m])
         shifted = self._memory[width - m :][: ticks * width].reshape(ticks, width, nsim)
-        self._output = list(shifted[:, : m + nz])
-        self._transition = process.transition()
+        #: (ticks, m + order, nsim): [f; z+] of each tick
+        self.after = shifted[:, : m + nz]
+        self._transition = transition or process.transition()
         self._quantised = bool((process.encoder_step > 0).any())
         self._line = None if process.delays is None else HeldLine(process.delays, nsim)
         self.net = process.net(nsim) if process.net else None
         self.first = 0  # the tick of row 0
-        self._shortest = self._without_calls()
+        self._straight = nsim == 1 and not (self._quantised or process.walls or self._line or self.net)
+        #: whether to try the next ticks by the linear law alone: nothing can bend it but a limiter that now rests
+        self.calm = self._straight
+        limiter, self._sent = process.limiter, []
+        if self._straight and limiter:
+            places = zip(limiter.sent_rows.tolist(), limiter.limit.tolist(), strict=True)
+            self._sent = [(self.after[:, row, 0], limit) for row, limit in places]
+
+    # views are made once, and only those that are used: making one costs as much as a small product
+
+    @cached_property
+    def plant_state(self) -> list[Array]:
+        """s of each row."""
+        return list(self.s)
+
+    @cached_property
+    def force(self) -> list[Array]:
+        """f of each row."""
+        return list(self.f)
+
+    @cached_property
+    def plant_input(self) -> list[Array]:
+        """[w; f] of each row."""
+        return list(self.rows[:, self.z.shape[1] + self.s.shape[1] :])
+
+    @cached_property
+    def plant_row(self) -> list[Array]:
+        """[s; w; f] of each row."""
+        return list(self.rows[:, self.z.shape[1] :])
+
+    @cached_property
+    def law_input(self) -> list[Array]:
+        """[z; x] of each row."""
+        return list(self.rows[:, : self.z.shape[1] + self.process.channels])
+
+    @cached_property
+    def law_output(self) -> list[Array]:
+        """[f; z+] of each tick."""
+        return list(self.after)
+
+    def linear_until(self, ticks: int, most: float = 1.0) -> int:
+        """The first of these ticks in which a force asks for more than `most` of what the limiter gives, else `ticks`.
+
+        Not a number counts as such.
+        """
+        for forces, limit in self._sent:
+            sent, limit = forces[:ticks], most * limit
+            if not (sent.max() <= limit and sent.min() >= -limit):
+                within = [np.abs(forces[:ticks]) <= most * limit for forces, limit in self._sent]
+                return int(np.all(within, axis=0).argmin())
+        return ticks
 
     def tick(self, k: int) -> None:
         """Steps 1, 2, 3 and 5 for row k, whose plant state has been written: f[k] and z[k + 1]."""
         seen = self.seen(k)
-        self._transition(seen, self._output[k])
+        self._transition(seen, self.law_output[k])
         if self.net is not None:
             self.net.send(seen[-self.process.channels :], self.force[k])
         if self._line is not None:
@@ -160,16 +219,17 @@ class StepBuffer:
         """`tick` by the shortest way that does it here."""
         return self._shortest or self.tick
 
-    def _without_calls(self) -> Callable[[int], object] | None:
+    @cached_property
+    def _shortest(self) -> Callable[[int], object] | None:
         """`tick` where it is one product, and one look at the forces that a limiter may limit."""
         if self._quantised or self._line is not None or self.net is not None:
             return None
-        transition, seen, after = self._transition, self._input, self._output
+        transition, seen, after = self._transition, self.law_input, self.law_output
         limiter = self.process.limiter
         if limiter is None or limiter.walls or self._memory.shape[1] > 1:
             return lambda k: transition(seen[k], after[k])
         # a single simulation spends its time in calls: its forces are looked at without numpy, of two channels by name
-        linear, first = self.process.linear, self._width - self.process.channels
+        linear, first = self.process.linear.dot, self._width - self.process.channels
         forces = [self._memory[first + i :: self._width, 0].data for i in limiter.sent_rows]
         sent = list(zip(forces, (-limiter.limit).tolist(), limiter.limit.tolist(), strict=True))
         (one, low, high), (other, lowest, highest), *others = sent if len(sent) > 1 else 2 * sent
@@ -184,7 +244,7 @@ class StepBuffer:
 
     def seen(self, k: int) -> Array:
         """[z; x] of row k with x as the encoders give it, (order + m, nsim); the plant's own positions stay."""
-        row = self._input[k]
+        row = self.law_input[k]
         if not self._quantised:
             return row
         m = self.process.channels
@@ -197,6 +257,7 @@ class StepBuffer:
 
     def rewind(self, ticks: int) -> None:
         """Start a new stretch where this one stood after `ticks` ticks."""
+        self.calm = self._straight and self.linear_until(ticks, _CALM) == ticks
         self.z[0] = self.z[ticks]
         self.s[0] = self.s[ticks]
         self.first += ticks

@@ -546,12 +546,13 @@ def assess(
     certificate just made, proves is not proved again.
     """
     loop = loop.at(loop.environment).switching(None)
-    here = multipliers.this_environment_of(loop, coupling)
-    proved = known and known.condition == "this-environment" and known.scenario == digest(loop, coupling.form())
-    return {
-        "any-environment": _proved(loop, coupling, any_environment_of(loop, coupling, phi), phi),
-        "this-environment": replace(here, proof="rational") if proved else _proved(loop, coupling, here),
-    }
+    asked = any_environment_of(loop, coupling, phi), multipliers.this_environment_of(loop, coupling)
+    proved = known.condition if known and known.scenario == digest(loop, coupling.form()) else None
+
+    def judged(each: Requirement) -> Requirement:
+        return replace(each, proof="rational") if each.condition == proved else _proved(loop, coupling, each, phi)
+
+    return {each.condition: judged(each) for each in asked}
 
 
 def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Requirement:

@@ -240,12 +240,12 @@ class Voluntary(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         w = 2 * np.pi * self.frequency
         wave = self.amplitude * np.sin(w * t + self.phase)
         wave_rate = self.amplitude * w * np.cos(w * t + self.phase)
-        if self.ease == 0 or t.min(initial=self.ease) >= self.ease:
-            return wave, wave_rate
-        rising = t < self.ease
-        gain = np.where(rising, (1 - np.cos(np.pi * t / self.ease)) / 2, 1.0)
-        gain_rate = np.where(rising, np.pi / (2 * self.ease) * np.sin(np.pi * t / self.ease), 0.0)
-        return gain * wave, gain_rate * wave + gain * wave_rate
+        rising = np.flatnonzero(t < self.ease)
+        if rising.size:
+            part, rate = wave[rising], np.pi / self.ease
+            gain, gain_rate = (1 - np.cos(rate * t[rising])) / 2, rate / 2 * np.sin(rate * t[rising])
+            wave[rising], wave_rate[rising] = gain * part, gain_rate * part + gain * wave_rate[rising]
+        return wave, wave_rate
 
 
 class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -18,7 +18,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from sim.graphics import set_aside
+from sim.mujoco_gl import set_aside
 
 if TYPE_CHECKING:
     from sim.api import simulate, validate

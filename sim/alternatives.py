@@ -15,11 +15,12 @@ from typing import Any
 from controller.coupling import Coupling
 from controller.lti import Array
 from design.certificate import assess
+from design.coverage import Limits
 from design.guarantees import guarantee_of
 from design.result import Requirement, finite
 from design.transparency import decibels, transparency
 from sim.accuracy import credible_part, force_error
-from sim.couplings import choose, limits_of
+from sim.couplings import Chosen, choose, limits_of
 from sim.run import assemble, run
 from sim.scenario import Scenario, load
 from sim.stability import exact_growth, unstable
@@ -88,11 +89,18 @@ class Alternative:
         return finite(max(float(n) / float(a) if a else math.inf for n, a in pairs))
 
 
+_Own = tuple[Chosen, dict[str, Requirement], Limits]
+
+
 def alternatives(
-    scenario: Scenario, case: str, progress: Callable[[int, int], None] = lambda done, of: None
+    scenario: Scenario,
+    case: str,
+    progress: Callable[[int, int], None] = lambda done, of: None,
+    own: _Own | None = None,
 ) -> list[Alternative]:
     """Every coupling that can stand in the place of the run's own; none where the delays switch.
 
+    `own` is the run's, with what was found of it in the same loop.
     Of ranges only couplings for any environment are shown, and the optimal one holds a linear model: none before walls.
     """
     if scenario.switches:
@@ -102,7 +110,8 @@ def alternatives(
     made = []
     for i, (kind, condition) in enumerate(rows):
         progress(i, len(rows))
-        made.append(_alternative(scenario, case, kind, condition))
+        same = own if own and (own[0].kind, own[0].condition) == (kind, condition) else None
+        made.append(_alternative(scenario, case, kind, condition, same))
     return made
 
 
@@ -114,14 +123,17 @@ def _possible(scenario: Scenario, case: str, kind: str, condition: str | None) -
     return kind != "optimal" or (scenario.channels <= _QUICK and not scenario.environment.walls)
 
 
-def _alternative(scenario: Scenario, case: str, kind: str, condition: str | None) -> Alternative:
+def _alternative(
+    scenario: Scenario, case: str, kind: str, condition: str | None, own: _Own | None = None
+) -> Alternative:
+    loop = scenario.loop(case)
     try:
-        chosen = choose(scenario, case, kind, condition)
+        chosen = own[0] if own else choose(scenario, case, kind, condition)
     except ValueError as error:
         return Alternative(kind, condition, reason=str(error))
-    loop = scenario.loop(case)
-    requirements = assess(loop, chosen.coupling, chosen.phi)
-    simulation = assemble(scenario, chosen.coupling, limits_of(scenario, chosen, requirements).rho)
+    requirements = own[1] if own else assess(loop, chosen.coupling, chosen.phi, chosen.known)
+    limits = own[2] if own else limits_of(scenario, chosen, requirements)
+    simulation = assemble(scenario, chosen.coupling, limits.rho)
     felt = transparency(simulation.felt, simulation.E, loop.lam)
     growth = exact_growth(simulation)
     made = Alternative(

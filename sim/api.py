@@ -11,7 +11,7 @@ from design.result import Design, number, of_kind, one_of, whole
 from sim import crowds
 from sim.couplings import given, limits_of
 from sim.engines import INTEGRATORS
-from sim.nets import EnergyNet, Plugged, netted
+from sim.passivity_layer import EnergyNet, Plugged, netted
 from sim.run import ENGINES, Progress, assemble, make_engine, run
 from sim.scenario import InputError, Scenario, require_linear
 from sim.shards import validate as validate_all

@@ -21,7 +21,7 @@ from models.scene import Crowd, variants
 from sim.accuracy import force_error
 from sim.couplings import Chosen, choose, limits_of
 from sim.engines import ExactBatchEngine, hold
-from sim.nets import BASELINES, Classic, EnergyNet, netted
+from sim.passivity_layer import BASELINES, Classic, EnergyNet, netted
 from sim.run import Simulation, assemble, run, run_blocks
 from sim.scenario import Scenario
 

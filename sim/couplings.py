@@ -12,10 +12,11 @@ from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design.certificate import assess, verify
 from design.coverage import Limits, covered_limits
-from design.designs import KINDS, design_by_kind
+from design.designs import KINDS, design_by_kind, usual_condition
 from design.guarantees import switching_guarantee
 from design.result import COUPLING, PUBLISHED, Design, DesignFailed, Requirement, bare
-from design.stored import LimiterCertificate, Stored, load
+from design.stored import Certificate, LimiterCertificate, Stored, load
+from sim import design_cache
 from sim.scenario import InputError, Scenario
 
 NAMES = ("none", "published", *KINDS)
@@ -32,6 +33,7 @@ class Chosen:
     notes: tuple[str, ...] = ()  # what a reader should know of its origin
     switching: DelayRange | None = None  # its file proves that any switching of the delays within it is safe here
     limiter: LimiterCertificate | None = None  # what it comes with for limited forces
+    known: Certificate | None = None  # proved in this process, and need not be again
 
 
 def choose(
@@ -61,8 +63,16 @@ def choose(
         return Chosen(name, PUBLISHED[case], condition or "any-environment")
     if name in KINDS:
         try:
+            loop = scenario.loop(case)
+            condition = condition or usual_condition(loop, name)
             asked: dict[str, Any] = {"limiter": limiter} if limiter is not None and name == "spring-damper" else {}
-            design = design_by_kind(scenario.loop(case), name, condition, progress, **asked)
+            question = (loop, name, condition, *asked.items())
+            if kept := design_cache.find(*question):
+                assert kept.certificate
+                proof = kept.certificate.limiter or None
+                return Chosen(name, kept.built(), condition, limiter=proof, known=kept.certificate)
+            design = design_by_kind(loop, name, condition, progress, **asked)
+            design_cache.keep(design, *question)
         except DesignFailed:
             raise
         except ValueError as error:
@@ -100,7 +110,7 @@ def limits_of(
         return Limits(None, "limiter: limited forces are proved for constant delays")
     loop = scenario.loop("I")  # the reference does not matter
     coupling, proof = chosen.coupling, chosen.limiter
-    return covered_limits(loop, coupling, requirements or assess(loop, coupling, chosen.phi), proof)
+    return covered_limits(loop, coupling, requirements or assess(loop, coupling, chosen.phi, chosen.known), proof)
 
 
 def read_coupling(path: str | Path) -> Stored:

@@ -58,6 +58,9 @@ _WHOLE = 1e-9  # of a step: rounding, where a number of steps is counted
 LEAST = 4  # steps per period of MuJoCo's own integrators
 
 
+_Stretch = Callable[[int], None]
+
+
 class Engine(Protocol):
     """Advances the plant by one period at a time, reading and writing a buffer."""
 
@@ -72,6 +75,20 @@ class Engine(Protocol):
     def troubled(self) -> bool:
         """Whether the engine itself has reported numbers that it cannot go on with."""
         ...
+
+    # One that can may also have, from `start` on:
+    #   stretch(ticks)   the linear law and `advance` for so many ticks from row 0 on, in fewer calls; or None
+    #   back(k)          after a stretch the plant goes back to the state of row k
+
+
+class _NeverTroubled:
+    stretch: _Stretch | None = None
+
+    def back(self, k: int) -> None:
+        """The exact engines have no state of their own."""
+
+    def troubled(self) -> bool:
+        return False
 
 
 def default_integrator(scene: Scene) -> str:
@@ -142,24 +159,83 @@ def at_the_latch(plant: Plant, late: Sequence[float]) -> Array:
     return rows
 
 
-class ExactEngine:
+class _Fused:
+    """The plant's step and the law at its end in one product a tick: [f; s; z+] of the next one.
+
+    A row of the memory is [w, f, s, z+, a] of a tick, where `further` entries a are the engine's own.
+    """
+
+    def __init__(self, buffer: StepBuffer, step: Array, further: int = 0) -> None:
+        """`step` makes the next s of the last entries of a row, (states, entries)."""
+        law, outside, states = buffer.process.linear, buffer.w.shape[1], len(step)
+        m, nz = buffer.process.channels, buffer.process.F.order
+        self._places = places = np.cumsum([outside, m, states, nz, further])
+        self.memory = memory = np.zeros((buffer.ticks + 1, places[-1]))
+        start, z = places[-1] - step.shape[1], slice(places[2] - places[-1], step.shape[1] - further)
+        seen = np.zeros((nz + m, step.shape[1]))
+        seen[:nz, z], seen[nz:] = np.eye(nz), step[:m]
+        after = law @ seen
+        self.product = np.vstack([after[:m], step, after[m:]]).dot
+        self.held, self.before = list(memory[:, : places[1]]), list(memory[:, start:])
+        self.next, self.states = list(memory[1:, places[0] : places[3]]), memory[1:, places[1] : places[2]]
+        self.further = list(memory[:, places[3] :])
+        self._buffer, self._law = buffer, law.dot
+
+    def begin(self, ticks: int) -> None:
+        """Take the first row of the buffer, with the law there, and the outside forces."""
+        buffer, memory, (outside, to_f, to_s, to_z, _) = self._buffer, self.memory, self._places
+        m = to_f - outside
+        self._law(buffer.rows[0, : to_z - to_s + m], buffer.after[0])
+        memory[:ticks, :outside] = buffer.w[:ticks, :, 0]
+        memory[0, outside:to_f], memory[0, to_s:to_z] = np.split(buffer.after[0, :, 0], [m])
+        memory[0, to_f:to_s] = buffer.s[0, :, 0]
+
+    def end(self, ticks: int) -> None:
+        """Write what the ticks came to, and the plant's state after them."""
+        buffer, (outside, to_f, to_s, to_z, _) = self._buffer, self._places
+        rows, m = self.memory[1 : ticks + 1], to_f - outside
+        buffer.s[1 : ticks + 1, :, 0] = rows[:, to_f:to_s]
+        buffer.after[1:ticks, :m, 0] = rows[:-1, outside:to_f]
+        buffer.after[1:ticks, m:, 0] = rows[:-1, to_s:to_z]
+
+
+def _exactly(buffer: StepBuffer, plant: Array) -> _Stretch:
+    """Stretches of the plant [A, B] that acts on [s; w; f]."""
+    states = len(plant)
+    step = np.hstack([plant[:, states:], plant[:, :states], np.zeros((states, buffer.process.F.order))])
+    fused = _Fused(buffer, step)
+    product, before, after = fused.product, fused.before, fused.next
+
+    def stretch(ticks: int) -> None:
+        fused.begin(ticks)
+        for k in range(ticks):
+            product(before[k], after[k])
+        fused.end(ticks)
+
+    return stretch
+
+
+class ExactEngine(_NeverTroubled):
     """One matrix product per period, after the actuators' limits."""
 
     def __init__(self, plant: HeldPlant, force_limit: Array) -> None:
-        self._product = np.ascontiguousarray(np.hstack([plant.A, plant.B])).dot
+        self._plant = np.hstack([plant.A, plant.B])
         self._high = force_limit[:, None]
         self.advance: Callable[[int], None]  # from `start` on
 
     def start(self, buffer: StepBuffer) -> None:
-        product, rows, states = self._product, buffer.plant_row, buffer.plant_state
+        product, rows, states = np.ascontiguousarray(self._plant).dot, buffer.plant_row, buffer.plant_state
 
         def free(k: int) -> None:
             product(rows[k], states[k + 1])
 
-        self.advance = free
+        self.advance, self.stretch = free, None
         limiter = buffer.process.limiter
-        if limiter and not buffer.process.net and (limiter.limit[:, None] <= self._high).all():
-            return  # forces have left within the limits
+        within = limiter and not buffer.process.net and (limiter.limit[:, None] <= self._high).all()
+        if within or np.isinf(self._high).all():  # forces have left within the limits
+            if buffer.calm:
+                self.stretch = _exactly(buffer, self._plant)
+            return
         forces, low, high = buffer.force, -self._high, self._high
 
         def limited(k: int) -> None:
@@ -168,14 +244,10 @@ class ExactEngine:
             np.maximum(force, low, out=force)
             product(rows[k], states[k + 1])
 
-        if np.isfinite(high).any():
-            self.advance = limited
-
-    def troubled(self) -> bool:
-        return False
+        self.advance = limited
 
 
-class ExactTimedEngine:
+class ExactTimedEngine(_NeverTroubled):
     """A tick of a timing moves the plant, or simulation j plant j of many, exactly, after the actuators' limits."""
 
     def __init__(self, plant: Plant, timing: Timing, force_limit: Array) -> None:
@@ -202,11 +274,8 @@ class ExactTimedEngine:
         np.maximum(force, self._low, out=force)
         self._product(which[(buffer.first + k) % len(which)])(buffer.plant_row[k], buffer.plant_state[k + 1])
 
-    def troubled(self) -> bool:
-        return False
 
-
-class ExactBatchEngine:
+class ExactBatchEngine(_NeverTroubled):
     """Simulation j of the buffer moves by A[j], B[j] of the plants, after the actuators' limits."""
 
     def __init__(self, plants: HeldPlant, force_limit: Array) -> None:
@@ -222,9 +291,6 @@ class ExactBatchEngine:
         np.minimum(force, self._high, out=force)
         np.maximum(force, self._low, out=force)
         self._product(self._slabs[k], self._states[k + 1])
-
-    def troubled(self) -> bool:
-        return False
 
 
 def expm_each(matrices: Array) -> Array:
@@ -351,19 +417,22 @@ class _Access:
     pace: Callable[[float], object]  # sets their length [s]
     move: Callable[[float], _Product] | None  # seconds -> [q; v; qacc] to [q; v] then, where steps are exponential
 
+    def put(self, buffer: StepBuffer, k: int) -> None:
+        """Put the plant into the state of row k."""
+        self.state[...] = buffer.s[k, : 2 * len(self.qacc)].reshape(self.state.shape)
+
     def ticks(self, buffer: StepBuffer, timing: Timing | None) -> Callable[[int], None]:
-        """What moves tick k of the buffer; the plant is put into the state of its first row."""
+        """What moves tick k of the buffer, from where the plant is."""
         one = (..., 0) if self.ctrl.ndim == 1 else ...
-        states = 2 * len(self.qacc)
-        rows, inputs = list(buffer.s[:, :states][one]), [row[one] for row in buffer.plant_input]
-        self.state[...] = rows[0].reshape(self.state.shape)
+        states = buffer.s[:, : 2 * len(self.qacc)][one]
+        rows, inputs = list(states), list(buffer.rows[:, -len(self.ctrl) :][one])
         if timing:
             return self._timed(buffer, timing, rows, inputs)
-        return self._by_exponentials(rows, inputs) if self.move else self._by_steps(rows, inputs)
+        shaped = list(states.reshape(-1, *self.state.shape))
+        return self._by_exponentials(rows, inputs, shaped) if self.move else self._by_steps(inputs, shaped)
 
-    def _by_steps(self, rows: list[Array], inputs: list[Array]) -> Callable[[int], None]:
+    def _by_steps(self, inputs: list[Array], written: list[Array]) -> Callable[[int], None]:
         ctrl, state, step, count = self.ctrl, self.state, self.step, self.substeps
-        written = [row.reshape(state.shape) for row in rows]
 
         def advance(k: int) -> None:
             ctrl[...] = inputs[k]
@@ -372,23 +441,23 @@ class _Access:
 
         return advance
 
-    def _by_exponentials(self, rows: list[Array], inputs: list[Array]) -> Callable[[int], None]:
+    def _by_exponentials(self, rows: list[Array], inputs: list[Array], shaped: list[Array]) -> Callable[[int], None]:
         assert self.move
         ctrl, state, qacc, forward, move = self.ctrl, self.state, self.qacc, self.forward, self.move
         sight = np.concatenate([rows[0], np.zeros_like(qacc)])  # [q; v; qacc]
         seen, qacc_seen = np.split(sight, [len(rows[0])])
-        shaped, each = [row.reshape(state.shape) for row in rows], range(self.substeps)
-        product = move(self.T / self.substeps)
+        product, each = move(self.T / self.substeps), range(self.substeps)
 
         def advance(k: int) -> None:
             ctrl[...] = inputs[k]
-            after = rows[k + 1]
+            before, after = rows[k], rows[k + 1]
             for _ in each:
                 forward()
+                seen[...] = before
                 qacc_seen[...] = qacc
                 product(sight, after)
-                seen[...] = after
                 state[...] = shaped[k + 1]
+                before = after
 
         return advance
 
@@ -438,7 +507,11 @@ class MujocoEngine:
 
         self.model = discretised(scene, T, integrator, substeps)
         self.data = mujoco.MjData(self.model)
+        self._warnings = self.data.warning.number
         self.advance: Callable[[int], None]  # from `start` on
+        self.stretch: _Stretch | None = None
+        moves = cache(lambda h: _rosenbrock(_rates(scene, None), h)[0])
+        self._whole = moves if integrator == EXPONENTIAL and substeps == 1 else None
         self._timing, both, q, v = timing, (self.model, self.data), self.data.qpos, self.data.qvel
         self._access = _Access(
             T,
@@ -450,14 +523,65 @@ class MujocoEngine:
             partial(mujoco.mj_forward, *both),
             partial(mujoco.mj_step, *both),
             partial(setattr, self.model.opt, "timestep"),
-            cache(lambda h: _rosenbrock(_rates(scene, None), h)[0].dot) if integrator == EXPONENTIAL else None,
+            (lambda h: moves(h).dot) if integrator == EXPONENTIAL else None,
         )
+        # what rubs is solved from the solution before, which nothing takes back
+        self._rubs = default_integrator(scene) != EXPONENTIAL
 
     def start(self, buffer: StepBuffer) -> None:
-        self.advance = self._access.ticks(buffer, self._timing)
+        self._buffer, self.stretch, access = buffer, None, self._access
+        access.put(buffer, 0)
+        self.advance = access.ticks(buffer, self._timing)
+        if buffer.calm and not self._timing and not (self._rubs and buffer.process.limiter):
+            if self._whole:
+                self.stretch = self._fused(buffer, self._whole(access.T))
+            elif not access.move:
+                self.stretch = self._stepped(buffer)
+
+    def _fused(self, buffer: StepBuffer, move: Array) -> _Stretch:
+        access, further = self._access, len(self._access.qacc)
+        none = np.zeros((len(move), buffer.process.F.order))
+        fused = _Fused(buffer, np.hstack([move[:, :-further], none, move[:, -further:]]), further)
+        ctrl, state, qacc, forward = access.ctrl, access.state, access.qacc, access.forward
+        product, held, before, after, rates = fused.product, fused.held, fused.before, fused.next, fused.further
+        shaped = list(fused.states.reshape(-1, *state.shape))
+
+        def stretch(ticks: int) -> None:
+            fused.begin(ticks)
+            for inputs, rate, now, then, moved in zip(held[:ticks], rates, before, after, shaped, strict=False):
+                ctrl[...] = inputs
+                forward()
+                rate[...] = qacc
+                product(now, then)
+                state[...] = moved
+            fused.end(ticks)
+
+        return stretch
+
+    def _stepped(self, buffer: StepBuffer) -> _Stretch:
+        access = self._access
+        ctrl, state, step, count = access.ctrl, access.state, access.step, access.substeps
+        rows, law, m = buffer.rows[:, :, 0], buffer.process.linear.dot, buffer.process.channels
+        states = list(buffer.s[1:, :, 0].reshape(-1, *state.shape))
+        before, after = list(rows[:, : buffer.z.shape[1] + m]), list(buffer.after[:, :, 0])
+        inputs = list(rows[:, -len(ctrl) :])
+
+        def stretch(ticks: int) -> None:
+            for now, then, held, moved in zip(before, after[:ticks], inputs, states, strict=False):
+                law(now, then)
+                ctrl[...] = held
+                step(count)
+                moved[...] = state
+
+        return stretch
+
+    def back(self, k: int) -> None:
+        """Put the plant into the state of row k; what was warned of since does not count."""
+        self._access.put(self._buffer, k)
+        self._warnings[:] = 0
 
     def troubled(self) -> bool:
-        return bool(self.data.warning.number.any())
+        return bool(self._warnings.any())
 
 
 class MujocoBatchEngine:
@@ -511,6 +635,7 @@ class MujocoBatchEngine:
         )
 
     def start(self, buffer: StepBuffer) -> None:
+        self._access.put(buffer, 0)
         self.advance = self._access.ticks(buffer, self._timing)
 
     def troubled(self) -> bool:
@@ -587,6 +712,7 @@ def quiet_warnings() -> Iterator[None]:
         mujoco.set_mju_user_warning(previous)
 
 
+@cache
 def _profiler_clock() -> ctypes.c_void_p | None:
     import mujoco
 

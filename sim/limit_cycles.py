@@ -343,13 +343,12 @@ class _ManyProcesses(StepBuffer):
     """A process for each simulation, all of the same order, number of walls, force limits and encoder steps."""
 
     def __init__(self, processes: Sequence[Process], ticks: int, plant_states: int, outside: int) -> None:
-        super().__init__(processes[0], ticks, plant_states, outside, len(processes))
         made, contact = _linear if processes[0].contact is None else _each, processes[0].contact
         if isinstance(contact, Contact) and len(contact.walls) == 1:
             made = _one_wall
         elif contact and not contact.walls:
             made = _limited
-        self._transition = made(processes)
+        super().__init__(processes[0], ticks, plant_states, outside, len(processes), made(processes))
 
 
 def _linear(processes: Sequence[Process]) -> _Transition:

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
@@ -30,7 +30,8 @@ _LINES: dict[str, dict[str, Any]] = {
 
 def plot_zwidth(drawn: Map, outcome: dict[str, Any], path: Path) -> Path:
     """Stiffness over damping; cells are the population's verdict, lines the certificates' edges, symbols MuJoCo's."""
-    figure, axes = plt.subplots(figsize=(8, 5.6), layout="constrained")  # areas in place of a grid
+    figure = Figure((8, 5.6), layout="constrained")
+    axes = figure.subplots()  # areas in place of a grid
     about_environment = outcome["axes"] == "environment"
     of = " of the environment's contacts" if about_environment else ""
     axes.set(xscale=drawn.grid.scale, yscale=drawn.grid.scale, xlabel=f"B{of} [N s/m]", ylabel=f"K{of} [N/m]")

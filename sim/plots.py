@@ -11,9 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib import pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont, get_font
@@ -25,8 +23,6 @@ from numpy.typing import NDArray
 from controller.lti import Array
 from design.files import printable, write
 from sim.trace import Trace
-
-mpl.use("Agg")
 
 # ----------------------------------------------------------------------------------------------------
 # The style.
@@ -48,7 +44,8 @@ CONDITIONS = {"this-environment": "this environment", "any-environment": "any pa
 
 def _panels(title: str, rows: int, columns: int, size: tuple[float, float], **shared: Any) -> tuple[Figure, Any]:
     """A figure of `size` [inch] with a title, and its axes (rows, columns), each with a grid."""
-    figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False, **shared)
+    figure = Figure(size, layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, **shared)
     for axis in axes.flat:
         axis.grid(alpha=0.3)
     figure.suptitle(title)
@@ -69,10 +66,7 @@ def _entries(axis: Axes) -> dict[str, Any]:
 def save(figure: Figure, path: Path, dpi: int = 130) -> Path:
     """The figure as a PNG, its texts taken literally; whole or not at all."""
     _literal(figure)
-    try:
-        return write(path, lambda file: figure.savefig(file, format="png", dpi=dpi))
-    finally:
-        plt.close(figure)
+    return write(path, lambda file: figure.savefig(file, format="png", dpi=dpi))
 
 
 def _literal(figure: Figure) -> None:

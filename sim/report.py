@@ -109,16 +109,18 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
 # What the paper prints beside what comes out here, for its own scenario.
 
 
-def beside_the_paper(scenario: Scenario, case: str, outcome: dict[str, Any]) -> list[dict[str, str]]:
+def beside_the_paper(
+    scenario: Scenario, case: str, stability: dict[str, Any], coupling: dict[str, Any]
+) -> list[dict[str, str]]:
     """Rows of {what, paper, here, why}; empty where the loop is not the paper's."""
     if scenario.varying_delay or scenario.loop(case) != load().loop(case):
         return []
-    figure = _figure(case, outcome["stability"])
-    return [figure] if case == "none" else [*_printed_gains(scenario, case, outcome), _tau(case), figure]
+    figure = _figure(case, stability)
+    return [figure] if case == "none" else [*_printed_gains(scenario, case, coupling), _tau(case), figure]
 
 
-def _printed_gains(scenario: Scenario, case: str, outcome: dict[str, Any]) -> list[dict[str, str]]:
-    printed, got = PUBLISHED[case], outcome["coupling"]
+def _printed_gains(scenario: Scenario, case: str, got: dict[str, Any]) -> list[dict[str, str]]:
+    printed = PUBLISHED[case]
     need = assess(scenario.loop(case), printed)
     any_environment, this_environment = (need[name].required for name in ("any-environment", "this-environment"))
     here = "none" if got["K"] is None else f"K = {listed(got['K'], 5)}, B = {listed(got['B'], 5)}"

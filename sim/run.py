@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -48,6 +49,7 @@ Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 
 _COPIES = 4  # of a trace, at most, from the run to its report
 _BLOCK = 1024  # ticks between two looks at the clock, the keyboard and the numbers
+_AHEAD = 8  # blocks for which outside forces are asked at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +147,6 @@ def run(
             finite = np.isfinite(buffer.s[:count]).all(axis=(1, 2)) & np.isfinite(buffer.f[:count]).all(axis=(1, 2))
             diverged |= not finite.all()
             count = count if finite.all() else int(np.argmin(finite))
-        buffer.saturate(count)
         done = first + count
         record[first:done] = rows[:count, :, 0]
         progress(done, ticks)
@@ -156,8 +157,11 @@ def run(
     except KeyboardInterrupt:  # what was finished is kept
         interrupted = True
     n, m, handles = simulation.scene.model.nq, process.channels, list(simulation.scene.handles)
-    record.setflags(write=False)
     z, s, w, f = np.split(record[:done], np.cumsum(widths)[:3], axis=1)
+    for force, limit in zip(f.T, process.force_limit, strict=True):
+        np.clip(force, -limit, limit, out=force)  # from asked for into applied
+    for part in (record, z, s, w, f):
+        part.setflags(write=False)
     return Trace(
         t=beginnings(scenario.T, simulation.timing, 0, done),
         x=process.measured(s[:, :m]),
@@ -198,9 +202,12 @@ def run_blocks(
     # a diverging run is reported, not warned about
     with profiler_off(), quiet_warnings(), np.errstate(over="ignore", invalid="ignore"):
         engine.start(buffer)
+        ahead = outside(0, 0)
         for first in range(0, ticks, block):
-            count = min(block, ticks - first)
-            buffer.w[:count] = outside(first, count)[:, :, None]
+            count, ahead = min(block, ticks - first), ahead[block:]
+            if not len(ahead):
+                ahead = outside(first, min(_AHEAD * block, ticks - first))
+            buffer.w[:count] = ahead[:count, :, None]
             run_block(buffer, engine, count)
             if look(buffer, first, count):
                 return
@@ -209,8 +216,15 @@ def run_blocks(
 
 def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
     """Close the loop for the first `ticks` rows of the buffer."""
+    done, fast = 0, cast(Any, engine)
+    if buffer.calm and getattr(engine, "stretch", None):
+        fast.stretch(ticks)  # the same by the linear law, whose forces are looked at afterwards
+        done = buffer.linear_until(ticks)
+        if done == ticks:
+            return
+        fast.back(done)
     tick, advance = buffer.ticking(), engine.advance
-    for k in range(ticks):
+    for k in range(done, ticks):
         tick(k)  # sample x, compute f and z+
         advance(k)  # limit f, hold -f on the actuators for T, move the plant
 
@@ -233,7 +247,8 @@ def outside_forces(
         for human, column in zip(scenario.human, scene.pushed, strict=True):
             w[:, column] += human.voluntary_force(t)
     if tap := scenario.tap:
-        k, begin, end = (np.round(time / scenario.T, 9) for time in (t, tap.start, tap.start + tap.duration))
+        begin, end = (np.round(time / scenario.T, 9) for time in (tap.start, tap.start + tap.duration))
+        k = np.round(t / scenario.T, 9) if timing else np.arange(first, first + ticks)
         w[(k >= begin) & (k < end), scene.tapped[tap.channel - 1]] += tap.force
     return w
 

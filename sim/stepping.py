@@ -4,7 +4,7 @@ On a smooth scene the exponential integrator is exact with one step. Of MuJoCo's
 the eigenvalues of the continuous plant: the fastest weakly damped mode, which must be resolved (mode h <= 0.2), and
 the strongest damping, which must be followed (rate h < 1). What the rule picks is then checked: the loop that the
 engine simulates must have the exact loop's verdict, else the number is doubled. Where an error is asked for, runs
-decide: see sim.engine_choice.
+decide: see sim.accuracy.
 """
 
 from __future__ import annotations

@@ -571,9 +571,9 @@ class Mark:
 class MapError:
     """How far the map is from single sweeps, over the columns that were compared."""
 
-    ratio: float  # largest relative error of the figure beside the edge
-    edge: float  # largest relative error in K of the edge, interpolated between two rows
-    columns: int
+    figure_relative: float  # largest relative error of the figure beside the edge
+    edge_relative_in_K: float  # largest relative error in K of the edge, interpolated between two rows
+    columns_compared: int
 
 
 def evaluate_point(sweep: Sweep, held: HeldDevices, K: float, B: float, grid_K: Array) -> Mark:

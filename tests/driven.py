@@ -28,3 +28,15 @@ def driven(process: Process, engine: Engine, outside: Outside, ticks: int, start
 
     run_blocks(process, engine, outside, ticks, start, look, 1000)
     return Driven(*(np.concatenate(rows) for rows in zip(*kept, strict=True)))
+
+
+def tick_by_tick(engine):
+    """The engine without stretches: every tick is looked at before the next."""
+    start = engine.start
+
+    def begin(buffer: StepBuffer) -> None:
+        start(buffer)
+        engine.stretch = None
+
+    engine.start = begin
+    return engine

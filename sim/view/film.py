@@ -23,7 +23,7 @@ from PIL import Image, ImageDraw, ImageFont
 from controller.lti import Array
 from design.files import check_file, write
 from models.scene import Scene
-from sim.graphics import asked
+from sim.mujoco_gl import asked
 from sim.scenario import InputError
 from sim.view import stage as drawn
 from sim.view.session import HISTORY, Frame

@@ -59,25 +59,23 @@ def raw(assembly, integrator, substeps, record) -> float:
     q, v, ctrl = data.qpos, data.qvel, data.ctrl
     inputs = list(np.concatenate([record.w, record.f], axis=1))
     with profiler_off():
-        begin = time.process_time()
         if integrator == EXPONENTIAL:
             forward, move = mujoco.mj_forward, make_engine(assembly, "mujoco", EXPONENTIAL, substeps)._access.move
-            product, qacc, sight, after = (
-                move(assembly.scenario.T / substeps),
-                data.qacc,
-                np.zeros(3 * nq),
-                np.zeros(2 * nq),
-            )
+            product, qacc = move(assembly.scenario.T / substeps), data.qacc
+            sight, after = np.zeros(3 * nq), np.zeros(2 * nq)
+            seen, rates, (at, by) = sight[: 2 * nq], sight[2 * nq :], np.split(after, 2)
             begin = time.process_time()
             for row in inputs:
                 ctrl[...] = row
                 forward(model, data)
-                sight[2 * nq :] = qacc
+                rates[...] = qacc
                 product(sight, after)
-                sight[: 2 * nq] = after
-                q[...], v[...] = after[:nq], after[nq:]
+                seen[...] = after
+                q[...] = at
+                v[...] = by
         else:
             step = mujoco.mj_step
+            begin = time.process_time()
             for row in inputs:
                 ctrl[...] = row
                 step(model, data, substeps)

@@ -27,11 +27,8 @@ from importlib import import_module
 from itertools import product
 from pathlib import Path
 
-import matplotlib as mpl
+import matplotlib.figure  # noqa: F401 - once, before the forks
 import numpy as np
-
-mpl.use("Agg")
-import matplotlib.pyplot  # noqa: F401 - once, before the forks
 from combined import combined
 
 from cli import options

@@ -5,6 +5,7 @@ import json
 import msgspec
 import numpy as np
 import pytest
+from driven import tick_by_tick
 from worlds import SOFT
 
 from cli.run import main
@@ -14,7 +15,7 @@ from design.coverage import covered_limits
 from design.stored import Stored, save
 from sim.api import simulate
 from sim.couplings import choose, limits_of
-from sim.run import assemble, run
+from sim.run import assemble, make_engine, run
 from sim.scenario import load
 
 BUILT = SpringDamper((5832.0, 2545.0), (0.187, 1.386))  # covered with limited forces in this environment
@@ -68,6 +69,21 @@ def test_both_engines_agree_on_limited_forces(coupling, rho):
     assert 0.2 < exact.clipped(limits).mean() < 0.95
     assert simulation.process.limiter is not None
     assert np.abs(simulation.process.limiter.slips(exact.z)).max() > 1e-4
+
+
+@pytest.mark.parametrize(("engine", "apart"), [("exact", 1e-12), ("exponential", 1e-12), ("RK4", 0.0)])
+@pytest.mark.parametrize("limit", [0.69, 1e3])
+def test_ticks_in_stretches_are_ticks_one_by_one(engine, apart, limit):
+    """Also where forces want to be limited here and there, and the plant goes back: the sums alone are others."""
+    simulation = assemble(weak(limit, limit).replace(duration=5.0), BUILT, (11.4167, 11.4167))
+    which, integrator = ("exact", None) if engine == "exact" else ("mujoco", engine)
+    fast, slow = (make_engine(simulation, which, integrator) for _ in range(2))
+    found, expected = run(simulation, fast), run(simulation, tick_by_tick(slow))
+    assert vars(fast)["stretch"] is not None
+    assert (0 < expected.clipped(np.array([limit] * 2)).mean() < 0.2) == (limit < 10)
+    for name in ("s", "z", "f", "w"):
+        rows = getattr(expected, name)
+        np.testing.assert_allclose(getattr(found, name), rows, rtol=0, atol=apart * np.abs(rows).max())
 
 
 def test_limited_and_clipped_runs_agree_while_no_force_is_at_its_limit():

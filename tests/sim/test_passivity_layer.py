@@ -13,7 +13,7 @@ from controller.coupling import NoCoupling
 from controller.delay import packet_delays
 from design import design_coupling
 from sim import load, simulate
-from sim.nets import BASELINES, Classic, EnergyNet, Plugged, netted
+from sim.passivity_layer import BASELINES, Classic, EnergyNet, Plugged, netted
 from sim.run import assemble, run
 from sim.switching import with_delays
 

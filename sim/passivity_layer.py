@@ -1,4 +1,4 @@
-"""Safety nets under a simulated controller: the energy budget, and the classics that it is compared with.
+"""Passivity layers under a simulated controller: the energy budget, and the classics that it is compared with.
 
     traced = run(netted(simulation, coupling, EnergyNet(0.01)), "exact").net.part()
 

@@ -29,7 +29,7 @@ from models.device import RigidDevice
 from models.human import Human, Link
 from models.scene import Crowd, variants
 from sim.engines import ExactBatchEngine, hold
-from sim.nets import EnergyNet, netted
+from sim.passivity_layer import EnergyNet, netted
 from sim.run import assemble, run_blocks
 from sim.scenario import Scenario
 
