@@ -283,7 +283,7 @@ def _proposed(helps: Sequence[dict[str, Any]]) -> list[str]:
     """Changes that were certified, the one that leaves most damping over first."""
     enough = sorted((each for each in helps if each["certified"]), key=lambda each: max(each["required_damping"]))
     if not enough:
-        return ["What helps: no single change of delay, damper or period was certified; a design finds other gains."]
+        return ["What helps: no single change of delay, damper or period was found to; a design finds other gains."]
     return [
         f"What helps: {each['change']} ({each['condition']} then needs "
         f"{listed(each['required_damping'])} N s/m, certified)."

@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,12 @@ import numpy as np
 from rich.table import Table
 
 from cli import options, render
-from cli.design import RETIRED_WITH_VALUE, add_optimal_options, optimal_options
+from cli.design import add_optimal_options, optimal_options
 from controller.loop import Loop
 from controller.lti import Array
 from design import compare
 from design.certificate import CONDITIONS
-from design.compare import AXES, FEEL_HZ, LADDERS, Judged, Limit, Perceived, Setting, optimum, settings
+from design.compare import AXES, FEEL_HZ, LADDERS, Judged, LadderRow, Limit, Perceived, Setting, optimum, settings
 from design.program import Options
 from design.result import OLDER_NAMES, DesignFailed, certificate_part, finite
 from design.robustness import robustness_part
@@ -77,7 +77,6 @@ def _parser() -> options.Parser:
     curve.add_argument("--beside", type=_beside, default=CONDITIONS, metavar="NAME", help=beside)
     optimal = parser.add_argument_group("the optimal coupling of --over")
     add_optimal_options(optimal)
-    optimal.add_argument("--diagonal", action="store_true", help=argparse.SUPPRESS)
     options.add_output_options(parser, picture=True)
     return parser
 
@@ -93,7 +92,6 @@ _MODES = {
     "no_plot": ("", "--over", "--baselines"),
     "limiter": ("--baselines",),
     **dict.fromkeys(("points", "keep", "beside", "objective", "band_hz", "high_gain", "seconds"), ("--over",)),
-    **dict.fromkeys((*RETIRED_WITH_VALUE, "diagonal"), ("--over",)),
 }
 
 
@@ -118,15 +116,53 @@ def _check_mode(args: argparse.Namespace, parser: options.Parser) -> None:
 # Couplings over frequency.
 
 
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """One coupling, with all that the pictures show of it."""
+
+    name: str
+    states: int
+    transparency: dict[str, Any]
+    robustness: dict[str, Any] | None
+    sigma_F: Array
+    sigma_M: Array
+    perceived: Perceived
+    coupling: dict[str, Any] = render.unseen("beside")
+    conditions: dict[str, dict[str, Any]] = render.unseen("beside")
+
+
+@dataclass(frozen=True, eq=False)
+class _Couplings:
+    """Couplings over frequency; SI units, null where a figure is infinite or does not exist."""
+
+    case: str
+    scenario: str
+    seed: int
+    T_s: float
+    theta: tuple[int, ...]
+    psi: tuple[int, ...]
+    lam: tuple[int, ...]
+    available_damping: tuple[float, ...]
+    frequency_hz: Array
+    sigma_E: Array
+    ideal: Perceived
+    couplings: list[_Shown]
+    notes: list[str]
+
+
 def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
     names, out = _names(args), options.out_folder(args, "compare")
     chosen, failed = _chosen(scenario, args, names)
     loop = scenario.loop(args.case)
-    outcome = {"case": args.case, "scenario": scenario.name, "seed": args.seed} | _data(loop, chosen)
-    outcome["notes"] = [*(f"{name}: {note}" for name, c in chosen.items() for note in c.notes), *failed]
-    outcome["notes"] += _missing_curves(outcome["couplings"])
-    files = _pictures(args, out, outcome)
-    render.publish(args, outcome, [_guarantees(outcome), _feel(outcome)], outcome["notes"], out, files)
+    judged = {name: compare.judge(loop, c.coupling, c.phi) for name, c in chosen.items()}
+    hz = compare.grid(loop, list(judged.values()))
+    sigma_E, undelayed = compare.ideal(loop, hz)
+    shown = [_shown(loop, name, c, judged[name], hz) for name, c in chosen.items()]
+    notes = [*(f"{name}: {note}" for name, c in chosen.items() for note in c.notes), *failed, *_missing_curves(shown)]
+    about = args.case, scenario.name, args.seed, loop.T, loop.theta, loop.psi, loop.lam, loop.delta
+    report = _Couplings(*about, hz, sigma_E, undelayed, shown, notes)
+    files = _pictures(args, out, render.plain(report))
+    render.publish(args, report, [_guarantees(report), _feel(report)], notes, out, files)
     return options.DOES_NOT_HOLD if failed else options.DONE
 
 
@@ -171,54 +207,30 @@ def _named(name: str) -> tuple[str, str | None]:
         return name, None  # a file may have a colon in its name
 
 
-def _data(loop: Loop, chosen: dict[str, Chosen]) -> dict[str, Any]:
-    """Everything that the pictures show; SI units, null where a figure is infinite or does not exist."""
-    judged = {name: compare.judge(loop, c.coupling, c.phi) for name, c in chosen.items()}
-    hz = compare.grid(loop, list(judged.values()))
-    sigma_E, undelayed = compare.ideal(loop, hz)
-    E, parts = loop.E(), []
-    for name, c in chosen.items():
-        at = judged[name]
-        shown = {"name": Path(name).name, **report.coupling_part(c.kind, c.coupling, loop.T), "states": at.F.order}
-        shown["transparency"] = report.transparency_part(transparency(at.F, E, loop.lam))
-        shown["robustness"] = robustness_part(loop, c.coupling)
-        parts.append(shown | _curves(at, compare.curves(loop, at, hz)))
-    return {
-        "T_s": loop.T,
-        "theta": list(loop.theta),
-        "psi": list(loop.psi),
-        "lam": list(loop.lam),
-        "available_damping": list(loop.delta),
-        "frequency_hz": hz.tolist(),
-        "sigma_E": sigma_E.tolist(),
-        "ideal": _perceived(undelayed),
-        "couplings": parts,
-    }
-
-
-def _curves(judged: Judged, lines: compare.Curves) -> dict[str, Any]:
-    data: dict[str, Any] = {"sigma_F": lines.sigma_F.tolist(), "sigma_M": lines.sigma_M.tolist()}
-    data["perceived"] = _perceived(lines.perceived)
+def _shown(loop: Loop, name: str, chosen: Chosen, judged: Judged, hz: Array) -> _Shown:
+    lines, conditions = compare.curves(loop, judged, hz), {}
     for key, requirement in judged.requirements.items():
         demand = lines.demands[key]
-        part = certificate_part(requirement) | {"ratio": finite(requirement.ratio), "demand": _row(demand)}
+        part = certificate_part(requirement) | {"ratio": finite(requirement.ratio), "demand": demand}
         if demand is None and not requirement.reason:
             part["reason"] = f"this coupling is no V in feedback around the environment: no curve for {key}"
-        data[key] = part
-    return data | {older: data[name] for older, name in OLDER_NAMES.items() if name in data}
+        conditions[key] = part
+    return _Shown(
+        Path(name).name,
+        judged.F.order,
+        report.transparency_part(transparency(judged.F, loop.E(), loop.lam)),
+        robustness_part(loop, chosen.coupling),
+        lines.sigma_F,
+        lines.sigma_M,
+        lines.perceived,
+        report.coupling_part(chosen.kind, chosen.coupling, loop.T),
+        conditions | {older: conditions[name] for older, name in OLDER_NAMES.items() if name in conditions},
+    )
 
 
-def _missing_curves(couplings: list[dict[str, Any]]) -> list[str]:
-    parts = [(c["name"], condition, c[condition]) for c in couplings for condition in CONDITIONS]
+def _missing_curves(couplings: list[_Shown]) -> list[str]:
+    parts = [(c.name, condition, c.conditions[condition]) for c in couplings for condition in CONDITIONS]
     return [f"{name}, {condition}: {part['reason']}" for name, condition, part in parts if "reason" in part]
-
-
-def _perceived(values: Perceived) -> dict[str, Any]:
-    return {"stiffness": values.stiffness.tolist(), "damping": values.damping.tolist()}
-
-
-def _row(values: Array | None) -> list[float | None] | None:
-    return None if values is None else [finite(v) for v in values]
 
 
 def _pictures(args: argparse.Namespace, out: Path, outcome: dict[str, Any]) -> list[Path]:
@@ -233,21 +245,21 @@ def _pictures(args: argparse.Namespace, out: Path, outcome: dict[str, Any]) -> l
     ]
 
 
-def _guarantees(outcome: dict[str, Any]) -> Table:
+def _guarantees(report: _Couplings) -> Table:
     """Required damping [N s/m] where all devices have the same, else as a multiple of what each has."""
-    available = outcome["available_damping"]
+    available = report.available_damping
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
-    title = f"{damping} of {_list(available)} N s/m · {outcome['scenario']}, case {outcome['case']}"
+    title = f"{damping} of {_list(available)} N s/m · {report.scenario}, case {report.case}"
     heads = ("coupling", "this-env.", "at Hz", "at 10 %", "any-env.", "at Hz", "sup dB", "rms dB")  # render.ORDER
     rows = []
-    for coupling in outcome["couplings"]:
-        parts = [coupling[condition] for condition in render.ORDER]
+    for coupling in report.couplings:
+        parts = [coupling.conditions[condition] for condition in render.ORDER]
         needs = [(_needs(p, available[0] if alike else 1.0), p["binding_frequency_hz"]) for p in parts]
         asked = [cell for need, hz in needs for cell in (need, render.optional(hz, "{:.4g}"))]
-        asked.insert(2, _robust(coupling["robustness"], available[0] if alike else 1.0))
-        errors = [coupling["transparency"][f"{which}_mismatch_db"] for which in ("relative", "rms")]
-        rows.append([coupling["name"], *asked, *(render.optional(e, "{:.2f}", "-inf") for e in errors)])
+        asked.insert(2, _robust(coupling.robustness, available[0] if alike else 1.0))
+        errors = [coupling.transparency[f"{which}_mismatch_db"] for which in ("relative", "rms")]
+        rows.append([coupling.name, *asked, *(render.optional(e, "{:.2f}", "-inf") for e in errors)])
     return render.grid(title, heads, rows)
 
 
@@ -266,20 +278,17 @@ def _robust(part: dict[str, Any] | None, scale: float = 1.0) -> str:
     return "infinite" if need is None else f"{scale * need:.4g}"
 
 
-def _feel(outcome: dict[str, Any]) -> Table:
+def _feel(report: _Couplings) -> Table:
     columns = [(what, unit, hz) for what, unit in (("stiffness", "N/m"), ("damping", "N s/m")) for hz in FEEL_HZ]
     heads = ["coupling", *(f"{what}\n{unit}, {hz:g} Hz" for what, unit, hz in columns)]
-    named = {"ideal (E)": outcome["ideal"], **{c["name"]: c["perceived"] for c in outcome["couplings"]}}
-    grid = outcome["frequency_hz"]
-    rows = [
-        [name, *(_list(_at(hz, grid, perceived[what])) for what, _, hz in columns)] for name, perceived in named.items()
-    ]
+    named = {"ideal (E)": report.ideal, **{c.name: c.perceived for c in report.couplings}}
+
+    def at(hz: float, curves: Array) -> list[float]:
+        """Each channel's curve at `hz`, which is in the grid; nan above Nyquist's frequency."""
+        return [float(np.interp(hz, report.frequency_hz, column, right=np.nan)) for column in curves.T]
+
+    rows = [[name, *(_list(at(hz, getattr(felt, what))) for what, _, hz in columns)] for name, felt in named.items()]
     return render.grid("perceived by each device's user, the other devices held still", heads, rows)
-
-
-def _at(hz: float, grid: Sequence[float], values: Sequence[Sequence[float]]) -> list[float]:
-    """Each channel's curve at `hz`, which is in the grid; nan above Nyquist's frequency."""
-    return [float(np.interp(hz, grid, column, right=np.nan)) for column in np.transpose(values)]
 
 
 def _list(values: Iterable[float]) -> str:
@@ -292,34 +301,59 @@ def _list(values: Iterable[float]) -> str:
 # Every design as a ladder.
 
 
+@dataclass(frozen=True)
+class _Ladder:
+    """Every design side by side, for both cases."""
+
+    scenario: str
+    seed: int
+    rows: Sequence[LadderRow]
+    wall_s: float
+    interrupted: bool
+
+
 def _ladder(args: argparse.Namespace, scenario: Scenario) -> int:
     out, begin = options.out_folder(args, "compare"), time.perf_counter()
     loops = {case: scenario.loop(case) for case in ("I", "II")}
     with render.progress("designing") as move:
         rows, interrupted = compare.compare_designs(loops, LADDERS[args.ladder], move)
-    outcome: dict[str, Any] = {"scenario": scenario.name, "seed": args.seed, "rows": [asdict(row) for row in rows]}
-    outcome |= {"wall_s": time.perf_counter() - begin, "interrupted": interrupted}
+    report = _Ladder(scenario.name, args.seed, rows, time.perf_counter() - begin, interrupted)
     heads = ("design", "needs N s/m", "at 10 %", "sup dB", "rms dB", "proof", "s")
     shown = []
     for case in loops:
-        cells = [_rung(row) for row in outcome["rows"] if row["case"] == case]
+        cells = [_rung(row) for row in rows if row.case == case]
         shown.append(render.grid(f"the ladder · {scenario.name}, case {case}", heads, cells, left=(0, 4)))
-    lines = [f"{row['design']}, case {row['case']}: {row['reason']}" for row in outcome["rows"] if row["reason"]]
-    render.publish(args, outcome, shown, [*lines, f"{outcome['wall_s']:.1f} s"], out)
+    lines = [f"{row.design}, case {row.case}: {row.reason}" for row in rows if row.reason]
+    render.publish(args, report, shown, [*lines, f"{report.wall_s:.1f} s"], out)
     return options.INTERRUPTED if interrupted else options.DONE
 
 
-def _rung(row: dict[str, Any]) -> tuple[str, ...]:
-    need = "inf" if row["required_damping"] is None else f"{max(row['required_damping']):.4f}"
-    need += "" if row["certified"] else " (no)"
-    errors = [render.optional(row[f"{which}_mismatch_db"], "{:.2f}", "exact") for which in ("relative", "rms")]
-    if row["required_damping"] is None:
-        need, errors = ("-", ["-", "-"]) if row["reason"] else ("-", ["-", errors[1]])
-    return row["design"], need, _robust(row["robustness"]), *errors, row["proof"] or "-", f"{row['wall_s']:.2f}"
+def _rung(row: LadderRow) -> tuple[str, ...]:
+    need = "inf" if row.required_damping is None else f"{max(row.required_damping):.4f}"
+    need += "" if row.certified else " (no)"
+    errors = [render.optional(getattr(row, f"{which}_mismatch_db"), "{:.2f}", "exact") for which in ("relative", "rms")]
+    if row.required_damping is None:
+        need, errors = ("-", ["-", "-"]) if row.reason else ("-", ["-", errors[1]])
+    return row.design, need, _robust(row.robustness), *errors, row.proof or "-", f"{row.wall_s:.2f}"
 
 
 # ----------------------------------------------------------------------------------------------------
 # The classics beside ours.
+
+
+@dataclass(frozen=True)
+class _Baselines:
+    """The classics and ours on the same runs."""
+
+    scenario: str
+    case: str
+    seed: int
+    rows: Sequence[Rival]
+    wall_s: float
+    interrupted: bool
+    hands: int = PAIRS
+    hands_s: float = SECONDS
+    start_m_s: float = SLOW
 
 
 def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
@@ -336,21 +370,19 @@ def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
             rows.extend(rivals(scenario, args.case, move, args.limiter))
         except KeyboardInterrupt:
             interrupted = True
-    outcome: dict[str, Any] = {"scenario": scenario.name, "case": args.case, "seed": args.seed}
-    outcome |= {"rows": [asdict(row) for row in rows], "hands": PAIRS, "hands_s": SECONDS, "start_m_s": SLOW}
-    outcome |= {"wall_s": time.perf_counter() - begin, "interrupted": interrupted}
+    report = _Baselines(scenario.name, args.case, args.seed, rows, time.perf_counter() - begin, interrupted)
     files = []
     if rows and not args.no_plot:
         from sim.plots import plot_baselines
 
-        files.append(plot_baselines(outcome, out / "baselines.png"))
+        files.append(plot_baselines(render.plain(report), out / "baselines.png"))
     heads = ("", "error %", "> 40 Hz N", "peak N", "acted %", "hands", "m/s", "guarantee")
     cells = [_rival(row) for row in rows]
     shown = [render.grid(f"on the same runs · {scenario.title(args.case)}", heads, cells, left=(0, 7))]
     lines = [f"* baseline {row.name}: {row.source}." for row in rows if row.source]
     lines.append(f"hands: of {PAIRS} lossless pairs, faster after {SECONDS:g} s than the {SLOW:g} m/s they began with.")
     lines += sorted({f"error: {row.reason}." for row in rows if row.reason})
-    render.publish(args, outcome, shown, [*lines, f"{outcome['wall_s']:.1f} s"], out, files)
+    render.publish(args, report, shown, [*lines, f"{report.wall_s:.1f} s"], out, files)
     return options.INTERRUPTED if interrupted else options.DONE
 
 
@@ -365,6 +397,37 @@ def _rival(row: Rival) -> tuple[str, ...]:
 # The limits of any coupling along an axis.
 
 
+@dataclass(frozen=True)
+class _Sweep:
+    """The designs along one axis of the loop."""
+
+    label: str
+    unit: str
+    values: list[float]
+    curves: dict[str, list[Limit]] = render.unseen("beside")
+
+    @classmethod
+    def of(cls, name: str, along: Sequence[Setting], curves: dict[str, list[Limit]]) -> _Sweep:
+        return cls(AXES[name].label, AXES[name].unit, [setting.value for setting in along], curves)
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """How good any coupling could be."""
+
+    scenario: str
+    seed: int
+    case: str
+    objective: str
+    delays_kept_in: str
+    wish: Options
+    here: dict[str, Any]
+    sweeps: dict[str, _Sweep]
+    gains: list[str]
+    wall_s: float
+    interrupted: bool
+
+
 def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
     wish, loop = _wish(args), scenario.loop(args.case)
     if min(loop.delta) <= 0:
@@ -374,36 +437,43 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
     designers |= {name: compare.remembered(compare.spring_damper(name), False) for name in args.beside}
     begin = time.perf_counter()
     curves, interrupted = _designed(plan, designers)
-    outcome: dict[str, Any] = {"scenario": scenario.name, "seed": args.seed, "case": args.case}
-    outcome |= {"objective": wish.objective, "delays_kept_in": args.keep, "wish": asdict(wish)}
-    outcome |= {
-        "here": {"delta": list(loop.delta), "theta": list(loop.theta), "psi": list(loop.psi), "T_s": loop.T},
-        "sweeps": {name: _sweep(name, plan[name], rows) for name, rows in curves.items()},
-        "gains": compare.gains(plan, curves, loop, wish),
-        "wall_s": time.perf_counter() - begin,
-        "interrupted": interrupted,
-    }
-    points = [(name, row) for name, sweep in outcome["sweeps"].items() for row in sweep["optimal"]]
+    report = _Limits(
+        scenario.name,
+        args.seed,
+        args.case,
+        wish.objective,
+        args.keep,
+        wish,
+        {"delta": loop.delta, "theta": loop.theta, "psi": loop.psi, "T_s": loop.T},
+        {
+            name: _Sweep(AXES[name].label, AXES[name].unit, [at.value for at in plan[name]], rows)
+            for name, rows in curves.items()
+        },
+        compare.gains(plan, curves, loop, wish),
+        time.perf_counter() - begin,
+        interrupted,
+    )
+    points = [(name, row) for name, sweep in report.sweeps.items() for row in sweep.curves["optimal"]]
     files = []
     if not args.no_plot and points:
         from sim.plots import plot_limits
 
-        files.append(plot_limits(outcome, out / "limits.png"))
+        files.append(plot_limits(render.plain(report), out / "limits.png"))
     names = " and by ".join(args.beside)
     lines = [f"beside the optimum: the designed spring-damper by {names}"] if names else []
-    lines += [f"{name} {row['value']:.4g}: {row['reason']}" for name, row in points if row["reason"]]
-    tables = [_limit_table(outcome, name, args.beside) for name in outcome["sweeps"]]
-    lines += [*outcome["gains"], *optimal_options(args)[1], f"{outcome['wall_s']:.1f} s"]
-    render.publish(args, outcome, tables, lines, out, files)
+    lines += [f"{name} {row.value:.4g}: {row.reason}" for name, row in points if row.reason]
+    tables = [_limit_table(report, name, args.beside) for name in report.sweeps]
+    lines += [*report.gains, f"{report.wall_s:.1f} s"]
+    render.publish(args, report, tables, lines, out, files)
     if interrupted:
         return options.INTERRUPTED
-    found = any(row["rms_mismatch_db"] is not None for _, row in points)
+    found = any(row.rms_mismatch_db is not None for _, row in points)
     return options.DONE if found else options.DOES_NOT_HOLD
 
 
 def _wish(args: argparse.Namespace) -> Options:
     try:
-        return Options(**optimal_options(args)[0])
+        return Options(**optimal_options(args))
     except ValueError as error:
         raise InputError(options.as_option(error, args)) from None
 
@@ -447,37 +517,31 @@ def _designed(
     return curves, False
 
 
-def _sweep(name: str, along: Sequence[Setting], rows: dict[str, list[Limit]]) -> dict[str, Any]:
-    axis = AXES[name]
-    points = {kind: [asdict(limit) for limit in limits] for kind, limits in rows.items()}
-    return {"label": axis.label, "unit": axis.unit, "values": [s.value for s in along]} | points
-
-
-def _limit_table(outcome: dict[str, Any], name: str, beside: Sequence[str]) -> Table:
-    sweep, designs = outcome["sweeps"][name], ("optimal", *beside)
+def _limit_table(report: _Limits, name: str, beside: Sequence[str]) -> Table:
+    sweep, designs = report.sweeps[name], ("optimal", *beside)
     rows = []
-    for i, row in enumerate(sweep["optimal"]):
-        limits = {design: sweep[design][i] if i < len(sweep[design]) else None for design in designs}
-        errors = [_error(limit, outcome["objective"]) for limit in limits.values()]
-        theta = ",".join(map(str, row["theta"]))
-        rows.append((f"{row['value']:.4g}", theta, *errors, _proofs(limits), f"{row['wall_s']:.1f}"))
-    title = f"{outcome['objective']} transparency error over {name} · {outcome['scenario']}, case {outcome['case']}"
-    heads = (sweep["unit"], "theta", "optimal", *beside, "proof", "seconds")
+    for i, row in enumerate(sweep.curves["optimal"]):
+        limits = {design: sweep.curves[design][i] if i < len(sweep.curves[design]) else None for design in designs}
+        errors = [_error(limit, report.objective) for limit in limits.values()]
+        theta = ",".join(map(str, row.theta))
+        rows.append((f"{row.value:.4g}", theta, *errors, _proofs(limits), f"{row.wall_s:.1f}"))
+    title = f"{report.objective} transparency error over {name} · {report.scenario}, case {report.case}"
+    heads = (sweep.unit, "theta", "optimal", *beside, "proof", "seconds")
     return render.grid(title, heads, rows, left=(1,))
 
 
-def _error(limit: dict[str, Any] | None, objective: str) -> str:
+def _error(limit: Limit | None, objective: str) -> str:
     if limit is None:
         return ""
-    value = limit["rms_mismatch_db" if objective == "rms" else "relative_mismatch_db"]
+    value = limit.rms_mismatch_db if objective == "rms" else limit.relative_mismatch_db
     if value is None:
-        return "exact" if limit["proof"] else "infeasible"
+        return "exact" if limit.proof else "infeasible"
     return compare.printed_decibels(value)
 
 
-def _proofs(limits: dict[str, dict[str, Any] | None]) -> str:
+def _proofs(limits: dict[str, Limit | None]) -> str:
     """Rational where every design of a row is proved exactly, else which are only sampled."""
-    found = {name: limit["proof"] for name, limit in limits.items() if limit and limit["proof"]}
+    found = {name: limit.proof for name, limit in limits.items() if limit and limit.proof}
     sampled = [name for name, proof in found.items() if proof != "rational"]
     if not found:
         return "-"

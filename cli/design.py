@@ -19,14 +19,13 @@ from design.audit import LONGEST_DELAY
 from design.bound import MOST, NO_BOUND, bound
 from design.certificate import SAMPLES, RangesCheck, assess, check_ranges, lag, prove, switching_requirement
 from design.coverage import Limits, cost_part, covered_limits, price, ranges_rows, switching_part
-from design.designs import KINDS, NO_LONGER, design_by_kind, usual_condition
+from design.designs import KINDS, design_by_kind, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
 from design.guarantees import ANY, HERE, switching_guarantee
-from design.optimal import Optimal
+from design.optimal import Optimal, robustness_parts, widest_ranges
 from design.program import DEFAULT, OBJECTIVES, Options
 from design.result import METHODS, Design, DesignFailed, NotProved, Row, listed
-from design.robustness import robustness_parts, widest_ranges
 from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
 from sim import report as parts
@@ -92,23 +91,17 @@ def add_optimal_options(group: argparse._ActionsContainer) -> None:
     group.add_argument("--high-gain", type=_number_or_none, metavar="G", help=gain)
     limit = "begin no larger basis after this time [s] (default 60)"
     group.add_argument("--seconds", type=options.number(0), metavar="S", help=limit)
-    for name in RETIRED_WITH_VALUE:
-        group.add_argument(f"--{name}", help=argparse.SUPPRESS)
 
 
-RETIRED_WITH_VALUE = ("functions", "filter", "margin")
-
-
-def optimal_options(args: argparse.Namespace) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """What is asked of an optimal coupling, and a note where an option is given that it no longer has."""
+def optimal_options(args: argparse.Namespace) -> dict[str, Any]:
+    """What is asked of an optimal coupling."""
     given = {name: getattr(args, name) for name in ("objective", "band_hz", "high_gain", "seconds")}
     given = {name: value for name, value in given.items() if value is not None}
     if getattr(args, "limiter", False):
         given["limiter"] = True
     if given.get("high_gain") == "none":
         given.pop("high_gain")
-    retired = [f"--{name}" for name in (*RETIRED_WITH_VALUE, "full", "diagonal") if getattr(args, name, None)]
-    return given, (NO_LONGER.format(", ".join(retired)),) if retired else ()
+    return given
 
 
 def _percent(text: str) -> float:
@@ -129,12 +122,11 @@ _OPTIONS = {
     "order": ("ccl",),
     "method": ("ccl",),
     "compare": ("ccl",),
-    "full": ("ccl", "optimal"),
+    "full": ("ccl",),
     "objective": ("optimal",),
     "band_hz": ("optimal", "spring-damper"),
     "high_gain": ("optimal",),
     "seconds": ("optimal",),
-    **dict.fromkeys(RETIRED_WITH_VALUE, ("optimal",)),
 }
 
 
@@ -186,7 +178,7 @@ def _asked(args: argparse.Namespace, loop: Loop) -> dict[str, Any]:
             shown = name.removesuffix("_hz").replace("_", "-")
             raise InputError(f"--{shown} is for --coupling {allowed}, not {args.coupling}")
     if args.coupling == "optimal":
-        return optimal_options(args)[0]
+        return optimal_options(args)
     given.pop("compare", None)
     if given.pop("full", False):
         given["diagonal"] = False
@@ -255,7 +247,7 @@ def _worth(args: argparse.Namespace, loop: Loop, design: Design) -> tuple[dict[s
     robust, best = {"robustness": None}, design if isinstance(design, Optimal) else None
     with render.progress("working out robustness and its price, and the bound"):
         if design.condition == "this-environment":
-            asked = Options(**optimal_options(args)[0]) if best else DEFAULT
+            asked = Options(**optimal_options(args)) if best else DEFAULT
             robust = robustness_parts(loop, design.coupling, asked)
         return robust, best and _best_figures(args, loop, best)
 
@@ -280,7 +272,7 @@ def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[s
         "bound": limit,
         "rendered_stiffness": best.g,
         "ladder": [asdict(rung) for rung in best.ladder],
-        "notes": [*args.notes, *optimal_options(args)[1]],
+        "notes": args.notes,
     }
 
 

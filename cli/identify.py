@@ -1,14 +1,15 @@
 """python -m hw.identify: how much damping does a device guarantee? From a chirp of a small force and a free release.
 
-Nobody holds the device. The chirp passes through the same session as the bridge, with all its limits, capped at its own
-amplitude.
+Nobody holds the device, in two sittings with the handles at other places: a hand that only damps is found out by the
+sitting in which it was not there. The chirp passes through the same session as the bridge, with all its limits, capped
+at its own amplitude.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,51 +19,69 @@ from rich.table import Table
 from cli import options, render
 from cli.session_cli import add_link_options, check_link, hold_session, measured_link
 from design.files import write
-from hw.identify import Estimate, Excitation, capped, chirp, estimate, held
+from hw.emulator import nobody
+from hw.identify import Estimate, Excitation, capped, chirp, estimate, held, settled
 from hw.limits import Stage
-from hw.monitor import Ages
+from hw.monitor import Ages, LinkSettings
 from hw.recording import Recorder, outcome, result_of
 from hw.session import Session, session_for
 from models.device import RigidDevice
 from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
 _LIMITS = (
-    "The bound is a statement about this record: the least viscous friction of all laws that fit it, less its scatter "
-    "between parts of the record (95 %), a part for what is left unexplained and 0.5 % for the encoder's scale. It "
-    "does not see friction that changes with temperature or wear, nor that of a handle behind its transmission apart "
-    "from the motor's. A hand that rests on the handle springs it, and from 5 N/m on is refused; one that only damps "
-    "cannot be told from the device. Dry friction is left out of delta: it dissipates too, but ever less than a "
-    "viscous damper as speed grows. Lag of the amplifier is not in delta: it belongs to the delay."
+    "The bound is a statement about these records: the least viscous friction of all laws that fit, less its scatter "
+    "between parts of a record (95 %), a part for what is left unexplained and 0.5 % for the encoder's scale; of all "
+    "sittings the least. It does not see friction that changes with temperature or wear, nor that of a handle behind "
+    "its transmission apart from the motor's. A hand that rests on the handle springs it: refused from 5 N/m on. One "
+    "that only damps is not in the bound if nobody touched the handle in one of the sittings. Dry friction is left out "
+    "of delta: it dissipates too, but ever less than a viscous damper as speed grows. Lag of the amplifier is not in "
+    "delta: it belongs to the delay."
 )
 
 
+@dataclass(frozen=True)
+class _Sitting:
+    """One session, and what its record says."""
+
+    report: dict[str, Any]
+    session: Session
+    estimates: list[Estimate]  # by axis; none where there is a reason
+    reason: str
+    trace: Path | None
+    signals: Sequence[int]
+
+    def part(self) -> dict[str, Any]:
+        return {"axes": [asdict(e) for e in self.estimates], "reason": self.reason or None}
+
+
 def main(argv: list[str]) -> int:
-    """Identify every axis. 0: each has a bound above zero, 1: not, or the session did not end as planned."""
+    """Identify every axis. 0: each has a bound above zero, 1: not, or a session did not end as planned."""
     args = _parser().parse_args(argv)
     scenario, settings = options.scenario_from(args), check_link(args)
     require_linear(scenario, "hw.identify")
     require_constant_delay(scenario, "hw.identify")
     require_even_ticks(scenario, "hw.identify")
-    force, seconds, (low, high) = args.force, args.seconds, args.band
+    low, high = args.band
     if not 0.5 <= low < high <= 0.4 / scenario.T:
         raise InputError(f"--band is {low:g},{high:g}, expected LOW,HIGH within 0.5 to {0.4 / scenario.T:.0f} Hz")
-    out = options.out_folder(args, "identify")
-    asks_nothing = scenario.replace(delta=(1e-6,) * scenario.channels)  # what the damping is, is the question
-    session = session_for(asks_nothing, replace(settings, test_encoders=False), cap=force)
-    session.record = recorder = Recorder(scenario.channels)
-
-    def plan(ages: Ages) -> Sequence[Excitation]:
-        link = measured_link(args, ages, scenario.T)
-        return [chirp(scenario.channels, scenario.T, link, force, (low, high), seconds)]
-
-    played = chirp(1, scenario.T, 1, force, (low, high), seconds).seconds - 0.2  # the lead has the ramp
-    live = hold_session(args, session, plan, played, out, nobody=True, coulomb=args.coulomb)
-    report, estimates = _identified(session, recorder, scenario, live.dropped, args.pace)
-    files = _save(out, session, recorder, scenario, estimates, report)
+    if args.hand and not args.rehearse:
+        raise InputError("--hand is for --rehearse")
+    out, sittings = options.out_folder(args, "identify"), list[_Sitting]()
+    settings = replace(settings, test_encoders=False)
+    while len(sittings) < args.sittings and not (sittings and sittings[-1].signals):
+        sittings.append(_sitting(args, scenario, settings, out, len(sittings) + 1))
+        last = sittings[-1].session.link.last
+        if args.port and not args.same_place and last:
+            settings = replace(settings, elsewhere=last.counts)
+    report, estimates = _identified(scenario, sittings)
+    files = [sitting.trace for sitting in sittings if sitting.trace]
+    if report["bounded"]:
+        tables = [_table(e, scenario, i) for i, e in enumerate(estimates)]
+        files.append(write(out / "devices.toml", "\n".join(tables)))
     render.publish(args, report, [_figures(report)], _lines(report), out, files)
-    if live.signals:
+    if sittings[-1].signals:
         return options.INTERRUPTED
-    return options.DONE if session.stage == Stage.FINISHED and report["bounded"] else options.DOES_NOT_HOLD
+    return options.DONE if report["bounded"] else options.DOES_NOT_HOLD
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -80,47 +99,67 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seconds", type=seconds, default=2.5, metavar="SECONDS", help="of the chirp (default 2.5)")
     rub = "dry friction of an emulated device"
     parser.add_argument("--coulomb", type=options.number(0.0, 10.0), default=0.0, metavar="NEWTON", help=rub)
+    count = "records of every axis, each with the handles at another place; two have to agree (default 2)"
+    parser.add_argument("--sittings", type=options.whole(1, 20), default=2, metavar="N", help=count)
+    stay = "do not ask that handles are taken elsewhere in between: at the emulator's nobody is there to do so"
+    parser.add_argument("--same-place", action="store_true", help=stay)
+    rests = "with --rehearse, a hand that only damps, at every handle in the first sitting"
+    parser.add_argument("--hand", type=options.number(0.0, 10.0), default=0.0, metavar="N_S/M", help=rests)
     options.add_output_options(parser)
     return parser
 
 
-def _identified(
-    session: Session, recorder: Recorder, scenario: Scenario, dropped: int, pace: float
-) -> tuple[dict[str, Any], list[Estimate]]:
-    report = outcome("identify", session, recorder, dropped, pace)
-    estimates: list[Estimate] = []
+def _sitting(args: argparse.Namespace, scenario: Scenario, settings: LinkSettings, out: Path, number: int) -> _Sitting:
+    """Play the excitation to every axis, record and estimate."""
+    asks_nothing = scenario.replace(delta=(1e-6,) * scenario.channels)  # what the damping is, is the question
+    session = session_for(asks_nothing, settings, cap=args.force)
+    session.record = recorder = Recorder(scenario.channels)
+
+    def played(link: int) -> Excitation:
+        return chirp(scenario.channels, scenario.T, link, args.force, args.band, args.seconds)
+
+    def plan(ages: Ages) -> Sequence[Excitation]:
+        return [played(measured_link(args, ages, scenario.T))]
+
+    if args.port and number > 1:
+        elsewhere = "let go of every handle" if args.same_place else "take every handle to another place and let go"
+        begin = "5 s later it begins" if args.arm else "press a"
+        render.console(args).print(f"sitting {number} of {args.sittings}: {elsewhere}; then {begin}")
+    alone = nobody(scenario, args.hand if number == 1 else 0.0)
+    seconds = played(1).seconds - 0.2  # the lead has the ramp
+    live = hold_session(args, session, plan, seconds, out, alone, args.coulomb)
+    report, estimates, reason = outcome("identify", session, recorder, live.dropped, args.pace), list[Estimate](), ""
     if session.stage == Stage.FINISHED and len(recorder):
         try:
             with render.progress("estimating") as move:
                 estimates = estimate(recorder, session, scenario, move)
         except ValueError as error:
-            report["reason"] = str(error)
+            reason = str(error)
     else:
-        report["reason"] = f"the session ended in {session.stage}: {session.cause}"
-    report["warnings"] = warnings = held(estimates, scenario, session)
-    estimates = capped(estimates, scenario, session)
-    report["axes"] = [asdict(e) for e in estimates]
-    report["bounded"] = bool(estimates) and all(e.delta > 0 for e in estimates) and not warnings
-    report["limits"] = _LIMITS
-    return report, estimates
-
-
-def _save(
-    out: Path,
-    session: Session,
-    recorder: Recorder,
-    scenario: Scenario,
-    estimates: list[Estimate],
-    report: dict[str, Any],
-) -> list[Path]:
-    files = []
+        reason = f"the session ended in {session.stage}: {session.cause}"
+    trace = None
     if len(recorder):
-        result = result_of(recorder, session.units, scenario.T, report)
-        files.append(result.save_npz(out / "trace.npz"))
-    if report["bounded"]:
-        tables = [_table(e, scenario, i) for i, e in enumerate(estimates)]
-        files.append(write(out / "devices.toml", "\n".join(tables)))
-    return files
+        trace = result_of(recorder, session.units, scenario.T, report).save_npz(out / f"trace-{number}.npz")
+    return _Sitting(report, session, estimates, reason, trace, live.signals)
+
+
+def _identified(scenario: Scenario, sittings: list[_Sitting]) -> tuple[dict[str, Any], list[Estimate]]:
+    """The report of all sittings, and one estimate per axis."""
+    session, told = sittings[-1].session, [sitting.estimates for sitting in sittings if sitting.estimates]
+    left_out = [f"sitting {k}: {sitting.reason}" for k, sitting in enumerate(sittings, start=1) if sitting.reason]
+    estimates, reason, warnings = (told[0] if told else []), "; ".join(left_out), left_out
+    try:
+        if told:
+            estimates, hands = settled(told)
+            reason, warnings = "", left_out + hands
+    except ValueError as error:
+        reason, warnings = str(error), left_out
+    suspicious = [] if reason else held(estimates, scenario, session)
+    estimates = capped(estimates, scenario, session)
+    bounded = not reason and not suspicious and all(e.delta > 0 for e in estimates)
+    report = sittings[-1].report | {"axes": [asdict(e) for e in estimates], "sittings": [s.part() for s in sittings]}
+    report |= {"bounded": bounded, "warnings": warnings + suspicious, "limits": _LIMITS}
+    return report | ({"reason": reason} if reason else {}), estimates
 
 
 def _table(e: Estimate, scenario: Scenario, i: int) -> str:
@@ -146,11 +185,11 @@ def _figures(report: dict[str, Any]) -> Table:
         mode = "-" if axis["transmission"] is None else f"{axis['transmission']['mode_hz']:.2f}"
         names = ("mass", "viscous", "coulomb", "stiffness")
         figures = [f"{found[name]:.5g} ± {2 * found['errors'][name]:.2g}" for name in names]
-        cells.append((str(i), *figures, mode, f"{found['delta']:.4f}"))
+        cells.append((str(i), *figures, mode, f"{found['delta']:.4f}" if report["bounded"] else "-"))
     heads = ("axis", "mass [kg]", "viscous [N s/m]", "dry [N]", "to ground [N/m]", "mode [Hz]", "delta at least")
     return render.grid(f"{report['scenario']}, identified", heads, cells, left=())
 
 
 def _lines(report: dict[str, Any]) -> list[str]:
-    reason = [f"nothing was identified: {report['reason']}"] if "reason" in report else []
+    reason = [f"no bound: {report['reason']}"] if "reason" in report else []
     return [*reason, *(f"[yellow]{warning}[/]" for warning in report["warnings"]), _LIMITS]

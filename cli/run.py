@@ -14,8 +14,8 @@ from controller.environment import GROUND
 from controller.loop import Loop
 from design.files import write
 from design.guarantees import ANY
+from design.optimal import robustness_parts
 from design.result import listed
-from design.robustness import robustness_parts
 from design.transparency import BAND_HZ, transparency
 from sim import report
 from sim.accuracy import (

@@ -19,7 +19,6 @@ from cli.dashboard import Dashboard
 from cli.render import console, progress
 from hw.control import Program, link_delay
 from hw.emulator import Emulator, FaultInjection, spawned
-from hw.emulator import nobody as without_hands
 from hw.force_dimension import FORCE_DIMENSION, ForceDimension
 from hw.monitor import Ages, LinkSettings
 from hw.recording import IncidentLog
@@ -161,19 +160,19 @@ def hold_session(
     plan: Callable[[Ages], Sequence[Program]],
     seconds: float,
     out: Path,
-    nobody: bool = False,
+    alone: Scenario | None = None,
     coulomb: float = 0.0,
 ) -> _Held:
     """From opening the port, or starting an emulator, to the end of the session.
 
-    An emulated device has `nobody` at its handles where that is asked for, and dry friction `coulomb` [N].
+    Where nobody is to hold an emulated device, `alone` is its scenario; `coulomb` [N] is its dry friction.
     """
     with ExitStack() as stack:
         incidents = IncidentLog(out / "incidents.jsonl")
         stack.callback(incidents.close)
         incidents.attach(session)
         if args.rehearse:
-            return _rehearsed(args, session, plan, seconds, incidents, nobody, coulomb)
+            return _rehearsed(args, session, plan, seconds, incidents, alone, coulomb)
         device: HapticDevice
         serial: SerialDevice | None = None
         if host_clocked(args):
@@ -184,7 +183,7 @@ def hold_session(
                     "the device has no watchdog of its own: were this program killed, its force would stay"
                 )
         else:
-            words = [*_emulator_options(args, seconds), *["--nobody"][:nobody], f"--coulomb={coulomb}"]
+            words = [*_emulator_options(args, seconds), *["--nobody"][: alone is not None], f"--coulomb={coulomb}"]
             with progress("starting the emulator" if args.emulate else "opening the port"):
                 path = args.port or stack.enter_context(spawned(words))
             port, pace = stack.enter_context(SerialPort(path, session.settings.baud)), args.pace
@@ -224,14 +223,13 @@ def _rehearsed(
     plan: Callable[[Ages], Sequence[Program]],
     seconds: float,
     incidents: IncidentLog,
-    nobody: bool,
+    alone: Scenario | None,
     coulomb: float,
 ) -> _Held:
     """The session in virtual time; whoever would be there arms once, and holds the deadman."""
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
     try:
-        scenario = without_hands(options.scenario_from(args)) if nobody else options.scenario_from(args)
-        emulator = Emulator(scenario, faults, coulomb=coulomb)
+        emulator = Emulator(alone or options.scenario_from(args), faults, coulomb=coulomb)
     except ValueError as error:
         raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
     with progress("rehearsing") as move:

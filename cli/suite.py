@@ -321,9 +321,9 @@ def _edges(report: dict[str, Any]) -> list[_Part]:
     rows, taken = [], []
     for name, factor in dict.fromkeys((row["guarantee"], row["factor"]) for row in report["rows"]):
         some = [row for row in report["rows"] if (row["guarantee"], row["factor"]) == (name, factor)]
-        motions, took, hands, grew = (sum(row[of] for row in some) for of in ("motions", "took", "hands", "grew"))
+        motions, took, grew = (sum(row[of] for row in some) for of in ("motions", "took", "grew"))
         limited, least = max(row["limited"] for row in some), min(row["least_J"] for row in some)
-        met = f"{took} of {motions}", f"{grew}" if hands else "-"
+        met = f"{took} of {motions}", f"{grew}"
         rows.append((name, f"{factor:g}", *met, f"{limited:.0%}", f"{least:.2g}"))
         if factor >= 1:
             taken.append(took + grew)

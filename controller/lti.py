@@ -35,19 +35,22 @@ class SingularLoop(ValueError):
 
 
 class TooLong(ValueError):
-    """Exact arithmetic that has used up the time it was given."""
+    """Exact arithmetic, or a search by sweeps, that has used up the time it was given."""
 
 
-_until: ContextVar[tuple[float, float]] = ContextVar("until", default=(float("inf"), 0.0))
+_until: ContextVar[tuple[float, str]] = ContextVar("until", default=(float("inf"), ""))
 
 
 @contextmanager
-def within(seconds: float) -> Iterator[None]:
-    """Exact arithmetic here may take so many seconds of this thread's processor, or what is left of a time around it.
+def within(
+    seconds: float, what: str = "exact arithmetic", why: str = "too many digits over many states"
+) -> Iterator[None]:
+    """What is done here may take so many seconds of this thread's processor, or what is left of a time around it.
 
-    Else it raises TooLong, at the next row of a product or of an elimination.
+    Else it raises TooLong, at the next row of an exact product or elimination, or at the next response.
     """
-    token = _until.set(min(_until.get(), (time.thread_time() + seconds, seconds)))
+    words = f"{what} was given up after {seconds:g} s: these are {why}"
+    token = _until.set(min(_until.get(), (time.thread_time() + seconds, words)))
     try:
         yield
     finally:
@@ -56,9 +59,9 @@ def within(seconds: float) -> Iterator[None]:
 
 def on_time() -> None:
     """Raises TooLong where the time of `within` is over."""
-    until, seconds = _until.get()
+    until, words = _until.get()
     if time.thread_time() > until:
-        raise TooLong(f"exact arithmetic was given up after {seconds:g} s: these are too many digits over many states")
+        raise TooLong(words)
 
 
 def rational(value: Any) -> Fraction:
@@ -162,6 +165,11 @@ class Lti(ReadOnly):
         return self.A.shape[-1]
 
     @property
+    def inner_order(self) -> int:
+        """States without those that delays at the outputs add, which cost a response nothing."""
+        return self._lines[0].size
+
+    @property
     def inputs(self) -> int:
         return self.B.shape[-1]
 
@@ -209,6 +217,7 @@ class Lti(ReadOnly):
 
         What only repeats another state later is no row: it is that state times a power of z.
         """
+        on_time()
         S, U = self._schur
         core, lines = self._lines
         at, X = np.tile(points, self.inputs), np.repeat(U.conj().T @ self.B[core], points.size, axis=1)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal, TypedDict, Unpack
+from typing import Literal, TypedDict, Unpack
 
 from controller.coupling import Coupling
 from controller.loop import Loop
 from design.certificate import assess, check_ranges, switching_requirement
-from design.designs import KINDS, NO_LONGER, OPTIONS, RETIRED, design_by_kind, usual_condition
+from design.designs import KINDS, OPTIONS, design_by_kind, usual_condition
 from design.guarantees import guarantee_of
 from design.result import Condition, Design, Requirement, bare, known, of_kind, one_of
 from design.stored import Stored
@@ -23,7 +22,7 @@ _LOOP = 'a Loop, as scenario.loop("I") gives it'
 
 
 class Options(TypedDict, total=False):
-    """What else can be asked of a kind, see design.designs.OPTIONS; functions, filter and margin have no effect."""
+    """What else can be asked of a kind, see design.designs.OPTIONS."""
 
     order: int  # ccl: states per channel
     method: str  # ccl: complementarity, inner or fixed-poles
@@ -36,9 +35,6 @@ class Options(TypedDict, total=False):
     band_hz: tuple[float, float]  # optimal, spring-damper for this environment: where the mismatch counts
     high_gain: float | None  # optimal: limit of |F|/|E| above 100 Hz; None: kept low, not limited
     seconds: float  # optimal: no further rung of the ladder is begun later than this
-    functions: int
-    filter: str
-    margin: float
 
 
 def design_coupling(
@@ -60,10 +56,7 @@ def design_coupling(
     of_kind("loop", loop, Loop, _LOOP)
     one_of("kind", kind, KINDS)
     known(options, OPTIONS[kind], f"kind {kind!r}")
-    asked: dict[str, Any] = dict(options)
-    if kind == "optimal" and (retired := [name for name in RETIRED if asked.pop(name, None) is not None]):
-        warnings.warn(NO_LONGER.format(", ".join(retired)), DeprecationWarning, stacklevel=2)
-    return design_by_kind(loop, kind, condition, **asked)
+    return design_by_kind(loop, kind, condition, **options)
 
 
 #: kinds and conditions that are quick to try in the place of something else; of the optimal coupling the first rung

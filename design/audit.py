@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
-from typing import Any, cast, get_args
+from typing import Any, TypeVar, cast, get_args
 
 import msgspec
 import numpy as np
@@ -18,9 +18,11 @@ from controller.coupling import (
 )
 from controller.environment import RIGID_WALL
 from controller.loop import DelayRange, Loop
+from controller.lti import TooLong
 from design.certificate import RangesCheck, any_environment_of, switching_requirement
 from design.conditions import any_environment
 from design.coverage import ranges_part, switching_part
+from design.frequency import sweeping, too_long
 from design.guarantees import ANY, CAVEATS, LATE, guarantee_of
 from design.multipliers import this_environment_of
 from design.result import Condition, Requirement, certificate_part, listed, refusal
@@ -38,6 +40,8 @@ def requirement(loop: Loop, coupling: Coupling, condition: Condition) -> Require
     ask = this_environment_of if condition == "this-environment" else any_environment_of
     try:
         return ask(loop, coupling)
+    except TooLong:
+        raise
     except ValueError as error:  # no solution of the algebraic loop
         return refusal(condition, loop.delta, str(error))
 
@@ -46,6 +50,8 @@ def _varied(loop: Loop, coupling: Coupling, condition: Condition, **changes: Any
     """The same with some of the loop's fields changed; a loop that cannot be is refused."""
     try:
         return requirement(msgspec.structs.replace(loop, **changes), coupling, condition)
+    except TooLong:
+        raise
     except ValueError as error:  # a latency that is longer than the period
         return refusal(condition, loop.delta, str(error))
 
@@ -312,10 +318,35 @@ def report(
     }
 
 
+_SWEEPS = 60  # that a search asks for, about
+
+_Found = TypeVar("_Found")
+
+
+def _in_time(loop: Loop, coupling: Coupling, search: Callable[[], _Found], without: Callable[[str], _Found]) -> _Found:
+    """What a search by many sweeps found, or `without` of the reason where it would take, or takes, too long."""
+    try:
+        if reason := too_long(loop.F(coupling), _SWEEPS):
+            return without(f"not searched: {reason}")
+        with sweeping():
+            return search()
+    except TooLong as error:
+        return without(str(error))
+    except ValueError:  # a loop without a force map, whose requirement says why
+        return search()
+
+
 def _condition_part(loop: Loop, coupling: Coupling, needs: Requirement) -> dict[str, Any]:
+    nothing, least = (None,) * loop.channels, needs.required if needs.certified else None
+    stiff = _in_time(
+        loop, coupling, lambda: stiffest(loop, coupling, needs.condition), lambda reason: _Stiffest(nothing, reason)
+    )
+    tolerated = _in_time(
+        loop, coupling, lambda: tolerance(loop, coupling, needs), lambda reason: _Tolerance(least, None, None, reason)
+    )
     return certificate_part(needs) | {
-        "stiffest": _stiffest_part(stiffest(loop, coupling, needs.condition)),
-        "sensitivity": _sensitivity_part(loop, needs, tolerance(loop, coupling, needs)),
+        "stiffest": _stiffest_part(stiff),
+        "sensitivity": _sensitivity_part(loop, needs, tolerated),
     }
 
 
@@ -356,7 +387,7 @@ def _helps(loop: Loop, coupling: Coupling, needs: Requirement) -> list[dict[str,
             "required_damping": list(remedy.requirement.required),
             "certified": remedy.requirement.certified,
         }
-        for remedy in remedies(loop, coupling, needs)
+        for remedy in _in_time(loop, coupling, lambda: remedies(loop, coupling, needs), lambda reason: [])
     ]
 
 

@@ -29,9 +29,9 @@ from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Complex, Lti
 from design.barrier import Block, Program, centre, towards
+from design.designs import design_by_kind
 from design.frequency import frequencies, hermitian, on_circle
-from design.optimal import design
-from design.program import LADDER, Options
+from design.program import LADDER
 from design.transparency import BAND_HZ, decibels
 
 _Indices = NDArray[np.intp]  # of points of the transform
@@ -47,7 +47,7 @@ _DEGREE = 3  # of the splines that h is made of
 _GAP = 0.003  # of the bound, relatively, that the barrier leaves
 _SWEEPS = 6
 _QUADRATURE = 3e-6  # of the mean square: what the sums over transform and band may differ from their integrals
-_SHORT = Options(ladder=LADDER[:2])
+_RUNGS = LADDER[:2]  # of the design that it begins from
 _LEFT_OUT = 0.0005  # of the mean square mismatch of a coupling: what the shapes of h lack
 _LARGEST_CHARGE = 0.003  # of the bound, for what D lacks between the frequencies where it is imposed
 _STEEPER = 4.0
@@ -76,7 +76,7 @@ def bound(
     if loop.channels <= _EVERY:
         shapes = np.eye(loop.channels**2)
     else:
-        shapes = _shapes(loop, loop.F(near or design(loop, _SHORT).coupling), band_hz)
+        shapes = _shapes(loop, loop.F(near or design_by_kind(loop, "optimal", ladder=_RUNGS).coupling), band_hz)
     dual = _Dual.of(loop, band_hz, knots or _KNOTS.get(loop.channels, _FEWEST), shapes)
     square = dual.best()
     return _Bound(float(np.sqrt(max(square - _QUADRATURE, 0.0))), time.perf_counter() - started)

@@ -364,7 +364,7 @@ class _Entry:
 
 
 @dataclass(frozen=True)
-class _LadderRow:
+class LadderRow:
     """One line of the table."""
 
     design: str
@@ -404,9 +404,9 @@ LADDERS = {"short": SHORT, "full": _FULL}
 
 def compare_designs(
     loops: Mapping[str, Loop], entries: Sequence[_Entry], progress: _Progress
-) -> tuple[list[_LadderRow], bool]:
+) -> tuple[list[LadderRow], bool]:
     """The rows of every case, and whether the keyboard ended it; what was done before is kept."""
-    rows: list[_LadderRow] = []
+    rows: list[LadderRow] = []
     total = len(loops) * len(entries)
     try:
         for case, loop in loops.items():
@@ -418,7 +418,7 @@ def compare_designs(
     return rows, False
 
 
-def ladder_row(case: str, loop: Loop, entry: _Entry) -> _LadderRow:
+def ladder_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:
     """One design with its proof; a request without a solution gives its reason."""
     begin = time.perf_counter()
     if entry.kind == "bound":
@@ -427,7 +427,7 @@ def ladder_row(case: str, loop: Loop, entry: _Entry) -> _LadderRow:
         coupling, design = _made(loop, case, entry)
     except DesignFailed as error:
         wall = time.perf_counter() - begin
-        return _LadderRow(
+        return LadderRow(
             _name(entry, case), case, None, False, entry.condition, None, None, None, wall, 0.0, str(error)
         )
     wall = time.perf_counter() - begin
@@ -445,12 +445,12 @@ def ladder_row(case: str, loop: Loop, entry: _Entry) -> _LadderRow:
     mismatch = finite(decibels(figures.relative_mismatch)), finite(decibels(figures.rms_mismatch))
     proof_s, certified = time.perf_counter() - begin, requirement.certified
     place = _name(entry, case), case, required, certified, entry.condition
-    return _LadderRow(*place, *mismatch, proof, wall, proof_s, reason, robustness_part(loop, coupling))
+    return LadderRow(*place, *mismatch, proof, wall, proof_s, reason, robustness_part(loop, coupling))
 
 
-def _bound_row(case: str, loop: Loop, entry: _Entry) -> _LadderRow:
+def _bound_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:
     """What no linear coupling can be better than: no design, and of the rms mismatch only."""
-    row = _LadderRow(entry.name, case, None, False, entry.condition, None, None, None, 0.0, 0.0)
+    row = LadderRow(entry.name, case, None, False, entry.condition, None, None, None, 0.0, 0.0)
     if loop.channels > MOST:
         return replace(row, reason=NO_BOUND)
     found = bound(loop)

@@ -52,6 +52,7 @@ from design.frequency import (
     rounding,
     suprema,
     supremum,
+    too_long,
 )
 from design.result import Requirement, from_ratio, refusal
 
@@ -232,6 +233,8 @@ def this_environment(
 
     if min(available) == 0:
         return refused("a device guarantees no damping, so no coupling is safe for every passive human")
+    if reason := too_long(F):
+        return refused(reason)
     radius = float(np.abs(F.poles()).max(initial=0.0))
     if radius >= 1:
         return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
@@ -281,6 +284,8 @@ def any_environment(V: Lti, theta: Sequence[int], delta: Sequence[float], T_max:
 
     if min(available) == 0:
         return refused("a device guarantees no damping, so no coupling is safe for every passive human")
+    if reason := too_long(V):
+        return refused(reason)
     if not V.is_stable():
         return refused("the coupling V has a pole on or outside the unit circle")
     demand = any_environment_demand(V, theta, available, T_max)
@@ -418,6 +423,8 @@ def any_environment_delayed(
     def refused(reason: str) -> Requirement:
         return refusal("any-environment", available, reason)
 
+    if reason := too_long(V) or too_long(environment):
+        return refused(reason)
     if not V.is_stable():
         return refused("the coupling V has a pole on or outside the unit circle")
     V1 = V.dc()

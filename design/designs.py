@@ -49,23 +49,8 @@ OPTIONS = {
     "spring-damper": ("switching", "limiter", "band_hz"),
     "moving-average": (),
     "ccl": ("order", "method", "diagonal"),
-    "optimal": (
-        "objective",
-        "band_hz",
-        "high_gain",
-        "limiter",
-        "seconds",
-        "switching",
-        "functions",
-        "filter",
-        "diagonal",
-        "margin",
-    ),
+    "optimal": ("objective", "band_hz", "high_gain", "limiter", "seconds", "switching"),
 }
-
-#: options of the optimal coupling before 0.2: accepted and without effect
-RETIRED = ("functions", "filter", "diagonal", "margin")
-NO_LONGER = "the optimal coupling chooses its own basis and margin; without effect: {}"
 
 
 def design_by_kind(

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.lti import Array, Lti
+from controller.lti import Array, Lti, within
 
 # ----------------------------------------------------------------------------------------------------
 # Integrals over frequency, by Gauss's rule on intervals that are halved until it no longer matters.
@@ -117,6 +118,33 @@ def frequencies_of_many(poles: NDArray[np.complex128], delay: int) -> tuple[Arra
     width = np.maximum(1 - np.abs(poles), 1e-9)
     near = (np.abs(np.angle(poles))[..., None] + width[..., None] * _NEAR_POLE).reshape(poles.shape[0], -1)
     return common, np.clip(near, _LOWEST, np.pi)
+
+
+_POINTS_SWEPT = 3000  # in the grid and its refinement, about
+_RESPONSE, _SCHUR = 0.4e-9, 3e-9  # [s] measured: a point's response per inputs x states^2, a Schur form per states^3
+#: [s] that one sweep, or a search by many of them, may take
+MOST_SECONDS = 60.0
+
+
+def sweep_seconds(G: Lti) -> float:
+    """About how long a sweep of G takes [s], to a factor of three; delays at its outputs cost nothing."""
+    n, m = G.inner_order, G.inputs
+    return _POINTS_SWEPT * m * (n**2 + m**2) * _RESPONSE + n**3 * _SCHUR
+
+
+def too_long(G: Lti, sweeps: int = 1) -> str | None:
+    """Why so many sweeps of G, or of what is like it, are not begun; None where they are."""
+    seconds, how = sweeps * sweep_seconds(G), f"some {sweeps} sweeps" if sweeps > 1 else "a sweep"
+    if seconds <= MOST_SECONDS:
+        return None
+    states = f"{G.inner_order} states and {G.inputs} channels"
+    fewer = "a smaller psi, or fewer channels or masses"
+    return f"{how} over {states} would take about {seconds:.0f} s, allowed are {MOST_SECONDS:g}: what helps is {fewer}"
+
+
+def sweeping() -> AbstractContextManager[None]:
+    """The clock of a search by sweeps: TooLong after MOST_SECONDS."""
+    return within(MOST_SECONDS, "a search by sweeps", "many states or channels")
 
 
 Response = Callable[[Array], Array]  # w (k,) [rad/sample] -> real values (k,)

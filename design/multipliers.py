@@ -24,6 +24,7 @@ from controller.lti import (
     Number,
     Sampled,
     SingularLoop,
+    TooLong,
     as_like,
     constant_like,
     hstack,
@@ -40,7 +41,7 @@ from design.conditions import (
     this_environment,
     this_environment_demand,
 )
-from design.frequency import frequencies, hermitian, on_circle, supremum
+from design.frequency import frequencies, hermitian, on_circle, supremum, sweeping, too_long
 from design.result import NotProved, Requirement, from_ratio, refusal
 
 #: c_ij >= 0 of the limiter's multiplier: for every channel i a weight per lag j = 1, 2, ..; none is zero
@@ -184,6 +185,8 @@ def walls_proof(
 
     if min(available) == 0:
         return refused("a device guarantees no damping, so no coupling is safe for every passive human")
+    if reason := too_long(G):
+        return refused(reason)
     radius = float(np.abs(G.poles()).max(initial=0.0))
     if radius >= 1:
         return refused(f"the force map has a pole at radius {radius:.6f}, on or outside the unit circle")
@@ -582,10 +585,10 @@ def swept(loop: Loop, coupling: Coupling, alpha: Sequence[float] | None = None) 
     """What switching within the loop's range asks, by a sweep; with the multiplier `alpha` [N/m] where it is given."""
     span = loop.delays
     try:
-        G = loop.sent(coupling)
-    except SingularLoop as error:
+        with sweeping():
+            return switching_sweep(loop.sent(coupling), span.lo, span.hi, loop.delta, alpha, loop.T_max)
+    except (SingularLoop, TooLong) as error:
         return _refused(loop.delta, str(error))
-    return switching_sweep(G, span.lo, span.hi, loop.delta, alpha, loop.T_max)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -617,8 +620,9 @@ def limiter_requirement(loop: Loop, coupling: Coupling, beta: float = BETA, c: L
     reason = limiter_refusal(loop)
     try:
         if reason is None:
-            return limiter(loop.sent(coupling), loop.theta, loop.delta, rho, c, T_max=loop.T_max)
-    except SingularLoop as error:
+            with sweeping():
+                return limiter(loop.sent(coupling), loop.theta, loop.delta, rho, c, T_max=loop.T_max)
+    except (SingularLoop, TooLong) as error:
         reason = str(error)
     return LimiterProof(refusal("limiter", loop.delta, reason), rho, ((),) * loop.channels, math.inf)
 
@@ -643,7 +647,11 @@ def walls_of(loop: Loop, coupling: Coupling, g: Sequence[Fraction] | None = None
     values = None if g is None else [float(value) for value in g]
     if values is not None and (len(values) != len(walls) or min(values) < 0):
         raise NotProved(f"{WALL_MULTIPLIER} is {values}, expected a number >= 0 for each of {len(walls)} walls")
-    return walls_proof(G, loop.delta, slopes, values, loop.T_max)
+    try:
+        with sweeping():
+            return walls_proof(G, loop.delta, slopes, values, loop.T_max)
+    except TooLong as error:
+        raise NotProved(str(error)) from None
 
 
 def this_environment_of(loop: Loop, coupling: Coupling) -> Requirement:

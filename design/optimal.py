@@ -9,19 +9,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling
-from controller.environment import Network
+from controller.environment import Network, Ranges
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
 from design.certificate import prove, prove_limiter
 from design.conditions import this_environment as requirement_of
 from design.designs import design_by_kind
-from design.environments import Searched, in_each, search_ranges, worst
+from design.environments import Searched, in_each, ratio_in, search_ranges, worst
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.program import (
     DEFAULT,
@@ -37,17 +38,18 @@ from design.program import (
     Span,
     limiter,
     most_gain,
-    need,
     span_of,
     static_weight,
     switching,
     this_environment,
     worst_mismatch,
 )
-from design.result import Design, DesignFailed, NotProved
+from design.result import Design, DesignFailed, NotProved, finite
+from design.robustness import at, ranges_around, robustness, robustness_part, vertices
 from design.stored import Certificate, LimiterCertificate
 from design.transparency import Transparency, decibels, transparency
 
+_MINIMISED = {"rms": "rms_mismatch", "sup": "relative_mismatch"}
 _SETTLED_DB = 0.05  # a rung that gains less ends the climb
 _FEWEST_RUNGS = 3
 _KEPT_STIFFNESS = 0.5  # of the static stiffness of the best rung so far: a rung that renders less is not taken
@@ -281,7 +283,7 @@ class _Climb:
             chosen = tuple(cases[i] for i in active)
             problem = Problem(span, chosen, self.options, SOFT[0] * min(share, SOFT[1]))
             coupling = span.filter(problem.solve(self._start(problem)))
-            needs = [need(case.loop, coupling) for case in cases]
+            needs = [ratio_in(case.loop, coupling) for case in cases]
             missed = [int(i) for i in np.argsort(needs)[::-1] if needs[i] > 1 + _TOLERATED and i not in active]
             if not missed:
                 break
@@ -381,12 +383,74 @@ class _Climb:
         return replace(found, requirement=requirement, certificate=certificate, wall_s=self.elapsed, reason=None)
 
 
-def at(loop: Loop, network: Network) -> Loop:
-    """The loop around this environment, its delays constant."""
-    return loop.at(network).switching(None)
-
-
 def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
     """The filter times a number, in decimals for which R(1) = g I holds exactly."""
     every = np.ones((len(coupling.R) - 1, *coupling.R.shape[1:]), dtype=bool)
     return Span(coupling.poles, coupling.pairs, every).filter(np.append(coupling.g, coupling.R[1:].ravel()), scale)
+
+
+# ----------------------------------------------------------------------------------------------------
+# What designs for more than one environment cost, and which ranges can be proved.
+
+
+@dataclass(frozen=True)
+class _Spread:
+    """What it costs to keep the condition over `vertices`, too: two designs over one small basis."""
+
+    mismatch_db: float  # of the design for the vertices, in the nominal environment
+    price_db: float  # beside the design for the nominal environment alone
+    g: float
+    worst: float  # times the damping that there is, over the vertices
+
+
+def spread(loop: Loop, options: Options = DEFAULT, percent: float = 10.0) -> _Spread | None:
+    """The design for `vertices` beside the nominal one, by sweeps: a price, not a coupling to run. None without one."""
+    try:
+        alone, wide = compromise(loop, list(vertices(loop.network, percent).values()), options)
+    except DesignFailed:
+        return None
+    mismatch, before = (decibels(getattr(one.figures, _MINIMISED[options.objective])) for one in (wide, alone))
+    return _Spread(mismatch, mismatch - before, wide.g, robustness(loop, wide.coupling, percent).worst)
+
+
+def robustness_parts(loop: Loop, coupling: Coupling, options: Options = DEFAULT) -> dict[str, Any]:
+    """A report's `robustness` of a coupling for this environment, and what a design for that range would cost.
+
+    The latter is null with walls, with ranges, and for a coupling that is no force filter.
+    """
+    alone = isinstance(coupling, ForceFilter) and not (loop.ranges or loop.environment.walls)
+    price = spread(loop, options) if alone else None
+    parts = price and {name: finite(value) for name, value in asdict(price).items()}
+    return {"robustness": robustness_part(loop, coupling), "designed_for_it": parts}
+
+
+_MOST_RANGES = 7  # whose 128 vertices can all be proved
+
+
+def widest_ranges(loop: Loop, percent: float) -> tuple[Ranges, str | None]:
+    """Every stiffness and every mass this much more or less, and a note.
+
+    Of more than MOST_RANGES those stay for which a small nominal design needs the most damping at their ends: the note
+    names the others, which are taken as known.
+    """
+    whole = ranges_around(loop.network, percent)
+    single = [Ranges(springs=(spring,)) for spring in whole.springs]
+    single += [Ranges(masses={node: span}) for node, span in whole.masses.items()]
+    if len(single) <= _MOST_RANGES:
+        return whole, None
+    small = design(loop.at(loop.network), replace(DEFAULT, ladder=DEFAULT.ladder[:1])).coupling
+
+    def most(box: Ranges) -> float:
+        there = msgspec.structs.replace(loop, ranges=box)
+        return max(ratio_in(loop.at(member.network), small) for member in there.members())
+
+    ranked = sorted(single, key=most, reverse=True)
+    kept, known = ranked[:_MOST_RANGES], ranked[_MOST_RANGES:]
+    names = [f"stiffness {' and '.join(spring.between)}" for box in known for spring in box.springs]
+    names += [f"mass {node}" for box in known for node in box.masses]
+    note = (
+        f"{len(single)} ranges have {2 ** len(single)} vertices, {2**_MOST_RANGES} can be proved: those that matter "
+        f"most are kept; nothing is proved of the others, which are taken as known: {', '.join(names)}"
+    )
+    springs = tuple(spring for box in kept for spring in box.springs)
+    return Ranges(springs, {node: span for box in kept for node, span in box.masses.items()}), note

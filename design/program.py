@@ -21,8 +21,8 @@ from controller.delay import delay
 from controller.loop import DelayRange, Loop
 from controller.lti import Array, Complex, Lti, Sampled, as_like
 from design.barrier import Block, Program, centre, towards
-from design.conditions import Demand, even_damping, least_multiple, this_environment_demand
-from design.frequency import frequencies, hermitian, on_circle, peaks, supremum
+from design.conditions import Demand, even_damping, this_environment_demand
+from design.frequency import frequencies, hermitian, on_circle, peaks
 from design.multipliers import SPARE, limiter_demand, limiter_lag, switching_block
 from design.result import number, one_of
 from design.transparency import BAND_HZ
@@ -305,23 +305,6 @@ class Case:
     def delayed(self, z: Complex) -> Sampled:
         """Psi E at z (k,)."""
         return Sampled.of(delay(self.loop.psi, self.loop.T) @ self.E, z[None])
-
-
-def need(loop: Loop, coupling: ForceFilter) -> float:
-    """The damping that this-environment asks, on a refined sweep, in units of what there is.
-
-    The responses of environment and filter are multiplied: the poles of their series are defective and cost digits.
-    """
-    E = loop.E()
-    delayed = delay(loop.psi, loop.T) @ E
-
-    def needed(w: Array) -> Array:
-        F = _late(loop, coupling.around(Sampled.of(delayed, on_circle(w)[None])))
-        demand = _demand(loop, F)
-        return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
-
-    chain = Span(coupling.poles, coupling.pairs, np.ones((len(coupling.R) - 1, 1, 1), dtype=bool)).chain(E.T)
-    return supremum(needed, frequencies(E, chain, low=SMALLEST / 10))[0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 
-from controller.coupling import Coupling, ForceFilter
+from controller.coupling import Coupling
 from controller.environment import Network, Ranges, UncertainSpring
 from controller.loop import Loop
-from design.environments import in_each, ratio_in
-from design.optimal import at, compromise, design
-from design.program import DEFAULT, Options
-from design.result import DesignFailed, finite
-from design.transparency import decibels
-
-_MINIMISED = {"rms": "rms_mismatch", "sup": "relative_mismatch"}
+from design.environments import ratio_in
+from design.result import finite
 
 
 @dataclass(frozen=True)
@@ -38,6 +33,11 @@ class _Robustness:
             "where": self.where,
             "certified": self.kept,
         }
+
+
+def at(loop: Loop, network: Network) -> Loop:
+    """The loop around this environment, its delays constant."""
+    return loop.at(network).switching(None)
 
 
 def vertices(network: Network, percent: float = 10.0) -> dict[str, Network]:
@@ -74,74 +74,11 @@ def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> _Robust
     return _Robustness(percent, worst, where, worst < 1)
 
 
-@dataclass(frozen=True)
-class _Spread:
-    """What it costs to keep the condition over `vertices`, too: two designs over one small basis."""
-
-    mismatch_db: float  # of the design for the vertices, in the nominal environment
-    price_db: float  # beside the design for the nominal environment alone
-    g: float
-    worst: float  # times the damping that there is, over the vertices
-
-
-def spread(loop: Loop, options: Options = DEFAULT, percent: float = 10.0) -> _Spread | None:
-    """The design for `vertices` beside the nominal one, by sweeps: a price, not a coupling to run. None without one."""
-    try:
-        alone, wide = compromise(loop, list(vertices(loop.network, percent).values()), options)
-    except DesignFailed:
-        return None
-    mismatch, before = (decibels(getattr(one.figures, _MINIMISED[options.objective])) for one in (wide, alone))
-    return _Spread(mismatch, mismatch - before, wide.g, robustness(loop, wide.coupling, percent).worst)
-
-
-def robustness_parts(loop: Loop, coupling: Coupling, options: Options = DEFAULT) -> dict[str, Any]:
-    """A report's `robustness` of a coupling for this environment, and what a design for that range would cost.
-
-    The latter is null with walls, with ranges, and for a coupling that is no force filter.
-    """
-    alone = isinstance(coupling, ForceFilter) and not (loop.ranges or loop.environment.walls)
-    price = spread(loop, options) if alone else None
-    parts = price and {name: finite(value) for name, value in asdict(price).items()}
-    return {"robustness": robustness_part(loop, coupling), "designed_for_it": parts}
-
-
 def robustness_part(loop: Loop, coupling: Coupling) -> dict[str, Any] | None:
     """The worst need within ten percent as plain data; None with walls, and for an environment that is no network."""
     if loop.environment.walls or not isinstance(loop.environment, Network):
         return None
     return robustness(loop, coupling).part()
-
-
-_MOST_RANGES = 7  # whose 128 vertices can all be proved
-
-
-def widest_ranges(loop: Loop, percent: float) -> tuple[Ranges, str | None]:
-    """Every stiffness and every mass this much more or less, and a note.
-
-    Of more than MOST_RANGES those stay for which a small nominal design needs the most damping at their ends: the note
-    names the others, which are taken as known.
-    """
-    whole = ranges_around(loop.network, percent)
-    single = [Ranges(springs=(spring,)) for spring in whole.springs]
-    single += [Ranges(masses={node: span}) for node, span in whole.masses.items()]
-    if len(single) <= _MOST_RANGES:
-        return whole, None
-    small = design(loop.at(loop.network), replace(DEFAULT, ladder=DEFAULT.ladder[:1])).coupling
-
-    def most(box: Ranges) -> float:
-        there = msgspec.structs.replace(loop, ranges=box)
-        return max(found.ratio for found in in_each(there, small, there.members()))
-
-    ranked = sorted(single, key=most, reverse=True)
-    kept, known = ranked[:_MOST_RANGES], ranked[_MOST_RANGES:]
-    names = [f"stiffness {' and '.join(spring.between)}" for box in known for spring in box.springs]
-    names += [f"mass {node}" for box in known for node in box.masses]
-    note = (
-        f"{len(single)} ranges have {2 ** len(single)} vertices, {2**_MOST_RANGES} can be proved: those that matter "
-        f"most are kept; nothing is proved of the others, which are taken as known: {', '.join(names)}"
-    )
-    springs = tuple(spring for box in kept for spring in box.springs)
-    return Ranges(springs, {node: span for box in kept for node, span in box.masses.items()}), note
 
 
 def ranges_around(network: Network, percent: float) -> Ranges:

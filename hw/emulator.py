@@ -241,9 +241,9 @@ class EmulatedPlant:
         return self._outside[row]
 
 
-def nobody(scenario: Scenario) -> Scenario:
-    """The scenario's devices with nobody at their handles, and no tap."""
-    return scenario.replace(human=(Human((Link(0.0, 0.0, 0.0),)),) * scenario.channels, tap=None)
+def nobody(scenario: Scenario, damping: float = 0.0) -> Scenario:
+    """The scenario's devices with nobody at their handles, or what only damps by `damping` [N s/m], and no tap."""
+    return scenario.replace(human=(Human((Link(0.0, damping, 0.0),)),) * scenario.channels, tap=None)
 
 
 def info_of(scenario: Scenario) -> Info:

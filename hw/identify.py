@@ -414,8 +414,8 @@ def _polished(model: _Model, p: Array) -> Array:
 def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> list[str]:
     """Axes with far more damping than they are said to have, by INFO's guarantee and the scenario's own damping.
 
-    A hand cannot be told from a device by its motion. Of an honest device the estimate scatters about what is
-    declared, and one bound in twenty lies above it: that alone is no reason to ask.
+    Of an honest device the estimate scatters about what is declared, and one bound in twenty lies above it: that alone
+    is no reason to ask.
     """
     found = []
     for i, (e, said) in enumerate(zip(estimates, _declared(scenario, session), strict=False), start=1):
@@ -425,6 +425,34 @@ def held(estimates: list[Estimate], scenario: Scenario, session: Session) -> lis
                 "holding it? No bound is offered; where the device really has more, declare it and take another record"
             )
     return found
+
+
+def settled(sittings: Sequence[Sequence[Estimate]]) -> tuple[list[Estimate], list[str]]:
+    """Of two or more sittings one estimate per axis, and in words where somebody damped in some of them only.
+
+    The least damped sitting of an axis counts, with the least bound of all. A passive hand adds damping to a device,
+    and takes none away (docs/hardware.md): it is enough that one sitting was free of it. Raises ValueError where the
+    least damped sitting is alone: nobody knows then whether it was free.
+    """
+    if len(sittings) < 2:
+        raise ValueError("one sitting tells no hand that only damps from more damping of the device: take two")
+    found, words = [], []
+    for i, axis in enumerate(zip(*sittings, strict=True), start=1):
+        least, *others = sorted(axis, key=lambda e: e.viscous)
+        figures = ", ".join(f"{e.viscous:.4g}" for e in axis)
+        told = f"axis {i}: {figures} N s/m in sittings 1 to {len(axis)}, a hand damped it in"
+        if _more_damped(others[0], least):
+            raise ValueError(f"{told} one at least. The two least have to agree: let go, and take more (--sittings)")
+        if hands := [f"{k}" for k, e in enumerate(axis, start=1) if _more_damped(e, least)]:
+            words.append(f"{told} {', '.join(hands)}, which did not count")
+        found.append(replace(least, friction=replace(least.friction, delta=min(e.delta for e in axis))))
+    return found, words
+
+
+def _more_damped(one: Estimate, least: Estimate) -> bool:
+    """Whether a sitting has more damping than two records of one free device differ by."""
+    scatter = 2 * np.hypot(one.friction.errors["viscous"], least.friction.errors["viscous"])
+    return one.viscous - least.viscous > _SUSPICIOUS * least.viscous + scatter
 
 
 def _declared(scenario: Scenario, session: Session) -> list[float]:

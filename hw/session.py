@@ -36,6 +36,8 @@ _QUIET_US = 1_000_000  # longest silence of a device that has no force to take a
 _STOPPING_US = 50_000  # in which STOP is repeated to a device that says nothing
 _OBEYING_US = 30_000  # in which one that was told to stop must rest: the longest hold and ramp, and half as long again
 _DEADMAN_US = 1_000_000  # after which nobody is there
+_ELSEWHERE = 5e-3  # [m] from its place, where a handle is at another one
+_LET_GO_US = 5_000_000  # in which whoever moved a handle lets go of it, where the session arms by itself
 _STRONGEST = 12.0  # [N] whatever a scenario allows
 _KEYS = {"a": "arm", "s": "stop", "q": "stop", " ": "estop"}
 
@@ -90,6 +92,21 @@ class Session:
         return not self.settings.deadman or (self.link.last is not None and self.link.last.deadman)
 
     @property
+    def hindrance(self) -> str | None:
+        """Why nobody can arm it at the moment."""
+        if not self.held:
+            return "the deadman at the device is not held"
+        last, before = self.link.last, self.settings.elsewhere
+        if before is None:
+            return None
+        if last is None:
+            return "no STATE has come yet"
+        places = zip(last.counts, before, self.units.encoder_step, strict=True)
+        near = [f"{i}" for i, (n, then, step) in enumerate(places, 1) if abs(n - then) * step < _ELSEWHERE]
+        where = f"within {1e3 * _ELSEWHERE:g} mm of where it was in the sitting before"
+        return f"handle {', '.join(near)} is {where}: take it elsewhere and let go" if near else None
+
+    @property
     def units(self) -> Units:
         """The device's units, once it is known."""
         assert self._units
@@ -118,10 +135,10 @@ class Session:
         return () if self.stage in ENDED else self._end(Stage.REFUSED, cause)
 
     def arm(self, now: int) -> Said:
-        """A person's wish to feel forces; does nothing unless the session is disarmed, and a deadman is held."""
+        """A person's wish to feel forces; does nothing unless the session is disarmed, and nothing hinders it."""
         self.now = now
-        if self.stage == Stage.DISARMED and not self.held:
-            self._log("the deadman at the device is not held")
+        if self.stage == Stage.DISARMED and (hindrance := self.hindrance):
+            self._log(hindrance)
         elif self.stage == Stage.DISARMED:
             assert self.program
             assert self.config
@@ -410,12 +427,15 @@ class Operator:
     _asked: bool = False  # auto_arm has been used up
     _armed_at: int | None = None  # [us]
     _seen_at: int | None = None  # [us] when somebody showed up last
+    _free_at: int = 0  # [us] before which it does not arm by itself
 
     def look(self, session: Session, now: int) -> Said:
         """What is to be said at `now` [us] because of where the session stands."""
         if session.stage == Stage.DISARMED:
             self._armed_at = None
-            if self.auto_arm and session.held:
+            if self.auto_arm and session.hindrance:
+                self._free_at = now + _LET_GO_US * bool(session.settings.elsewhere)
+            elif self.auto_arm and now >= self._free_at:
                 return self._arm_once(session, now)
         if session.stage == Stage.ARMED and self._armed_at is None:
             self._armed_at = now

@@ -28,7 +28,7 @@ from design.multipliers import BETA, limiter, limiter_lag, walls_of
 from models.device import RigidDevice
 from models.human import Human, Link
 from models.scene import Crowd, variants
-from sim.engines import ExactBatchEngine, hold
+from sim.engines import ExactBatchEngine, HeldPlant, hold
 from sim.passivity_layer import EnergyNet, netted
 from sim.run import assemble, run_blocks
 from sim.scenario import Scenario
@@ -50,7 +50,7 @@ class _Challenge:
     motions: int  # tried
     took: int  # motions that took more than they may
     least_J: float  # the lowest energy balance of all, motions and hands, with what may be given added
-    hands: int  # tried, as many in each generation; 0 where no linear hand can be asked
+    hands: int  # tried, as many in each generation
     grew: int  # hands that moved faster and faster, or took more than they may
     limited: float  # the share of ticks that were limited, or in contact, in the motions that were limited most
     holds: bool  # nothing was taken, or nothing is claimed
@@ -67,7 +67,7 @@ class _Case:
     friction: Array | float = 0.0  # (m,) [N]
     given: float = 0.0  # [J]
     start: float = 0.0  # [m] where motions begin
-    hands: bool = True
+    push: float = 1.0  # of the speeds at which hands are let go
 
     def limited(self, buffer: StepBuffer, ticks: int) -> float:
         """The share of the ticks in which forces were limited, or a wall touched."""
@@ -105,12 +105,11 @@ def _challenge(
         balances.append(balance)
         share = max(share, limited_share)
     least = np.concatenate(balances)
-    took, tried, grew = int((least < 0).sum()), 0, 0
-    if case.hands:
-        grown, lowest = _held(case, rng, hands, seconds)
-        tried, grew, least = hands, grown, np.append(least, lowest)
+    took = int((least < 0).sum())
+    grew, lowest = _held(case, rng, hands, seconds)
     holds = factor < 1 or (took == 0 and grew == 0)
-    return _Challenge(name, number, factor, 3 * _PUSHED, took, float(least.min()), tried, grew, share, holds)
+    lowest = min(float(least.min()), lowest)
+    return _Challenge(name, number, factor, 3 * _PUSHED, took, lowest, hands, grew, share, holds)
 
 
 # ---- the adversaries
@@ -152,7 +151,7 @@ def _held(case: _Case, rng: np.random.Generator, hands: int, seconds: float) -> 
     m, grew, lowest = len(case.delta), 0, 0.0
     mass = np.exp(rng.uniform(np.log(0.02), np.log(2.0), (hands, m, 2)))
     stiff = np.exp(rng.uniform(np.log(30.0), np.log(1e4), (hands, m, 2)))
-    speed = rng.choice([0.03, 0.3, 1.0], hands) * rng.choice([-1.0, 1.0], (m, hands))
+    speed = case.push * rng.choice([0.03, 0.3, 1.0], hands) * rng.choice([-1.0, 1.0], (m, hands))
     for _ in range(3):
         ratio, least = _let_go(case, mass, stiff, speed, seconds)
         # a budget lets a motion die as slowly as its share of the damping asks: only what was taken counts
@@ -171,8 +170,10 @@ def _let_go(case: _Case, mass: Array, stiff: Array, speed: Array, seconds: float
     links = np.stack([mass, np.zeros_like(mass), stiff], axis=-1)
     devices = tuple(RigidDevice(mass=0.1, damping=float(d)) for d in case.delta)
     crowd = variants(devices, Crowd(links))
-    plants, process = hold(crowd.plants(), case.T), case.process(hands, ticks)
+    process, rubs = case.process(hands, ticks), np.any(case.friction)
+    plants = hold(crowd.plants(), case.T / _PARTS if rubs else case.T)
     states, m = plants.A.shape[-1], len(case.delta)
+    friction = np.broadcast_to(case.friction, (m,))[:, None]
     start = np.zeros((states, hands))
     start[states // 2 : states // 2 + m] = speed
     D, (first, last) = case.delta[:, None] / case.T, np.zeros((2, hands))
@@ -181,7 +182,7 @@ def _let_go(case: _Case, mass: Array, stiff: Array, speed: Array, seconds: float
     def look(buffer: StepBuffer, begin: int, count: int) -> None:
         nonlocal balance, flow, least
         dx, f = np.diff(buffer.x[: count + 1], axis=0), buffer.f[:count]
-        work, spent = (f * dx).sum(axis=1), (D * dx**2).sum(axis=1)
+        work, spent = (f * dx).sum(axis=1), (D * dx**2 + friction * np.abs(dx)).sum(axis=1)
         run = balance + np.cumsum(work + spent, axis=0)
         flow = flow + (np.abs(work) + spent).sum(axis=0)
         least = np.minimum(least, run.min(axis=0) + case.given + _ROUNDING * flow)
@@ -190,11 +191,37 @@ def _let_go(case: _Case, mass: Array, stiff: Array, speed: Array, seconds: float
         first[...] += square[quarter == 0].sum(axis=0)
         last[...] += square[quarter == 3].sum(axis=0)
 
-    engine = ExactBatchEngine(plants, process.force_limit)
+    engine = _Rubbing(plants, friction) if rubs else ExactBatchEngine(plants, process.force_limit)
     outside = plants.B.shape[-1] - m
     run_blocks(process, engine, lambda begin, count: np.zeros((count, outside)), ticks, start, look)
     with np.errstate(invalid="ignore", over="ignore"):
         return np.nan_to_num(np.sqrt(last / first), nan=np.inf), np.nan_to_num(least, nan=-np.inf)
+
+
+_PARTS = 6  # of a tick, in each of which friction acts anew
+
+
+class _Rubbing:
+    """Devices with Coulomb friction, in parts of a tick: a force of at most that stops the device, or brakes it."""
+
+    def __init__(self, plants: HeldPlant, friction: Array) -> None:
+        self._A, self._B, self._most = plants.A, plants.B[..., -len(friction) :], friction.T[..., None]
+        states, m = plants.A.shape[-1], len(friction)
+        self._speeds = slice(states // 2, states // 2 + m)  # of the devices; a force moves its own device alone
+        self._gain = np.diagonal(self._B[:, self._speeds], axis1=1, axis2=2)[..., None]
+
+    def start(self, buffer: StepBuffer) -> None:
+        self._states, self._forces = buffer.plant_state, buffer.force
+
+    def advance(self, k: int, /) -> None:
+        s, pushed = self._states[k].T[..., None], self._B @ self._forces[k].T[..., None]
+        for _ in range(_PARTS):
+            free = self._A @ s + pushed
+            s = free + self._B @ np.clip(-free[:, self._speeds] / self._gain, -self._most, self._most)
+        self._states[k + 1][...] = s[..., 0].T
+
+    def troubled(self) -> bool:
+        return False
 
 
 # ---- the guarantees
@@ -271,21 +298,24 @@ def _walls(rng: np.random.Generator, factor: float) -> _Case:
 
 
 def _friction(rng: np.random.Generator, factor: float) -> _Case:
-    """Encoders of 10 um; the friction is the claim, and the damping what the loop needs with ideal ones."""
+    """Encoders of 10 um; the friction is the claim, and the damping what the loop needs with ideal ones.
+
+    Hands are let go at a millimetre a second and less, where steps matter."""
     loop, coupling = _pair(rng)
     F, step = loop.F(coupling), 1e-5
     needed = np.array(this_environment(F, loop.delta).required)
     process = Process(F, np.full(2, np.inf), np.full(2, step))
     pays = factor * encoder_friction(F, [step] * 2)
     damping = needed * (1 + 1e-9)
-    return _Case(lambda nsim, ticks: process, damping, loop.T, step / 4, pays, start=step / 2, hands=False)
+    return _Case(lambda nsim, ticks: process, damping, loop.T, step / 4, pays, start=step / 2, push=0.001)
 
 
 def _scenario(loop: Loop, delta: Array) -> Scenario:
     """The loop with rigid devices of this damping, held by somebody."""
     devices = tuple(RigidDevice(mass=0.1, damping=float(d)) for d in delta)
     people = tuple(Human((Link(0.5, 1.0, 100.0),)) for _ in devices)
-    return Scenario("drawn", loop.T, loop.theta, loop.psi, devices, people, loop.network)
+    loop_of = {"T": loop.T, "theta": loop.theta, "psi": loop.psi, "environment": loop.network}
+    return Scenario(name="drawn", device=devices, human=people, **loop_of)
 
 
 #: guarantee -> how a case of it is made, and how much is far too little of what it asks for
@@ -294,5 +324,5 @@ GUARANTEES: dict[str, tuple[Callable[[np.random.Generator, float], _Case], float
     "limited forces": (_limits, 0.5),
     "energy budget": (_budget, 0.5),
     "walls": (_walls, 0.6),
-    "encoder steps": (_friction, 0.1),
+    "encoder steps": (_friction, 0.02),
 }

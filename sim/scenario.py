@@ -98,7 +98,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
                 require(f"{name}[{i}]", n, 0, LONGEST_DELAY, "samples")
         if (total := sum((*self.theta, *self.psi))) > _MOST_DELAYS:
             many = f"theta and psi are {total} samples in all, allowed are {_MOST_DELAYS}"
-            raise ValueError(f"{many}: each is a state of the loop, and the work grows with the cube of their number")
+            seconds = f"each is a state, and their eigenvalues would take about {1e-8 * total**3:.0f} s"
+            raise ValueError(f"{many}: {seconds}; a longer T has fewer samples for the same delay")
         for i, lam in enumerate(self.lam or ()):
             if lam > self.theta[i] + self.psi[i]:
                 total = self.theta[i] + self.psi[i]

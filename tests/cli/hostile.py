@@ -171,7 +171,7 @@ NUMERIC = {
     "export": "seed",
     "bridge": "pace quantile guard measure force-cap max-speed continuous-force thermal-time duration seed baud",
     "emulator": "duration coulomb pace parent seed",
-    "identify": "force band seconds coulomb",
+    "identify": "force band seconds coulomb sittings hand",
 }
 
 

@@ -459,3 +459,18 @@ def test_the_passivity_controller_returns_what_its_observer_misses(together):
     assert control.limited.max() > 0
     weak = PassivityControl(1, T, strongest=0.5)
     assert weak.limit(np.array([[-3.0]]), np.array([[1e-3]])) == pytest.approx(-3 + 0.5 * 1e-3 / T)
+
+
+def test_the_passivity_controller_is_the_published_one_step_by_step():
+    """The series controller in velocities: W += f v + alpha_- v_-^2, alpha = -W/v^2 where W < 0, force f + alpha v."""
+    rng, control = np.random.default_rng(17), PassivityControl(1, T)
+    W = alpha = before = acted = 0.0
+    for _ in range(500):
+        v = rng.normal()
+        wanted = rng.normal() - 0.5 * v
+        W += wanted * v + alpha * before**2
+        alpha, before = (-W / v**2 if W < 0 else 0.0), v
+        acted += alpha > 0
+        force = control.limit(np.array([[wanted]]), np.array([[T * v]]))
+        assert force == pytest.approx(wanted + alpha * v, rel=1e-9, abs=1e-9)
+    assert acted > 100

@@ -7,6 +7,7 @@ import sys
 import msgspec
 import numpy as np
 import pytest
+from worlds import PAIR, SOFT
 
 from cli.audit import main
 from cli.options import execute
@@ -14,7 +15,7 @@ from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, RIGID_WALL, Network, Ranges, Spring
 from controller.loop import Loop
 from controller.lti import Lti
-from design import certificate, stored
+from design import certificate, frequency, stored
 from design.api import certify
 from design.audit import MOST_EXTRA_SAMPLES, edge, remedies, report, requirement, stiffest, tolerance
 from design.guarantees import ANY, CAVEATS, guarantee_of
@@ -372,3 +373,24 @@ def test_an_audit_without_environment_delay_imports_no_solver(tmp_path):
     argv = ["--K", "879,552", "--B", ".39,.52", "--out", str(tmp_path)]
     code = f"import sys, cli.audit as a; r = a.main({argv!r}); sys.exit(r or ('cvxpy' in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
+# time
+
+
+def test_what_would_take_minutes_is_not_begun_and_what_does_is_given_up(monkeypatch):
+    """A sweep of the pair is estimated at .16 ms, a search at sixty times that."""
+    monkeypatch.setattr(frequency, "MOST_SECONDS", 5e-3)
+    part = report(PAIR, SOFT)["this-environment"]
+    assert part["certified"]
+    assert part["stiffest"]["reason"].startswith("not searched: some 60 sweeps over 8 states and 2 channels would take")
+    assert part["sensitivity"]["least_delta"] == part["required_damping"]
+    monkeypatch.setattr("design.audit.too_long", lambda *_: None)
+    monkeypatch.setattr(frequency, "MOST_SECONDS", 1e-3)
+    part = report(PAIR, SOFT)["this-environment"]
+    assert part["stiffest"] == {
+        "K": [None, None],
+        "reason": "a search by sweeps was given up after 0.001 s: these are many states or channels",
+    }
+    monkeypatch.setattr(frequency, "MOST_SECONDS", 1e-5)
+    assert "a sweep over 8 states and 2 channels would take" in requirement(PAIR, SOFT, "this-environment").reason

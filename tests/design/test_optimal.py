@@ -17,15 +17,15 @@ from controller.coupling import ForceFilter, NoCoupling, basis
 from controller.environment import Network, Spring
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, Sampled
-from design.api import design_coupling
 from design.barrier import Block, Program, centre
 from design.bound import bound
 from design.certificate import verify
 from design.conditions import this_environment
+from design.environments import ratio_in
 from design.frequency import hermitian, on_circle
-from design.optimal import design
-from design.program import MARGIN, Options, Span, need, span_of, static_weight
-from design.robustness import ranges_around, robustness, spread, vertices, widest_ranges
+from design.optimal import design, spread, widest_ranges
+from design.program import MARGIN, Options, Span, span_of, static_weight
+from design.robustness import ranges_around, robustness, vertices
 from design.stored import Stored, save
 from design.stored import load as load_file
 from design.transparency import transparency
@@ -206,10 +206,10 @@ def test_a_scaled_wall_needs_what_is_known(theta):
     loop = wall(3000.0, theta, 1.3)
     for g in (0.1, 0.5):
         coupling = ForceFilter([], [], [[[g]]])
-        assert need(loop, coupling) == pytest.approx(g * 3000 * (theta + 0.5) * 1e-3 / 1.3, rel=1e-6)
+        assert ratio_in(loop, coupling) == pytest.approx(g * 3000 * (theta + 0.5) * 1e-3 / 1.3, rel=1e-6)
     found = design(loop, SHORT).coupling
     half = ForceFilter(found.poles, found.pairs, found.R / 2)
-    assert need(loop, half) == pytest.approx(need(loop, found) / 2, rel=1e-6)
+    assert ratio_in(loop, half) == pytest.approx(ratio_in(loop, found) / 2, rel=1e-6)
 
 
 @pytest.mark.parametrize("theta", [1, 16])
@@ -278,7 +278,7 @@ def test_more_ranges_than_can_be_proved_leave_those_that_matter_least(monkeypatc
     assert (
         len(msgspec.structs.replace(loop, ranges=widest_ranges(loop, 10.0)[0]).members()) == 129
     )  # with the nominal one
-    monkeypatch.setattr("design.robustness._MOST_RANGES", 6)
+    monkeypatch.setattr("design.optimal._MOST_RANGES", 6)
     kept, note = widest_ranges(loop, 10.0)
     assert len(kept.springs) + len(kept.masses) == 6
     assert len(msgspec.structs.replace(loop, ranges=kept).members()) == 65
@@ -451,15 +451,9 @@ def test_a_basis_has_more_for_few_than_for_many():
     assert five.used[:, :, 5].all()
 
 
-def test_options_of_old_have_no_effect_and_say_so():
-    loop, same = loop_of("o02"), {"functions": 16, "filter": "mixed", "margin": 0.01}
-    with pytest.warns(DeprecationWarning, match="without effect: functions, filter, margin"):
-        assert isinstance(design_coupling(loop, "optimal", **same).coupling, NoCoupling)
-
-
 def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
     scenario, report = next(LOOPS.glob("n3*.toml")), tmp_path / "r.json"
-    options = ["--best", "--scenario", str(scenario), "--margin", "0.01", "--out", str(tmp_path / "c.json")]
+    options = ["--best", "--scenario", str(scenario), "--out", str(tmp_path / "c.json")]
     assert main([*options, "--json", str(report)]) == 0
     found, text = json.loads(report.read_text()), " ".join(capsys.readouterr().out.split())
     assert found["bound"]["rms_mismatch_db"] < found["transparency"]["rms_mismatch_db"]
@@ -467,7 +461,6 @@ def test_the_command_reports_bound_robustness_and_stiffness(tmp_path, capsys):
     assert found["robustness"]["required_over_available"] > 1
     assert found["ladder"][-1]["mismatch_db"] <= found["ladder"][0]["mismatch_db"]
     assert "no linear coupling can be better than" in text
-    assert "without effect: --margin" in text
     assert verify(load_file(tmp_path / "c.json")).proved
 
 
@@ -489,7 +482,7 @@ def test_a_wall_whose_force_latches_late_is_as_stiff_as_the_closed_form_says():
     T, t2, delta = 1.2e-3, 0.13e-3, 0.5
     K = 1000 * delta / 0.841354  # switching in [0, t2]: this wall needs all of delta
     loop = msgspec.structs.replace(wall(2 * K, 0, delta, T), latency=((0.0, t2),))
-    assert need(loop, ForceFilter([], [], [[[0.5]]])) == pytest.approx(1.0, rel=1e-5)
+    assert ratio_in(loop, ForceFilter([], [], [[[0.5]]])) == pytest.approx(1.0, rel=1e-5)
     found = design(loop, Options(ladder=((4, 3),)))
     assert found.proved
     assert found.g >= 0.49

@@ -1,5 +1,6 @@
 """Identification on the emulated device, in virtual time: known parameters come back, and a bound is a lower bound."""
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -12,12 +13,12 @@ import pytest
 
 from cli.identify import main as identify_command
 from hw.emulator import Emulator, FaultInjection, nobody
-from hw.identify import capped, chirp, estimate, held, identify, worth
+from hw.identify import Estimate, capped, chirp, estimate, held, identify, settled, worth
 from hw.limits import SafetyLimits, Stage
 from hw.monitor import LinkSettings
 from hw.recording import Recorder
 from hw.rehearsal import Rehearsal
-from hw.session import Session
+from hw.session import Operator, Session
 from models.device import RigidDevice
 from sim.scenario import InputError, load
 from sim.trace import Trace
@@ -112,6 +113,7 @@ HANDS = {
     "touch": (0.002, 0.1, 10.0),
     "grip": (0.4, 3.0, 300.0),
 }
+DASHPOTS = {"faint": (0.0, 0.08, 0.0), "firm": (0.0, 0.3, 0.0)}
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +121,7 @@ def odd():
     """What comes of the benchmark's rigs with one imperfection each, by its own plant, and of hands on the first."""
     bench = run_path(str(Path(__file__).parents[1] / "benchmarks/odd_rigs.py"))
     rigs, signal = bench["rigs"]()[: len(ODD)], bench["excitation"]()
-    rigs += [replace(rigs[0], name=name, hand=hand) for name, hand in HANDS.items()]
+    rigs += [replace(rigs[0], name=name, hand=hand) for name, hand in (HANDS | DASHPOTS).items()]
     x = bench["records"](rigs, signal, substeps=8)
     return {rig.name: bench["judged"](rig, x[:, i], signal)[0] for i, rig in enumerate(rigs)}
 
@@ -136,6 +138,96 @@ def test_rigs_that_are_not_ideal_have_bounds(odd, name):
 def test_a_hand_or_finger_on_the_handle_is_found_out(odd, name):
     """Its damping, 0.1 to 3 N s/m, is not the device's; its spring says that it is there."""
     assert re.search(r"handle is sprung by .* a hand or a finger rests on it", odd[name])
+
+
+def sitting(odd, *names):
+    """One record of as many axes."""
+    return [Estimate(odd[name], None) for name in names]
+
+
+def test_a_hand_that_only_damps_is_found_out_by_a_sitting_without_it(odd):
+    """Its 0.3 N s/m are nowhere in the record that has them: that one's bound alone is 30 % above the truth of 1."""
+    assert odd["firm"].delta == pytest.approx(1.29, abs=0.01)
+    for sittings in ([("firm", "ideal"), ("ideal", "ideal")], [("ideal", "ideal"), ("firm", "ideal")]):
+        with pytest.raises(
+            ValueError, match=r"axis 1: 1(\.3)?, 1(\.3)? N s/m in sittings 1 to 2, a hand damped it in one"
+        ):
+            settled([sitting(odd, *names) for names in sittings])
+    with pytest.raises(ValueError, match=r"axis 2: 1.3, 1.08, 1.3 N s/m .* one at least\. The two least have to agree"):
+        settled([sitting(odd, "ideal", name) for name in ("firm", "faint", "firm")])
+    three = [sitting(odd, *names) for names in (("firm", "ideal"), ("ideal", "ideal"), ("late 0.3", "firm"))]
+    (first, second), words = settled(three)
+    assert words == [
+        "axis 1: 1.3, 1, 0.9997 N s/m in sittings 1 to 3, a hand damped it in 1, which did not count",
+        "axis 2: 1, 1, 1.3 N s/m in sittings 1 to 3, a hand damped it in 3, which did not count",
+    ]
+    assert (first.viscous, second.viscous) == (min(odd["ideal"].viscous, odd["late 0.3"].viscous), odd["ideal"].viscous)
+    assert first.delta == min(odd["ideal"].delta, odd["late 0.3"].delta) <= 1
+
+
+def test_a_hand_too_faint_to_be_found_out_is_not_credited_either(odd):
+    """8 % more damping may be a device's own scatter; the least bound counts, so one record without it is enough."""
+    assert odd["faint"].delta > 1.05
+    for order in (("faint", "ideal"), ("ideal", "faint")):
+        (found,), words = settled([sitting(odd, name) for name in order])
+        assert words == []
+        assert (found.delta, found.viscous) == (odd["ideal"].delta, odd["ideal"].viscous)
+        assert found.delta <= 1
+    with pytest.raises(ValueError, match="one sitting tells no hand that only damps from more damping"):
+        settled([sitting(odd, "ideal")])
+
+
+def test_the_command_takes_two_sittings_and_refuses_what_only_one_of_them_damps(tmp_path):
+    """In virtual time, a dashpot of 0.3 N s/m at the handles in the first one: two records of three agree."""
+    for sittings, code in ((2, 1), (3, 0)):
+        out, options = tmp_path / str(sittings), ["--rehearse", "--scenario", "omega-pair-rigid", "--measure", "60"]
+        options += [
+            "--seconds",
+            "0.8",
+            "--coulomb",
+            "0.02",
+            "--hand",
+            "0.3",
+            "--sittings",
+            str(sittings),
+            "--out",
+            str(out),
+        ]
+        assert identify_command(options) == code
+        report = json.loads((out / "report.json").read_text())
+        assert report["bounded"] == (code == 0) == (out / "devices.toml").exists()
+        assert len(report["sittings"]) == sittings
+        told = "; ".join([*report["warnings"], report.get("reason", "")])
+        assert re.search(r"axis 1: 1.6\d*, 1.3\d*, .* a hand damped it in 1" if code == 0 else "damped it in one", told)
+    for axis in report["axes"]:
+        assert 1.3 < axis["friction"]["delta"] <= 1.37
+        assert axis["friction"]["coulomb"] == pytest.approx(0.02, rel=0.05)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_second_sitting_waits_until_every_handle_was_taken_elsewhere(axis, sign, monkeypatch):
+    """By 5 mm or more. Where it arms by itself, whoever did so has 5 s (here 0.2) to let go, and again later."""
+    monkeypatch.setattr("hw.session._LET_GO_US", 200_000)
+    scenario = nobody(load("omega-pair-rigid"))
+    session = Session(scenario, SafetyLimits((1.0, 1.0)), LinkSettings(measure=60, elsewhere=(0, 0)))
+    excitation = chirp(2, scenario.T, 1, 1.0, (3.0, 200.0), 0.5)
+    rehearsal = Rehearsal(session, Emulator(scenario), lambda ages: [excitation], operator=Operator(True, 1.0))
+
+    def put(mm, on):
+        rehearsal.emulator.plant.s[on] = 1e-3 * mm
+
+    put(6, 1 - axis)
+    rehearsal.run(0.6)
+    assert session.stage == Stage.DISARMED
+    session.arm(session.now)
+    assert session.log[-1].cause.startswith(f"handle {axis + 1} is within 5 mm of where it was in the sitting before")
+    for mm, seconds in ((5.1, 0.7), (4.9, 0.8), (5.1, 0.99)):
+        put(sign * mm, axis)
+        rehearsal.run(seconds)
+        assert session.stage == Stage.DISARMED
+    rehearsal.run(1.01)
+    assert session.stage == Stage.ARMING
 
 
 def test_an_axis_that_does_not_move_gives_nothing():
@@ -157,6 +249,8 @@ def test_a_record_with_gaps_gives_no_bound():
         (["--band", "3,1000"], "within 0.5 to 333 Hz"),
         (["--force", "20"], "--force is 20, allowed are 0.05 to 6"),
         (["--coulomb", "-1"], "--coulomb is -1"),
+        (["--hand", "0.1"], "--hand is for --rehearse"),
+        (["--sittings", "0"], "--sittings is 0, allowed are 1 to 20"),
     ],
 )
 def test_bad_input_is_one_line(options, words, tmp_path, monkeypatch):

@@ -253,7 +253,8 @@ def test_a_device_is_identified_over_the_line(tmp_path, monkeypatch):
     """Half a second a sweep, nobody at the handles: a bound below the emulated device's 1.37 N s/m, or why not."""
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     for pace in (1.0, *PACES):
-        options = ["--emulate", "--seconds", "0.5", "--measure", "60", "--pace", str(pace), "--out", str(tmp_path)]
+        options = ["--emulate", "--seconds", "0.5", "--measure", "60", "--sittings", "1"]
+        options += ["--pace", str(pace), "--out", str(tmp_path)]
         identify.main(options)
         report = json.loads((tmp_path / "report.json").read_text())
         if report["session"]["log"][-1]["stage"] == "finished" and "without a STATE" not in report.get("reason", ""):

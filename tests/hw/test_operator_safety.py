@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from worlds import FakePort
 
-from cli import bridge, identify, replay
+from cli import bridge, replay
 from cli.bridge import _parser
 from cli.session_cli import limits_from, touched
 from hw.control import certified_couplings
@@ -261,15 +261,6 @@ def test_a_rehearsal_is_the_same_every_time(rehearsed):
 def test_a_rehearsal_shows_the_faults_that_are_ordered(tmp_path, capsys):
     assert bridge.main(["--rehearse", "--duration", "1", "--fault", "axis2:jump=-5@0.5", "--out", str(tmp_path)]) == 1
     assert "encoder 2 jumped by" in capsys.readouterr().out
-
-
-def test_a_device_is_identified_in_virtual_time(tmp_path):
-    """The emulated device's own 1.37 N s/m, with dry friction beside it."""
-    out = ["--out", str(tmp_path), "--json", str(tmp_path / "r.json")]
-    assert identify.main(["--rehearse", "--coulomb", "0.02", "--seconds", "1.5", *out]) == 0
-    report = json.loads((tmp_path / "r.json").read_text())
-    assert [1.30 < axis["friction"]["delta"] <= 1.37 for axis in report["axes"]] == [True, True]
-    assert [axis["friction"]["coulomb"] for axis in report["axes"]] == pytest.approx([0.02] * 2, rel=0.03)
 
 
 def test_unreadable_frames_ask_about_the_baud_rate(scenario):

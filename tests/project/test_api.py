@@ -65,13 +65,12 @@ def test_the_options_are_those_that_the_designs_take():
     """One table, the types of the arguments, and the designs' own signatures say the same."""
     from design import fixed_order as ccl
     from design import optimal, spring_damper
-    from design.designs import RETIRED
 
     assert set(OPTIONS) == set(KINDS)
     assert set(OPTIONS["ccl"]) < set(signature(ccl.design).parameters)
     assert set(OPTIONS["spring-damper"]) - {"limiter"} < set(signature(spring_damper.design).parameters)
     own = {field.name for field in fields(optimal.Options)} - {"ladder"}
-    assert set(OPTIONS["optimal"]) == {*own, "switching", *RETIRED}
+    assert set(OPTIONS["optimal"]) == {*own, "switching"}
     assert set(Options.__annotations__) == {name for names in OPTIONS.values() for name in names}
 
 

@@ -110,6 +110,16 @@ def test_files_have_no_circle():
     assert circle(between_files()) is None
 
 
+def test_design_stands_on_six_floors():
+    """A file stands one floor above the highest that it imports."""
+    arrows = between_files()
+
+    def floor(path: str) -> int:
+        return 1 + max((floor(one) for one in arrows[path] if one.startswith("design/")), default=0)
+
+    assert max(floor(path) for path in arrows if path.startswith("design/")) <= 6
+
+
 def test_folders_have_no_circle():
     folders: dict[str, set[str]] = {}
     for name, after in between_files().items():
