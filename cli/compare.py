@@ -28,8 +28,7 @@ from design.program import Options
 from design.result import OLDER_NAMES, DesignFailed, certificate_part, finite
 from design.robustness import robustness_part
 from design.transparency import transparency
-from sim import report
-from sim.baselines import PAIRS, SECONDS, SLOW, Rival, rivals
+from sim import baselines, report
 from sim.couplings import NAMES, Chosen, choose
 from sim.scenario import InputError, Scenario, require_even_ticks
 
@@ -348,12 +347,12 @@ class _Baselines:
     scenario: str
     case: str
     seed: int
-    rows: Sequence[Rival]
+    rows: Sequence[baselines.Rival]
     wall_s: float
     interrupted: bool
-    hands: int = PAIRS
-    hands_s: float = SECONDS
-    start_m_s: float = SLOW
+    hands: int = baselines.PAIRS
+    hands_s: float = baselines.SECONDS
+    start_m_s: float = baselines.SLOW
 
 
 def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
@@ -367,7 +366,7 @@ def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
     begin = time.perf_counter()
     with render.progress("comparing") as move:
         try:
-            rows.extend(rivals(scenario, args.case, move, args.limiter))
+            rows.extend(baselines.rivals(scenario, args.case, move, args.limiter))
         except KeyboardInterrupt:
             interrupted = True
     report = _Baselines(scenario.name, args.case, args.seed, rows, time.perf_counter() - begin, interrupted)
@@ -380,13 +379,14 @@ def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
     cells = [_rival(row) for row in rows]
     shown = [render.grid(f"on the same runs · {scenario.title(args.case)}", heads, cells, left=(0, 7))]
     lines = [f"* baseline {row.name}: {row.source}." for row in rows if row.source]
-    lines.append(f"hands: of {PAIRS} lossless pairs, faster after {SECONDS:g} s than the {SLOW:g} m/s they began with.")
+    began = f"{baselines.SLOW:g} m/s they began with"
+    lines.append(f"hands: of {baselines.PAIRS} lossless pairs, faster after {baselines.SECONDS:g} s than the {began}.")
     lines += sorted({f"error: {row.reason}." for row in rows if row.reason})
     render.publish(args, report, shown, [*lines, f"{report.wall_s:.1f} s"], out, files)
     return options.INTERRUPTED if interrupted else options.DONE
 
 
-def _rival(row: Rival) -> tuple[str, ...]:
+def _rival(row: baselines.Rival) -> tuple[str, ...]:
     error = render.optional(row.error_percent, "{:.2f}")
     figures = f"{row.fast_n:.3f}", f"{row.peak_n:.1f}", f"{row.acted_percent:.0f}", str(row.moving)
     short = "energy" if row.name == "energy budget" else row.guarantee or "none"

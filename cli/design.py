@@ -15,10 +15,10 @@ from rich.table import Table
 from cli import options, render
 from cli.judged import Judged
 from controller.loop import DelayRange, Loop
+from design import coverage
 from design.audit import LONGEST_DELAY
 from design.bound import MOST, NO_BOUND, bound
 from design.certificate import SAMPLES, RangesCheck, assess, check_ranges, lag, prove, switching_requirement
-from design.coverage import Limits, cost_part, covered_limits, price, ranges_rows, switching_part
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.files import out_file
 from design.gain_search import STIFFEST
@@ -210,9 +210,9 @@ def _judged(args: argparse.Namespace, scenario: Scenario, loop: Loop, design: De
     samples = SAMPLES if args.samples is None else args.samples
     with render.progress("searching the ranges" if loop.ranges else "judging the coupling") as move:
         whole = check_ranges(loop, design.coupling, args.seed, samples, move, searched, held)
-    limits = Limits(None, "as asked")
+    limits = coverage.Limits(None, "as asked")
     if args.limiter is not False:
-        limits = covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None)
+        limits = coverage.covered_limits(loop, design.coupling, requirements, (held and held.limiter) or None)
     return Judged.of(args.coupling, design.coupling, loop, requirements, whole, limits, scenario)
 
 
@@ -281,7 +281,7 @@ def _switching_figures(loop: Loop, design: Design) -> dict[str, Any] | None:
     if loop.varying_delay is None:
         return None
     found, sent = switching_requirement(loop, design.coupling), loop.sent(design.coupling)
-    return switching_part(found, sent, loop.varying_delay, loop.T_max)
+    return coverage.switching_part(found, sent, loop.varying_delay, loop.T_max)
 
 
 def _robustness_loss(args: argparse.Namespace, loop: Loop, design: Design) -> list[dict[str, Any]]:
@@ -294,7 +294,7 @@ def _robustness_loss(args: argparse.Namespace, loop: Loop, design: Design) -> li
             couplings = {"nominal only": alone.coupling, **couplings}
         except DesignFailed:  # ranges are given another basis by default
             pass
-    return [cost_part(row) for row in price(loop, couplings)]
+    return [coverage.cost_part(row) for row in coverage.price(loop, couplings)]
 
 
 def _store(
@@ -395,7 +395,7 @@ class _Report:
     coupling: dict[str, Any] = render.several(_coupling_rows)
     certificates: dict[str, Any] = render.several(partial(render.certificate_rows, proof=False))
     switching: dict[str, Any] | None = render.figure("damping, any switching", _switching_words)
-    ranges: dict[str, Any] | None = render.several(ranges_rows)
+    ranges: dict[str, Any] | None = render.several(coverage.ranges_rows)
     promise: str | None = render.figure("guarantee", absent="none")
     limiter: dict[str, Any] = render.figure("guarantee, forces", "{[words]}")
     delays: str | None = render.figure("guarantee, delays", json="table")

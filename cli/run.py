@@ -17,21 +17,11 @@ from design.guarantees import ANY
 from design.optimal import robustness_parts
 from design.result import listed
 from design.transparency import BAND_HZ, transparency
-from sim import report
-from sim.accuracy import (
-    EngineChoice,
-    ForceError,
-    compare_engines,
-    credible_part,
-    cross_check,
-    force_error,
-    pick,
-    position_error,
-)
+from sim import accuracy, report
+from sim import passivity_layer as layer
 from sim.alternatives import Alternative, alternatives
 from sim.couplings import NAMES, Chosen, choose
 from sim.engines import INTEGRATORS, default_integrator
-from sim.passivity_layer import BASELINES, Classic, EnergyNet, idle, netted
 from sim.run import ENGINES, Simulation, assemble, beginnings, make_engine, run
 from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, stability_part
@@ -66,7 +56,7 @@ def _parser() -> options.Parser:
     )
     options.add_loop_options(parser)
     options.add_varying_delay_options(parser)
-    options.add_coupling_options(parser, f"{', '.join(NAMES)}, as baselines {', '.join(BASELINES)}")
+    options.add_coupling_options(parser, f"{', '.join(NAMES)}, as baselines {', '.join(layer.BASELINES)}")
     options.add_energy_budget_option(parser)
     parser.add_argument("--engine", choices=ENGINES, default="mujoco", help="MuJoCo, or the exact solution")
     steppers = "of MuJoCo (default exponential, RK4 where devices rub)"
@@ -94,12 +84,12 @@ def _parser() -> options.Parser:
 
 def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen:
     """The coupling; with a baseline there is none, and the note says whose that is. Raises InputError."""
-    if args.coupling not in BASELINES:
+    if args.coupling not in layer.BASELINES:
         with render.designing(scenario.loop(args.case), args.coupling, args.condition) as heard:
             return choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
     if args.energy_budget:
         raise InputError(f"--energy-budget with --coupling {args.coupling}: give one of them")
-    note = f"baseline, without a guarantee here: {BASELINES[args.coupling]}; no coupling besides."
+    note = f"baseline, without a guarantee here: {layer.BASELINES[args.coupling]}; no coupling besides."
     return replace(choose(scenario, args.case, "none", args.condition), kind=args.coupling, notes=(note,))
 
 
@@ -133,7 +123,7 @@ class _Run:
     period: Period | None  # of the worst switching found, where the delays switch
     integrator: str | None  # None for the exact engine, and so are the substeps
     substeps: int | None
-    choices: tuple[EngineChoice, ...]  # what --error compared, the cheapest first
+    choices: tuple[accuracy.EngineChoice, ...]  # what --error compared, the cheapest first
     warnings: list[str]
     trace: Trace
     exact: Trace | None  # None where friction makes the loop another one than the linear
@@ -153,11 +143,11 @@ def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tupl
     choices = _compared(args, simulation)
     integrator, substeps, warnings = _steps(args, simulation)
     if choices:
-        kept = pick(choices, args.error)
+        kept = accuracy.pick(choices, args.error)
         integrator, substeps = kept.integrator, kept.substeps
     engine, ran = make_engine(simulation, args.engine, integrator, substeps), simulation
-    if args.coupling in BASELINES:
-        ran = netted(simulation, chosen.coupling, Classic(args.coupling))
+    if args.coupling in layer.BASELINES:
+        ran = layer.netted(simulation, chosen.coupling, layer.Classic(args.coupling))
     elif args.energy_budget:
         ran = _budgeted(simulation, chosen, *args.energy_budget)
     with render.progress("simulating") as move:
@@ -172,7 +162,7 @@ def _run(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, lag: tupl
 
 def _budgeted(simulation: Simulation, chosen: Chosen, start: float, cap: float) -> Simulation:
     try:
-        return netted(simulation, chosen.coupling, EnergyNet(start, cap))
+        return layer.netted(simulation, chosen.coupling, layer.EnergyNet(start, cap))
     except ValueError as error:
         raise InputError(f"--energy-budget: {error}") from None
 
@@ -192,12 +182,12 @@ def _steps(args: argparse.Namespace, simulation: Simulation) -> tuple[str | None
         raise InputError(f"--integrator {integrator}: {error}") from None
 
 
-def _compared(args: argparse.Namespace, simulation: Simulation) -> tuple[EngineChoice, ...]:
+def _compared(args: argparse.Namespace, simulation: Simulation) -> tuple[accuracy.EngineChoice, ...]:
     """Every engine and step on this scene, where an error is asked for. Raises InputError."""
     if args.error is None:
         return ()
     with render.progress("comparing engines"):
-        return compare_engines(simulation, args.error)
+        return accuracy.compare_engines(simulation, args.error)
 
 
 def _alternatives(args: argparse.Namespace, scenario: Scenario, run: _Run, own: Any) -> list[Alternative]:
@@ -246,7 +236,7 @@ class _Report:
     run: dict[str, Any] = render.unseen()
     error: dict[str, Any] = render.unseen()
     credible: dict[str, Any] = render.unseen()
-    alike: ForceError = render.unseen("table")
+    alike: accuracy.ForceError = render.unseen("table")
     ideal_force: dict[str, Any] = render.unseen()
     energy_budget: dict[str, Any] | None = render.unseen()
     baseline: dict[str, Any] | None = render.unseen()
@@ -314,7 +304,7 @@ def _reported(
         stability = report.switched_stability_part(simulation, run.trace, delays)
     else:
         stability = stability_part(simulation, run.trace)
-    alike, net = force_error(run.ran, run.trace, lam), run.trace.net.part() if run.trace.net else None
+    alike, net = accuracy.force_error(run.ran, run.trace, lam), run.trace.net.part() if run.trace.net else None
     budget = net if net and net["guarantee"] is not None else None
     unstable = _switched(delays) and stability["verdict"] == "unstable"
     found = _Report(
@@ -327,11 +317,11 @@ def _reported(
         stability,
         delays,
         _settings(args, run, lam) | {"environment": environment},
-        position_error(run.trace, run.exact, simulation, unstable),
-        credible_part(simulation, run.trace),
+        accuracy.position_error(run.trace, run.exact, simulation, unstable),
+        accuracy.credible_part(simulation, run.trace),
         alike,
         alike.part(),
-        budget and budget | {"idle": idle(simulation, judged.requirements["any-environment"], budget)},
+        budget and budget | {"idle": layer.idle(simulation, judged.requirements["any-environment"], budget)},
         None if budget else net,
         _robustness(chosen, scenario.loop(args.case), judged),
         [other.part() for other in others],
@@ -368,7 +358,9 @@ def _settings(args: argparse.Namespace, run: _Run, lam: tuple[int, ...]) -> dict
         "timing": report.timing_part(run.simulation.timing, scenario),
         "seed": args.seed,
         "engines": [choice.part() for choice in run.choices] or None,
-        "cross_check": cross_check(run.ran, run.trace, run.integrator, run.substeps) if args.cross_check else None,
+        "cross_check": accuracy.cross_check(run.ran, run.trace, run.integrator, run.substeps)
+        if args.cross_check
+        else None,
         "interrupted": run.trace.interrupted,
         "scenario_digest": scenario.digest,
         "encoder_step_m": process.encoder_step,

@@ -26,27 +26,12 @@ from design.certificate import CONDITIONS
 from design.files import write
 from design.guarantees import CAVEATS
 from design.result import certificate_part
+from sim import zwidth
 from sim.couplings import NAMES, Chosen, choose
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
 from sim.scenario import InputError, Scenario, require_constant_delay
 from sim.stability import MARGINAL
 from sim.trace import SUSTAINED, slowest_seen
-from sim.zwidth import (
-    MODEL_KEPT,
-    CouplingSweep,
-    EnvironmentSweep,
-    Grid,
-    Map,
-    Mark,
-    Range,
-    Sweep,
-    contact_springs,
-    draw_map,
-    evaluate_point,
-    make_grid,
-    map_error,
-    one_sided,
-)
 
 # ----------------------------------------------------------------------------------------------------
 # What a Z-width map says, in a few lines on the terminal.
@@ -77,11 +62,11 @@ def _designed_rows(fixed: dict[str, Any], limited: list[float] | None) -> render
 def _about(conditions: Sequence[str]) -> str:
     """What the axes are, and what a certified cell guarantees."""
     line = "K and B are those of every spring at a contact; each is certified for its environment alone, by a sweep"
-    if MODEL_KEPT not in conditions:
+    if zwidth.MODEL_KEPT not in conditions:
         return f"{line}."
     return (
         f"{line}: this-environment, the population and MuJoCo with the coupling's model set to the cell's environment, "
-        f"{MODEL_KEPT} with the model left at what the coupling was designed for."
+        f"{zwidth.MODEL_KEPT} with the model left at what the coupling was designed for."
     )
 
 
@@ -208,11 +193,11 @@ class _Report:
 def _reported(
     args: argparse.Namespace,
     scenario: Scenario,
-    sweep: Sweep,
-    drawn: Map,
+    sweep: zwidth.Sweep,
+    drawn: zwidth.Map,
     plan: Plan,
     fixed: dict[str, Any],
-    marks: Sequence[Mark],
+    marks: Sequence[zwidth.Mark],
 ) -> _Report:
     known, loop, whole = np.isfinite(drawn.growth), sweep.loop, not drawn.interrupted
     unsafe = known & (drawn.growth > MARGINAL)
@@ -247,12 +232,12 @@ def _reported(
         drawn.seconds,
         ratios,
         fixed,
-        {name: map_error(sweep, drawn, name) for name in drawn.ratio} if whole else None,
+        {name: zwidth.map_error(sweep, drawn, name) for name in drawn.ratio} if whole else None,
         [_mark(mark) for mark in marks] if whole else None,
     )
 
 
-def _ratio(sweep: Sweep, drawn: Map, name: str, unsafe: NDArray[np.bool_]) -> dict[str, Any]:
+def _ratio(sweep: zwidth.Sweep, drawn: zwidth.Map, name: str, unsafe: NDArray[np.bool_]) -> dict[str, Any]:
     ratio, reason = drawn.ratio[name], _nulls(sweep, drawn, name)
     part = {"required_over_available": ratio.reshape(drawn.grid.shape), "certified_cells": int((ratio < 1).sum())}
     if name in CONDITIONS:  # the population meets the loop that they are about
@@ -260,7 +245,7 @@ def _ratio(sweep: Sweep, drawn: Map, name: str, unsafe: NDArray[np.bool_]) -> di
     return part | ({"reason": reason} if reason else {})
 
 
-def _mark(mark: Mark) -> dict[str, Any]:
+def _mark(mark: zwidth.Mark) -> dict[str, Any]:
     """What is asked about a single coupling."""
     return {
         "K": mark.K,
@@ -274,7 +259,7 @@ def _mark(mark: Mark) -> dict[str, Any]:
     }
 
 
-def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
+def _nulls(sweep: zwidth.Sweep, drawn: zwidth.Map, name: str) -> str | None:
     """Why a condition has cells without a figure, in words of one such cell; None where it has none."""
     if name in sweep.refusals:
         return sweep.refusals[name]
@@ -289,7 +274,7 @@ def _nulls(sweep: Sweep, drawn: Map, name: str) -> str | None:
     return "; ".join(parts) or None
 
 
-def _simulation(sweep: Sweep, drawn: Map, plan: Plan) -> dict[str, Any]:
+def _simulation(sweep: zwidth.Sweep, drawn: zwidth.Map, plan: Plan) -> dict[str, Any]:
     points, (K, B) = drawn.points, (axis[drawn.points.cell] for axis in drawn.grid.flat)
     figures = (K, B, points.verdicts, points.amplitude, points.frequency_hz, points.growth, points.differ)
     names = ("K", "B", "verdict", "amplitude_m", "frequency_hz", "linear_growth_rate_per_s", "differs_from_linear")
@@ -316,7 +301,7 @@ def _simulation(sweep: Sweep, drawn: Map, plan: Plan) -> dict[str, Any]:
     }
 
 
-def _save_csv(drawn: Map, path: Path) -> Path:
+def _save_csv(drawn: zwidth.Map, path: Path) -> Path:
     """One line per cell, SI units in the header; empty where nothing is known."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -354,7 +339,7 @@ def main(argv: list[str]) -> int:
     if chosen:
         fixed = _environment_sweep(scenario, chosen)
         designed = _coupling(args, scenario, chosen)
-        sweep: Sweep = replace(fixed, lag=designed["limiter"]["rho"])
+        sweep: zwidth.Sweep = replace(fixed, lag=designed["limiter"]["rho"])
     else:
         sweep = _coupling_sweep(args, scenario)
     marks = _marks(args)
@@ -364,8 +349,8 @@ def main(argv: list[str]) -> int:
         sweep.devices, sweep.population, sweep.loop.T, args.seed, args.humans, latency=sweep.loop.latency
     )
     with render.progress("certificates") as move:
-        drawn = draw_map(sweep, grid, crowd, plan, lambda stage, k, of: move(k, of, stage))
-    found = [] if drawn.interrupted else [evaluate_point(sweep, crowd, *mark, grid.K) for mark in marks]
+        drawn = zwidth.draw_map(sweep, grid, crowd, plan, lambda stage, k, of: move(k, of, stage))
+    found = [] if drawn.interrupted else [zwidth.evaluate_point(sweep, crowd, *mark, grid.K) for mark in marks]
     report = _reported(args, scenario, sweep, drawn, plan, designed, found)
     lines = [_mark_line(mark, args.humans) for mark in report.marks or ()]
     files = _save(args, drawn, render.plain(report), out)
@@ -447,17 +432,19 @@ def _chosen(args: argparse.Namespace, scenario: Scenario) -> Chosen | None:
         return choose(scenario, args.case, args.coupling, args.condition, args.limiter, heard)
 
 
-def _environment_sweep(scenario: Scenario, chosen: Chosen) -> EnvironmentSweep:
+def _environment_sweep(scenario: Scenario, chosen: Chosen) -> zwidth.EnvironmentSweep:
     """The loop with that coupling. Raises InputError."""
     try:
-        return EnvironmentSweep(scenario.device, scenario.population, _nominal(scenario.loop("I")), chosen.coupling)
+        return zwidth.EnvironmentSweep(
+            scenario.device, scenario.population, _nominal(scenario.loop("I")), chosen.coupling
+        )
     except ValueError as error:
         raise InputError(str(error)) from None
 
 
 def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> dict[str, Any]:
     """The fixed coupling and what is guaranteed of it where it was designed, in the scenario's own environment."""
-    judged, springs = judge(args, scenario, chosen), contact_springs(scenario.loop(args.case).network)
+    judged, springs = judge(args, scenario, chosen), zwidth.contact_springs(scenario.loop(args.case).network)
     return {
         "axes": "environment",
         "coupling": judged.coupling,
@@ -473,16 +460,16 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
     }
 
 
-def _coupling_sweep(args: argparse.Namespace, scenario: Scenario) -> CouplingSweep:
+def _coupling_sweep(args: argparse.Namespace, scenario: Scenario) -> zwidth.CouplingSweep:
     """The loop without its coupling. Raises InputError."""
     devices, loop = scenario.device, _nominal(scenario.loop("I"))
     try:
         if args.rigid:
             loop, devices = _nominal(options.rigid_loop(args, scenario)), devices[:1]
         elif args.wall:
-            loop = loop.at(one_sided(scenario.environment))
+            loop = loop.at(zwidth.one_sided(scenario.environment))
         wall, clip = args.rigid and args.wall, args.limiter is False
-        return CouplingSweep(devices, scenario.population, loop, args.velocity_filter, wall, clip)
+        return zwidth.CouplingSweep(devices, scenario.population, loop, args.velocity_filter, wall, clip)
     except ValueError as error:
         raise error if isinstance(error, InputError) else InputError(str(error)) from None
 
@@ -492,7 +479,7 @@ def _nominal(loop: Loop) -> Loop:
     return msgspec.structs.replace(loop, ranges=None, varying_delay=None)
 
 
-def _marks(args: argparse.Namespace) -> tuple[Range, ...]:
+def _marks(args: argparse.Namespace) -> tuple[zwidth.Range, ...]:
     """The couplings that are asked about. Raises InputError."""
     for K, B in args.mark or ():
         if not (1e-3 <= K <= 1e9 and 0 <= B <= 1e6):
@@ -500,11 +487,11 @@ def _marks(args: argparse.Namespace) -> tuple[Range, ...]:
     return tuple(args.mark or ())
 
 
-def _grid(args: argparse.Namespace, sweep: Sweep, marks: tuple[Range, ...]) -> Grid:
-    return make_grid(sweep, args.grid, args.K_range, args.B_range, args.scale, marks)
+def _grid(args: argparse.Namespace, sweep: zwidth.Sweep, marks: tuple[zwidth.Range, ...]) -> zwidth.Grid:
+    return zwidth.make_grid(sweep, args.grid, args.K_range, args.B_range, args.scale, marks)
 
 
-def _plan(args: argparse.Namespace, sweep: Sweep) -> Plan:
+def _plan(args: argparse.Namespace, sweep: zwidth.Sweep) -> Plan:
     effects = Effects(args.quantisation, args.friction, args.saturation)
     coarsest = max(device.encoder_step for device in effects.on(sweep.devices))
     threshold = max(2 * coarsest, _FINEST) if args.threshold is None else args.threshold
@@ -514,7 +501,7 @@ def _plan(args: argparse.Namespace, sweep: Sweep) -> Plan:
     return Plan(effects, args.points, args.trials, args.start, args.press, args.duration, threshold)
 
 
-def _save(args: argparse.Namespace, drawn: Map, outcome: dict[str, Any], out: Path) -> list[Path]:
+def _save(args: argparse.Namespace, drawn: zwidth.Map, outcome: dict[str, Any], out: Path) -> list[Path]:
     """The table and the picture."""
     files = [_save_csv(drawn, out / "map.csv")]
     if not args.no_plot:

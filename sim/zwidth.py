@@ -20,19 +20,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from controller import environment
 from controller.contact import Limiter, contact, limited
 from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
 from controller.delay import delay
-from controller.environment import (
-    GROUND,
-    RIGID_WALL,
-    Matrices,
-    Network,
-    Spring,
-    Wall,
-    environment_of,
-    sampled_environment,
-)
 from controller.loop import Loop
 from controller.lti import Array, Complex, Lti, Sampled, SingularLoop, as_like
 from controller.process import Process
@@ -45,7 +36,7 @@ from design.lmi import least_phi
 from design.result import DesignFailed, Requirement, refusal
 from models.device import Device
 from models.human import Population
-from sim.limit_cycles import UNLIMITED, Cells, HeldDevices, Plan, Points, Progress, simulate_cells
+from sim import limit_cycles
 from sim.scenario import InputError
 from sim.stability import MARGINAL
 
@@ -55,7 +46,7 @@ from sim.stability import MARGINAL
 
 MODEL_KEPT = "model kept"
 #: a one-sided wall behind the coupling is this stiff [N/m], which makes K too soft by K / 1e10
-_HARD_WALL = Network(("tip",), walls=(Wall(("tip", GROUND), stiffness=1e10),))
+_HARD_WALL = environment.Network(("tip",), walls=(environment.Wall(("tip", environment.GROUND), stiffness=1e10),))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +85,7 @@ class CouplingSweep(_Sweep):
         check_loop(self.loop)
 
     @property
-    def walled(self) -> Network | None:
+    def walled(self) -> environment.Network | None:
         """The network whose contact is made and broken in the simulated loop, if there is one."""
         if self.one_sided:
             return _HARD_WALL
@@ -103,7 +94,7 @@ class CouplingSweep(_Sweep):
     @property
     def usual_scale(self) -> str:
         """Against a rigid wall couplings are all of one size; against an environment far stiffer ones can be safe."""
-        return "linear" if self.loop.environment is RIGID_WALL else "log"
+        return "linear" if self.loop.environment is environment.RIGID_WALL else "log"
 
     @property
     def stiffness_scale(self) -> float:
@@ -146,7 +137,7 @@ class CouplingSweep(_Sweep):
         Where motors have limits, forces leave through the limiter that a guarantee covers; the rest are clipped.
         """
         limits = self._limits(devices)
-        if (limits[0] < UNLIMITED).any() and not self.clip:
+        if (limits[0] < limit_cycles.UNLIMITED).any() and not self.clip:
             return [Process(limiter.open, *limits, limiter) for limiter in self._limiters(K, B, limits[0])]
         if self.walled is None:
             F = self.force_maps(K, B)[0]
@@ -266,7 +257,7 @@ class EnvironmentSweep(_Sweep):
     def processes(self, K: Array, B: Array, devices: Sequence[Device]) -> list[Process]:
         """What the computer does every T in each environment; limits and encoder steps are those of `devices`."""
         limits = self._limits(devices)
-        if self.lag is None or not (limits[0] < UNLIMITED).any():
+        if self.lag is None or not (limits[0] < limit_cycles.UNLIMITED).any():
             F = self.force_maps(K, B)[0]
             return [Process(F[i], *limits) for i in range(K.size)]
         sent, lag = self._sent(self._matrices(K, B), self.coupling), np.array(self.lag)
@@ -280,7 +271,7 @@ class EnvironmentSweep(_Sweep):
         matrices, coupling, psi = self._matrices(K, B), self._facing(condition), delay(self.loop.psi, self.loop.T)
 
         def sent(z: Complex) -> Sampled:
-            E = sampled_environment(matrices, self.loop.channels, z, self.loop.T)
+            E = environment.sampled_environment(matrices, self.loop.channels, z, self.loop.T)
             return coupling.around(as_like(E, psi) @ E)
 
         return self._ratios(self._force_map(matrices, coupling), sent)
@@ -312,14 +303,14 @@ class EnvironmentSweep(_Sweep):
     def _kept(self) -> Coupling | None:
         return self.coupling.with_model(self.loop.sent(NoCoupling()))
 
-    def _sent(self, matrices: Matrices, coupling: Coupling) -> Lti:
+    def _sent(self, matrices: environment.Matrices, coupling: Coupling) -> Lti:
         loop = self.loop
-        return coupling.around(delay(loop.psi, loop.T) @ environment_of(matrices, loop.channels, loop.T))
+        return coupling.around(delay(loop.psi, loop.T) @ environment.environment_of(matrices, loop.channels, loop.T))
 
-    def _force_map(self, matrices: Matrices, coupling: Coupling) -> Lti:
+    def _force_map(self, matrices: environment.Matrices, coupling: Coupling) -> Lti:
         return delay(self.loop.theta, self.loop.T) @ self._sent(matrices, coupling)
 
-    def _matrices(self, K: Array, B: Array) -> Matrices:
+    def _matrices(self, K: Array, B: Array) -> environment.Matrices:
         """Mass, damping and stiffness of every network, (n, nodes, nodes)."""
         network = self.loop.network
         M, D, S = network.matrices()
@@ -335,12 +326,12 @@ class EnvironmentSweep(_Sweep):
 Sweep = CouplingSweep | EnvironmentSweep
 
 
-def contact_springs(network: Network) -> tuple[Spring, ...]:
+def contact_springs(network: environment.Network) -> tuple[environment.Spring, ...]:
     """Those that end at a contact."""
     return tuple(s for s in network.springs if set(s.between) & set(network.contacts))
 
 
-def one_sided(network: Network) -> Network:
+def one_sided(network: environment.Network) -> environment.Network:
     """The network whose contacts only push: every spring at a contact becomes a wall, in the direction it is given in.
 
     Raises ValueError where the contacts have no springs.
@@ -349,11 +340,11 @@ def one_sided(network: Network) -> Network:
     if not at_contact:
         raise ValueError("no spring ends at a contact, so there is nothing to make one-sided")
     kept = tuple(spring for spring in network.springs if spring not in at_contact)
-    walls = tuple(Wall(s.between, s.stiffness, s.damping) for s in at_contact)
-    return Network(network.contacts, kept, network.masses, (*network.walls, *walls))
+    walls = tuple(environment.Wall(s.between, s.stiffness, s.damping) for s in at_contact)
+    return environment.Network(network.contacts, kept, network.masses, (*network.walls, *walls))
 
 
-def _press_directions(network: Network | None, channels: int) -> Array:
+def _press_directions(network: environment.Network | None, channels: int) -> Array:
     """(m,) +1 or -1: into the walls where contacts have some, else alternately."""
     directions = (-1.0) ** np.arange(channels)
     for i, name in enumerate(network.contacts if network else ()):
@@ -390,7 +381,7 @@ class Grid:
         K, B = np.meshgrid(self.K, self.B, indexing="ij")
         return K.ravel(), B.ravel()
 
-    def subset(self, count: int) -> Cells:
+    def subset(self, count: int) -> limit_cycles.Cells:
         """(k,) flat indices of `count` rows and columns at most, evenly spread, with the corners."""
         rows, columns = (np.unique(np.round(np.linspace(0, n - 1, min(count, n))).astype(int)) for n in self.shape)
         return (rows[:, None] * self.shape[1] + columns).ravel()
@@ -456,18 +447,24 @@ class Map:
     ratio: dict[str, Array]  # condition -> required over available damping
     growth: Array  # [1/s] worst over the humans that were tried: all of them where none is unstable
     unstable: Array  # humans that make the cell unstable, at least
-    points: Points
+    points: limit_cycles.Points
     seconds: dict[str, float]  # of each stage
     interrupted: bool
 
 
-def draw_map(sweep: Sweep, grid: Grid, held: HeldDevices, plan: Plan, progress: Callable[[str, int, int], None]) -> Map:
+def draw_map(
+    sweep: Sweep,
+    grid: Grid,
+    held: limit_cycles.HeldDevices,
+    plan: limit_cycles.Plan,
+    progress: Callable[[str, int, int], None],
+) -> Map:
     """All stages, each with its name in `progress` (stage, done, total); Ctrl-C keeps what is done."""
     K, B = grid.flat
     seconds, n = {}, K.size
     ratio: dict[str, Array] = {name: np.full(n, np.nan) for name in sweep.conditions}
     growth, unstable = np.full((2, n), np.nan)
-    points, stopped = Points.joined([]), False
+    points, stopped = limit_cycles.Points.joined([]), False
 
     def ratios(part: slice) -> tuple[Array, ...]:
         return tuple(sweep.ratios(name, K[part], B[part]) for name in sweep.conditions)
@@ -475,7 +472,7 @@ def draw_map(sweep: Sweep, grid: Grid, held: HeldDevices, plan: Plan, progress: 
     def population(part: slice) -> tuple[float, int]:
         return _population(held, [F[part.start] for F in maps], leading)
 
-    def loops(some: Cells) -> tuple[Lti, list[Process]]:
+    def loops(some: limit_cycles.Cells) -> tuple[Lti, list[Process]]:
         devices = plan.effects.on(sweep.devices)
         return sweep.force_maps(K[some], B[some])[0], sweep.processes(K[some], B[some], devices)
 
@@ -499,12 +496,14 @@ def draw_map(sweep: Sweep, grid: Grid, held: HeldDevices, plan: Plan, progress: 
         begin = time.perf_counter()
         cells = grid.subset(plan.points)
         press = plan.press * _press_directions(sweep.walled, sweep.loop.channels)
-        points, stopped = simulate_cells(cells, loops, held, plan, press, lambda k, of: progress("MuJoCo", k, of))
+        points, stopped = limit_cycles.simulate_cells(
+            cells, loops, held, plan, press, lambda k, of: progress("MuJoCo", k, of)
+        )
         seconds["simulation"] = time.perf_counter() - begin
     return Map(grid, ratio, growth, unstable, points, seconds, stopped)
 
 
-def _population(held: HeldDevices, states: Sequence[Lti], leading: NDArray[np.bool_]) -> tuple[float, int]:
+def _population(held: limit_cycles.HeldDevices, states: Sequence[Lti], leading: NDArray[np.bool_]) -> tuple[float, int]:
     """Worst growth and number of unstable humans among the leading ones, or, if none of these, among all.
 
     `states` are the force maps of one cell; a human is unstable if it is with any of them.
@@ -520,7 +519,7 @@ _Part = TypeVar("_Part")
 
 
 def _in_slices(
-    task: Callable[[slice], _Part], count: int, size: int, progress: Progress
+    task: Callable[[slice], _Part], count: int, size: int, progress: limit_cycles.Progress
 ) -> tuple[list[tuple[slice, _Part]], bool]:
     """task(slice) for slices of `size` that cover range(count), and whether the keyboard ended it before the last.
 
@@ -576,7 +575,7 @@ class MapError:
     columns_compared: int
 
 
-def evaluate_point(sweep: Sweep, held: HeldDevices, K: float, B: float, grid_K: Array) -> Mark:
+def evaluate_point(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: float, grid_K: Array) -> Mark:
     """What each condition and the population say at (K, B), and up to which K they are content at this B."""
 
     def calm(k: float) -> bool:
@@ -625,7 +624,7 @@ def _edge(sweep: Sweep, condition: str, low: float, high: float, B: float) -> fl
     return edge(lambda K: sweep.requirement(condition, K, B).ratio, low, high)
 
 
-def _growth(sweep: Sweep, held: HeldDevices, K: float, B: float) -> Array:
+def _growth(sweep: Sweep, held: limit_cycles.HeldDevices, K: float, B: float) -> Array:
     """Of every human, in the worst contact state."""
     states = sweep.force_maps(np.array([K]), np.array([B]))
     return np.max([held.growth(F[0])[0] for F in states], axis=0)
