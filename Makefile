@@ -1,6 +1,6 @@
 # make run    the paper's case I, from a fresh clone to a picture
 # make test   the whole test suite
-# make check  lint, and the tests of what your change touches, under a minute
+# make check  lint and the tests of what your change touches, under a minute
 # make lint   ruff and pyright, without a finding: to be run, with make test, before anything is committed
 # make coverage  the whole test suite again, slower, and the lines that it does not reach
 # make validate  every check that a verdict rests on: a report in out/validate/report.md, about ten minutes
@@ -10,8 +10,9 @@
 # make figures  the pictures that README and docs show, and the output in their blocks
 PYTHON ?= python3
 PY := .venv/bin/python
-# a file of tests stays on one core: its tests share fixtures, and those of the documentation files
-PARALLEL := -n auto --dist loadfile
+# a file of tests stays with one worker: its tests share fixtures, and those of the documentation files; one worker more
+# than cores, since sessions in real time mostly wait; tests/conftest.py has the longest files first
+PARALLEL := -n $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1) --dist loadfile --no-loadscope-reorder
 
 .PHONY: run test check validate lint coverage bench mutate oldest installed figures clean
 
@@ -21,13 +22,17 @@ run: .venv/ready
 test: .venv/ready
 	$(PY) -m pytest $(PARALLEL)
 
-check: lint
+check: .venv/ready
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m pyright $$($(PY) tests/touched.py sources)
 	$(PY) -m pytest $(PARALLEL) $$($(PY) tests/touched.py)
 
 validate: .venv/ready
 	$(PY) -m sim.suite --out out/validate
 	$(PY) tests/cli/hostile.py --signals
 	$(PY) docs/regenerate.py --check
+	$(MAKE) installed
 
 mutate: .venv/ready
 	$(PY) tests/mutate.py
@@ -64,7 +69,7 @@ bench: .venv/ready
 installed:
 	$(PYTHON) -m venv .venv-installed
 	.venv-installed/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt .
-	cd out && ../.venv-installed/bin/haptic-loop audit --rigid --K 1000 --B 0 --T 1e-3 --theta 0 --delta 1.37
+	mkdir -p out && cd out && ../.venv-installed/bin/haptic-loop audit --rigid --K 1000 --B 0 --T 1e-3 --theta 0 --delta 1.37
 
 oldest:
 	$(PYTHON) -m venv .venv-oldest

@@ -23,7 +23,7 @@ from controller.loop import Loop
 from controller.lti import Array
 from design import compare
 from design.certificate import CONDITIONS
-from design.compare import AXES, FEEL_HZ, LADDERS, Judged, LadderRow, Limit, Perceived, Setting, optimum, settings
+from design.compare import AXES, FEEL_HZ, LADDERS, Demands, LadderRow, Limit, Perceived, Setting, optimum, settings
 from design.program import Options
 from design.result import OLDER_NAMES, DesignFailed, certificate_part, finite
 from design.robustness import robustness_part
@@ -206,7 +206,7 @@ def _named(name: str) -> tuple[str, str | None]:
         return name, None  # a file may have a colon in its name
 
 
-def _shown(loop: Loop, name: str, chosen: Chosen, judged: Judged, hz: Array) -> _Shown:
+def _shown(loop: Loop, name: str, chosen: Chosen, judged: Demands, hz: Array) -> _Shown:
     lines, conditions = compare.curves(loop, judged, hz), {}
     for key, requirement in judged.requirements.items():
         demand = lines.demands[key]

@@ -18,7 +18,7 @@ from controller.coupling import SpringDamperForm
 from controller.lti import Array
 from design.certificate import Verdict, verify
 from design.export import (
-    Block,
+    ExportedBlock,
     NothingToExport,
     Trial,
     c_source,
@@ -61,7 +61,7 @@ class _Exported:
     channels: int = render.figure("block", "{} channels, {r.states} states, T = {r.T_s:g} s")
     certificate: _Proof = render.figure("certificate")
     multiplications: int = render.figure("one tick", "{} multiplications")
-    force_limit: Array | None
+    force_limit: Array | None = render.unseen()
     forces: str | None = render.figure("forces")
     test: dict[str, Any] = render.figure("test vector", "{[ticks]} ticks, in the file")
 
@@ -124,13 +124,13 @@ def _verdict(stored: Stored) -> Verdict:
         return Verdict(False, str(error))
 
 
-def _forces(block: Block) -> str:
+def _forces(block: ExportedBlock) -> str:
     if block.limiter:
         return f"limited to {listed(block.limiter.limit)} N by the limiter"
     return "not limited in this file: the proof holds below what the motors give (--force-limit for more)"
 
 
-def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> Block:
+def _block(args: argparse.Namespace, stored: Stored, verdict: Verdict) -> ExportedBlock:
     """The block that was asked for, with lines on where it comes from. Raises InputError."""
     try:
         m = len(stored.loop.theta)
@@ -169,11 +169,11 @@ def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
     )
 
 
-def _destination(args: argparse.Namespace, block: Block) -> Path:
+def _destination(args: argparse.Namespace, block: ExportedBlock) -> Path:
     return out_file(args.out, f"out/export/{Path(args.coupling).stem}-{block.name}{_SUFFIX[args.format]}")
 
 
-def _content(kind: str, block: Block, test: Trial, file: str) -> Any:
+def _content(kind: str, block: ExportedBlock, test: Trial, file: str) -> Any:
     """What `design.files.write` takes."""
     if kind == "c":
         return c_source(block, test, file)

@@ -36,7 +36,7 @@ from hw.limits import Stage
 from hw.monitor import LinkSettings
 from hw.rehearsal import Rehearsal
 from hw.session import session_for
-from sim.adversary import Attempt, attempts
+from sim.adversary import Attack, attempts
 from sim.challenges import challenges
 from sim.couplings import choose
 from sim.crowds import Validation
@@ -73,7 +73,7 @@ def shortages(couplings: Sequence[str], short: Sequence[float], generations: int
     return rows
 
 
-def _shortage(attempt: Attempt) -> _Row:
+def _shortage(attempt: Attack) -> _Row:
     worst = attempt.worst
     return {
         "loop": attempt.name,

@@ -136,23 +136,6 @@ def inside(network: Network, ranges: Ranges, count: int, seed: int) -> tuple[Mem
     return tuple(_member(f"sample {i}", network, parts, [p.draw(rng) for p in parts]) for i in range(1, count + 1))
 
 
-def _shrunk(network: Network, ranges: Ranges, factor: float) -> Ranges:
-    """The ranges with every one drawn in towards the environment's own value; what may be absent still may."""
-
-    def closer(limits: _Range, own: float) -> _Range:
-        return own + factor * (limits[0] - own), own + factor * (limits[1] - own)
-
-    springs = []
-    for one in ranges.springs:
-        own = next((s for s in network.springs if set(s.between) == set(one.between)), None)
-        stiffness, damping = one.stiffness, one.damping
-        if own:
-            stiffness = stiffness and closer(stiffness, own.stiffness)
-            damping = damping and closer(damping, own.damping)
-        springs.append(UncertainSpring(one.between, stiffness, damping, one.absent))
-    return Ranges(tuple(springs), {n: closer(r, network.masses.get(n, 0.0)) for n, r in ranges.masses.items()})
-
-
 def _parts(network: Network, ranges: Ranges) -> list[_Part]:
     if not (ranges.springs or ranges.masses):
         raise ValueError("ranges are empty: give springs or masses whose parameters have ranges")

@@ -294,24 +294,24 @@ class Lti(ReadOnly):
         Raises SingularLoop where A has the eigenvalue one.
         """
         C = -np.swapaxes(_solve(np.swapaxes(_identity(self) - self.A, -1, -2), np.swapaxes(self.C, -1, -2)), -1, -2)
-        return self.D - C @ self.B, Lti(self.A, self.B, C, np.zeros_like(self.D), self.T)
+        return self.D - _times(C, self.B), Lti(self.A, self.B, C, np.zeros_like(self.D), self.T)
 
     def quotient_at_one(self) -> Lti:
         """(G(z) - G(1))/(z - 1)."""
         return self.split_at_one()[1]
 
     def __matmul__(self, other: Lti | Array) -> Lti:
+        B, D = self.B, self.D
         if not isinstance(other, Lti):
-            return Lti(self.A, self.B @ other, self.C, self.D @ other, self.T)
+            return Lti(self.A, _times(B, other), self.C, _times(D, other), self.T)
         T = _common_period(self, other)
         zero = np.zeros((other.order, self.order), dtype=int)
-        A = _block([[other.A, zero], [self.B @ other.C, self.A]])
-        return Lti(
-            A, _block([[other.B], [self.B @ other.D]]), _block([[self.D @ other.C, self.C]]), self.D @ other.D, T
-        )
+        A = _block([[other.A, zero], [_times(B, other.C), self.A]])
+        C = _block([[_times(D, other.C), self.C]])
+        return Lti(A, _block([[other.B], [_times(B, other.D)]]), C, _times(D, other.D), T)
 
     def __rmatmul__(self, matrix: Array) -> Lti:
-        return Lti(self.A, self.B, matrix @ self.C, matrix @ self.D, self.T)
+        return Lti(self.A, self.B, _times(matrix, self.C), _times(matrix, self.D), self.T)
 
     def __add__(self, other: Lti | Array) -> Lti:
         if not isinstance(other, Lti):
@@ -346,19 +346,20 @@ class Lti(ReadOnly):
         Raises SingularLoop where I + D_G D_H cannot be inverted.
         """
         T = _common_period(self, other)
-        S = inverse(_eye(self.outputs, T) + self.D @ other.D)
+        S = inverse(_eye(self.outputs, T) + _times(self.D, other.D))
         # y = S (C x - D_G C_H h + D_G u), and the feedback block is driven by y
-        y_x = _block([[S @ self.C, -(S @ self.D @ other.C)]])
-        y_u = S @ self.D
-        u_x = _block([[np.zeros((self.inputs, self.order), dtype=int), -other.C]]) - other.D @ y_x
-        u_u = _eye(self.inputs, T) - other.D @ y_u
-        A = _block_diagonal([self.A, other.A]) + _block([[self.B @ u_x], [other.B @ y_x]])
-        return Lti(A, _block([[self.B @ u_u], [other.B @ y_u]]), y_x, y_u, T)
+        y_u = _times(S, self.D)
+        y_x = _block([[_times(S, self.C), -_times(y_u, other.C)]])
+        u_x = _block([[np.zeros((self.inputs, self.order), dtype=int), -other.C]]) - _times(other.D, y_x)
+        u_u = _eye(self.inputs, T) - _times(other.D, y_u)
+        A = _block_diagonal([self.A, other.A]) + _block([[_times(self.B, u_x)], [_times(other.B, y_x)]])
+        return Lti(A, _block([[_times(self.B, u_u)], [_times(other.B, y_u)]]), y_x, y_u, T)
 
     def inverse(self) -> Lti:
         """G^-1, where D has an inverse. Raises SingularLoop where it has none."""
         D = inverse(self.D)
-        return Lti(self.A - self.B @ D @ self.C, self.B @ D, -(D @ self.C), D, self.T)
+        B, C = _times(self.B, D), _times(D, self.C)
+        return Lti(self.A - _times(B, self.C), B, -C, D, self.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -555,6 +556,26 @@ def inverse(M: Array) -> Array:
     if M.size and np.max(np.linalg.cond(M)) > 1e12:
         raise SingularLoop(f"the algebraic loop I + D_G D_H is singular: {M.tolist()}")
     return np.linalg.inv(M)
+
+
+def _times(left: Array, right: Array) -> Array:
+    """left @ right; of Fractions only the entries that are not zero are multiplied, since next to all are."""
+    if left.ndim != 2 or right.ndim != 2 or object not in (left.dtype, right.dtype):
+        return left @ right
+    if left.shape[1] != right.shape[0]:
+        raise ValueError(f"shapes {left.shape} and {right.shape} do not fit")
+    rows = [[(j, v) for j, v in enumerate(row) if v] for row in right.tolist()]
+    result = np.full((left.shape[0], right.shape[1]), _ZERO, dtype=object)
+    for i, row in enumerate(left.tolist()):
+        on_time()
+        total: dict[int, Any] = {}
+        for factor, entries in zip(row, rows, strict=True):
+            if factor:
+                for j, v in entries:
+                    total[j] = total.get(j, _ZERO) + factor * v
+        for j, v in total.items():
+            result[i, j] = v
+    return result
 
 
 def _solve(M: Array, right: Array) -> Array:

@@ -173,11 +173,6 @@ class StepBuffer:
         return list(self.f)
 
     @cached_property
-    def plant_input(self) -> list[Array]:
-        """[w; f] of each row."""
-        return list(self.rows[:, self.z.shape[1] + self.s.shape[1] :])
-
-    @cached_property
     def plant_row(self) -> list[Array]:
         """[s; w; f] of each row."""
         return list(self.rows[:, self.z.shape[1] :])

@@ -52,7 +52,7 @@ class Perceived:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class Demands:
     """A coupling in its loop, with what both conditions ask of the devices."""
 
     F: Lti
@@ -61,7 +61,7 @@ class Judged:
 
 
 @dataclass(frozen=True, eq=False)
-class Curves:
+class _Curves:
     """One coupling at the frequencies `hz` of its picture."""
 
     sigma_F: Array  # (k, m) singular values of F [N/m], largest first
@@ -70,7 +70,7 @@ class Curves:
     demands: dict[str, Array | None]  # (k,) required over available damping
 
 
-def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Judged:
+def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Demands:
     """Both conditions of a coupling, as figures and over frequency. Raises SingularLoop."""
     F = loop.F(coupling)
     phi = _multiplier(loop, coupling) if phi is None and any(loop.psi) else phi
@@ -94,10 +94,10 @@ def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Judged:
             demands["any-environment"] = partial(
                 least_scale, any_environment_demand(V, loop.theta, loop.delta, loop.T_max)
             )
-    return Judged(F, requirements, demands)
+    return Demands(F, requirements, demands)
 
 
-def grid(loop: Loop, couplings: Sequence[Judged], low_hz: float = _LOWEST_HZ) -> Array:
+def grid(loop: Loop, couplings: Sequence[Demands], low_hz: float = _LOWEST_HZ) -> Array:
     """Frequencies [Hz] up to Nyquist's, dense around every pole, with FEEL_HZ and where conditions bind."""
     per_hz = 2 * np.pi * loop.T
     systems = (loop.E(), *(judged.F for judged in couplings))
@@ -107,7 +107,7 @@ def grid(loop: Loop, couplings: Sequence[Judged], low_hz: float = _LOWEST_HZ) ->
     return np.unique([*even, *(hz for hz in wanted if low_hz <= hz <= even[-1])])
 
 
-def curves(loop: Loop, judged: Judged, hz: Array) -> Curves:
+def curves(loop: Loop, judged: Demands, hz: Array) -> _Curves:
     """The curves of one coupling at `hz` (k,)."""
     w = 2 * np.pi * hz * loop.T
     z = on_circle(w)
@@ -115,7 +115,7 @@ def curves(loop: Loop, judged: Judged, hz: Array) -> Curves:
     target = (delay(loop.lam, loop.T) @ E).at(z)
     F = judged.F.at(z)
     demands = {name: None if demand is None else demand(w) for name, demand in judged.demands.items()}
-    return Curves(_singular_values(F), _singular_values(F - target), perceived(F, hz), demands)
+    return _Curves(_singular_values(F), _singular_values(F - target), perceived(F, hz), demands)
 
 
 def ideal(loop: Loop, hz: Array) -> tuple[Array, Perceived]:

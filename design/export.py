@@ -48,7 +48,7 @@ _GIVEN_WAY = _Signal("d", "displacement [m]", 1e-3)
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class ExportedBlock:
     """A square block that runs once per sampling period, from rest."""
 
     name: str  # "coupling" | "process"
@@ -71,16 +71,16 @@ class NothingToExport(ValueError):
     """The coupling has no block of the kind that was asked for."""
 
 
-def coupling_block(stored: Stored) -> Block:
+def coupling_block(stored: Stored) -> ExportedBlock:
     """V(z), force to displacement. Raises NothingToExport where the coupling is no V in feedback."""
     V = stored.built().compliance(stored.loop.T)
     if V is None:
         raise NothingToExport("this coupling is no V in feedback around the environment; the whole process can be had")
     about = ("d = V f: what the coupling gives way by. In its loop the environment sees u = x - d, and f = Psi E u.",)
-    return Block("coupling", _with_a_state(V), FORCE, _GIVEN_WAY, about)
+    return ExportedBlock("coupling", _with_a_state(V), FORCE, _GIVEN_WAY, about)
 
 
-def process_block(stored: Stored, with_theta: bool = True, force_limit: Sequence[float] | None = None) -> Block:
+def process_block(stored: Stored, with_theta: bool = True, force_limit: Sequence[float] | None = None) -> ExportedBlock:
     """F(z) (6), device displacements to forces; Theta is left out where the link to the devices is the delay.
 
     With `force_limit` (m,) [N] they leave through the limiter of the certificate. Raises NothingToExport where that
@@ -97,10 +97,12 @@ def process_block(stored: Stored, with_theta: bool = True, force_limit: Sequence
         "f = F x: the whole discrete process; the devices get -f, held for T. Forces are not limited here.",
         _delays(loop, with_theta),
     )
-    return Block("process", _with_a_state(F), _DISPLACEMENT, FORCE, about)
+    return ExportedBlock("process", _with_a_state(F), _DISPLACEMENT, FORCE, about)
 
 
-def _limited_block(stored: Stored, theta: Sequence[int], force_limit: Sequence[float], with_theta: bool) -> Block:
+def _limited_block(
+    stored: Stored, theta: Sequence[int], force_limit: Sequence[float], with_theta: bool
+) -> ExportedBlock:
     loop, rho = stored.loop, lag(stored.loop, stored.certificate)
     if rho is None:
         raise NothingToExport("its certificate covers no limited forces: design it anew, or leave out --force-limit")
@@ -110,7 +112,7 @@ def _limited_block(stored: Stored, theta: Sequence[int], force_limit: Sequence[f
         f"{', '.join(f'{f:g}' for f in force_limit)} N: the contact slips instead, and the certificate holds there.",
         _delays(loop, with_theta),
     )
-    return Block("process", limiter.open, _DISPLACEMENT, FORCE, about, limiter)
+    return ExportedBlock("process", limiter.open, _DISPLACEMENT, FORCE, about, limiter)
 
 
 def _with_a_state(system: Lti) -> Lti:
@@ -121,7 +123,7 @@ def _with_a_state(system: Lti) -> Lti:
     return Lti(np.zeros((1, 1)), np.zeros((1, m)), np.zeros((system.outputs, 1)), system.D, system.T)
 
 
-def trial(block: Block, seed: int = 0) -> Trial:
+def trial(block: ExportedBlock, seed: int = 0) -> Trial:
     """Normally distributed inputs, with a limiter such that a third of the ticks are limited, and the outputs."""
     rng = np.random.default_rng(seed)
     inputs = block.input.size * rng.standard_normal((_TICKS, block.system.inputs))
@@ -206,7 +208,7 @@ def _boxed(M: list[list[float]], limit: list[float], q: list[float]) -> tuple[li
     return e, f
 
 
-def data(block: Block, test: Trial) -> dict[str, Any]:
+def data(block: ExportedBlock, test: Trial) -> dict[str, Any]:
     """The block as plain data, for JSON."""
     system = block.system
     return {
@@ -302,7 +304,7 @@ if __name__ == "__main__":
 ''')
 
 
-def control_source(block: Block, test: Trial) -> str:
+def control_source(block: ExportedBlock, test: Trial) -> str:
     """The file's text; numbers are decimals that read back to the same doubles."""
     system = block.system
     return SOURCE.substitute(
@@ -530,7 +532,7 @@ _LIMITED = """    {
 """
 
 
-def c_source(block: Block, test: Trial, file: str) -> str:
+def c_source(block: ExportedBlock, test: Trial, file: str) -> str:
     """The file's text; numbers are hexadecimal, so that no compiler's decimal conversion matters."""
     system, name = block.system, block.name
     words = {

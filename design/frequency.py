@@ -126,7 +126,7 @@ _RESPONSE, _SCHUR = 0.4e-9, 3e-9  # [s] measured: a point's response per inputs 
 MOST_SECONDS = 60.0
 
 
-def sweep_seconds(G: Lti) -> float:
+def _sweep_seconds(G: Lti) -> float:
     """About how long a sweep of G takes [s], to a factor of three; delays at its outputs cost nothing."""
     n, m = G.inner_order, G.inputs
     return _POINTS_SWEPT * m * (n**2 + m**2) * _RESPONSE + n**3 * _SCHUR
@@ -134,7 +134,7 @@ def sweep_seconds(G: Lti) -> float:
 
 def too_long(G: Lti, sweeps: int = 1) -> str | None:
     """Why so many sweeps of G, or of what is like it, are not begun; None where they are."""
-    seconds, how = sweeps * sweep_seconds(G), f"some {sweeps} sweeps" if sweeps > 1 else "a sweep"
+    seconds, how = sweeps * _sweep_seconds(G), f"some {sweeps} sweeps" if sweeps > 1 else "a sweep"
     if seconds <= MOST_SECONDS:
         return None
     states = f"{G.inner_order} states and {G.inputs} channels"

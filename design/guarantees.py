@@ -19,7 +19,7 @@ from design.result import Requirement, finite
 ANY, RANGES, HERE = "any passive environment", "these ranges", "this environment"
 
 
-FROZEN = "each frozen contact state of this environment (with ranges, contact that makes and breaks is not covered)"
+_FROZEN = "each frozen contact state of this environment (with ranges, contact that makes and breaks is not covered)"
 
 
 MAKING = "this environment, with walls up to their stiffness and damping that make and break contact"
@@ -52,7 +52,7 @@ def guarantee_of(requirements: Mapping[str, Requirement], loop: Loop, whole_rang
     if not any(requirement.certified for requirement in requirements.values()):
         return None
     if loop.environment.walls:
-        return MAKING if making_covered(loop) else FROZEN
+        return MAKING if making_covered(loop) else _FROZEN
     return loop.environment.here
 
 

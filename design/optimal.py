@@ -158,7 +158,7 @@ def design(
     return replace(best, ladder=tuple(rungs), sdps=len(rungs), wall_s=climb.elapsed)
 
 
-def compromise(loop: Loop, around: Sequence[Network], options: Options) -> tuple[Optimal, Optimal]:
+def _compromise(loop: Loop, around: Sequence[Network], options: Options) -> tuple[Optimal, Optimal]:
     """(the design for the loop's environment, the one that keeps the condition in these, too), over one small basis.
 
     By sweeps, without proofs: what it costs, not a coupling to run. Raises DesignFailed where there is none.
@@ -406,7 +406,7 @@ class _Spread:
 def spread(loop: Loop, options: Options = DEFAULT, percent: float = 10.0) -> _Spread | None:
     """The design for `vertices` beside the nominal one, by sweeps: a price, not a coupling to run. None without one."""
     try:
-        alone, wide = compromise(loop, list(vertices(loop.network, percent).values()), options)
+        alone, wide = _compromise(loop, list(vertices(loop.network, percent).values()), options)
     except DesignFailed:
         return None
     mismatch, before = (decibels(getattr(one.figures, _MINIMISED[options.objective])) for one in (wide, alone))

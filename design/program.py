@@ -50,7 +50,7 @@ _GAPS = (0.05, 0.01)  # of the objective, or of what it gains over no force: gap
 _FORGIVEN = 5e-4  # by which an inequality may fail between its frequencies: scaling makes up for it
 _MOST_SWEEPS = 6
 _STEEPER = 3.0  # factor between one centre of the barrier and the next
-SMALLEST = 1e-5  # least frequency of an inequality [rad/sample]: below it nothing changes
+_SMALLEST = 1e-5  # least frequency of an inequality [rad/sample]: below it nothing changes
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Constraint:
     name: str
     block: Callable[[Sampled, Array], Sampled]
     unit: Array  # (r,) rows and columns of the block are scaled by it, so that its eigenvalues count in one measure
-    low: float = SMALLEST  # [rad/sample]
+    low: float = _SMALLEST  # [rad/sample]
     high: float = np.pi
     start: tuple[float, ...] = ()  # own unknowns for which R = kappa I is strictly feasible for a small kappa
     cost: tuple[float, ...] = ()  # of the own unknowns in the objective
@@ -421,12 +421,12 @@ class Problem:
     def grid(self, case: Case, constraint: Constraint) -> Array:
         """The frequencies at which a constraint is imposed first."""
         even = np.linspace(constraint.low, constraint.high, 50)
-        rising = np.geomspace(max(constraint.low, SMALLEST), constraint.high, 60)
+        rising = np.geomspace(max(constraint.low, _SMALLEST), constraint.high, 60)
         modes = np.concatenate([case.E.poles(), self.span.chain(case.E.T).poles()])
         modes = np.array(_distinct(modes[modes.imag > 1e-6]), dtype=complex)
         around = (np.angle(modes)[:, None] + (1 - np.abs(modes))[:, None] * np.array([-1.0, 0.0, 1.0])).ravel()
         w = np.unique(np.concatenate([even, rising, around]))
-        return w[(w >= max(constraint.low, SMALLEST)) & (w <= constraint.high)]
+        return w[(w >= max(constraint.low, _SMALLEST)) & (w <= constraint.high)]
 
     def room(self, x: Array, dense: bool = False) -> float:
         """The least eigenvalue of any constraint at x, where each is imposed first or over the whole sweep."""
@@ -439,7 +439,7 @@ class Problem:
 
     def _sweep(self, case: Case, constraint: Constraint) -> Array:
         """A grid that knows every pole, over the band of a constraint."""
-        return frequencies(case.E, self.span.chain(case.E.T), low=max(constraint.low, SMALLEST), high=constraint.high)
+        return frequencies(case.E, self.span.chain(case.E.T), low=max(constraint.low, _SMALLEST), high=constraint.high)
 
     def missed(self, x: Array) -> tuple[list[Array], float]:
         """(where each constraint fails, case by case and constraint by constraint; by how much the worst does)."""

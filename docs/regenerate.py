@@ -1,7 +1,7 @@
 """python docs/regenerate.py: run what README and docs command, and write the real output where a block asks for it.
 
-`--check` runs the slow commands alone (`make validate` does) and compares what they print with what the pages show, but
-for times: exit code 1 where that is something else.
+`--check` runs the slow commands alone (`make validate` does) and compares what they print with what the pages show, of
+what is measured all but times: exit code 1 where that is something else.
 
     <!-- output: certified|binds -->      lines with one of these words (a regular expression); all without ": .."
     ```console
@@ -42,6 +42,10 @@ MEASURED = re.compile(_BLOCK.format("measured", "text"))
 BLOCK = re.compile(r"^```(sh|console|toml|python)\n(.*?)^```", re.DOTALL | re.MULTILINE)
 SOURCE = re.compile(r"(<!-- source: (\S+) (\S+) -->\n)```python\n(?:.*\n)*?```")
 PICTURE = re.compile(r"<!-- picture: (\S+) (\S+) -->")
+#: a design that a sentence names
+IN_SENTENCES = re.compile(r"`(python -m design -[^`]*)`")
+#: commands that take most of a minute
+SLOW = re.compile(r"--coupling optimal --(grid 10|varying-delay)|ranges")
 
 
 class Step(NamedTuple):
@@ -133,17 +137,27 @@ def _close(shown: str, number: str, measured: bool) -> bool:
 
 
 def check() -> int:
-    """Run what is measured and say which lines of which pages are something else now."""
+    """Run what is slow or measured and say which lines of which pages are something else now."""
     found, printed = 0, {}
     with TemporaryDirectory() as place:
         for page in PAGES:
-            for _, pattern, command, shown in MEASURED.findall(page.read_text(encoding="utf-8")):
+            text = page.read_text(encoding="utf-8")
+            slow = [step.text for step in steps(text) if SLOW.search(step.text) and step.kind == "command"]
+            slow += [command for command in IN_SENTENCES.findall(text) if SLOW.search(command)]
+            blocks = [(*block, False) for block in SHOWN.findall(text) if SLOW.search(block[2])]
+            blocks += [(*block, True) for block in MEASURED.findall(text)]
+            for command in [*slow, *(command for _, _, command, *_ in blocks)]:
                 if command not in printed:
                     print(f"{page.name}: {command}", flush=True)
-                    printed[command] = run(command, Path(place)).stdout
+                    done = run(command, Path(place))
+                    printed[command] = done.stdout
+                    if done.returncode not in (0, 1):
+                        found += 1
+                        print(f"  {done.stderr}")
+            for _, pattern, command, shown, measured in blocks:
                 fresh = kept(printed[command], pattern).splitlines()
                 for was, now in itertools.zip_longest(shown.splitlines(), fresh, fillvalue=""):
-                    if not same_line(was, now, measured=True):
+                    if not same_line(was, now, measured):
                         found += 1
                         print(f"  the page shows  {was}\n  and there is    {now}")
     return 1 if found else 0

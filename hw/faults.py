@@ -38,7 +38,7 @@ _Call = Callable[[Session, int], Said]
 
 
 @dataclass(frozen=True)
-class Case:
+class Fault:
     """A fault, the stage it must end in, and words that must be in the cause."""
 
     name: str
@@ -88,96 +88,96 @@ def at(text: str) -> tuple[str, ...]:
 
 def _signed(
     name: str, kind: str, value: float, cause: str, within: float | None, when: str = f"@{_WHEN}", **more: Any
-) -> list[Case]:
+) -> list[Fault]:
     """One case for each axis and each sign of `value`."""
     cases = []
     for axis in (1, 2):
         for sign in ("", "-"):
             fault = f"axis{axis}:{kind}={sign}{value}{when}"
             words = cause.format(axis=axis, sign=sign)
-            cases.append(Case(name.format(f"{sign}{value}", axis), Stage.STOPPED, words, (fault,), within, **more))
+            cases.append(Fault(name.format(f"{sign}{value}", axis), Stage.STOPPED, words, (fault,), within, **more))
     return cases
 
 
 G, A = Stage, Stage.ARMED
 _LATE = at("down:jitter=0.0007")
 CASES = (
-    Case("nothing", A),
-    Case("ticks wrap around", A, first_tick=65000),
+    Fault("nothing", A),
+    Fault("ticks wrap around", A, first_tick=65000),
     # the line, a little
-    Case("5 % of STATEs lost", A, faults=at("up:drop=0.05"), counted=("gaps", "misses")),
-    Case("5 % of FORCEs lost", A, faults=at("down:drop=0.05"), counted=("misses",)),
-    Case("bits of STATEs flipped", A, faults=at("up:flip=0.05"), counted=("gaps", "host_errors")),
-    Case("bits of FORCEs flipped", A, faults=at("down:flip=0.05"), counted=("misses", "device_errors")),
-    Case("STATEs cut short", A, faults=at("up:truncate=0.03"), counted=("gaps", "host_errors")),
-    Case("FORCEs cut short", A, faults=at("down:truncate=0.03"), counted=("misses", "device_errors")),
-    Case("a little garbage", A, faults=at("garbage=0.03"), counted=("gaps", "host_errors", "device_errors")),
-    Case("STATEs twice", A, faults=at("up:duplicate=0.3"), counted=("duplicates",)),
-    Case("FORCEs twice", A, faults=at("down:duplicate=0.3")),
-    Case("STATEs out of order", A, faults=at("up:reorder=0.03"), counted=("stale", "gaps")),
-    Case("FORCEs out of order", A, faults=at("down:reorder=0.03"), counted=("late", "misses")),
-    Case("0.5 ms later both ways", A, faults=at("delay=0.0005")),
-    Case("device freezes for 4 ms", A, faults=at("stall=0.004")),
-    Case("host freezes for 4 ms", A, host_stall=0.004, counted=("misses",)),
-    Case("handshake over a bad line", A, faults=("drop=0.04", "flip=0.01"), counted=("gaps",)),
+    Fault("5 % of STATEs lost", A, faults=at("up:drop=0.05"), counted=("gaps", "misses")),
+    Fault("5 % of FORCEs lost", A, faults=at("down:drop=0.05"), counted=("misses",)),
+    Fault("bits of STATEs flipped", A, faults=at("up:flip=0.05"), counted=("gaps", "host_errors")),
+    Fault("bits of FORCEs flipped", A, faults=at("down:flip=0.05"), counted=("misses", "device_errors")),
+    Fault("STATEs cut short", A, faults=at("up:truncate=0.03"), counted=("gaps", "host_errors")),
+    Fault("FORCEs cut short", A, faults=at("down:truncate=0.03"), counted=("misses", "device_errors")),
+    Fault("a little garbage", A, faults=at("garbage=0.03"), counted=("gaps", "host_errors", "device_errors")),
+    Fault("STATEs twice", A, faults=at("up:duplicate=0.3"), counted=("duplicates",)),
+    Fault("FORCEs twice", A, faults=at("down:duplicate=0.3")),
+    Fault("STATEs out of order", A, faults=at("up:reorder=0.03"), counted=("stale", "gaps")),
+    Fault("FORCEs out of order", A, faults=at("down:reorder=0.03"), counted=("late", "misses")),
+    Fault("0.5 ms later both ways", A, faults=at("delay=0.0005")),
+    Fault("device freezes for 4 ms", A, faults=at("stall=0.004")),
+    Fault("host freezes for 4 ms", A, host_stall=0.004, counted=("misses",)),
+    Fault("handshake over a bad line", A, faults=("drop=0.04", "flip=0.01"), counted=("gaps",)),
     # the line, too much
-    Case("no STATE arrives", G.LOST, "no new STATE", at("up:drop=1"), _SILENCE),
-    Case("no FORCE arrives", G.STOPPED, "cause watchdog", at("down:drop=1"), _WATCHDOG),
-    Case("nothing arrives", G.LOST, "no new STATE", at("drop=1"), _WATCHDOG),
-    Case("every STATE damaged", G.LOST, "no new STATE", at("up:flip=1"), _SILENCE),
-    Case("every FORCE damaged", G.STOPPED, "cause watchdog", at("down:flip=1"), _WATCHDOG),
-    Case("every frame cut short", G.LOST, "no new STATE", at("truncate=1"), _WATCHDOG),
-    Case("noise all the time", G.LOST, "no new STATE", at("up:garbage=60"), _SILENCE),
-    Case("noise at the device", G.STOPPED, "cause watchdog", at("down:garbage=60"), _WATCHDOG),
-    Case("40 % of FORCEs lost", G.STOPPED, "no answer in time|watchdog", at("down:drop=0.4"), 300.0),
-    Case("2 ms later both ways", G.STOPPED, "cause watchdog", at("delay=0.002"), _WATCHDOG + 4.0),
-    Case("host freezes for 20 ms", G.STOPPED, "in ramp|in stopped", within=_WATCHDOG, host_stall=0.02),
-    Case("cable pulled", G.LOST, "port is gone", at("unplug"), _WATCHDOG),
+    Fault("no STATE arrives", G.LOST, "no new STATE", at("up:drop=1"), _SILENCE),
+    Fault("no FORCE arrives", G.STOPPED, "cause watchdog", at("down:drop=1"), _WATCHDOG),
+    Fault("nothing arrives", G.LOST, "no new STATE", at("drop=1"), _WATCHDOG),
+    Fault("every STATE damaged", G.LOST, "no new STATE", at("up:flip=1"), _SILENCE),
+    Fault("every FORCE damaged", G.STOPPED, "cause watchdog", at("down:flip=1"), _WATCHDOG),
+    Fault("every frame cut short", G.LOST, "no new STATE", at("truncate=1"), _WATCHDOG),
+    Fault("noise all the time", G.LOST, "no new STATE", at("up:garbage=60"), _SILENCE),
+    Fault("noise at the device", G.STOPPED, "cause watchdog", at("down:garbage=60"), _WATCHDOG),
+    Fault("40 % of FORCEs lost", G.STOPPED, "no answer in time|watchdog", at("down:drop=0.4"), 300.0),
+    Fault("2 ms later both ways", G.STOPPED, "cause watchdog", at("delay=0.002"), _WATCHDOG + 4.0),
+    Fault("host freezes for 20 ms", G.STOPPED, "in ramp|in stopped", within=_WATCHDOG, host_stall=0.02),
+    Fault("cable pulled", G.LOST, "port is gone", at("unplug"), _WATCHDOG),
     # the delay
-    Case("answers get late", G.DISARMED, "theta = 2", _LATE, 500.0, designed=True, counted=("late",), lasts=1.2),
-    Case("late, nothing softer", G.STOPPED, "nothing softer", _LATE, 500.0, counted=("late",), lasts=1.2),
-    Case("a slow link from the start", A, faults=("delay=0.004",), designed=True),
-    Case("a link too slow", G.REFUSED, "at most theta = 15", ("delay=0.012",), designed=True),
-    Case("a coupling not certified", G.REFUSED, "published is not certified", coupling="published", designed=True),
-    Case("no coupling", G.REFUSED, "without coupling is not certified", coupling="none", designed=True),
+    Fault("answers get late", G.DISARMED, "theta = 2", _LATE, 500.0, designed=True, counted=("late",), lasts=1.2),
+    Fault("late, nothing softer", G.STOPPED, "nothing softer", _LATE, 500.0, counted=("late",), lasts=1.2),
+    Fault("a slow link from the start", A, faults=("delay=0.004",), designed=True),
+    Fault("a link too slow", G.REFUSED, "at most theta = 15", ("delay=0.012",), designed=True),
+    Fault("a coupling not certified", G.REFUSED, "published is not certified", coupling="published", designed=True),
+    Fault("no coupling", G.REFUSED, "without coupling is not certified", coupling="none", designed=True),
     # while the gain rises
-    Case("answers late in ramp-in", G.DISARMED, "theta = 2", ("down:jitter=0.0007@0.02",), _AT_ONCE, designed=True),
-    Case("no FORCE in ramp-in", G.STOPPED, "cause watchdog", ("down:drop=1@0.1",), _AT_ONCE),
-    Case("many FORCEs lost in ramp-in", G.STOPPED, "no answer in time|watchdog", ("down:drop=0.4@0.02",), _AT_ONCE),
-    Case(
+    Fault("answers late in ramp-in", G.DISARMED, "theta = 2", ("down:jitter=0.0007@0.02",), _AT_ONCE, designed=True),
+    Fault("no FORCE in ramp-in", G.STOPPED, "cause watchdog", ("down:drop=1@0.1",), _AT_ONCE),
+    Fault("many FORCEs lost in ramp-in", G.STOPPED, "no answer in time|watchdog", ("down:drop=0.4@0.02",), _AT_ONCE),
+    Fault(
         "tick number leaps in ramp-in", G.STOPPED, "leapt by 301, the watchdog allows 5", ("leap=300@0.03",), _AT_ONCE
     ),
     # the measurement
-    Case("a third of FORCEs lost from the start", G.REFUSED, "% of the answers never reached", ("down:drop=0.33",)),
-    Case("3 % lost from the start", G.REFUSED, "no delay keeps 99 %", ("down:drop=0.03",), designed=True),
+    Fault("a third of FORCEs lost from the start", G.REFUSED, "% of the answers never reached", ("down:drop=0.33",)),
+    Fault("3 % lost from the start", G.REFUSED, "no delay keeps 99 %", ("down:drop=0.03",), designed=True),
     # the device
-    Case("tick number leaps by 300", G.STOPPED, "leapt by 301", at("leap=300"), _STOP),
-    Case("tick number leaps by 3", G.STOPPED, "by its own clock", at("leap=3"), _STOP),
+    Fault("tick number leaps by 300", G.STOPPED, "leapt by 301", at("leap=300"), _STOP),
+    Fault("tick number leaps by 3", G.STOPPED, "by its own clock", at("leap=3"), _STOP),
     *_signed(
         "a force of {} N of its own on axis {}", "own", 2, "it was told .*, and so for 5 ticks", _STOP + 6 * _T_MS
     ),
-    Case("a force of its own in ramp-in", G.STOPPED, "it was told", ("own=2@0.05",), _AT_ONCE),
-    Case("a tick lasts twice as long", G.STOPPED, "by its own clock", at("period=2"), 2 * _STOP + 6 * _T_MS),
-    Case("clock drifts by 2 %", G.STOPPED, "lasts 12.. us by its own clock", at("period=1.02"), 250.0),
-    Case("clock drifts by 0.5 %", A, faults=at("period=1.005")),
-    Case("device freezes for 20 ms", G.LOST, "no new STATE", at("stall=0.02"), 20.0 + _WATCHDOG),
-    Case("device resets", G.LOST, "no new STATE", at("reset"), _AT_ONCE),
-    Case("encoder jumps by 2 mm", A, faults=at("jump=2")),
+    Fault("a force of its own in ramp-in", G.STOPPED, "it was told", ("own=2@0.05",), _AT_ONCE),
+    Fault("a tick lasts twice as long", G.STOPPED, "by its own clock", at("period=2"), 2 * _STOP + 6 * _T_MS),
+    Fault("clock drifts by 2 %", G.STOPPED, "lasts 12.. us by its own clock", at("period=1.02"), 250.0),
+    Fault("clock drifts by 0.5 %", A, faults=at("period=1.005")),
+    Fault("device freezes for 20 ms", G.LOST, "no new STATE", at("stall=0.02"), 20.0 + _WATCHDOG),
+    Fault("device resets", G.LOST, "no new STATE", at("reset"), _AT_ONCE),
+    Fault("encoder jumps by 2 mm", A, faults=at("jump=2")),
     *_signed("jump of {} mm, encoder {}", "jump", 5, "encoder {axis} jumped by", _STOP),
     *_signed("shaking by {} mm, encoder {}", "shake", 2, "encoder {axis} shakes", _STOP + 2 * _T_MS),
     *_signed("{} m/s, handle {}", "drift", 1.5, "axis {axis} moves at 1", _STOP + 12 * _T_MS),
     *_signed(
         "{} mm, out of the range of encoder {}", "jump", 200, r"encoder {axis} is at {sign}\d.*its range is", None, ""
     ),
-    Case("encoder dead before", G.STOPPED, "axis 1 does not follow: it moved by 0 counts", ("freeze",), _AT_ONCE),
-    Case("encoder 2 dead before", G.STOPPED, "axis 2 does not follow: it moved by 0", ("axis2:freeze",), _AT_ONCE),
-    Case("a channel of it dead before", G.STOPPED, "axis 1 does not follow", ("toggle",), _AT_ONCE),
-    Case("a channel of encoder 2 dead before", G.STOPPED, "axis 2 does not follow", ("axis2:toggle",), _AT_ONCE),
-    Case("encoder dies", G.STOPPED, "axis 1 does not follow", at("freeze"), _DEAD),
-    Case("encoder 2 dies", G.STOPPED, "axis 2 does not follow", at("axis2:freeze"), _DEAD),
-    Case("both encoders die", G.STOPPED, "axis . does not follow", at("freeze axis2:freeze"), _DEAD, lasts=1.5),
-    Case("a channel of encoder 1 dies", G.STOPPED, "axis 1 does not follow", at("toggle"), _DEAD),
-    Case("a channel of encoder 2 dies", G.STOPPED, "axis 2 does not follow", at("axis2:toggle"), _DEAD),
+    Fault("encoder dead before", G.STOPPED, "axis 1 does not follow: it moved by 0 counts", ("freeze",), _AT_ONCE),
+    Fault("encoder 2 dead before", G.STOPPED, "axis 2 does not follow: it moved by 0", ("axis2:freeze",), _AT_ONCE),
+    Fault("a channel of it dead before", G.STOPPED, "axis 1 does not follow", ("toggle",), _AT_ONCE),
+    Fault("a channel of encoder 2 dead before", G.STOPPED, "axis 2 does not follow", ("axis2:toggle",), _AT_ONCE),
+    Fault("encoder dies", G.STOPPED, "axis 1 does not follow", at("freeze"), _DEAD),
+    Fault("encoder 2 dies", G.STOPPED, "axis 2 does not follow", at("axis2:freeze"), _DEAD),
+    Fault("both encoders die", G.STOPPED, "axis . does not follow", at("freeze axis2:freeze"), _DEAD, lasts=1.5),
+    Fault("a channel of encoder 1 dies", G.STOPPED, "axis 1 does not follow", at("toggle"), _DEAD),
+    Fault("a channel of encoder 2 dies", G.STOPPED, "axis 2 does not follow", at("axis2:toggle"), _DEAD),
     *_signed(
         "saturated at {} mm, encoder {}",
         "saturate",
@@ -187,52 +187,52 @@ CASES = (
         "@0.3",
         lasts=2.0,
     ),
-    Case("e-stop at the device", G.ESTOP, "estop_device", at("estop"), _AT_ONCE),
-    Case("e-stop at the device before", G.REFUSED, "refuses the configuration: estop", ("estop",)),
-    Case("motor 1 gets hot", G.STOPPED, "motor 1 gets hot", within=1500.0, continuous=(0.2, 12.0), lasts=2.5),
-    Case("motor 2 gets hot", G.STOPPED, "motor 2 gets hot", within=1500.0, continuous=(12.0, 0.2), lasts=2.5),
-    Case("firmware finds a fault", G.STOPPED, "cause device", at("trip"), _STOP),
-    Case("device clock runs 5 % fast", G.REFUSED, "by its own clock", period=1.05),
+    Fault("e-stop at the device", G.ESTOP, "estop_device", at("estop"), _AT_ONCE),
+    Fault("e-stop at the device before", G.REFUSED, "refuses the configuration: estop", ("estop",)),
+    Fault("motor 1 gets hot", G.STOPPED, "motor 1 gets hot", within=1500.0, continuous=(0.2, 12.0), lasts=2.5),
+    Fault("motor 2 gets hot", G.STOPPED, "motor 2 gets hot", within=1500.0, continuous=(12.0, 0.2), lasts=2.5),
+    Fault("firmware finds a fault", G.STOPPED, "cause device", at("trip"), _STOP),
+    Fault("device clock runs 5 % fast", G.REFUSED, "by its own clock", period=1.05),
     # the controller
-    Case("controller asks for nan", G.STOPPED, "nan, nan N, which is no force", within=_STOP, action=_spoiled(np.nan)),
-    Case("controller asks for inf", G.STOPPED, "inf, inf N, which is no force", within=_STOP, action=_spoiled(np.inf)),
-    Case("controller raises", G.STOPPED, "ZeroDivisionError", within=_STOP, action=_spoiled(None)),
-    Case(
+    Fault("controller asks for nan", G.STOPPED, "nan, nan N, which is no force", within=_STOP, action=_spoiled(np.nan)),
+    Fault("controller asks for inf", G.STOPPED, "inf, inf N, which is no force", within=_STOP, action=_spoiled(np.inf)),
+    Fault("controller raises", G.STOPPED, "ZeroDivisionError", within=_STOP, action=_spoiled(None)),
+    Fault(
         "controller asks for -inf", G.STOPPED, "-inf, -inf N, which is no force", within=_STOP, action=_spoiled(-np.inf)
     ),
-    Case("controller asks for 100 N", A, action=_spoiled(100.0), counted=("clipped", "slowed"), lasts=0.48),
-    Case("controller asks for -100 N", A, action=_spoiled(-100.0), counted=("clipped", "slowed"), lasts=0.48),
+    Fault("controller asks for 100 N", A, action=_spoiled(100.0), counted=("clipped", "slowed"), lasts=0.48),
+    Fault("controller asks for -100 N", A, action=_spoiled(-100.0), counted=("clipped", "slowed"), lasts=0.48),
     # people
-    Case("planned stop", G.FINISHED, "asked to", within=100.0 + _STOP, action=person("stop")),
-    Case("deadman let go", G.FINISHED, "deadman at the device", at("letgo"), 100.0 + _STOP, deadman=True),
-    Case("e-stop at the host", G.ESTOP, "asked to", within=_AT_ONCE, action=person("estop")),
+    Fault("planned stop", G.FINISHED, "asked to", within=100.0 + _STOP, action=person("stop")),
+    Fault("deadman let go", G.FINISHED, "deadman at the device", at("letgo"), 100.0 + _STOP, deadman=True),
+    Fault("e-stop at the host", G.ESTOP, "asked to", within=_AT_ONCE, action=person("estop")),
     # the handshake
-    Case("an older protocol", G.REFUSED, "version 1 .*give it the firmware", info=lambda i: i._replace(version=1)),
-    Case("a newer protocol", G.REFUSED, "version 3 of the protocol", info=lambda i: i._replace(version=3)),
-    Case(
+    Fault("an older protocol", G.REFUSED, "version 1 .*give it the firmware", info=lambda i: i._replace(version=1)),
+    Fault("a newer protocol", G.REFUSED, "version 3 of the protocol", info=lambda i: i._replace(version=3)),
+    Fault(
         "one axis",
         G.REFUSED,
         "1 axis, the scenario 2",
         info=lambda i: i._replace(**{n: getattr(i, n)[:1] for n in i._fields[4:]}),
     ),
-    Case("another period", G.REFUSED, "every 1000000 ns", info=lambda i: i._replace(period_ns=1_000_000)),
-    Case("a weak motor", G.REFUSED, "can do 6 N", info=lambda i: i._replace(hard_limit=(30000, 15000))),
-    Case("little damping", G.REFUSED, "guarantees 1 N s/m", info=lambda i: i._replace(osp_damping=(10**6, 10**6))),
-    Case(
+    Fault("another period", G.REFUSED, "every 1000000 ns", info=lambda i: i._replace(period_ns=1_000_000)),
+    Fault("a weak motor", G.REFUSED, "can do 6 N", info=lambda i: i._replace(hard_limit=(30000, 15000))),
+    Fault("little damping", G.REFUSED, "guarantees 1 N s/m", info=lambda i: i._replace(osp_damping=(10**6, 10**6))),
+    Fault(
         "coarse motors",
         G.REFUSED,
         "force step of axis 1 is 3 N, at most 0.75 N",
         info=lambda i: i._replace(force_step=(3_000_000,) * 2, hard_limit=(4, 4)),
     ),
-    Case(
+    Fault(
         "coarse encoders",
         G.REFUSED,
         "count of axis 1 is 0.5 mm, at most 0.3 mm",
         info=lambda i: i._replace(encoder_step=(500_000_000,) * 2, range=(200, 200)),
     ),
-    Case("115200 baud", G.REFUSED, "4167 us, more than T = 1200 us", baud=115200),
-    Case("921600 baud", A, baud=921600),
-    Case("nobody there", G.LOST, "no answer to HELLO", ("up:drop=1",)),
+    Fault("115200 baud", G.REFUSED, "4167 us, more than T = 1200 us", baud=115200),
+    Fault("921600 baud", A, baud=921600),
+    Fault("nobody there", G.LOST, "no answer to HELLO", ("up:drop=1",)),
 )
 
 
@@ -272,7 +272,7 @@ def lively(scenario: Scenario) -> Scenario:
 
 
 def rehearse_case(
-    case: Case, scenario: Scenario, made: tuple[CertifiedCoupling, ...]
+    case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...]
 ) -> tuple[Rehearsal, _FaultOutcome]:
     """One case. `made` are couplings for a link of one tick, and softer ones."""
     info = info_of(scenario)
@@ -302,7 +302,7 @@ def rehearse_case(
     return rehearsal, _FaultOutcome(case.name, str(session.stage), session.cause, zero_ms, case.within, wrong)
 
 
-def _plan(case: Case, scenario: Scenario, made: tuple[CertifiedCoupling, ...]) -> Plan:
+def _plan(case: Fault, scenario: Scenario, made: tuple[CertifiedCoupling, ...]) -> Plan:
     def plan(ages: Ages) -> tuple[CertifiedCoupling, ...]:
         if not case.designed:
             return made[:1]
@@ -314,7 +314,7 @@ def _plan(case: Case, scenario: Scenario, made: tuple[CertifiedCoupling, ...]) -
     return plan
 
 
-def _wrong(case: Case, rehearsal: Rehearsal, zero_ms: float | None) -> list[str]:
+def _wrong(case: Fault, rehearsal: Rehearsal, zero_ms: float | None) -> list[str]:
     """What did not go as it must."""
     session, wrong = rehearsal.session, []
     if session.stage != case.stage:

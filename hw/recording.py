@@ -354,7 +354,7 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class _Comparison:
     """Where the replay differs from the record."""
 
     asked: NDArray[np.bool_]  # (N,) the controller's forces, as 64-bit floats
@@ -390,7 +390,7 @@ def _require_limits(raw: object) -> None:
             raise ValueError(f"limits are {', '.join(sorted(names))}; missing or unknown: {wrong}")
 
 
-def replay(result: Trace, link: dict[str, Array]) -> Comparison:
+def replay(result: Trace, link: dict[str, Array]) -> _Comparison:
     """Feed the recorded displacements through controller, gain, limits and rounding, every arming from rest."""
     recipes, arming = recipes_of(result), link["arming"]
     channels = result.x.shape[1]
@@ -402,7 +402,7 @@ def replay(result: Trace, link: dict[str, Array]) -> Comparison:
         _again(recipe, np.flatnonzero(arming == i), result, link, (asked, sent))
     different = asked.view(np.int64) != link["asked"].view(np.int64)
     largest = float(np.abs(asked - link["asked"]).max(initial=0.0))
-    return Comparison(different.any(axis=1), (sent != link["sent"]).any(axis=1), largest)
+    return _Comparison(different.any(axis=1), (sent != link["sent"]).any(axis=1), largest)
 
 
 def _again(

@@ -155,7 +155,7 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
 
 
 @dataclass(frozen=True)
-class Attempt:
+class Attack:
     """A search against a loop placed short of its required damping."""
 
     name: str
@@ -168,8 +168,8 @@ def attempts(
     shortages: Array,
     seed: int = 0,
     generations: int = 150,
-    attempted: Callable[[Attempt], None] = lambda attempt: None,
-) -> list[Attempt]:
+    attempted: Callable[[Attack], None] = lambda attempt: None,
+) -> list[Attack]:
     """Attack every loop at every shortage: devices get (1 - short) times the damping that `this_environment` requires.
 
     A negative shortage gives the devices more than required: there the search must fail. `attempted` is called
@@ -181,7 +181,7 @@ def attempts(
         required = np.array(this_environment(F, scenario.delta, scenario.longest_period, scenario.latency).required)
         for short in shortages:
             placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
-            rows.append(Attempt(name, float(short), search(placed, F, seed, generations=generations, first=True)))
+            rows.append(Attack(name, float(short), search(placed, F, seed, generations=generations, first=True)))
             attempted(rows[-1])
     return rows
 

@@ -8,6 +8,8 @@ controller.process for the order of these steps and sim.engines for what advance
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -48,6 +50,7 @@ _Look = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, tic
 Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 
 _COPIES = 4  # of a trace, at most, from the run to its report
+_COLUMNS = 50  # numbers a tick that the report of a trace on the disk takes in memory
 _BLOCK = 1024  # ticks between two looks at the clock, the keyboard and the numbers
 _AHEAD = 8  # blocks for which outside forces are asked at once
 
@@ -133,9 +136,8 @@ def run(
     outside = outside or partial(outside_forces, scenario, simulation.scene, timing=simulation.timing)
     ticks = scenario.samples if ticks is None else ticks
     start = np.zeros((simulation.plant.A.shape[0], 1)) if start is None else start
-    _require_memory(process.F.order + len(start) + simulation.scene.outside + process.channels, ticks, scenario.T)
     widths = (process.F.order, len(start), simulation.scene.outside, process.channels)
-    record, done = np.empty((ticks, sum(widths))), 0
+    record, done = _room(sum(widths), ticks, scenario.T), 0
     net: Net | None = None
     diverged = interrupted = False
 
@@ -177,17 +179,30 @@ def run(
     )
 
 
-def _require_memory(width: int, ticks: int, T: float) -> None:
-    """Raises InputError where the trace of a run, its report and the exact run beside it do not fit into memory."""
+def _room(width: int, ticks: int, T: float) -> Array:
+    """(ticks, width): in memory, or in a temporary file that ends with the trace where that is not enough.
+
+    Raises InputError where the report of such a trace does not fit into memory, or the trace on the disk.
+    """
+    shape, free, each = (ticks, width), _free_memory(), 8 * width
+    if _COPIES * each * ticks <= free:
+        return np.empty(shape)
+    disk = shutil.disk_usage(tempfile.gettempdir()).free
+    for needed, there, what in ((8 * _COLUMNS, free, "memory"), (2 * each, disk, tempfile.gettempdir())):
+        if needed * ticks > there:
+            needs = f"{ticks * T:g} s need {ticks * needed / 2**30:.3g} GiB of {what}, {there / 2**30:.3g} are free"
+            raise InputError(f"duration: {needs}: allowed are {there / needed * T:.3g} s; sim.validate keeps no traces")
+    with tempfile.TemporaryFile() as file:
+        return np.memmap(file, np.float64, "w+", shape=shape).view(np.ndarray)
+
+
+def _free_memory() -> float:
+    """[bytes]; infinite where the system does not say."""
     try:
         lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
-        free = 1024 * int(lines["MemAvailable"].split()[0])
+        return 1024 * int(lines["MemAvailable"].split()[0])
     except (OSError, KeyError, ValueError):
-        return  # this system does not say
-    each = _COPIES * 8 * width
-    if ticks * each > free:
-        needs = f"a trace of {ticks * T:g} s takes {ticks * each / 2**30:.3g} GiB, {free / 2**30:.3g} GiB are free"
-        raise InputError(f"duration: {needs}: allowed are {free / each * T:.3g} s; sim.validate keeps no traces")
+        return np.inf
 
 
 def run_blocks(

@@ -179,6 +179,9 @@ _VECTOR_ROUNDING = 1e-12  # of the largest entry: what an eigenvector's entries 
 _UNLIKE = 0.05  # rms of what y does beside the mode, relative to it: above, it is no such mode but noise
 
 
+_AT_ONCE = 1 << 16  # ticks of a trace, whose states may be more than memory holds
+
+
 def measured_growth(
     loop: ClosedLoop, trace: Trace, force_limit: Array, ahead: int = 0
 ) -> tuple[float | None, str | None]:
@@ -194,15 +197,19 @@ def measured_growth(
         which = "ticks before the first clipped one" if clipped.any() else "ticks"
         return None, f"only {max(usable, 0)} {which}; a growth rate needs {_SHORTEST_TRACE}"
     left = left_eigenvector(loop).conj()
-    y = np.concatenate([trace.s[: usable + 1], trace.z[: usable + 1]], axis=1) @ left
     pushed = trace.w[:usable] @ (loop.B.T @ left)
-    weight = float(np.vdot(y[:-1], y[:-1]).real)
-    states = np.concatenate([trace.s[:usable], trace.z[:usable]], axis=1)
     # what rounding is relative to: large parts that cancel in y, and the eigenvector's own zeros
-    summed = np.abs(states) @ (np.abs(left) + _VECTOR_ROUNDING / _NOISE_FLOOR * np.abs(left).max())
+    sizes = np.abs(left) + _VECTOR_ROUNDING / _NOISE_FLOOR * np.abs(left).max()
+    y, squares = np.empty(usable + 1, dtype=np.complex128), 0.0
+    for begin in range(0, usable + 1, _AT_ONCE):
+        part = slice(begin, min(begin + _AT_ONCE, usable + 1))
+        states = np.concatenate([trace.s[part], trace.z[part]], axis=1)
+        y[part] = states @ left
+        squares += float(np.sum((np.abs(states[: usable - begin]) @ sizes) ** 2))
+    weight = float(np.vdot(y[:-1], y[:-1]).real)
     eigenvalue = np.array(np.vdot(y[:-1], y[1:] - pushed) / weight if weight else 0.0, dtype=np.complex128)
     rest = y[1:] - pushed - eigenvalue * y[:-1]
-    if weight <= _NOISE_FLOOR**2 * float(summed @ summed) or float(np.vdot(rest, rest).real) > _UNLIKE**2 * weight:
+    if weight <= _NOISE_FLOOR**2 * squares or float(np.vdot(rest, rest).real) > _UNLIKE**2 * weight:
         return None, NOT_EXCITED
     return float(Mode(eigenvalue, loop.T).growth), None
 

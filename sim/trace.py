@@ -43,7 +43,7 @@ def _real(name: str, values: NDArray[Any]) -> Array:
 def _is_frozen(value: Any, ndim: int) -> bool:
     """Whether nobody can write to it, so that a long run needs no second copy."""
     own = isinstance(value, np.ndarray) and value.dtype == np.float64 and value.ndim == ndim
-    return own and not value.flags.writeable and not (value.base is not None and value.base.flags.writeable)
+    return own and not value.flags.writeable and not (isinstance(value.base, np.ndarray) and value.base.flags.writeable)
 
 
 @dataclass(frozen=True, eq=False)

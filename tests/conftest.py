@@ -1,8 +1,6 @@
 """What holds for every test: one BLAS thread, and no verdict on how fast the machine is."""
 
-import hashlib
 import os
-import pickle
 import signal
 
 # `make test &` has SIGINT ignored, and whoever is started inherits that: tests that send it would wait for ever.
@@ -23,30 +21,23 @@ settings.register_profile("no-clock", deadline=None, suppress_health_check=[Heal
 settings.load_profile("no-clock")
 
 
+#: files of the most seconds: begun first, so that no worker is alone with one at the end
+LONGEST = ("test_docs.py", "test_hostile.py", "test_live_bridge.py", "test_limits.py", "test_session.py", "test_run.py")
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
+
+
 @pytest.fixture(autouse=True, scope="session")
 def a_run_designs_once(tmp_path_factory):
-    """Runs, maps and crowds ask for the same couplings again and again, seconds each: one design for all processes.
-
-    The designs' own tests (tests/design) call what makes them, and are not served from here.
-    """
-    from design import designs
-    from design.stored import digest
-    from sim import couplings
+    """Runs, maps and crowds ask for the same couplings again and again, seconds each: one design for all processes."""
+    from forked import share_designs
 
     folder = tmp_path_factory.getbasetemp()
     folder = (folder.parent if os.environ.get("PYTEST_XDIST_WORKER") else folder) / "designs"
     folder.mkdir(exist_ok=True)
-
-    def remembered(loop, kind, condition=None, progress=None, **asked):
-        asked_for = digest(loop), kind, condition, *sorted(asked.items())
-        file = folder / hashlib.sha256(repr(asked_for).encode()).hexdigest()
-        if not file.exists():
-            made = designs.design_by_kind(loop, kind, condition, *([progress] if progress else []), **asked)
-            part = file.with_suffix(f".{os.getpid()}")
-            part.write_bytes(pickle.dumps(made))
-            part.rename(file)
-        return pickle.loads(file.read_bytes())
-
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(couplings, "design_by_kind", remembered)
+        patch.setenv("SHARED_DESIGNS", str(folder))
+        share_designs(folder, patch.setattr)
         yield

@@ -59,7 +59,7 @@ AUDIT = ["design.audit", "--K", "2870,2320", "--B", "5.47,5.55"]  # not certifie
 @pytest.mark.parametrize(
     ("command", "code"),
     [
-        (["sim.run", "--duration", "0.3", "--no-plot"], 0),
+        (["sim.run", "--coupling", "published", "--duration", "0.3", "--no-plot", "--no-alternatives"], 0),
         (["sim.run", "--help"], 0),
         ([*AUDIT, "--json", "-"], 1),
     ],
@@ -107,7 +107,17 @@ def test_no_command_makes_the_folder_of_a_file(command, tmp_path, monkeypatch, c
 
 @pytest.mark.parametrize("asked", ["osmesa", "bogus"])
 def test_a_command_that_draws_nothing_does_not_need_what_mujoco_gl_names(asked, tmp_path):
-    command = [sys.executable, "-m", "sim.run", "--case", "none", "--duration", "0.05", "--no-plot"]
+    command = [
+        sys.executable,
+        "-m",
+        "sim.run",
+        "--case",
+        "none",
+        "--duration",
+        "0.05",
+        "--no-plot",
+        "--no-alternatives",
+    ]
     environment = ENVIRONMENT | {"MUJOCO_GL": asked}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")

@@ -29,7 +29,7 @@ def run(tmp_path, *options):
 
 
 def test_case_none_is_figure_5(tmp_path):
-    code, report = run(tmp_path, "--case", "none")
+    code, report = run(tmp_path, "--case", "none", "--no-alternatives")
     stability = report["stability"]
     assert code == 0
     assert report["certificate"]["required_damping"] == pytest.approx([1.7229] * 2, rel=1e-4)
@@ -107,7 +107,7 @@ def test_the_papers_case_i_is_designed_certified_and_proved(tmp_path):
 
 
 def test_published_gains_are_refused_by_their_own_condition(tmp_path):
-    _, report = run(tmp_path, "--coupling", "published", "--no-plot", "--engine", "exact")
+    _, report = run(tmp_path, "--coupling", "published", "--no-plot", "--engine", "exact", "--no-alternatives")
     assert report["certificate"]["required_damping"] == pytest.approx([7.63, 7.84], abs=0.005)
     assert report["certificates"]["this-environment"]["required_damping"] == pytest.approx([1.3987] * 2, rel=1e-4)
     assert report["stability"]["exact_growth_rate_per_s"] == pytest.approx(-0.939, abs=1e-3)
@@ -116,7 +116,7 @@ def test_published_gains_are_refused_by_their_own_condition(tmp_path):
 
 
 def test_three_devices_of_ones_own(tmp_path):
-    code, report = run(tmp_path, "--scenario", "three-rigid", "--no-plot", "--duration", "2")
+    code, report = run(tmp_path, "--scenario", "three-rigid", "--no-plot", "--duration", "2", "--no-alternatives")
     assert code == 0
     assert len(report["coupling"]["K"]) == 3
     assert report["certificate"]["certified"]
@@ -124,14 +124,16 @@ def test_three_devices_of_ones_own(tmp_path):
 
 
 def test_a_zero_damping_device_is_reported_not_certified(tmp_path):
-    _, report = run(tmp_path, "--coupling", "published", "--delta", "0", "--no-plot", "--duration", "1")
+    _, report = run(
+        tmp_path, "--coupling", "published", "--delta", "0", "--no-plot", "--duration", "1", "--no-alternatives"
+    )
     assert report["certificate"]["required_damping"] == [None, None]
     assert "no damping" in report["certificate"]["reason"]
 
 
 def test_running_twice_gives_the_same_files(tmp_path):
     for _ in range(2):
-        run(tmp_path, "--duration", "0.5", "--coupling", "published")
+        run(tmp_path, "--duration", "0.5", "--coupling", "published", "--no-alternatives")
     names = sorted(p.name for p in (tmp_path / "out").iterdir())
     assert names == ["figure.png", "report.json", "scene.xml", "trace.csv", "trace.npz"]
     table = np.genfromtxt(tmp_path / "out" / "trace.csv", delimiter=",", names=True)
@@ -148,7 +150,7 @@ def test_a_tampered_coupling_is_named(tmp_path):
     save(stored, tmp_path / "good.json")
     changed = SpringDamper((404.0, 300.0), (0.1, 0.1))
     save(msgspec.structs.replace(stored, coupling=changed.form()), tmp_path / "bad.json")
-    short = ("--no-plot", "--duration", "0.5")
+    short = ("--no-plot", "--duration", "0.5", "--no-alternatives")
     for name, doubted in (("good.json", False), ("bad.json", True)):
         _, report = run(tmp_path, "--coupling", str(tmp_path / name), *short)
         assert any("certificate in the coupling's file does not hold" in r for r in report["remarks"]) == doubted
@@ -220,7 +222,7 @@ def test_what_cannot_be_designed_is_exit_code_1(tmp_path):
 
 
 def test_json_on_standard_output_is_only_json(tmp_path):
-    process = command("--coupling", "published", "--no-plot", "--json", "-", cwd=tmp_path)
+    process = command("--coupling", "published", "--no-plot", "--no-alternatives", "--json", "-", cwd=tmp_path)
     out, err = process.communicate()
     assert process.returncode == 0
     assert json.loads(out)["case"] == "I"
@@ -251,7 +253,7 @@ def test_interrupting_keeps_what_was_simulated(tmp_path, monkeypatch):
         block(*args)
 
     monkeypatch.setattr(loop, "run_block", interrupted)
-    code, report = run(tmp_path, "--coupling", "published")
+    code, report = run(tmp_path, "--coupling", "published", "--no-alternatives")
     trace = Trace.load_npz(tmp_path / "out" / "trace.npz")
     assert code == 130
     assert report["run"]["interrupted"]

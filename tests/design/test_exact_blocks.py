@@ -15,7 +15,7 @@ from scipy.optimize import minimize_scalar
 from worlds import STIFF, T
 
 from controller.coupling import Compliance, InternalModel, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, Network, Ranges, Spring, UncertainSpring
+from controller.environment import FIGURE_4, Network, Ranges, Spring, UncertainSpring, Wall
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, rational
 from design import certificate
@@ -27,7 +27,7 @@ from design.conditions import (
     this_environment_demand,
 )
 from design.exact import find_storage, prove_positive_real
-from design.multipliers import SwitchingSweep, switching_block
+from design.multipliers import SwitchingSweep, limiter_demand, switching_block, walls_demand
 from design.result import NotProved, from_ratio
 from design.stored import Stored, digest, sealed
 
@@ -258,6 +258,58 @@ def test_switching_against_a_dense_sweep(lo, hi):
 
     G = loop(FIGURE_4, (0, 0)).sent(STIFF, exact=True)
     assert_limit(lambda d: switching_block(G, lo, hi, [d, d], alpha.tolist())[0], highest(needed))
+
+
+# periods, latency, limits and walls
+
+
+@pytest.mark.parametrize("longest", [T, 1.7 * T])
+def test_the_longest_period_scales_each_block(longest):
+    """T_max/T times what the even period asks; of a spring behind two samples 2.5 K T_max."""
+    rigid = Compliance(Lti.constant([[0.0]], T))
+    F, V = loop(to_ground(1000.0), (2,)).F(rigid, exact=True), SpringDamper([900.0], [0.4]).compliance(rational(T))
+    assert_limit(lambda d: both(this_environment_demand(F, [d], longest)), 2.5 * 1000 * longest)
+    needs = any_environment_limit(900.0, 0.4, 1) * longest / T
+    assert_limit(lambda d: both(any_environment_demand(V, (1,), [d], longest)), needs)
+    G = loop(to_ground(1000.0), (0,)).sent(rigid, exact=True)
+    assert_limit(lambda d: switching_block(G, [1], [3], [d], [1000.0], longest)[0], 3.5 * 1000 * longest)
+
+
+@pytest.mark.parametrize(("first", "last", "longest"), [(1.3e-4, 1.3e-4, T), (0.0, 5e-4, T), (2e-4, 6e-4, 1.5e-3)])
+def test_a_wall_that_latches_late(first, last, longest):
+    """(d/t2 - 3 K/2)(d/(T_max - t1) - K/2) = K^2, its larger root."""
+    K, a, b = 1000.0, 1 / last, 1 / (longest - first)
+    limit = max(np.roots([a * b, -K * (a + 3 * b) / 2, -(K**2) / 4]))
+    F = loop(to_ground(K), (0,)).F(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    assert_limit(lambda d: both(this_environment_demand(F, [d], longest, [(first, last)])), limit)
+
+
+@pytest.mark.parametrize(("theta", "c"), [(0, 0.0), (1, 0.5), (2, 1.3)])
+def test_a_limited_spring(theta, c):
+    """The block by hand: its part with d is [1, 1; 1, 1] d/T, nothing on (1, -1), so a Schur complement is left."""
+    K, rho = 1000.0, 20.0
+
+    def needed(w):
+        z = np.exp(1j * w)
+        n = -sum(z**-i for i in range(theta + 1)) - c
+        corner = -rho * z ** -(theta + 1) + rho * (z**-theta - (z - 1) * n) / z
+        a, b = np.real(K * z**-theta / (z - 1)), (-rho * z ** -(theta + 1) + np.conj(n * K)) / 2
+        both_ways = np.real(corner) - 2 * np.real(b) + a  # on (1, -1)
+        return T * (np.abs(a - b) ** 2 / both_ways - a)
+
+    G = loop(to_ground(K), (0,)).sent(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    assert_limit(lambda d: both(limiter_demand(G, [theta], [d], [rho], [[c]])), highest(needed))
+
+
+@pytest.mark.parametrize(("theta", "g"), [(0, 1.0), (1, 2.0), (2, 0.7)])
+def test_a_wall_on_the_device_itself(theta, g):
+    """(theta + 1 + g)^2 (K + 2 B/T) T/(4 g): no force but the wall's, so the block is constant but for what is late."""
+    wall = Wall(("tip", "ground"), 3000.0, 0.6)
+    network = Network(("tip",), (), walls=(wall,))
+    G = loop(network, (theta,)).walled(Compliance(Lti.constant([[0.0]], T)), exact=True)
+    slope = 3000.0 + 2 * 0.6 / T
+    limit = (theta + 1 + g) ** 2 * slope * T / (4 * g)
+    assert_limit(lambda d: both(walls_demand(G, [d], [rational(slope)], [g])), limit)
 
 
 # prove and verify, with the sweep saying yes to everything

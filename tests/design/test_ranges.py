@@ -322,7 +322,9 @@ def test_design_check_run_audit_and_validate_speak_of_the_ranges(scenario_file, 
         capsys.readouterr()
         return code, json.loads(report.read_text())
 
-    code, design = told(design_main, "--coupling", "optimal", "--samples", "8", "--out", str(file), *common)
+    code, design = told(
+        design_main, "--coupling", "optimal", "--seconds", "0.1", "--samples", "8", "--out", str(file), *common
+    )
     assert (code, design["promise"], design["ranges"]["vertices"]) == (0, "these ranges", 3)
     assert (design["guarantee"], design["set"]) == (design["promise"], design["ranges"])  # today's and older names
     alone, whole = design["price"]
@@ -335,9 +337,8 @@ def test_design_check_run_audit_and_validate_speak_of_the_ranges(scenario_file, 
     assert (code, checked["promise"], checked["vertices"]) == (0, "these ranges", 3)
 
     out = ["--out", str(tmp_path / "out"), *common]
-    code, run = told(
-        run_main, "--coupling", str(file), "--vertex", "3", "--engine", "exact", "--duration", "1", "--no-plot", *out
-    )
+    at_vertex = ["--coupling", str(file), "--vertex", "3", "--engine", "exact", "--duration", "1", "--no-plot"]
+    code, run = told(run_main, *at_vertex, *out)
     assert (code, run["promise"]) == (0, "these ranges")
     assert run["run"]["environment"].startswith("vertex 3 (mass-contact 1 absent")
     assert np.abs(np.load(tmp_path / "out" / "trace.npz")["f"][:, 0]).max() < 1e-3  # of the other's force, filtered

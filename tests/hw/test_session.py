@@ -17,7 +17,7 @@ from design.stored import Stored
 from design.stored import save as save_coupling
 from hw.control import CertifiedCoupling, LinearController, certified_coupling, certified_couplings, fill, link_delay
 from hw.emulator import Emulator, FaultInjection
-from hw.faults import CASES, Case, at, lively, person, rehearse_case
+from hw.faults import CASES, Fault, at, lively, person, rehearse_case
 from hw.limits import SafetyLimits, SafetyStop, Stage, Units
 from hw.monitor import Ages, LinkSettings
 from hw.protocol import Command, Decoder, Force, Hello, Phase, State, Stop, encode
@@ -67,13 +67,13 @@ def rehearsal_of(scenario, rungs, *faults, recorder=None, settings=FAST, **optio
 def test_a_session_whose_device_is_deaf_to_stop_has_not_finished(scenario, rungs):
     """Nothing at this end of the line can take the force away; it can be said, and the exit code not be 0."""
     planned = rehearse_case(
-        Case("planned", Stage.FINISHED, faults=at("stuck"), action=person("stop")), scenario, rungs
+        Fault("planned", Stage.FINISHED, faults=at("stuck"), action=person("stop")), scenario, rungs
     )[0]
     session = planned.session
     assert session.stage == Stage.STOPPED
     assert session.cause.endswith("cut its power")
     assert [event.stage for event in session.log[-2:]] == [Stage.FINISHED, Stage.STOPPED]
-    fault = rehearse_case(Case("fault", Stage.STOPPED, faults=at("stuck jump=5")), scenario, rungs)[0].session
+    fault = rehearse_case(Fault("fault", Stage.STOPPED, faults=at("stuck jump=5")), scenario, rungs)[0].session
     assert fault.stage == Stage.STOPPED
     assert [event.cause[:7] for event in fault.log[-2:]] == ["encoder", "told to"]
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from forked import run
 
 ROOT = Path(__file__).parents[2]
 _spec = importlib.util.spec_from_file_location("regenerate", ROOT / "docs/regenerate.py")
@@ -27,12 +28,12 @@ IN_TEXT = sorted(
     {
         c
         for text in TEXTS.values()
-        for c in re.findall(r"`(python -m design -[^`]*)`", text)
-        if not re.search("FILE|--ranges 10%", c)
+        for c in regenerate.IN_SENTENCES.findall(text)
+        if "FILE" not in c and not regenerate.SLOW.search(c)
     }
 )
-#: commands that take most of a minute: `make figures` runs them, and writes what they print
-SLOW = re.compile(r"set\.json|--coupling optimal --grid 10")
+#: commands that take most of a minute: `make validate` runs them, and `make figures` writes what they print
+SLOW = regenerate.SLOW
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +56,8 @@ def printed():
 def test_every_command_runs(command, place, printed):
     """0 or 1 (done, and it holds or does not): never bad input, never a traceback."""
     if SLOW.search(command):
-        pytest.skip("most of a minute: python docs/regenerate.py runs it")
-    done = regenerate.run(command, place)
+        pytest.skip("most of a minute: python docs/regenerate.py --check runs it")
+    done = run(command, place)
     assert done.returncode in (0, 1), f"{COMMANDS[command]}: {done.stderr}"
     assert "Traceback" not in done.stderr
     printed[command] = done.stdout
@@ -66,8 +67,8 @@ def test_every_command_runs(command, place, printed):
 def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown, place, printed):
     """`python docs/regenerate.py` writes it anew."""
     if SLOW.search(command):
-        pytest.skip("most of a minute: python docs/regenerate.py runs it")
-    output = printed.get(command) or regenerate.run(command, place).stdout
+        pytest.skip("most of a minute: python docs/regenerate.py --check runs it")
+    output = printed.get(command) or run(command, place).stdout
     fresh = regenerate.kept(output, pattern).splitlines()
     assert shown.splitlines()
     assert len(fresh) == len(shown.splitlines()), f"{page.name}: {output}"
@@ -76,7 +77,7 @@ def test_output_that_a_page_shows_is_the_commands(page, command, pattern, shown,
 
 @pytest.mark.parametrize("command", IN_TEXT)
 def test_a_design_that_a_sentence_names_can_be_had(command, place):
-    done = regenerate.run(command, place)
+    done = run(command, place)
     assert done.returncode == 0, done.stderr
 
 
@@ -138,7 +139,7 @@ def test_measured_blocks_are_compared_but_for_times(monkeypatch, tmp_path, capsy
     page.write_text("<!-- measured: rows -->\n```text\n$ python -m x\n3 rows in 0.2 s\n```\n")
     monkeypatch.setattr(regenerate, "PAGES", [page])
     for printed, found in (("noise\n3 rows in 9 s\n", 0), ("9 rows in 0.2 s\n", 1), ("", 1)):
-        monkeypatch.setattr(regenerate, "run", lambda *words, out=printed: SimpleNamespace(stdout=out))
+        monkeypatch.setattr(regenerate, "run", lambda *words, out=printed: SimpleNamespace(stdout=out, returncode=0))
         assert regenerate.check() == found
     assert "and there is    9 rows in 0.2 s" in capsys.readouterr().out
 

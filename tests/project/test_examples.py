@@ -1,12 +1,10 @@
 """The six examples run as a newcomer would run them, and say what they should."""
 
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from forked import run
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -40,10 +38,7 @@ def test_a_device_without_damping_ends_the_example_with_one_line(tmp_path):
     text = (ROOT / "examples/your_own_device.py").read_text()
     assert '"damping": 0.9' in text
     (tmp_path / "mine.py").write_text(text.replace('"damping": 0.9', '"damping": 0.0'))
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [sys.executable, "mine.py"], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
+    done = run(["python", tmp_path / "mine.py"], tmp_path)
     assert done.returncode == 1
     assert done.stderr == "error: delta is [0.0, 0.0]: a device without damping can guarantee nothing to any human\n"
 
@@ -63,10 +58,7 @@ def test_every_example_is_tested_and_short():
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs(path, tmp_path):
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, str(path)], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
+    done = run(["python", path], tmp_path)
     assert done.returncode == 0, done.stderr
     missing = [words for words in SAYS[path.stem] if not re.search(words, done.stdout)]
     assert not missing, done.stdout

@@ -85,7 +85,9 @@ def test_the_person_found_is_kept_for_a_replay(tmp_path, monkeypatch):
     assert main([*base, "--humans", "5", "--duration", "0", "--adversary", "--generations", "8"]) == 0
     found = json.loads(file.read_text())["adversary"]
     assert found["person"][0]["holds"] == [1, 2]
-    assert run_command.main([*base, "--human", str(out / "adversary.toml"), "--duration", "0.5"]) == 0
+    assert (
+        run_command.main([*base, "--no-alternatives", "--human", str(out / "adversary.toml"), "--duration", "0.5"]) == 0
+    )
     stability = json.loads(file.read_text())["stability"]
     assert stability["spectral_radius"] == pytest.approx(found["spectral_radius"], abs=1e-12)
 
@@ -110,7 +112,7 @@ def test_the_command_keeps_the_human_for_a_replay(tmp_path):
     assert adversary["found"]
     assert adversary["required_over_available_damping"] == pytest.approx(1.7229 / 1.37, rel=1e-4)
     replay = ["--case", "none", "--human", str(out / "adversary.toml"), "--duration", "0.5", "--engine", "exact"]
-    assert run_command.main([*replay, "--no-plot", "--out", str(out), "--json", str(file)]) == 0
+    assert run_command.main([*replay, "--no-alternatives", "--no-plot", "--out", str(out), "--json", str(file)]) == 0
     stability = json.loads(file.read_text())["stability"]
     assert stability["spectral_radius"] == pytest.approx(adversary["spectral_radius"], abs=1e-12)
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from controller.coupling import SpringDamper
 from sim import couplings
-from sim.couplings import choose
+from sim.couplings import Chosen, choose
 from sim.scenario import load
 
 
@@ -23,8 +24,13 @@ def asked(monkeypatch, tmp_path):
     return made
 
 
-def soft():
+def soft() -> Chosen:
     return choose(load(), "I", "spring-damper", "any-environment")
+
+
+def stiffness(chosen: Chosen) -> np.ndarray:
+    assert isinstance(chosen.coupling, SpringDamper)
+    return chosen.coupling.K
 
 
 def test_a_design_is_made_once(asked, tmp_path):
@@ -39,18 +45,18 @@ def test_a_design_is_made_once(asked, tmp_path):
 
 @pytest.mark.parametrize("spoilt", ["cut", "stiffer", "folder"])
 def test_an_entry_that_is_no_proof_is_designed_again(asked, tmp_path, spoilt):
-    first = soft()
+    K = stiffness(soft())
     (entry,) = tmp_path.glob("haptic-loop/*.json")
     text = entry.read_text()
     if spoilt == "cut":
         entry.write_text(text[: len(text) // 2])
     elif spoilt == "stiffer":
-        entry.write_text(text.replace(repr(float(first.coupling.K[0])), repr(float(first.coupling.K[0]) * 1.01)))
+        entry.write_text(text.replace(repr(float(K[0])), repr(float(K[0]) * 1.01)))
         assert entry.read_text() != text
     else:
         entry.unlink()
         entry.mkdir()
-    np.testing.assert_array_equal(soft().coupling.K, first.coupling.K)
+    np.testing.assert_array_equal(stiffness(soft()), K)
     assert len(asked) == 2
     assert spoilt == "folder" or entry.read_text() == text
 

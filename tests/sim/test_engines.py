@@ -1,9 +1,11 @@
 """The two engines simulate the same plant; MuJoCo converges to the exact one at each integrator's order."""
 
 import ctypes
+import tempfile
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,9 +15,10 @@ from controller.coupling import NoCoupling
 from design.result import CASE_I
 from models.scene import plant
 from sim import engines as mujoco_engine
+from sim import run as loop
 from sim.engines import MujocoBatchEngine, MujocoEngine, profiler_off
 from sim.run import assemble, make_engine, outside_forces, run
-from sim.scenario import load
+from sim.scenario import InputError, load
 from sim.stability import close, dominant_mode
 
 SHORT = load().replace(duration=0.6)
@@ -157,3 +160,21 @@ def test_without_the_clock_everything_still_runs(monkeypatch, assembly):
     with profiler_off() as found:
         assert not found
     assert run(assembly).s.shape[0] == SHORT.samples
+
+
+def test_a_long_trace_lies_on_the_disk(assembly, monkeypatch, tmp_path):
+    """The same numbers as in memory; refused where neither has room, with the duration that has."""
+    expected, ticks = run(assembly, "exact"), assembly.scenario.samples
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(loop, "_free_memory", lambda: 400 * ticks)
+    found = run(assembly, "exact")
+    for name in ("t", "x", "f", "x_handle", "w", "z", "s"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    assert not any(tmp_path.iterdir())  # the file has no name, and goes with the trace
+    monkeypatch.setattr(loop, "_free_memory", lambda: 200 * ticks)
+    with pytest.raises(InputError, match=r"duration: 0.6 s need .* GiB of memory, .* allowed are 0.3 s"):
+        run(assembly, "exact")
+    monkeypatch.setattr(loop, "_free_memory", lambda: 400 * ticks)
+    monkeypatch.setattr(loop.shutil, "disk_usage", lambda place: SimpleNamespace(free=1000))
+    with pytest.raises(InputError, match=r"duration: .* GiB of .* are free: allowed are"):
+        run(assembly, "exact")

@@ -88,7 +88,18 @@ def test_too_few_ticks_say_so():
 
 
 def test_the_command_reads_what_sim_run_writes(tmp_path, capsys):
-    options = ["--case", "none", "--engine", "exact", "--duration", "9", "--no-plot", "--out", str(tmp_path)]
+    options = [
+        "--case",
+        "none",
+        "--engine",
+        "exact",
+        "--duration",
+        "9",
+        "--no-plot",
+        "--no-alternatives",
+        "--out",
+        str(tmp_path),
+    ]
     assert command.main(options) == 0
     capsys.readouterr()
     path = tmp_path / "trace.npz"

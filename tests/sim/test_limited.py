@@ -103,7 +103,16 @@ def test_a_script_limits_forces_as_the_command_does():
 
 def test_the_report_says_which_guarantee_holds(tmp_path):
     def report(*options) -> dict:
-        where = ["--no-plot", "--duration", "1", "--out", str(tmp_path), "--json", str(tmp_path / "r.json")]
+        where = [
+            "--no-plot",
+            "--no-alternatives",
+            "--duration",
+            "1",
+            "--out",
+            str(tmp_path),
+            "--json",
+            str(tmp_path / "r.json"),
+        ]
         assert main([*options, *where]) == 0
         return json.loads((tmp_path / "r.json").read_text())
 

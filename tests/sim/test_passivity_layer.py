@@ -117,7 +117,18 @@ def test_the_shell_bounds_what_an_environment_of_ones_own_gives():
 
 @pytest.mark.parametrize("name", BASELINES)
 def test_a_classic_acts_in_the_loop_and_is_marked_as_a_baseline(name, tmp_path):
-    options = ["--coupling", name, "--duration", "1", "--no-plot", "--out", str(tmp_path), "--engine", "exact"]
+    options = [
+        "--coupling",
+        name,
+        "--duration",
+        "1",
+        "--no-plot",
+        "--no-alternatives",
+        "--out",
+        str(tmp_path),
+        "--engine",
+        "exact",
+    ]
     assert run_command([*options, "--json", str(tmp_path / "r.json")]) == 0
     report = json.loads((tmp_path / "r.json").read_text())
     assert report["baseline"]["name"] == name
@@ -138,7 +149,16 @@ def test_energy_bounding_sends_what_its_law_says():
 
 
 def test_the_report_of_a_run_says_what_the_budget_did(tmp_path):
-    options = ["--energy-budget", "0,0.0005", "--duration", "1.5", "--no-plot", "--out", str(tmp_path)]
+    options = [
+        "--energy-budget",
+        "0,0.0005",
+        "--duration",
+        "1.5",
+        "--no-plot",
+        "--no-alternatives",
+        "--out",
+        str(tmp_path),
+    ]
     assert run_command([*options, "--json", str(tmp_path / "r.json")]) == 0
     part = json.loads((tmp_path / "r.json").read_text())["energy_budget"]
     assert (part["start_J"], part["cap_J"], part["idle"]) == (0, 0.0005, None)

@@ -112,7 +112,16 @@ def test_run_uses_and_reports_the_rule(tmp_path):
     path = tmp_path / "stiff.toml"
     text = (SCENARIOS / "omega-pair.toml").read_text()
     path.write_text(text.replace("transmission_stiffness = 14500", "transmission_stiffness = 1e6"))
-    options = ["--scenario", str(path), "--coupling", "published", "--duration", "0.3", "--no-plot"]
+    options = [
+        "--scenario",
+        str(path),
+        "--coupling",
+        "published",
+        "--duration",
+        "0.3",
+        "--no-plot",
+        "--no-alternatives",
+    ]
     options += ["--out", str(tmp_path / "o"), "--json", str(tmp_path / "r.json")]
     stepped = [*options, "--integrator", "RK4"]
     assert main(stepped) == 0

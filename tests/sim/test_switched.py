@@ -126,7 +126,15 @@ def test_switching_depends_on_the_seed_only():
 
 
 def run(tmp_path, *options):
-    options = [*options, "--no-plot", "--out", str(tmp_path / "out"), "--json", str(tmp_path / "r.json")]
+    options = [
+        *options,
+        "--no-plot",
+        "--no-alternatives",
+        "--out",
+        str(tmp_path / "out"),
+        "--json",
+        str(tmp_path / "r.json"),
+    ]
     assert main(options) == 0
     return json.loads((tmp_path / "r.json").read_text())
 

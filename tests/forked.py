@@ -1,0 +1,140 @@
+"""Commands as a user runs them, without their second of imports: one process has imported all and forks for each.
+
+python tests/forked.py FOLDER     designs that runs ask for are kept in FOLDER; a request a line, its answer a line
+"""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import hashlib
+import json
+import os
+import pickle
+import runpy
+import shlex
+import subprocess
+import sys
+import tempfile
+from contextlib import suppress
+from importlib import import_module
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+def share_designs(folder: Path, patch=setattr) -> None:
+    """One design for all tests and processes that ask for the same one: seconds each, and the same at every time.
+
+    What makes them, design.designs and the modules behind it, is as it was.
+    """
+    import cli.design
+    from design import api, bound, compare, designs
+    from sim import couplings
+
+    for module in (cli.design, api, compare, couplings):
+        patch(module, "design_by_kind", _remembering(folder, designs.design_by_kind))
+    for module in (cli.design, compare):
+        patch(module, "bound", _remembering(folder, bound.bound))
+
+
+def _remembering(folder: Path, make):
+    """The same function, with its results kept in the folder; failures and loops without a digest are not."""
+    from design.stored import digest
+
+    def remembered(loop, *asked, **named):
+        plain = [x for x in asked if not callable(x)], sorted((k, x) for k, x in named.items() if not callable(x))
+        try:
+            loop_and_asked = digest(loop), make.__name__, plain
+        except TypeError:  # an environment of a test's own class
+            return make(loop, *asked, **named)
+        file = folder / hashlib.sha256(repr(loop_and_asked).encode()).hexdigest()
+        if not file.exists():
+            made = make(loop, *asked, **named)
+            part = file.with_suffix(f".{os.getpid()}")
+            part.write_bytes(pickle.dumps(made))
+            part.rename(file)
+        return pickle.loads(file.read_bytes())
+
+    return remembered
+
+
+@functools.cache
+def _warm() -> subprocess.Popen[str]:
+    """The process that forks; it ends with this one."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    words = [sys.executable, str(Path(__file__)), os.environ.get("SHARED_DESIGNS", "")]
+    warm = subprocess.Popen(words, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    atexit.register(lambda: (warm.stdin.close(), warm.wait()))
+    return warm
+
+
+def run(command: str | list[str], folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """`python -m MODULE ...` of a command, or `python FILE ...`, in a terminal of 100 columns."""
+    words = shlex.split(command, comments=True) if isinstance(command, str) else [str(word) for word in command]
+    warm = _warm()
+    with tempfile.TemporaryDirectory() as place:
+        files = [Path(place, name) for name in ("out", "err")]
+        request = {"words": words[1:], "folder": str(folder), "files": [str(file) for file in files]}
+        print(json.dumps(request | {"environment": {"COLUMNS": "100"} | environment}), file=warm.stdin, flush=True)
+        code = int(warm.stdout.readline())
+        return subprocess.CompletedProcess(words, code, *(file.read_text(encoding="utf-8") for file in files))
+
+
+def _command(words: list[str]) -> None:
+    """In the child: the command by its door, or the file; the code that it leaves with."""
+    from cli.main import COMMANDS, door
+
+    if words[0] != "-m":
+        sys.argv = words
+        runpy.run_path(str(ROOT / words[0]), run_name="__main__")
+        return
+    sys.argv = words[1:]
+    door({module: command for command, (module, _) in COMMANDS.items()}[words[1]])
+
+
+def _child(request: dict) -> None:
+    """Never returns."""
+    code = 99
+    try:
+        os.chdir(request["folder"])
+        os.environ.update(request["environment"])
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        for number, name in enumerate(request["files"], start=1):
+            os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
+            stream = os.fdopen(number, "w", encoding="utf-8", closefd=False)
+            setattr(sys, ("stdout", "stderr")[number - 1], stream)
+        _command(request["words"])
+        code = 0
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    except BaseException:
+        import traceback
+
+        traceback.print_exc()
+        code = 1
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(Exception):
+                stream.flush()
+        os._exit(code)
+
+
+def _serve() -> None:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    from cli.main import COMMANDS
+
+    for name in ["matplotlib.pyplot", "cvxpy", *(f"cli.{command}" for command in COMMANDS)]:
+        import_module(name)
+    if sys.argv[1]:
+        share_designs(Path(sys.argv[1]))
+    for line in sys.stdin:
+        if (child := os.fork()) == 0:
+            _child(json.loads(line))
+        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+
+
+if __name__ == "__main__":
+    _serve()
