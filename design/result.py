@@ -163,17 +163,6 @@ class Design:
     certificate: Any = field(kw_only=True, default=None)  # design.stored.Certificate, where the design has proved it
 
 
-@dataclass(frozen=True)
-class Row:
-    """One line of a comparison."""
-
-    method: str
-    norm: float | None  # ||W1 L W2||_inf, None where the method gave nothing that could be verified
-    sdps: int
-    wall_s: float
-    reason: str | None = None
-
-
 COUPLING = "a coupling (controller.coupling), or a Design"
 
 
