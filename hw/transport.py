@@ -213,7 +213,8 @@ class Live(Driver):
         session = self.session
         if self._typed():
             self._pressed()
-        self.do(self._operator.look(session, now))
+        if said := self._operator.look(session, now):
+            self.do(said)
         if signal.SIGUSR1 in self.signals:
             self.do(session.estop("SIGUSR1", now))
         elif self.signals:
