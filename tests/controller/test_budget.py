@@ -173,7 +173,7 @@ def test_varying_delays_and_losses_keep_the_guarantee(told, hold, loss):
         budget = EnergyBudget(DELTA, T, lo, hi, hold=hold, start=W0, nsim=30)
         line, force, x, acted = Line(rng, lo, hi, hold, loss, 30), controller(hands, rng), hands.x, [np.zeros((2, 30))]
         worked = np.zeros(30)
-        for k in range(900):
+        for k in range(1200):
             sent = budget.limit(force(), hands.x - x, acted[-1] if told == "at once" else None)
             x = hands.x
             if told == "late" and k > late:
@@ -434,7 +434,7 @@ def test_the_shell_leaves_a_passive_implicit_environment_as_it_is():
 def test_energy_bounding_is_the_published_interval_and_the_budget_that_saves_nothing():
     rng = np.random.default_rng(15)
     bounding, c1, before = EnergyBounding([1.2], T), 2 * 1.2 / T, 0.0
-    for k in range(900):
+    for k in range(1200):
         dx, wanted = (0.0 if k % 7 == 0 else 1e-4 * rng.normal()), 3 * rng.normal()
         force = bounding.limit(np.array([[wanted]]), np.array([[dx]])).item()
         if dx == 0:
