@@ -22,7 +22,7 @@ from controller.lti import Array
 from design.certificate import prove, prove_limiter
 from design.conditions import this_environment as requirement_of
 from design.designs import design_by_kind
-from design.environments import Searched, in_each, search_ranges, worst
+from design.environments import Searched, in_each, ratio_in, search_ranges, worst
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.program import (
     DEFAULT,
@@ -199,8 +199,8 @@ class _Climb:
         if options.limiter and (reason := limiter_refusal(loop)):
             raise ValueError(reason)
         needs = in_each(loop, NoCoupling(), loop.members())
-        if not np.isfinite(bare := max(need.ratio for need in needs)):
-            raise ValueError(f"no coupling is safe here: {next(n.reason for n in needs if n.reason)}")
+        if not np.isfinite(bare := max(each.ratio for each in needs)):
+            raise ValueError(f"no coupling is safe here: {next(each.reason for each in needs if each.reason)}")
         return cls(loop, options, tuple(cases), bare, started)
 
     @property
@@ -283,7 +283,7 @@ class _Climb:
             chosen = tuple(cases[i] for i in active)
             problem = Problem(span, chosen, self.options, SOFT[0] * min(share, SOFT[1]))
             coupling = span.filter(problem.solve(self._start(problem)))
-            needs = [case.need(coupling) for case in cases]
+            needs = [ratio_in(case.loop, coupling) for case in cases]
             missed = [int(i) for i in np.argsort(needs)[::-1] if needs[i] > 1 + _TOLERATED and i not in active]
             if not missed:
                 break
@@ -424,7 +424,7 @@ def robustness_parts(loop: Loop, coupling: Coupling, options: Options = DEFAULT)
     return {"robustness": robustness_part(loop, coupling), "designed_for_it": parts}
 
 
-_MOST_RANGES = 6  # whose 64 vertices can all be proved
+_MOST_RANGES = 7  # whose 128 vertices can all be proved
 
 
 def widest_ranges(loop: Loop, percent: float) -> tuple[Ranges, str | None]:
@@ -440,17 +440,17 @@ def widest_ranges(loop: Loop, percent: float) -> tuple[Ranges, str | None]:
         return whole, None
     small = design(loop.at(loop.network), replace(DEFAULT, ladder=DEFAULT.ladder[:1])).coupling
 
-    def need(box: Ranges) -> float:
+    def most(box: Ranges) -> float:
         there = msgspec.structs.replace(loop, ranges=box)
-        return max(found.ratio for found in in_each(there, small, there.members()))
+        return max(ratio_in(loop.at(member.network), small) for member in there.members())
 
-    ranked = sorted(single, key=need, reverse=True)
+    ranked = sorted(single, key=most, reverse=True)
     kept, known = ranked[:_MOST_RANGES], ranked[_MOST_RANGES:]
     names = [f"stiffness {' and '.join(spring.between)}" for box in known for spring in box.springs]
     names += [f"mass {node}" for box in known for node in box.masses]
     note = (
         f"{len(single)} ranges have {2 ** len(single)} vertices, {2**_MOST_RANGES} can be proved: those that matter "
-        f"most are kept, taken as known: {', '.join(names)}"
+        f"most are kept; nothing is proved of the others, which are taken as known: {', '.join(names)}"
     )
     springs = tuple(spring for box in kept for spring in box.springs)
     return Ranges(springs, {node: span for box in kept for node, span in box.masses.items()}), note

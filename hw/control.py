@@ -83,17 +83,18 @@ class _LimitedController:
 
     def __init__(self, limiter: Limiter) -> None:
         F = limiter.open
-        self.limiter, self.T, self._m = limiter, F.T, F.inputs
+        self.limiter, self.T = limiter, F.T
         self._tick = limiter.transition()
-        self._input, self._output = (np.zeros((F.order + F.inputs, 1)) for _ in range(2))
+        m = F.inputs
+        before, after = self._buffers = np.zeros((F.order + m, 1)), np.zeros((F.order + m, 1))
+        self._state, self._x, self._next, self._f = before[:-m], before[-m:, 0], after[m:], after[:m, 0]
 
     def step(self, x: Sequence[float]) -> list[float]:
         """Forces (m,) [N] within the limits for the displacements x (m,) [m]; the state moves on by one tick."""
-        m, before, after = self._m, self._input, self._output
-        before[-m:, 0] = x
-        self._tick(before, after)
-        before[:-m] = after[m:]
-        return after[:m, 0].tolist()
+        self._x[:] = x
+        self._tick(*self._buffers)
+        self._state[:] = self._next
+        return self._f.tolist()
 
 
 def host_controller(
@@ -235,8 +236,7 @@ class Drive:
         self._test = EncoderTest(limits.cap, T) if settings.test_encoders else None
         self._encoders, self._heat = EncoderMonitor(units.encoder_step, units.force_step, T), Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] over which a speed is taken
-        self._recent: deque[tuple[int, tuple[float, ...]]] = deque()  # ticks since arming, and x [m]
-        self._ticks = 0  # since arming
+        self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] tick by tick
         self._before: tuple[float, ...] | None = None  # [m] of the STATE before that, where none is missing
         self._counters, self._record, self._arming = counters, record, arming
         self._commands, self._clock = CommandMonitor(config), ClockMonitor(limits, T)
@@ -288,13 +288,13 @@ class Drive:
             check_jump(x, self.x, ticks, self.limits)
             if ticks == 1 and self._before is not None:
                 check_jolt(x, self.x, self._before, self.limits)
-        self._ticks += ticks
         recent = self._recent
-        while recent and recent[0][0] < self._ticks - self._window:
-            recent.popleft()
-        if recent and (since := self._ticks - recent[0][0]) >= self._window // 2:
-            check_speed(x, recent[0][1], since * self.T, self.limits)
-        recent.append((self._ticks, x))
+        if ticks == 1 or self.x is None:
+            recent.append(x)
+        else:
+            recent.extend(fill(self.x, x, ticks))
+        if (since := len(recent) - 1) >= self._window // 2:
+            check_speed(x, recent[0], since * self.T, self.limits)
 
     def _miss(self, state: State, positions: list[tuple[float, ...]]) -> None:
         """The controller moves on through ticks of which no STATE came."""
@@ -453,10 +453,11 @@ def certified_coupling(
         wanted = condition or ("this-environment" if slower.latency else None)
         chosen = choose(slower, case, name, wanted, limiter) if own is None else given(own)
     except DesignFailed as error:
-        raise SafetyStop(f"no coupling for a link of {link} ticks: {error}") from None
+        raise SafetyStop(f"no coupling for a link of {link} tick{'s' if link > 1 else ''}: {error}") from None
     requirements = assess(slower.loop(case), chosen.coupling, chosen.phi)
     limits = limits_of(slower, chosen, requirements, limiter)
-    made = CertifiedCoupling(min(slower.theta) if link else 0, slower, case, chosen, requirements, limits)
+    waits = min(MAX_THETA, *slower.theta) if link else 0  # what is longer, the host waits for
+    made = CertifiedCoupling(waits, slower, case, chosen, requirements, limits)
     if not made.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"
         raise SafetyStop(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(made)}")

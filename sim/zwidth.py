@@ -387,16 +387,13 @@ class Grid:
         return (rows[:, None] * self.shape[1] + columns).ravel()
 
 
-def make_grid(
-    sweep: Sweep, n: int, K: Range | None, B: Range | None, scale: str | None, marks: tuple[Range, ...] = ()
-) -> Grid:
+def make_grid(sweep: Sweep, n: int, K: Range | None, B: Range | None, marks: tuple[Range, ...] = ()) -> Grid:
     """n x n cells. Ranges that are not given come from the loop, and make room for the marks.
 
     K is about the loop's stiffness_scale, B about delta, the most that a linear law may damp. A linear map goes up to
     2.5 times these, a logarithmic one from far below to far above. Raises InputError.
     """
-    scale = scale or sweep.usual_scale
-    stiff, most = sweep.stiffness_scale, max(sweep.loop.delta)
+    scale, stiff, most = sweep.usual_scale, sweep.stiffness_scale, max(sweep.loop.delta)
     if scale == "linear":
         wide = (2.5 * stiff / n, 2.5 * stiff), (0.0, 2.5 * most)
     else:
