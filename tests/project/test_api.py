@@ -164,6 +164,15 @@ def test_delays_that_vary_are_simulated():
     assert first.meta["stability"] is None
 
 
+def test_periods_are_drawn_by_the_seed_that_is_reported():
+    scenario = load().replace(period={"min": 0.8e-3, "max": 1.6e-3}, duration=0.1)
+    for seed in (0, 1):
+        trace = simulate(scenario, SOFT, seed=seed)
+        periods = scenario.timing(seed, scenario.samples).period[: trace.t.size - 1]
+        np.testing.assert_allclose(np.diff(trace.t), periods)
+        assert trace.meta["seed"] == seed
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
