@@ -69,7 +69,7 @@ def test_the_options_are_those_that_the_designs_take():
     assert set(OPTIONS) == set(KINDS)
     assert set(OPTIONS["ccl"]) < set(signature(ccl.design).parameters)
     assert set(OPTIONS["spring-damper"]) - {"limiter"} < set(signature(spring_damper.design).parameters)
-    own = {field.name for field in fields(optimal.Options)} - {"ladder"}
+    own = {field.name for field in fields(optimal.program.Options)} - {"ladder"}
     assert set(OPTIONS["optimal"]) == {*own, "switching"}
     assert set(Options.__annotations__) == {name for names in OPTIONS.values() for name in names}
 
