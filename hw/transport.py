@@ -1,4 +1,4 @@
-"""Wire: a session in real time over a serial port, by pyserial, and one thread that waits for nothing else.
+"""A session in real time over a serial port, by pyserial, and one thread that waits for nothing else.
 
 Python holds up a loop by itself: a full garbage collection takes 40 ms with MuJoCo and cvxpy loaded. So what is loaded
 is frozen and the collector is off while forces act.

@@ -69,7 +69,7 @@ def test_the_options_are_those_that_the_designs_take():
     assert set(OPTIONS) == set(KINDS)
     assert set(OPTIONS["ccl"]) < set(signature(ccl.design).parameters)
     assert set(OPTIONS["spring-damper"]) - {"limiter"} < set(signature(spring_damper.design).parameters)
-    own = {field.name for field in fields(optimal.Options)} - {"ladder"}
+    own = {field.name for field in fields(optimal.program.Options)} - {"ladder"}
     assert set(OPTIONS["optimal"]) == {*own, "switching"}
     assert set(Options.__annotations__) == {name for names in OPTIONS.values() for name in names}
 
@@ -162,6 +162,15 @@ def test_delays_that_vary_are_simulated():
     np.testing.assert_array_equal(first.f, again.f)
     assert np.any(first.f != other.f)
     assert first.meta["stability"] is None
+
+
+def test_periods_are_drawn_by_the_seed_that_is_reported():
+    scenario = load().replace(period={"min": 0.8e-3, "max": 1.6e-3}, duration=0.1)
+    for seed in (0, 1):
+        trace = simulate(scenario, SOFT, seed=seed)
+        periods = scenario.timing(seed, scenario.samples).period[: trace.t.size - 1]
+        np.testing.assert_allclose(np.diff(trace.t), periods)
+        assert trace.meta["seed"] == seed
 
 
 @pytest.mark.parametrize(
