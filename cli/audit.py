@@ -36,7 +36,7 @@ def main(argv: list[str]) -> int:
     """Audit a coupling. 0: safe in this environment and at every vertex of its ranges, 1: not."""
     args = _parser().parse_args(argv)
     if args.devices:
-        beside = [name for name in ("K", "B", "coupling", "device", "preset", "rigid") if getattr(args, name)]
+        beside = [name for name in ("K", "B", "coupling", "device", "rigid") if getattr(args, name)]
         if beside:
             raise InputError(f"--devices with --{beside[0]}: the list is of the whole catalogue, give one of them")
         return _list_devices(args)
@@ -58,7 +58,7 @@ def main(argv: list[str]) -> int:
         "case": args.case,
         "scenario": None if args.rigid else scenario.name,
         "device": args.device and {"name": args.device, **_device_part(CATALOGUE[args.device])},
-        "preset": args.preset and {"name": args.preset, "source": args.source},
+        "gains": args.source if args.device else None,
         **judged,
         "encoder": None if args.rigid else encoder_steps(scenario, args.case, coupling),
         "notes": _notes(args, scenario, switching),
@@ -82,7 +82,6 @@ def _parser() -> options.Parser:
     coupling.add_argument("--coupling", metavar="FILE.json", help="a stored coupling, in place of --K and --B")
     device = "its damping and, where no gains are given, the largest that CHAI3D allows it, on a rigid wall at 1 kHz"
     coupling.add_argument("--device", metavar="NAME", help=f"of the catalogue: {device}; other options go first")
-    coupling.add_argument("--preset", choices=("chai3d-omega3",), help="as --device omega.3")
     coupling.add_argument("--devices", action="store_true", help="list the catalogue, with a source for every number")
     options.add_loop_options(parser)
     options.add_rigid_option(parser)
@@ -94,14 +93,10 @@ def _parser() -> options.Parser:
 
 def _with_device(args: argparse.Namespace) -> argparse.Namespace:
     """The options, with a device's numbers where none are given; `source` allows its gains. Raises InputError."""
-    if not args.device and not args.preset:
+    if not args.device:
         return args
-    if args.device and args.preset:
-        raise InputError("--device with --preset: give one of them")
-    if args.preset and args.coupling:
-        raise InputError("--preset with --coupling: give one of them")
     try:
-        name, device = listed_device(args.device or "omega.3")
+        name, device = listed_device(args.device)
     except ValueError as error:
         raise InputError(f"--{error}") from None
     found: dict[str, Any] = {"device": name, "source": None}
@@ -109,7 +104,7 @@ def _with_device(args: argparse.Namespace) -> argparse.Namespace:
         if device.damping is None:
             raise InputError(f"--device {name}: nobody publishes its damping: give --delta, as measured by hw.identify")
         found["delta"] = (device.damping[0].value,)
-    gained = args.coupling or args.case == "none" or (args.K and args.B and not args.preset)
+    gained = args.coupling or args.case == "none" or (args.K and args.B)
     if device.stiffness and device.framework_damping and not gained:
         found["source"] = f"K and B: {device.stiffness.source}; T: the 1 kHz that haptic loops customarily run at"
         largest = {"K": (device.stiffness.value,), "B": (device.framework_damping.value,)}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -25,7 +24,7 @@ from design.gain_search import STIFFEST
 from design.guarantees import ANY, HERE, switching_guarantee
 from design.optimal import Optimal, robustness_parts, widest_ranges
 from design.program import DEFAULT, OBJECTIVES, Options
-from design.result import METHODS, Design, DesignFailed, NotProved, Row, listed
+from design.result import METHODS, Design, DesignFailed, NotProved, listed
 from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
 from sim import report as parts
@@ -72,7 +71,6 @@ def _parser() -> options.Parser:
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
     ccl.add_argument("--method", choices=METHODS, help="complementarity is as printed (default inner)")
-    ccl.add_argument("--compare", action="store_true", help="run every method, one state per channel (a minute)")
     optimal = parser.add_argument_group("optimal: the best filter of the environment's forces")
     add_optimal_options(optimal)
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"
@@ -116,17 +114,9 @@ def _number_or_none(text: str) -> float | str:
 # The request.
 
 
-#: options of a design -> the couplings that take them
-_OPTIONS = {
-    "limiter": ("spring-damper", "optimal"),
-    "order": ("ccl",),
-    "method": ("ccl",),
-    "compare": ("ccl",),
-    "full": ("ccl",),
-    "objective": ("optimal",),
-    "band_hz": ("optimal", "spring-damper"),
-    "high_gain": ("optimal",),
-    "seconds": ("optimal",),
+#: options of a design; --full says of the ccl's `diagonal` that it is not
+_OPTIONS = {"full": "diagonal"} | {
+    name: name for name in ("limiter", "order", "method", "objective", "band_hz", "high_gain", "seconds")
 }
 
 
@@ -162,7 +152,7 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 
 def _for_switching(args: argparse.Namespace) -> bool:
     """Whether this design can be made for delays that vary; any other is only judged under them."""
-    condition = args.condition or KINDS[args.coupling][0]
+    condition = args.condition or KINDS[args.coupling].conditions[0]
     return args.coupling in ("spring-damper", "optimal") and condition == "this-environment"
 
 
@@ -173,13 +163,13 @@ def _asked(args: argparse.Namespace, loop: Loop) -> dict[str, Any]:
     if args.coupling == "spring-damper" and args.limiter is not None:
         given["limiter"] = args.limiter
     for name in given:
-        if args.coupling not in _OPTIONS[name]:
-            allowed = " or ".join(_OPTIONS[name])
+        taking = [kind for kind, design in KINDS.items() if _OPTIONS[name] in design.options]
+        if args.coupling not in taking:
+            allowed = " or ".join(taking)
             shown = name.removesuffix("_hz").replace("_", "-")
             raise InputError(f"--{shown} is for --coupling {allowed}, not {args.coupling}")
     if args.coupling == "optimal":
         return optimal_options(args)
-    given.pop("compare", None)
     if given.pop("full", False):
         given["diagonal"] = False
     return given
@@ -238,7 +228,6 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         *_worth(args, loop, design),
         design.sdps,
         stored,
-        _comparison(loop) if args.compare else None,
     )
 
 
@@ -250,13 +239,6 @@ def _worth(args: argparse.Namespace, loop: Loop, design: Design) -> tuple[dict[s
             asked = Options(**optimal_options(args)) if best else DEFAULT
             robust = robustness_parts(loop, design.coupling, asked)
         return robust, best and _best_figures(args, loop, best)
-
-
-def _comparison(loop: Loop) -> Sequence[Row]:
-    from design import fixed_order  # cvxpy takes a second to import
-
-    with render.progress("comparing the methods"):
-        return fixed_order.compare(loop)
 
 
 def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[str, Any]:
@@ -405,7 +387,6 @@ class _Report:
     best: dict[str, Any] | None = render.several(_best_rows, "beside")
     sdps: int = render.figure("convex problems", "{} in {r.wall_s:.2f} s")
     stored: dict[str, Any] = render.several(_stored_rows)
-    comparison: Sequence[Row] | None = render.unseen("given")
 
     @property
     def aim(self) -> str:
@@ -418,13 +399,6 @@ def _tables(scenario: Scenario, report: _Report) -> list[Table]:
     shown = [render.facts(title, rows)]
     if report.price:
         shown.append(_over_the_ranges(report.price))
-    if report.comparison:
-        cells = [
-            (row.method, render.optional(row.norm, "{:.4g}"), str(row.sdps), f"{row.wall_s:.1f}")
-            for row in report.comparison
-        ]
-        heads = ("method", "||W1 L W2||", "SDPs", "seconds")
-        shown.append(render.grid("one state per channel, diagonal", heads, cells, left=range(4)))
     return shown
 
 

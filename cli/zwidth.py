@@ -375,7 +375,6 @@ def _parser() -> options.Parser:
     K, B = "[N/m]; default from delta, theta and T", "[N s/m]; default from delta"
     of_map.add_argument("--K-range", type=options.pair, metavar="LOW,HIGH", help=K)
     of_map.add_argument("--B-range", type=options.pair, metavar="LOW,HIGH", help=B)
-    of_map.add_argument("--scale", choices=("linear", "log"), help="default linear with --rigid, else log")
     mark = "where does this coupling lie? (repeatable)"
     of_map.add_argument("--mark", type=options.pair, action="append", metavar="K,B", help=mark)
     humans = "random humans per device (default 200)"
@@ -488,7 +487,7 @@ def _marks(args: argparse.Namespace) -> tuple[zwidth.Range, ...]:
 
 
 def _grid(args: argparse.Namespace, sweep: zwidth.Sweep, marks: tuple[zwidth.Range, ...]) -> zwidth.Grid:
-    return zwidth.make_grid(sweep, args.grid, args.K_range, args.B_range, args.scale, marks)
+    return zwidth.make_grid(sweep, args.grid, args.K_range, args.B_range, marks)
 
 
 def _plan(args: argparse.Namespace, sweep: zwidth.Sweep) -> Plan:

@@ -33,7 +33,7 @@ from controller.lti import Array, Complex, Lti, Number, Sampled, inverse, number
 
 _Range = tuple[float, float]
 
-_MOST_VERTICES = 64  # each is a world of the design and a proof
+_MOST_VERTICES = 128  # each is a world of the design and a proof
 
 
 class UncertainSpring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -106,7 +106,7 @@ class Region:
 def members(network: Network, ranges: Ranges) -> tuple[Member, ...]:
     """The environment itself, then the vertices of the ranges that differ from it.
 
-    Raises ValueError naming the field where the ranges do not fit the network, or have more than 64 vertices.
+    Raises ValueError naming the field where the ranges do not fit the network, or have more than 128 vertices.
     """
     nominal = Member("the nominal environment", network)
     parts = _parts(network, ranges)

@@ -196,7 +196,7 @@ class _Dual:
         """D itself, without its slopes."""
         m, inner = self.m, self.inner
         z = np.exp(2j * np.pi * points / _POINTS)
-        D = np.zeros((points.size, m, m), dtype=complex)
+        D: Complex = np.zeros((points.size, m, m), dtype=np.complex128)
         h = x[: 2 * inner * len(self.shapes)].reshape(-1, 2 * inner)
         D += 2 * np.tensordot(self.parts[:, points].T @ h.T, self.shapes, axes=1) * np.outer(self.root, self.root)
         at = h.size

@@ -8,11 +8,13 @@ from itertools import product
 
 import numpy as np
 
-from controller.coupling import Coupling
+from controller.coupling import Coupling, ForceFilter
+from controller.delay import delay
 from controller.environment import Member, Region, regions
 from controller.loop import Loop
-from controller.lti import Array, SingularLoop
-from design.conditions import this_environment
+from controller.lti import Array, Sampled, SingularLoop
+from design.conditions import least_multiple, this_environment, this_environment_demand
+from design.frequency import frequencies, hermitian, on_circle, supremum
 from design.result import Requirement, refusal
 
 
@@ -56,6 +58,9 @@ _DRAWN, _SEED = 48, 0xFACE  # points on faces and inside of each region
 
 
 _STARTS, _APART, _SAME = 4, 0.2, 0.05  # of the compass search in a region; least distance of starts, and of tops
+
+
+_LOWEST = 1e-6  # [rad/sample]: below it nothing changes
 
 
 _FIRST, _LAST = 1 / 16, 1 / 128  # its steps, in widths of the ranges
@@ -158,4 +163,25 @@ def search_ranges(loop: Loop, coupling: Coupling, progress: Progress = lambda do
     """The worst environments of the loop's ranges that the search of design.environments finds."""
     assert loop.ranges
     parts = regions(loop.network, loop.ranges)
-    return search(parts, lambda member: in_each(loop, coupling, [member])[0].ratio, progress)
+    return search(parts, lambda member: ratio_in(loop.at(member.network), coupling), progress)
+
+
+def ratio_in(loop: Loop, coupling: Coupling) -> float:
+    """What this-environment asks in units of what there is, on a refined sweep, of a coupling that is stable there.
+
+    Of a force filter the responses of environment and filter are multiplied: the poles of their series are defective
+    and cost digits, and time.
+    """
+    if not isinstance(coupling, ForceFilter):
+        return _required(loop, coupling, Member("", loop.environment)).ratio
+    E, one = loop.E(), np.append(np.zeros(len(coupling.R) - 1), 1.0)[:, None, None]
+    chain = ForceFilter(coupling.poles, coupling.pairs, one).filter(loop.T)  # a block with all of its poles
+    late, delayed = delay(loop.theta, loop.T), delay(loop.psi, loop.T) @ E
+
+    def needed(w: Array) -> Array:
+        z = on_circle(w)[None]
+        F = Sampled.of(late, z) @ coupling.around(Sampled.of(delayed, z))
+        demand = this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
+        return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
+
+    return supremum(needed, frequencies(E, chain, low=_LOWEST))[0]

@@ -11,7 +11,7 @@ Theorem 4 on a refined sweep, judged from the coupling alone.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import cvxpy as cp
 import msgspec
@@ -24,7 +24,7 @@ from controller.loop import Loop
 from controller.lti import Array, Lti
 from design import lmi, spring_damper
 from design.frequency import on_circle
-from design.result import METHODS, Design, DesignFailed, Requirement, Row, of_kind, one_of, whole
+from design.result import METHODS, Design, DesignFailed, Requirement, of_kind, one_of, whole
 
 # ----------------------------------------------------------------------------------------------------
 # State-space couplings of fixed order, in a realisation where both conditions are affine.
@@ -460,20 +460,6 @@ def design(
         wall_s=time.perf_counter() - started,
         phi=search.phi,
     )
-
-
-def compare(loop: Loop, methods: Iterable[str] = METHODS, most_sdps: int = 100) -> tuple[Row, ...]:
-    """Every method on the same loop, one state per channel, diagonal; the first row is their common start."""
-    first = spring_damper.design(loop)
-    rows = [Row("spring-damper", first.objective, first.sdps, first.wall_s)]
-    for method in methods:
-        started = time.perf_counter()
-        try:
-            found = design(loop, method=method, most_sdps=most_sdps)
-            rows.append(Row(method, found.objective, found.sdps, found.wall_s))
-        except DesignFailed as error:
-            rows.append(Row(method, None, len(error.results), time.perf_counter() - started, str(error)))
-    return tuple(rows)
 
 
 class _Search:

@@ -21,8 +21,8 @@ from controller.delay import delay
 from controller.loop import DelayRange, Loop
 from controller.lti import Array, Complex, Lti, Sampled, as_like
 from design.barrier import Block, Program, centre, towards
-from design.conditions import Demand, even_damping, least_multiple, this_environment_demand
-from design.frequency import frequencies, hermitian, on_circle, peaks, supremum
+from design.conditions import Demand, even_damping, this_environment_demand
+from design.frequency import frequencies, hermitian, on_circle, peaks
 from design.multipliers import SPARE, limiter_demand, limiter_lag, switching_block
 from design.result import number, one_of
 from design.transparency import BAND_HZ
@@ -305,20 +305,6 @@ class Case:
     def delayed(self, z: Complex) -> Sampled:
         """Psi E at z (k,)."""
         return Sampled.of(delay(self.loop.psi, self.loop.T) @ self.E, z[None])
-
-    def need(self, coupling: ForceFilter) -> float:
-        """The damping that this-environment asks, on a refined sweep, in units of what there is.
-
-        The responses of environment and filter are multiplied: their series has defective poles, which cost digits.
-        """
-
-        def needed(w: Array) -> Array:
-            F = _late(self.loop, coupling.around(self.delayed(on_circle(w))))
-            demand = _demand(self.loop, F)
-            return least_multiple(hermitian(demand.free.G[0]), hermitian(demand.gain.G[0]))
-
-        chain = Span(coupling.poles, coupling.pairs, np.ones((len(coupling.R) - 1, 1, 1), dtype=bool)).chain(self.E.T)
-        return supremum(needed, frequencies(self.E, chain, low=_SMALLEST / 10))[0]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Arguments of the functions for scripts, checked before any work: an error names the argument and what came."""
+"""What a condition asks, what a design is, and the checks of the arguments of functions for scripts."""
 
 from __future__ import annotations
 
@@ -119,7 +119,6 @@ class Infeasible(DesignFailed):
 # Figures and conditions as text.
 
 
-#: the key of a condition in files and reports -> its name in words and options
 #: what files, options and reports called the conditions before
 OLDER_NAMES = {"closed-loop": "this-environment", "theorem4": "any-environment"}  # older name
 
@@ -161,17 +160,6 @@ class Design:
     wall_s: float
     phi: Array | None = None  # (N,) multiplier Phi_E [N s/m] of Theorem 4, None where the environment has none
     certificate: Any = field(kw_only=True, default=None)  # design.stored.Certificate, where the design has proved it
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of a comparison."""
-
-    method: str
-    norm: float | None  # ||W1 L W2||_inf, None where the method gave nothing that could be verified
-    sdps: int
-    wall_s: float
-    reason: str | None = None
 
 
 COUPLING = "a coupling (controller.coupling), or a Design"

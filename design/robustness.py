@@ -8,11 +8,10 @@ from typing import Any
 
 import msgspec
 
-from controller.coupling import Coupling, ForceFilter
+from controller.coupling import Coupling
 from controller.environment import Network, Ranges, UncertainSpring
 from controller.loop import Loop
-from design.conditions import this_environment
-from design.program import Case
+from design.environments import ratio_in
 from design.result import finite
 
 
@@ -69,11 +68,7 @@ def robustness(loop: Loop, coupling: Coupling, percent: float = 10.0) -> _Robust
     """The worst need of a coupling over `vertices`, by the refined sweep."""
     worst, where = 0.0, "nominal"
     for name, network in {"nominal": loop.environment, **vertices(loop.network, percent)}.items():
-        there = at(loop, network)
-        if isinstance(coupling, ForceFilter):
-            ratio = Case(there, there.E()).need(coupling)
-        else:
-            ratio = this_environment(there.F(coupling), loop.delta, loop.T_max, loop.latency).ratio
+        ratio = ratio_in(at(loop, network), coupling)
         if ratio > worst:
             worst, where = ratio, name
     return _Robustness(percent, worst, where, worst < 1)

@@ -18,7 +18,7 @@ from controller.coupling import MovingAverage, SpringDamper
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.conditions import any_environment, any_environment_delayed, even_damping, this_environment
-from design.frequency import peaks
+from design.frequency import peaks, too_long
 from design.gain_search import LimiterLoop, SampledLoop, SwitchingLoop, least_rms, polynomials
 from design.lmi import RESERVE, Complex, Shaping, affine_lmis, gain_lmi, least_phi, solve, solved, usable
 from design.multipliers import (
@@ -228,6 +228,7 @@ def design(
 
 #: Digits that gains keep in a loop of many devices, finer than RESERVE: with all of them exact proofs take minutes.
 _DIGITS = 5
+_SWEEPS = 150  # take as long as a search for gains in this environment
 #: Devices whose search ends within half a minute: matrix inequalities cost their sixth power, eigenvalues their third.
 _MOST_ANY, _MOST_LIMITED = 16, 12
 
@@ -290,6 +291,9 @@ def _for_this_environment(
     limiter: bool,
     band_hz: tuple[float, float] | None,
 ) -> Design:
+    each = np.full(loop.channels, 1000.0)  # gains do not matter to how long it takes
+    if reason := too_long(loop.F(SpringDamper(each, each / 1000)), _SWEEPS):
+        raise DesignFailed(None, (), reason)
     started, starts = time.perf_counter(), starts or _default_starts(loop)
     band = band_hz or BAND_HZ
     if band_hz and switching:

@@ -1,6 +1,6 @@
 """The optimal coupling of every loop in tests/loops: what it reaches, how long it takes, and what no coupling can do.
 
-PYTHONPATH=. python tests/benchmarks/optimal_loops.py [--bound 2] [--only n0,o03]     (some minutes)
+PYTHONPATH=. python tests/benchmarks/optimal_loops.py [--bound 4] [--only n0,o03]     (some minutes)
 
 `before` is the rms mismatch of version 0.1's optimal couplings, for the nine loops that it was measured on. `to beat`
 is the figure, and the rendered stiffness g, that this design was asked for. The bound is worked out for as many devices
@@ -19,7 +19,7 @@ from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from design.bound import bound
+from design.bound import MOST, bound
 from design.optimal import design
 from design.program import Options
 from design.robustness import robustness
@@ -45,7 +45,7 @@ BEFORE = {
 
 def main() -> None:
     arguments = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    arguments.add_argument("--bound", type=int, default=2, help="most devices for which the bound is worked out")
+    arguments.add_argument("--bound", type=int, default=MOST, help="most devices for which the bound is worked out")
     arguments.add_argument("--limiter", type=int, default=2, help="most devices for which the limiter is")
     arguments.add_argument("--only", default="", help="beginnings of names, separated by commas")
     chosen = arguments.parse_args()
@@ -61,7 +61,7 @@ def _row(path: Path, most: int, limited: int) -> None:
     loop = load(path).loop("I")
     before, beat = BEFORE.get(path.stem[:2], ("", ""))
     found, seconds = _timed(lambda: design(loop, PATIENT))
-    limit, took = _timed(lambda: f"{bound(loop).rms_db:7.2f}" if loop.channels <= most else "")
+    limit, took = _timed(lambda: f"{bound(loop, near=found.coupling).rms_db:7.2f}" if loop.channels <= most else "")
     held = design(loop, replace(PATIENT, limiter=True)) if loop.channels <= limited else None
     shown = f"{held.figures.rms_mismatch_db:8.2f}" if held and held.proved else ""
     figures = found.figures

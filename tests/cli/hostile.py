@@ -721,7 +721,6 @@ def silence() -> Iterator[Case]:
         (("design", "--coupling", "ccl", "--order", "99"), "--order"),
         (("design", "--samples", "5"), "--samples"),
         (("export", "c.json", "--without-theta"), "--without-theta"),
-        (("audit", "--preset", "chai3d-omega.3", "--coupling", "c.json"), "--preset"),
         (("audit", "--K", "1,2"), "--K"),
         (("audit",), "nothing to audit"),
         (("audit", "--rigid", "--K", "1,2", "--B", "1"), "--K"),

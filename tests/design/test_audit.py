@@ -230,10 +230,9 @@ def test_edge_takes_the_certified_side():
         (["--case", "I", "--K", "2870,2320", "--B", "5.47,5.55"], 1, 1.39871),
         (["--rigid", "--K", "5000", "--B", "0", "--T", "1e-3", "--theta", "0", "--delta", "1.37"], 1, 2.5),
         (["--rigid", "--K", "2000", "--B", "0", "--T", "1e-3", "--theta", "1", "--delta", "3.1"], 0, 3.0),
-        (["--preset", "chai3d-omega3"], 1, 32.5),
-        (["--preset", "chai3d-omega3", "--B", "0"], 1, 2.5),
-        (["--preset", "chai3d-omega3", "--B", "0", "--K", "2000"], 0, 1.0),
         (["--device", "omega.3"], 1, 32.5),
+        (["--device", "omega.3", "--B", "0"], 1, 2.5),
+        (["--device", "omega.3", "--B", "0", "--K", "2000", "--rigid", "--T", "1e-3", "--theta", "0"], 0, 1.0),
         (["--device", "falcon", "--delta", "0.5"], 1, 21.5),
         (["--device", "omega", "--case", "I", "--K", "2870,2320", "--B", "5.47,5.55"], 1, 1.39871),
         (["--device", "touch", "--delta", "1.37", "--K", "879,552", "--B", ".39,.52"], 0, 0.714344),
@@ -260,10 +259,10 @@ def test_the_report_is_kept(run, tmp_path):
     assert strict((tmp_path / "here" / "report.json").read_text())["promise"] == "any passive environment"
 
 
-def test_a_preset_names_its_source(run):
-    outcome = strict(run("--preset", "chai3d-omega3", "--json", "-")[1])
-    assert outcome["preset"]["name"] == "chai3d-omega3"
-    assert "CDeltaDevices.cpp" in outcome["preset"]["source"]
+def test_gains_of_a_device_name_their_source(run):
+    outcome = strict(run("--device", "omega.3", "--json", "-")[1])
+    assert outcome["device"]["name"] == "omega.3"
+    assert "CDeltaDevices.cpp" in outcome["gains"]
     assert (outcome["loop"]["T_s"], outcome["loop"]["theta"]) == (1e-3, [0])
 
 
@@ -307,12 +306,9 @@ BAD = [
     ("--rigid --coupling gains.json", "gains.json couples 2 channels, the loop has 1"),
     ("--rigid --case none", "--rigid with --case none"),
     ("--case none --K 1 --B 1", "--K with --case none"),
-    ("--preset chai3d", "invalid choice: 'chai3d'"),
     ("--device falkon --delta 1", "--device is 'falkon' (did you mean falcon?), the catalogue has omega.3, delta.3"),
     ("--device falcon", "--device falcon: nobody publishes its damping: give --delta"),
     ("--device hapkit --delta 1", "nothing to audit"),
-    ("--device falcon --preset chai3d-omega3", "--device with --preset"),
-    ("--preset chai3d-omega3 --coupling gains.json", "--preset with --coupling"),
     ("--coupling gains.json --K 1", "--K with --coupling"),
     ("--coupling gains.json --scenario three-rigid", "gains.json couples 2 channels, the loop has 3"),
     ("--coupling space.json --T 1e-3", "its coefficients are for T = 0.0012 s, the loop has 0.001 s"),

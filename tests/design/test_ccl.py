@@ -137,13 +137,10 @@ def test_delay_in_the_environment_is_paid_for():
     assert found.objective < spring_damper.design(loop).objective
 
 
-def test_the_comparison_names_every_method():
-    rows = ccl.compare(asked(), most_sdps=3)
-    assert [row.method for row in rows] == ["spring-damper", *ccl.METHODS]
-    assert all(row.sdps > 0 and row.wall_s > 0 for row in rows)
-    norms = {row.method: row.norm for row in rows}
-    # as printed the iteration stalls at its start
-    assert norms["inner"] < norms["complementarity"] <= norms["spring-damper"] * 1.01
+def test_as_printed_the_iteration_stalls_at_its_start():
+    start = spring_damper.design(asked()).objective
+    inner, printed = (ccl.design(asked(), method=name, most_sdps=3).objective for name in ("inner", "complementarity"))
+    assert inner < printed <= start * 1.01
 
 
 @pytest.mark.parametrize(

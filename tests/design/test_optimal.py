@@ -21,9 +21,10 @@ from design.barrier import Block, Program, centre
 from design.bound import bound
 from design.certificate import verify
 from design.conditions import this_environment
+from design.environments import ratio_in
 from design.frequency import hermitian, on_circle
 from design.optimal import design, spread, widest_ranges
-from design.program import MARGIN, Case, Options, Span, span_of
+from design.program import MARGIN, Options, Span, span_of, static_weight
 from design.robustness import ranges_around, robustness, vertices
 from design.stored import Stored, save
 from design.stored import load as load_file
@@ -199,20 +200,19 @@ def test_of_equal_couplings_the_one_is_taken_that_errs_least_where_the_environme
 # closed forms --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("theta", [0, 1, 4])
+@pytest.mark.parametrize("theta", [0, 1, 16])
 def test_a_scaled_wall_needs_what_is_known(theta):
     """g K behind theta samples needs g K (theta + 1/2) T, and a scaled filter scales its need exactly."""
     loop = wall(3000.0, theta, 1.3)
-    case = Case(loop, loop.E())
     for g in (0.1, 0.5):
         coupling = ForceFilter([], [], [[[g]]])
-        assert case.need(coupling) == pytest.approx(g * 3000 * (theta + 0.5) * 1e-3 / 1.3, rel=1e-6)
+        assert ratio_in(loop, coupling) == pytest.approx(g * 3000 * (theta + 0.5) * 1e-3 / 1.3, rel=1e-6)
     found = design(loop, SHORT).coupling
     half = ForceFilter(found.poles, found.pairs, found.R / 2)
-    assert case.need(half) == pytest.approx(case.need(found) / 2, rel=1e-6)
+    assert ratio_in(loop, half) == pytest.approx(ratio_in(loop, found) / 2, rel=1e-6)
 
 
-@pytest.mark.parametrize("theta", [1, 3])
+@pytest.mark.parametrize("theta", [1, 16])
 def test_no_wall_is_stiffer_than_the_moments_allow(theta):
     """F(1) T/2 is the mass at z = 1 of a measure delta whose moments 1 .. theta are zero: at most delta/(theta + 1).
 
@@ -273,11 +273,15 @@ def test_a_coupling_for_ranges_is_proved_at_every_vertex_and_searched_between():
     assert nominal.figures.rms_mismatch < found.figures.rms_mismatch < 10 ** (1 / 20) * nominal.figures.rms_mismatch
 
 
-def test_more_ranges_than_can_be_proved_leave_those_that_matter_least():
+def test_more_ranges_than_can_be_proved_leave_those_that_matter_least(monkeypatch):
     loop = loop_of("o06")
+    assert (
+        len(msgspec.structs.replace(loop, ranges=widest_ranges(loop, 10.0)[0]).members()) == 129
+    )  # with the nominal one
+    monkeypatch.setattr("design.optimal._MOST_RANGES", 6)
     kept, note = widest_ranges(loop, 10.0)
     assert len(kept.springs) + len(kept.masses) == 6
-    assert len(msgspec.structs.replace(loop, ranges=kept).members()) == 65  # with the nominal one
+    assert len(msgspec.structs.replace(loop, ranges=kept).members()) == 65
     assert "7 ranges have 128 vertices" in note
     assert widest_ranges(loop_of("n3"), 10.0)[1] is None
 
@@ -319,31 +323,60 @@ def test_the_barrier_finds_what_a_cone_solver_finds():
     assert Program(A, b, c, (block,)).feasible(np.linalg.solve(U, y))
 
 
-def test_the_optimum_over_a_basis_is_the_one_of_a_dense_cone_program():
-    """n3 with four taps and three poles, condition at 240 frequencies, by cvxpy: the same mismatch to 0.05 dB."""
-    loop = loop_of("n3")
-    E = loop.E()
+ORDINARY = {
+    "no static stiffness": lambda: loop_of("n3"),
+    "theta 16, psi 2": lambda: msgspec.structs.replace(loop_of("n3"), theta=(16,), psi=(2,), lam=(18,)),
+    "unlike devices, psi 1": lambda: loop_of("n4"),
+}
+
+
+@pytest.mark.parametrize("name", ORDINARY)
+def test_the_optimum_over_a_basis_is_the_one_of_a_dense_cone_program(name, monkeypatch):
+    """Four taps and three poles, the condition at many frequencies, by cvxpy: the same objective to 0.1 dB."""
+    monkeypatch.setattr("design.program.SOFT", (0.0, 0.3))  # what the cone program does not have
+    monkeypatch.setattr("design.program._EVEN", 0.0)
+    loop = ORDINARY[name]()
+    m, E = loop.channels, loop.E()
     span = span_of(E, 4, 3)
     found = design(loop, Options(ladder=((4, 3),)))
-    w = np.union1d(np.geomspace(2e-4, np.pi, 200), np.linspace(0.01, np.pi, 120))
-    z = on_circle(w)
+    many = 400 if m == 1 else 160
+    z = on_circle(np.union1d(np.geomspace(2e-4, np.pi, many), np.linspace(0.01, np.pi, many // 2)))
 
     def map_of(z: np.ndarray) -> np.ndarray:
-        """F as a row over [g, R_1, ..], per frequency."""
-        shapes = np.column_stack([np.ones(z.size), basis(span.poles, z, span.pairs)[:, 1:] - 1])
-        return shapes * (z ** -(loop.theta[0] + loop.psi[0]) * E.at(z)[:, 0, 0])[:, None]
+        """Theta b R_ij Psi E of each unknown, (unknowns, k, m, m): g, then b by b and entry by entry."""
+        late = [z[:, None] ** -np.asarray(delays) for delays in (loop.theta, loop.psi)]
+        inner = late[1][:, :, None] * E.at(z)
+        shapes, units = basis(span.poles, z, span.pairs)[:, 1:] - 1, np.eye(m * m).reshape(m, m, m, m)
+        entries = [b[:, None, None] * unit for b in shapes.T for row in units for unit in row]
+        return np.stack([late[0][:, :, None] * (R @ inner) for R in [np.eye(m)[None], *entries]])
 
-    x = cp.Variable(1 + len(span.used))
-    ratio = (map_of(z) / (z - 1)[:, None]).real * loop.T / loop.delta[0]
+    y = cp.Variable(1 + m * m * len(span.used))
+    root = np.sqrt(loop.T / np.asarray(loop.delta))
+    He = hermitian(root[:, None] * map_of(z) / (z - 1)[:, None, None] * root)
+    _, size, axes = np.linalg.svd(np.vstack([part.reshape(len(He), -1).T for part in (He.real, He.imag)]), False)
+    change = axes.T / np.maximum(size, 1e-7 * size[0])  # the functions of a basis are nearly dependent
+    x = change @ y
+    if m == 1:
+        held = [He[:, :, 0, 0].real.T @ x >= -0.998]
+    else:
+        doubled = np.block([[He.real, -He.imag], [He.imag, He.real]])
+        one = 0.998 * np.eye(2 * m)
+        held = [
+            one + cp.reshape(D.reshape(len(D), -1).T @ x, (2 * m, 2 * m), order="C") >> 0
+            for D in doubled.swapaxes(0, 1)
+        ]
     band = np.geomspace(2 * np.pi * 0.5 * loop.T, 2 * np.pi * 80 * loop.T, 400)
-    zb = on_circle(band)
-    unit = np.abs(E.at(zb)[:, 0, 0])[:, None] * np.sqrt(band.size)
-    M, target = map_of(zb) / unit, (zb ** -loop.lam[0] * E.at(zb)[:, 0, 0])[:, None] / unit
-    rows, right = np.vstack([M.real, M.imag]), np.concatenate([target.real, target.imag])[:, 0]
-    value = cp.Problem(cp.Minimize(cp.sum_squares(rows @ x - right)), [ratio @ x >= -0.998]).solve(solver=cp.CLARABEL)
-    # the cone program has neither the soft row nor the weight of the static stiffness
-    assert found.figures.rms_mismatch_db == pytest.approx(10 * np.log10(value), abs=0.25)
-    assert found.figures.rms_mismatch_db > 10 * np.log10(value) - 0.02
+    z = on_circle(band)
+    unit = 1 / np.linalg.norm(E.at(z), axis=(1, 2))[:, None, None] / np.sqrt(band.size)
+    M = (map_of(z) * unit).reshape(len(He), -1).T
+    target = (unit * z[:, None, None] ** -np.asarray(loop.lam)[:, None] * E.at(z)).ravel()
+    rows, right = np.vstack([M.real, M.imag]), np.concatenate([target.real, target.imag])
+    rows, right = np.vstack([rows, static_weight(loop) * np.eye(1, len(He))]), np.append(right, static_weight(loop))
+    Q, R = np.linalg.qr(rows @ change)
+    value = cp.Problem(cp.Minimize(cp.sum_squares(R @ y - Q.T @ right)), held).solve(solver=cp.CLARABEL)
+    value += right @ right - (Q.T @ right) @ (Q.T @ right)
+    merit = found.figures.rms_mismatch**2 + (static_weight(loop) * (found.g - 1)) ** 2
+    assert -0.005 < 10 * np.log10(merit / value) < 0.1
 
 
 # the force filter ----------------------------------------------------------------------------------------------------
@@ -449,8 +482,7 @@ def test_a_wall_whose_force_latches_late_is_as_stiff_as_the_closed_form_says():
     T, t2, delta = 1.2e-3, 0.13e-3, 0.5
     K = 1000 * delta / 0.841354  # switching in [0, t2]: this wall needs all of delta
     loop = msgspec.structs.replace(wall(2 * K, 0, delta, T), latency=((0.0, t2),))
-    case = Case(loop, loop.E())
-    assert case.need(ForceFilter([], [], [[[0.5]]])) == pytest.approx(1.0, rel=1e-5)
+    assert ratio_in(loop, ForceFilter([], [], [[[0.5]]])) == pytest.approx(1.0, rel=1e-5)
     found = design(loop, Options(ladder=((4, 3),)))
     assert found.proved
     assert found.g >= 0.49

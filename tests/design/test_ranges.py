@@ -120,9 +120,11 @@ def test_the_number_of_vertices_is_limited():
     nodes = [f"n{i}" for i in range(7)]
     springs = [Spring((a, b), 100.0, 1.0) for a, b in pairwise(nodes)]
     network = Network(("n0",), tuple(springs), dict.fromkeys(nodes[1:], 1.0))
-    ranges = Ranges(tuple(UncertainSpring(s.between, (50.0, 200.0)) for s in springs), {"n1": (0.5, 2.0)})
+    ranges = Ranges(
+        tuple(UncertainSpring(s.between, (50.0, 200.0)) for s in springs), {"n1": (0.5, 2.0), "n2": (0.5, 2.0)}
+    )
     with pytest.raises(
-        ValueError, match="ranges have 128 vertices, allowed are 64: leave out the ranges that matter least"
+        ValueError, match="ranges have 256 vertices, allowed are 128: leave out the ranges that matter least"
     ):
         members(network, ranges)
 

@@ -165,18 +165,19 @@ def test_suprema_find_what_a_dense_sweep_finds():
 def test_the_grid_says_what_is_wrong_with_it():
     sweep = rigid(1)
     for arguments, message in (
-        ((8, (10, 5), None, None), "--K-range is 10,5, expected the lower end first"),
-        ((8, None, (0, 2), "log"), "--B-range begins at 0"),
-        ((8, (1, 1e12), None, None), "allowed are 0.001 to 1e+09 N/m"),
-        ((8, (1, 10), None, None, ((20, 0.5),)), "--mark has K = 20, outside"),
+        ((8, (10, 5), None), "--K-range is 10,5, expected the lower end first"),
+        ((8, (1, 1e12), None), "allowed are 0.001 to 1e+09 N/m"),
+        ((8, (1, 10), None, ((20, 0.5),)), "--mark has K = 20, outside"),
     ):
         with pytest.raises(InputError, match=message.replace("+", r"\+")):
             make_grid(sweep, *arguments)
-    wide = make_grid(sweep, 8, None, None, None, ((1e5, 9.0),))
+    wide = make_grid(sweep, 8, None, None, ((1e5, 9.0),))
     assert wide.K[-1] > 1e5
     assert wide.B[-1] > 9
     assert wide.scale == "linear"
-    assert make_grid(of(PAIR, (1, 1)), 8, None, None, None).scale == "log"
+    assert make_grid(of(PAIR, (1, 1)), 8, None, None).scale == "log"
+    with pytest.raises(InputError, match="--B-range begins at 0"):
+        make_grid(of(PAIR, (1, 1)), 8, None, (0, 2))
 
 
 # --- the population ------------------------------------------------------------------------------------------------
@@ -467,7 +468,7 @@ def test_the_keyboard_keeps_what_is_done(stage, tmp_path, monkeypatch, capsys):
 
         return draw_map(*arguments[:-1], stop)
 
-    monkeypatch.setattr(zwidth, "draw_map", draw)
+    monkeypatch.setattr(zwidth.zwidth, "draw_map", draw)
     options = ["--rigid", "--theta", "1", "--humans", "10", "--grid", "12", "--points", "5", "--out", str(tmp_path)]
     assert zwidth.main(options) == INTERRUPTED
     report = json.loads((tmp_path / "report.json").read_text())
