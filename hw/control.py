@@ -27,6 +27,7 @@ from design.certificate import assess
 from design.coverage import Limits
 from design.guarantees import guarantee_of
 from design.result import Design, DesignFailed, Requirement, certificate_part
+from hw import monitor
 from hw.limits import (
     Gain,
     Heat,
@@ -39,7 +40,6 @@ from hw.limits import (
     check_speed,
     shape,
 )
-from hw.monitor import Ages, ClockMonitor, CommandMonitor, Counters, EncoderMonitor, EncoderTest, LinkSettings
 from hw.protocol import MAX_THETA, Config, State
 from sim.couplings import Chosen, choose, given, limits_of
 from sim.report import coupling_part
@@ -219,8 +219,8 @@ class Drive:
         units: Units,
         config: Config,
         limits: SafetyLimits,
-        settings: LinkSettings,
-        counters: Counters,
+        settings: monitor.LinkSettings,
+        counters: monitor.Counters,
         record: Callable[[TraceRow], None],
         arming: int = 0,
         budget: SentBudget | None = None,
@@ -233,13 +233,13 @@ class Drive:
         self.reference: tuple[int, ...] | None = None  # [counts] that positions are counted from
         self._budget = budget
         self._rereference = settings.rereference
-        self._test = EncoderTest(limits.cap, T) if settings.test_encoders else None
-        self._encoders, self._heat = EncoderMonitor(units.encoder_step, units.force_step, T), Heat(limits, T)
+        self._test = monitor.EncoderTest(limits.cap, T) if settings.test_encoders else None
+        self._encoders, self._heat = monitor.EncoderMonitor(units.encoder_step, units.force_step, T), Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] over which a speed is taken
         self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] tick by tick
         self._before: tuple[float, ...] | None = None  # [m] of the STATE before that, where none is missing
         self._counters, self._record, self._arming = counters, record, arming
-        self._commands, self._clock = CommandMonitor(config), ClockMonitor(limits, T)
+        self._commands, self._clock = monitor.CommandMonitor(config), monitor.ClockMonitor(limits, T)
 
     def step(self, state: State, ticks: int, direction: int, now: int) -> tuple[int, ...]:
         """The force [steps] that answers `state`, which came at `now` [us], `ticks` after the one before.
@@ -306,14 +306,14 @@ class Drive:
 # couplings that are certified for a link
 
 
-def link_delay(ages: Ages, T_us: float, quantile: float, guard_us: float) -> int:
+def link_delay(ages: monitor.Ages, T_us: float, quantile: float, guard_us: float) -> int:
     """Ticks from a sample to its latch: what a fraction of the answers keeps, with a guard, and at least one."""
     needed = ages.quantile(quantile) + guard_us
     return max(1, int(-(-needed // T_us)))
 
 
 def timed(
-    scenario: Scenario, ages: Ages, quantile: float, guard_us: float, at_once: bool = False
+    scenario: Scenario, ages: monitor.Ages, quantile: float, guard_us: float, at_once: bool = False
 ) -> tuple[Scenario, int]:
     """The scenario with what was measured of its ticks, and the ticks that the link takes.
 

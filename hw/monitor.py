@@ -189,11 +189,11 @@ class LinkMonitor:
         odd = late or self.margin is None or self.missed > 0 or ahead > 1
         tick, counters = _Tick(self.margin, self.missed, ahead - 1, late, odd), self.counters
         counters.states += 1
-        counters.gaps += tick.gap
-        counters.misses += tick.missed
-        counters.late += tick.late
         self._window.append(tick)
         if odd:
+            counters.gaps += tick.gap
+            counters.misses += tick.missed
+            counters.late += tick.late
             self._add(tick, 1)
         if len(self._window) > self.settings.window and (oldest := self._window.popleft()).odd:
             self._add(oldest, -1)
@@ -323,6 +323,7 @@ class CommandMonitor:
         self._config = config
         self._forces: dict[int, tuple[int, ...]] = {}  # by the tick that they are for
         self._last: State | None = None
+        self._ready = False  # whether it was armed in that one
         self._run = (0, 0)  # fewest and most forces latched since arming, where STATEs were lost
         self._unlike = self._holding = 0
 
@@ -341,11 +342,11 @@ class CommandMonitor:
         self._holding = self._holding + 1 if phase == Phase.HOLDING else 0
         if self._holding > self._config.hold:
             raise SafetyStop(f"the device holds a force for {self._holding} ticks, {self._config.hold} are agreed")
-        told, last = self._forces.pop(state.tick, None), self._last
-        self._last = state
-        if last is None or phase == Phase.DISARMED:
+        told, last, ready = self._forces.pop(state.tick, None), self._last, self._ready
+        self._last, self._ready = state, phase != Phase.DISARMED
+        if last is None or not self._ready:
             return False
-        if last.phase != Phase.DISARMED:
+        if ready:
             fewest, most = self._run
             self._run = (fewest + (phase == Phase.ARMED), most + ticks)
         if ticks > 1:

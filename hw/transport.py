@@ -215,7 +215,7 @@ class Live(Driver):
             self._pressed()
         if said := self._operator.look(session, now):
             self.do(said)
-        if signal.SIGUSR1 in self.signals:
+        if self.signals and signal.SIGUSR1 in self.signals:
             self.do(session.estop("SIGUSR1", now))
         elif self.signals:
             name = signal.Signals(self.signals[0]).name

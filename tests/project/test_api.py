@@ -18,7 +18,7 @@ from cli.run import main as run_command
 from cli.validate import main as validate_command
 from controller.coupling import NoCoupling, SpringDamper
 from design import Options, certify, design_coupling, guarantee, transparency_of
-from design.designs import KINDS, OPTIONS
+from design.designs import KINDS
 from hw import rehearse
 from models.device import RigidDevice
 from sim import InputError, Result, Scenario, load, parse, simulate, validate
@@ -66,12 +66,11 @@ def test_the_options_are_those_that_the_designs_take():
     from design import fixed_order as ccl
     from design import optimal, spring_damper
 
-    assert set(OPTIONS) == set(KINDS)
-    assert set(OPTIONS["ccl"]) < set(signature(ccl.design).parameters)
-    assert set(OPTIONS["spring-damper"]) - {"limiter"} < set(signature(spring_damper.design).parameters)
-    own = {field.name for field in fields(optimal.Options)} - {"ladder"}
-    assert set(OPTIONS["optimal"]) == {*own, "switching"}
-    assert set(Options.__annotations__) == {name for names in OPTIONS.values() for name in names}
+    assert set(KINDS["ccl"].options) < set(signature(ccl.design).parameters)
+    assert set(KINDS["spring-damper"].options) - {"limiter"} < set(signature(spring_damper.design).parameters)
+    own = {field.name for field in fields(optimal.program.Options)} - {"ladder"}
+    assert set(KINDS["optimal"].options) == {*own, "switching"}
+    assert set(Options.__annotations__) == {name for kind in KINDS.values() for name in kind.options}
 
 
 def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
@@ -211,8 +210,8 @@ LOOP = SHORT.loop("I")
         (lambda: design_coupling(SHORT), 'loop is a Scenario, expected a Loop, as scenario.loop("I") gives it'),
         (lambda: design_coupling("omega-pair"), "loop is 'omega-pair' (str), expected a Loop"),
         (
-            lambda: design_coupling(LOOP, "optimal", funtions=3),
-            "funtions is no option of kind 'optimal' (did you mean",
+            lambda: design_coupling(LOOP, "optimal", objectiv=3),
+            "objectiv is no option of kind 'optimal' (did you mean",
         ),
         (lambda: design_coupling(LOOP, order=3), "order is no option of kind 'spring-damper', allowed are switching"),
         (lambda: design_coupling(LOOP, "optimal", high_gain="x"), "high_gain is 'x' (str), expected a number"),
