@@ -178,8 +178,7 @@ class Gain:
 
     def rise(self, ticks: int = 1) -> float:
         """The gain `ticks` ticks later, on its way to 1."""
-        if self.value < 1.0:
-            self.value = min(1.0, self.value + ticks * self.T / self.limits.ramp_in)
+        self.value = min(1.0, self.value + ticks * self.T / self.limits.ramp_in)
         return self.value
 
     def fall(self, ticks: int = 1) -> float:
