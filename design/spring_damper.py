@@ -320,7 +320,8 @@ def _for_this_environment(
         raise DesignFailed(None, (), line)
     coupling = SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B))
     if loop.channels > _MOST_LIMITED:
-        coupling = SpringDamper(*([float(f"{v:.{_DIGITS}g}") for v in gains] for gains in (coupling.K, coupling.B)))
+        K, B = ([float(f"{v:.{_DIGITS}g}") for v in gains] for gains in (coupling.K, coupling.B))
+        coupling = SpringDamper(K, B)
         rms = transparency(loop.F(coupling), loop.E(), loop.lam, band).rms_mismatch
     requirement = this_environment(loop.F(coupling), loop.delta, loop.T_max)
     return Design(coupling, "this-environment", "rms", rms, requirement, searches, time.perf_counter() - started)
