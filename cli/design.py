@@ -114,16 +114,9 @@ def _number_or_none(text: str) -> float | str:
 # The request.
 
 
-#: options of a design -> the couplings that take them
-_OPTIONS = {
-    "limiter": ("spring-damper", "optimal"),
-    "order": ("ccl",),
-    "method": ("ccl",),
-    "full": ("ccl",),
-    "objective": ("optimal",),
-    "band_hz": ("optimal", "spring-damper"),
-    "high_gain": ("optimal",),
-    "seconds": ("optimal",),
+#: options of a design; --full says of the ccl's `diagonal` that it is not
+_OPTIONS = {"full": "diagonal"} | {
+    name: name for name in ("limiter", "order", "method", "objective", "band_hz", "high_gain", "seconds")
 }
 
 
@@ -159,7 +152,7 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
 
 def _for_switching(args: argparse.Namespace) -> bool:
     """Whether this design can be made for delays that vary; any other is only judged under them."""
-    condition = args.condition or KINDS[args.coupling][0]
+    condition = args.condition or KINDS[args.coupling].conditions[0]
     return args.coupling in ("spring-damper", "optimal") and condition == "this-environment"
 
 
@@ -170,8 +163,9 @@ def _asked(args: argparse.Namespace, loop: Loop) -> dict[str, Any]:
     if args.coupling == "spring-damper" and args.limiter is not None:
         given["limiter"] = args.limiter
     for name in given:
-        if args.coupling not in _OPTIONS[name]:
-            allowed = " or ".join(_OPTIONS[name])
+        taking = [kind for kind, design in KINDS.items() if _OPTIONS[name] in design.options]
+        if args.coupling not in taking:
+            allowed = " or ".join(taking)
             shown = name.removesuffix("_hz").replace("_", "-")
             raise InputError(f"--{shown} is for --coupling {allowed}, not {args.coupling}")
     if args.coupling == "optimal":

@@ -122,9 +122,9 @@ def _sitting(args: argparse.Namespace, scenario: Scenario, settings: LinkSetting
         return [played(measured_link(args, ages, scenario.T))]
 
     if args.port and number > 1:
-        elsewhere = "let go of every handle" if args.same_place else "take every handle to another place and let go"
-        begin = "5 s later it begins" if args.arm else "press a"
-        render.console(args).print(f"sitting {number} of {args.sittings}: {elsewhere}; then {begin}")
+        told = "let go of every handle" if args.same_place else "take every handle 5 mm or more away and let go"
+        told += "; then press a" if not args.arm else "" if args.same_place else ": it begins 5 s later"
+        render.console(args).print(f"sitting {number} of {args.sittings}: {told}")
     alone = nobody(scenario, args.hand if number == 1 else 0.0)
     seconds = played(1).seconds - 0.2  # the lead has the ramp
     live = hold_session(args, session, plan, seconds, out, alone, args.coulomb)

@@ -282,7 +282,8 @@ class Lti(ReadOnly):
         if self.A.ndim > 2:
             return np.linalg.eigvals(self.A).astype(np.complex128)
         core = self._lines[0]
-        return np.append(np.linalg.eigvals(self.A[np.ix_(core, core)]), np.zeros(self.order - core.size, np.complex128))
+        kept = np.linalg.eigvals(self.A[np.ix_(core, core)])
+        return np.append(kept, np.zeros(self.order - core.size)).astype(np.complex128)
 
     def is_stable(self) -> bool:
         """Whether every pole lies strictly inside the unit circle."""

@@ -252,7 +252,7 @@ class StepBuffer:
 
     def rewind(self, ticks: int) -> None:
         """Start a new stretch where this one stood after `ticks` ticks."""
-        self.calm = self._straight and self.linear_until(ticks, _CALM) == ticks
+        self.calm = self.calm or (self._straight and self.linear_until(ticks, _CALM) == ticks)
         self.z[0] = self.z[ticks]
         self.s[0] = self.s[ticks]
         self.first += ticks

@@ -9,7 +9,7 @@ from typing import Literal, TypedDict, Unpack
 from controller.coupling import Coupling
 from controller.loop import Loop
 from design.certificate import assess, check_ranges, switching_requirement
-from design.designs import KINDS, OPTIONS, design_by_kind, usual_condition
+from design.designs import KINDS, design_by_kind, usual_condition
 from design.guarantees import guarantee_of
 from design.result import Condition, Design, Requirement, bare, known, of_kind, one_of
 from design.stored import Stored
@@ -22,7 +22,7 @@ _LOOP = 'a Loop, as scenario.loop("I") gives it'
 
 
 class Options(TypedDict, total=False):
-    """What else can be asked of a kind, see design.designs.OPTIONS."""
+    """What else can be asked of a kind, see design.designs.KINDS."""
 
     order: int  # ccl: states per channel
     method: str  # ccl: complementarity, inner or fixed-poles
@@ -55,7 +55,7 @@ def design_coupling(
     """
     of_kind("loop", loop, Loop, _LOOP)
     one_of("kind", kind, KINDS)
-    known(options, OPTIONS[kind], f"kind {kind!r}")
+    known(options, KINDS[kind].options, f"kind {kind!r}")
     return design_by_kind(loop, kind, condition, **options)
 
 

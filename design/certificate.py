@@ -42,7 +42,7 @@ from design.stored import Certificate, Guarantee, LimiterCertificate, Stored, Sw
 _CLAIM_TOLERANCE = 1e-6  # between the required damping on file and the one swept again, which repeats to 1e-9
 
 
-_LONGEST = 60.0  # [s] of exact arithmetic for one certificate: what fits into the limits on states takes less
+_LONGEST = 60.0  # [s] of exact arithmetic for one coupling: what fits into the limits on states takes less
 
 
 @contextmanager
@@ -552,7 +552,8 @@ def assess(
     def judged(each: Requirement) -> Requirement:
         return replace(each, proof="rational") if each.condition == proved else _proved(loop, coupling, each, phi)
 
-    return {each.condition: judged(each) for each in asked}
+    with within(_LONGEST):  # both proofs together
+        return {each.condition: judged(each) for each in asked}
 
 
 def any_environment_of(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Requirement:

@@ -17,16 +17,9 @@ from controller.coupling import Coupling, NoCoupling
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
+from design import conditions
 from design.bound import MOST, NO_BOUND, bound
 from design.certificate import any_environment_of, prove
-from design.conditions import (
-    any_environment_demand,
-    delayed_demand,
-    even_damping,
-    least_scale,
-    this_environment,
-    this_environment_demand,
-)
 from design.designs import design_by_kind
 from design.frequency import Response, frequencies, on_circle
 from design.program import LADDER, Options
@@ -75,24 +68,24 @@ def judge(loop: Loop, coupling: Coupling, phi: Array | None = None) -> Demands:
     F = loop.F(coupling)
     phi = _multiplier(loop, coupling) if phi is None and any(loop.psi) else phi
     requirements = {
-        "this-environment": this_environment(F, loop.delta, loop.T_max, loop.latency),
+        "this-environment": conditions.this_environment(F, loop.delta, loop.T_max, loop.latency),
         "any-environment": any_environment_of(loop, coupling, phi),
     }
     demands: dict[str, Response | None] = dict.fromkeys(requirements)
     if np.isfinite(requirements["this-environment"].ratio):
         demands["this-environment"] = partial(
-            least_scale, this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
+            conditions.least_scale, conditions.this_environment_demand(F, loop.delta, loop.T_max, loop.latency)
         )
     V = coupling.compliance(loop.T)
     if V is not None and np.isfinite(requirements["any-environment"].ratio):
         if any(loop.psi):
             assert phi is not None  # a finite figure had a multiplier
-            demands["any-environment"] = delayed_demand(
-                V, loop.theta, even_damping(loop.delta, loop.T, loop.T_max), phi
+            demands["any-environment"] = conditions.delayed_demand(
+                V, loop.theta, conditions.even_damping(loop.delta, loop.T, loop.T_max), phi
             )
         else:
             demands["any-environment"] = partial(
-                least_scale, any_environment_demand(V, loop.theta, loop.delta, loop.T_max)
+                conditions.least_scale, conditions.any_environment_demand(V, loop.theta, loop.delta, loop.T_max)
             )
     return Demands(F, requirements, demands)
 
@@ -260,7 +253,7 @@ def measured(setting: Setting, kind: str, condition: Condition | None, options: 
     figures: dict[str, Any] = dict.fromkeys(names)
     bare: tuple[float | None, ...] = (None,) * len(loop.delta)
     try:
-        bare = _damping(this_environment(loop.F(NoCoupling()), loop.delta, loop.T_max, loop.latency))
+        bare = _damping(conditions.this_environment(loop.F(NoCoupling()), loop.delta, loop.T_max, loop.latency))
         design = design_by_kind(loop, kind, condition, **options)
     except ValueError as error:  # no such design, or a loop that cannot be
         figures["reason"] = str(error)
@@ -271,7 +264,7 @@ def measured(setting: Setting, kind: str, condition: Condition | None, options: 
             "states": F.order,
             "rms_mismatch_db": finite(decibels(transparent.rms_mismatch)),
             "relative_mismatch_db": finite(decibels(transparent.relative_mismatch)),
-            "required_damping": _damping(this_environment(F, loop.delta, loop.T_max, loop.latency)),
+            "required_damping": _damping(conditions.this_environment(F, loop.delta, loop.T_max, loop.latency)),
             "dc_ratio": finite(transparent.dc_ratio),
         } | _proof(loop, design)
     wall = time.perf_counter() - begin
@@ -432,7 +425,7 @@ def ladder_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:
         )
     wall = time.perf_counter() - begin
     F = loop.F(coupling)
-    requirement = this_environment(F, loop.delta, loop.T_max, loop.latency)
+    requirement = conditions.this_environment(F, loop.delta, loop.T_max, loop.latency)
     figures = transparency(F, loop.E(), loop.lam)
     begin, proof, reason = time.perf_counter(), None, requirement.reason
     if design or requirement.certified:

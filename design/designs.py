@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -15,22 +15,34 @@ from design.guarantees import LATE
 from design.multipliers import this_environment_of
 from design.result import Design, DesignFailed
 
-#: name -> the conditions that it can be made for, its own first
+
+class Kind(NamedTuple):
+    """One design: what it promises, where it is made, and what can be asked of it."""
+
+    conditions: tuple[str, ...]  # that it can be made for, its own first
+    module: str  # loaded when it is asked for: cvxpy takes a second
+    function: str  # from a loop to a Design
+    takes: tuple[str, ...] = ()  # besides the loop and its options: condition, progress
+    options: tuple[str, ...] = ()  # in words of design.api.Options
+
+
 KINDS = {
-    "spring-damper": ("this-environment", "any-environment"),
-    "moving-average": ("any-environment",),
-    "ccl": ("any-environment",),
-    "optimal": ("this-environment",),
-}
-
-
-#: name -> the module and the function that make it, loaded when it is asked for (cvxpy takes a second), and what the
-#: function takes besides the loop and its options
-_HOMES: dict[str, tuple[str, str, tuple[str, ...]]] = {
-    "spring-damper": ("design.spring_damper", "design_with", ("condition",)),
-    "moving-average": ("design.spring_damper", "moving_average", ()),
-    "ccl": ("design.fixed_order", "design", ()),
-    "optimal": ("design.optimal", "design_with", ("progress",)),
+    "spring-damper": Kind(
+        ("this-environment", "any-environment"),
+        "design.spring_damper",
+        "design_with",
+        ("condition",),
+        ("switching", "limiter", "band_hz"),
+    ),
+    "moving-average": Kind(("any-environment",), "design.spring_damper", "moving_average"),
+    "ccl": Kind(("any-environment",), "design.fixed_order", "design", options=("order", "method", "diagonal")),
+    "optimal": Kind(
+        ("this-environment",),
+        "design.optimal",
+        "design_with",
+        ("progress",),
+        ("objective", "band_hz", "high_gain", "limiter", "seconds", "switching"),
+    ),
 }
 
 
@@ -41,16 +53,7 @@ def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
     that vary. Other kinds for their own condition.
     """
     less = loop.environment.walls or loop.ranges or loop.varying_delay
-    return "any-environment" if less and "any-environment" in KINDS[kind] else KINDS[kind][0]
-
-
-#: kind -> what else can be asked of it, in words of design.api.Options
-OPTIONS = {
-    "spring-damper": ("switching", "limiter", "band_hz"),
-    "moving-average": (),
-    "ccl": ("order", "method", "diagonal"),
-    "optimal": ("objective", "band_hz", "high_gain", "limiter", "seconds", "switching"),
-}
+    return "any-environment" if less and "any-environment" in KINDS[kind].conditions else KINDS[kind].conditions[0]
 
 
 def design_by_kind(
@@ -71,11 +74,12 @@ def design_by_kind(
     if kind not in KINDS:
         raise ValueError(f"coupling is {kind!r}, allowed are {', '.join(KINDS)}")
     condition = condition or usual_condition(loop, kind)
-    if condition not in KINDS[kind]:
-        raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(KINDS[kind])}")
-    module, function, takes = _HOMES[kind]
-    further = {name: value for name, value in (("condition", condition), ("progress", progress)) if name in takes}
-    made = partial(getattr(import_module(module), function), **further, **options)
+    chosen = KINDS[kind]
+    if condition not in chosen.conditions:
+        raise ValueError(f"condition is {condition!r}, for {kind} allowed are {', '.join(chosen.conditions)}")
+    own = (("condition", condition), ("progress", progress))
+    further = {name: value for name, value in own if name in chosen.takes}
+    made = partial(getattr(import_module(chosen.module), chosen.function), **further, **options)
 
     if condition == "any-environment" and loop.latency and kind != "optimal":
         raise ValueError(f"latency: {LATE}, or design for this-environment")

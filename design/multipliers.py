@@ -32,15 +32,7 @@ from controller.lti import (
     taps,
     vstack,
 )
-from design.conditions import (
-    Demand,
-    dampings,
-    even_damping,
-    least_multiple,
-    least_scale,
-    this_environment,
-    this_environment_demand,
-)
+from design import conditions
 from design.frequency import frequencies, hermitian, on_circle, supremum, sweeping, too_long
 from design.result import NotProved, Requirement, from_ratio, refusal
 
@@ -55,7 +47,7 @@ def walls_demand(
     g: Any,
     lam: Sequence[Any] | None = None,
     T_max: float | None = None,
-) -> Demand[Block]:
+) -> conditions.Demand[Block]:
     """this-environment for walls of any stiffness and damping with k + 2 b/T up to `slopes` (w,) [N/m], and any gap.
 
     G takes [x; p] to [f; y], displacements (m,) and wall forces to the forces of the devices and the ways into the
@@ -72,10 +64,10 @@ def walls_demand(
     steep = np.diag(np.concatenate([numbers([0] * m, T), weights * gains]))
     limits = np.concatenate([numbers([0] * m, T), weights * gains / numbers(slopes, T)])
     free = np.hstack([one, -steep]) @ vstack(R, G) - S1 / 2 + np.diag(limits)
-    damping = np.concatenate([even_damping(delta, T, T_max) / T, numbers([0] * w, T)])
+    damping = np.concatenate([conditions.even_damping(delta, T, T_max) / T, numbers([0] * w, T)])
     F1, Y1 = S1[..., :m, :m], S1[..., m:, m:]
     static = {"F(1)": F1, "-Y(1)": -Y1, "the static map of devices and walls": S1}
-    return Demand(free, constant_like(G, np.diag(damping)), static, ("F(1)", "-Y(1)"))
+    return conditions.Demand(free, constant_like(G, np.diag(damping)), static, ("F(1)", "-Y(1)"))
 
 
 def switching_block(
@@ -105,7 +97,7 @@ def switching_block(
     both: Any = as_like(G, vstack(half, spread)) @ G
     m = len(lo)
     F1, R = both.rows(slice(None, m)).split_at_one()
-    upper = R - F1 / 2 + np.diag(even_damping(delta, T, T_max) / T - a / 2)
+    upper = R - F1 / 2 + np.diag(conditions.even_damping(delta, T, T_max) / T - a / 2)
     if not varying:
         return upper, F1
     lower = np.zeros((m + len(varying), len(varying)), dtype=object)
@@ -119,7 +111,7 @@ def _halves(lo: int, hi: int) -> list[Number]:
 
 def limiter_demand(
     G: Block, theta: Sequence[int], delta: Any, rho: Sequence[Any], c: Lags, T_max: float | None = None
-) -> Demand[Block]:
+) -> conditions.Demand[Block]:
     """The limiter's block on (dx - de, de), the steps of what the environment follows and of the slip.
 
     G are the forces as they leave without the limiter, rho (m,) [N/m] its lag, fixed numbers that the damping does
@@ -128,7 +120,7 @@ def limiter_demand(
     N_i = -(1 + .. + z^-theta_i) - sum_j c_ij (j + (j-1)/z + .. + z^-(j-1)).
     """
     m, T = len(theta), G.T
-    damping = np.diag(even_damping(delta, T, T_max) / T)
+    damping = np.diag(conditions.even_damping(delta, T, T_max) / T)
     lines = Lti.diag(*(_delay_and_weights(n, row, T) for n, row in zip(theta, c, strict=True)))
     lines = lines.rows([*range(0, 2 * m, 2), *range(1, 2 * m, 2)])
     difference = Lti.diag(*(taps([1, -1], T) for _ in theta))
@@ -138,7 +130,7 @@ def limiter_demand(
     zero = np.zeros((m, m), dtype=int)
     free = vstack(ramp - static / 2, both.rows(slice(m, None)))
     gain = np.block([[damping, zero], [2 * damping, damping]])
-    return Demand(free, constant_like(G, gain), {"F(1)": static[..., :m]}, ("F(1)",))
+    return conditions.Demand(free, constant_like(G, gain), {"F(1)": static[..., :m]}, ("F(1)",))
 
 
 def _delay_and_weights(theta: int, c: Sequence[Any], T: Number) -> Lti:
@@ -178,7 +170,7 @@ def walls_proof(
     G takes [x; p] to [f; y] while no wall touches.
     """
     m, w = len(delta), len(slopes)
-    available = dampings(delta, m)
+    available = conditions.dampings(delta, m)
 
     def refused(reason: str) -> _WallsProof:
         return _WallsProof(refusal("this-environment", available, reason), tuple(g or (1.0,) * w))
@@ -204,11 +196,11 @@ def walls_proof(
 
     def needed(values: Array) -> float:
         demand = walls_demand(sampled, available, slopes, values, None, T_max)
-        return float(least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G)).max())
+        return float(conditions.least_multiple(hermitian(demand.free.G), hermitian(demand.gain.G)).max())
 
     found = _best_g(needed, w) if g is None else np.asarray(g, dtype=float)
     demand = walls_demand(G, available, slopes, found, None, T_max)
-    ratio, at = supremum(lambda w: least_scale(demand, w), grid)
+    ratio, at = supremum(lambda w: conditions.least_scale(demand, w), grid)
     if np.isinf(ratio):
         return refused("no multiplier was found with which the walls are covered, whatever the damping")
     return _WallsProof(
@@ -284,13 +276,13 @@ def switching_sweep(
     G is the force map without Theta. The factor is that of the refined sweep (design.frequency.sweep) at the multiplier
     found, or at `alpha` (m,) [N/m] where it is given, positive where lo < hi; `bound` is then that factor.
     """
-    available, h = dampings(delta, G.inputs), half_widths(lo, hi)
+    available, h = conditions.dampings(delta, G.inputs), half_widths(lo, hi)
     if len(h) != G.inputs:
         raise ValueError(f"delays are given for {len(h)} channels, expected {G.inputs}")
-    constant = this_environment(nominal(lo, hi, G.T) @ G, delta, T_max)
+    constant = conditions.this_environment(nominal(lo, hi, G.T) @ G, delta, T_max)
     if not np.isfinite(constant.ratio):
         return _refused(available, constant.reason or "no constant delay is safe")
-    damping = even_damping(available, G.T, T_max)
+    damping = conditions.even_damping(available, G.T, T_max)
     search, unit = _Search(G, lo, hi, damping), damping / G.T
     given = None if alpha is None else (np.asarray(alpha) / unit)[search.active]
     a, ratio, w, bound = search.least() if given is None else search.only(given)
@@ -317,7 +309,7 @@ class _Search:
 
     def __init__(self, G: Lti, lo: Sequence[int], hi: Sequence[int], delta: Array) -> None:
         F = nominal(lo, hi, G.T) @ G
-        self._G, self._demand = G, this_environment_demand(F, delta.tolist())
+        self._G, self._demand = G, conditions.this_environment_demand(F, delta.tolist())
         self._weight, self._h = np.sqrt(G.T / delta), half_widths(lo, hi)
         self.active = np.flatnonzero(self._h)
         self._grid = np.concatenate([[0.0], frequencies(G)])
@@ -456,14 +448,14 @@ def limiter(
     G is the force map without Theta, rho (m,) [N/m] the limiter's lag. With `c` given its figure is that of the
     refined sweep at this multiplier; otherwise the best with so many lags per channel is searched.
     """
-    available, m = dampings(delta, G.inputs), G.inputs
+    available, m = conditions.dampings(delta, G.inputs), G.inputs
     if len(theta) != m or len(rho) != m or (c is not None and len(c) != m):
         raise ValueError(f"theta, rho and c need one entry for each of {m} channels")
     if not all(0 <= r < np.inf for r in rho) or any(not 0 <= v < np.inf for row in c or () for v in row):
         raise ValueError(f"rho is {list(rho)} and c is {c}, expected numbers >= 0")
     none = tuple((0.0,) * lags for _ in theta) if c is None else tuple(tuple(float(v) for v in row) for row in c)
     # the slip at rest: its rows are among the block's
-    linear = this_environment(delay(theta, G.T) @ G, available, T_max)
+    linear = conditions.this_environment(delay(theta, G.T) @ G, available, T_max)
     if not np.isfinite(linear.ratio):
         reason = linear.reason or "the loop without limiter is not covered"
         return LimiterProof(refusal("limiter", available, reason), tuple(rho), none, np.inf)
@@ -498,7 +490,7 @@ class _LimiterSearch:
             return refusal("limiter", self._delta, reason)
         return from_ratio("limiter", max(ratio, 0.0), self._delta, w / (2 * np.pi * T))
 
-    def demand(self, c: Lags) -> Demand[Lti]:
+    def demand(self, c: Lags) -> conditions.Demand[Lti]:
         G, theta, delta, rho = self._loop
         return limiter_demand(G, theta, delta, rho, c, self._T_max)
 
@@ -506,7 +498,7 @@ class _LimiterSearch:
         """(s(c), w [rad/sample]) by a sweep that is refined between its samples, with so much of rho to spare."""
         demand = self.demand(c)
         demand = replace(demand, free=demand.free - spare * self._lag)
-        return supremum(lambda w: least_scale(demand, w), self._grid)
+        return supremum(lambda w: conditions.least_scale(demand, w), self._grid)
 
     def least(self) -> tuple[tuple[tuple[float, ...], ...], float, float, float]:
         """(c, s(c), where it binds, a lower bound on s over all c that have something to spare)."""
@@ -557,7 +549,7 @@ class _LimiterSearch:
     def _cuts(self, c: Array, free: Complex, slopes: Complex, gain: Complex) -> tuple[Array, float]:
         """(rows, s): the bounds value + slope.c + s gain >= 0 at the worst peaks, and the worst s there."""
         block, gain = free[0] + np.tensordot(c, slopes, axes=1), gain[0]
-        needed = least_multiple(block, gain)
+        needed = conditions.least_multiple(block, gain)
         padded = np.concatenate([[-np.inf], needed, [-np.inf]])
         peaks = np.flatnonzero((needed >= padded[:-2]) & (needed >= padded[2:]))
         peaks = peaks[np.argsort(needed[peaks])[-_MOST_PEAKS:]]
@@ -661,4 +653,4 @@ def this_environment_of(loop: Loop, coupling: Coupling) -> Requirement:
             return walls_of(loop, coupling).requirement
         except NotProved as error:
             return refusal("this-environment", loop.delta, str(error))
-    return this_environment(loop.F(coupling), loop.delta, loop.T_max, loop.latency)
+    return conditions.this_environment(loop.F(coupling), loop.delta, loop.T_max, loop.latency)

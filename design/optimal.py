@@ -19,31 +19,12 @@ from controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling
 from controller.environment import Network, Ranges
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
+from design import program
 from design.certificate import prove, prove_limiter
 from design.conditions import this_environment as requirement_of
 from design.designs import design_by_kind
 from design.environments import Searched, in_each, ratio_in, search_ranges, worst
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
-from design.program import (
-    DEFAULT,
-    FULL,
-    HIGH_HZ,
-    MARGIN,
-    RICH,
-    SOFT,
-    Case,
-    Options,
-    Problem,
-    Slip,
-    Span,
-    limiter,
-    most_gain,
-    span_of,
-    static_weight,
-    switching,
-    this_environment,
-    worst_mismatch,
-)
 from design.result import Design, DesignFailed, NotProved, finite
 from design.robustness import at, ranges_around, robustness, robustness_part, vertices
 from design.stored import Certificate, LimiterCertificate
@@ -105,7 +86,7 @@ def design_with(
 
     The rungs of its ladder are the steps that `progress` hears of.
     """
-    asked, done = Options(**options), 0
+    asked, done = program.Options(**options), 0
 
     def heard(rung: _Rung) -> None:
         nonlocal done
@@ -118,7 +99,7 @@ def design_with(
 
 def design(
     loop: Loop,
-    options: Options = DEFAULT,
+    options: program.Options = program.DEFAULT,
     progress: Callable[[_Rung], None] = lambda rung: None,
 ) -> Optimal:
     """The coupling of the least mismatch in the loop's environment, certified and proved.
@@ -158,15 +139,15 @@ def design(
     return replace(best, ladder=tuple(rungs), sdps=len(rungs), wall_s=climb.elapsed)
 
 
-def _compromise(loop: Loop, around: Sequence[Network], options: Options) -> tuple[Optimal, Optimal]:
+def _compromise(loop: Loop, around: Sequence[Network], options: program.Options) -> tuple[Optimal, Optimal]:
     """(the design for the loop's environment, the one that keeps the condition in these, too), over one small basis.
 
     By sweeps, without proofs: what it costs, not a coupling to run. Raises DesignFailed where there is none.
     """
-    taps, poles = options.ladder[: 2 if loop.channels <= RICH else 1][-1]
+    taps, poles = options.ladder[: 2 if loop.channels <= program.RICH else 1][-1]
     climb = _Climb.of(loop.at(loop.environment), options)
     others = [at(loop, network) for network in around]
-    more = tuple(Case(there, there.E(), (this_environment(there),), 0.0) for there in others)
+    more = tuple(program.Case(there, there.E(), (program.this_environment(there),), 0.0) for there in others)
     climbs = (climb, replace(climb, cases=climb.cases + more))
     alone, wide = (each.solved(taps, poles, None, each.slips(None)[0], proved=False) for each in climbs)
     return alone, wide
@@ -177,25 +158,28 @@ class _Climb:
     """The loop and what is asked of it, with the clock."""
 
     loop: Loop
-    options: Options
-    cases: tuple[Case, ...]  # the loop's own environment first, then the vertices of its ranges
+    options: program.Options
+    cases: tuple[program.Case, ...]  # the loop's own environment first, then the vertices of its ranges
     bare: float  # damping that the environments themselves need, the most
     started: float
 
     @classmethod
-    def of(cls, loop: Loop, options: Options) -> _Climb:
+    def of(cls, loop: Loop, options: program.Options) -> _Climb:
         started = time.perf_counter()
         if loop.environment.walls:
             raise ValueError("an optimal coupling holds a linear model of the environment: walls have none")
-        cases: list[Case] = []
+        cases: list[program.Case] = []
         for member in loop.members():
             there = at(loop, member.network)
-            asked = [this_environment(there), *([switching(there, loop.varying_delay)] if loop.varying_delay else [])]
-            if options.high_gain is not None and 2 * HIGH_HZ * loop.T < 1 and there.E().D.any():
-                asked.append(most_gain(there, options.high_gain))
+            asked = [
+                program.this_environment(there),
+                *([program.switching(there, loop.varying_delay)] if loop.varying_delay else []),
+            ]
+            if options.high_gain is not None and 2 * program.HIGH_HZ * loop.T < 1 and there.E().D.any():
+                asked.append(program.most_gain(there, options.high_gain))
             if options.objective == "sup" and not cases:
-                asked.append(worst_mismatch(there, options.band_hz))
-            cases.append(Case(there, there.E(), tuple(asked), weight=0.0 if cases else 1.0))
+                asked.append(program.worst_mismatch(there, options.band_hz))
+            cases.append(program.Case(there, there.E(), tuple(asked), weight=0.0 if cases else 1.0))
         if options.limiter and (reason := limiter_refusal(loop)):
             raise ValueError(reason)
         needs = in_each(loop, NoCoupling(), loop.members())
@@ -212,21 +196,21 @@ class _Climb:
         """Whether anything but this-environment is asked."""
         return self.options.limiter or any(len(case.constraints) > 1 for case in self.cases)
 
-    def slips(self, before: Optimal | None) -> tuple[Slip | None, ...]:
+    def slips(self, before: Optimal | None) -> tuple[program.Slip | None, ...]:
         """The limiters that a rung is solved for: that of the rung before, with the best multiplier that it has."""
         if not self.options.limiter:
             return (None,)
         if before and before.certificate:
             proof = before.certificate.limiter
             assert isinstance(proof, LimiterCertificate)
-            return (Slip(proof.beta, proof.c),)
-        return tuple(Slip.even(self.loop, *some) for some in (_LAGS if any(self.loop.psi) else _LAGS[:1]))
+            return (program.Slip(proof.beta, proof.c),)
+        return tuple(program.Slip.even(self.loop, *some) for some in (_LAGS if any(self.loop.psi) else _LAGS[:1]))
 
-    def asked(self, slip: Slip | None) -> tuple[Case, ...]:
+    def asked(self, slip: program.Slip | None) -> tuple[program.Case, ...]:
         """The environments with all that holds in each."""
         if slip is None:
             return self.cases
-        here = limiter(self.loop, slip)
+        here = program.limiter(self.loop, slip)
         return tuple(replace(case, constraints=(*case.constraints, here)) for case in self.cases)
 
     def mismatch(self, found: Optimal) -> float:
@@ -239,7 +223,7 @@ class _Climb:
 
     def merit(self, found: Optimal) -> float:
         """The objective of the climb: mismatch and lost static stiffness, as a ratio."""
-        static = static_weight(self.loop) * (found.g - 1) if np.isfinite(found.g) else 0.0
+        static = program.static_weight(self.loop) * (found.g - 1) if np.isfinite(found.g) else 0.0
         return float(np.hypot(self.mismatch(found), static))
 
     def better(self, found: Optimal, best: Optimal) -> bool:
@@ -251,20 +235,20 @@ class _Climb:
         loop = self.loop
         exact_delay = all(n == t + p for n, t, p in zip(loop.lam, loop.theta, loop.psi, strict=True))
         more = any(len(case.constraints) > 1 for case in self.cases)
-        if more or not exact_delay or self.bare > 1 - MARGIN:
+        if more or not exact_delay or self.bare > 1 - program.MARGIN:
             return None
         found = self._proved(self._assessed(NoCoupling(), 1.0), self.slips(None)[0])
         return found if found.proved or not self.options.limiter else None
 
-    def span(self, taps: int, poles: int) -> Span:
-        return span_of(self.cases[0].E, taps, poles, self.options.band_hz[1])
+    def span(self, taps: int, poles: int) -> program.Span:
+        return program.span_of(self.cases[0].E, taps, poles, self.options.band_hz[1])
 
     def room(self, taps: int, poles: int) -> bool:
         """Whether a rung is tried: by its size, which is the same on a busy machine."""
         span, loop = self.span(taps, poles), self.loop
         m = loop.channels
         own = int((span.used.sum(axis=1) > 0)[:, :m].sum())
-        states = own + (len(span.used) - own // m if m > FULL else 0)
+        states = own + (len(span.used) - own // m if m > program.FULL else 0)
         states += self.cases[0].E.order + sum(loop.theta) + sum(loop.psi)
         proofs = len(self.cases) * states**2.7  # what they take, in seconds
         return states <= _MOST_STATES and (m * span.unknowns) ** 2 <= _MOST_WORK and proofs <= _MOST_PROOFS
@@ -275,13 +259,15 @@ class _Climb:
         found = min(tried, key=lambda one: (one.reason is not None, self.merit(one)))
         return found, _Rung(taps, poles, found.states, self.decibels(found), found.g, found.reason, self.elapsed)
 
-    def solved(self, taps: int, poles: int, before: Optimal | None, slip: Slip | None, proved: bool = True) -> Optimal:
+    def solved(
+        self, taps: int, poles: int, before: Optimal | None, slip: program.Slip | None, proved: bool = True
+    ) -> Optimal:
         share = self.mismatch(before) if before else 1.0
         span, cases = self.span(taps, poles), self.asked(slip)
         active = [0]
         while True:
             chosen = tuple(cases[i] for i in active)
-            problem = Problem(span, chosen, self.options, SOFT[0] * min(share, SOFT[1]))
+            problem = program.Problem(span, chosen, self.options, program.SOFT[0] * min(share, program.SOFT[1]))
             coupling = span.filter(problem.solve(self._start(problem)))
             needs = [ratio_in(case.loop, coupling) for case in cases]
             missed = [int(i) for i in np.argsort(needs)[::-1] if needs[i] > 1 + _TOLERATED and i not in active]
@@ -290,8 +276,8 @@ class _Climb:
             active += missed[:2]
         if slip:
             needs.append(min(limiter_requirement(self.loop, coupling, slip.beta).requirement.ratio, 1 + _TOLERATED))
-        for limit in (1 - 0.95 * MARGIN, 1 - 1.5 * MARGIN, 1 - 2.5 * MARGIN):
-            scale = min(1.0, (1 - MARGIN) / max(needs)) if max(needs) > limit else 1.0
+        for limit in (1 - 0.95 * program.MARGIN, 1 - 1.5 * program.MARGIN, 1 - 2.5 * program.MARGIN):
+            scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))
             found = self._assessed(scaled, scaled.g)
             if not proved or self.loop.ranges or (found := self._proved(found, slip)).proved:
@@ -307,7 +293,7 @@ class _Climb:
         assert isinstance(whole, ForceFilter)
         searched = search_ranges(self.loop, whole)
         ratio, last = searched.worst[0].ratio, found
-        for limit in (1 - MARGIN / 2, 1 - 2.5 * MARGIN):
+        for limit in (1 - program.MARGIN / 2, 1 - 2.5 * program.MARGIN):
             share = min(1.0, limit / ratio)
             coupling = _scaled(whole, share)
             lower = tuple(replace(one, ratio=one.ratio * share) for one in searched.worst)  # each need scales
@@ -319,10 +305,10 @@ class _Climb:
 
     def scaled(self) -> Optimal:
         """The environment itself, scaled down until it is safe."""
-        span = Span(np.zeros(0), NO_PAIRS, np.zeros((0, self.loop.channels, self.loop.channels), dtype=bool))
-        simple = (1 - MARGIN) / self.bare if self.bare > 0 else 1.0
+        span = program.Span(np.zeros(0), NO_PAIRS, np.zeros((0, self.loop.channels, self.loop.channels), dtype=bool))
+        simple = (1 - program.MARGIN) / self.bare if self.bare > 0 else 1.0
         (slip, *_) = self.slips(None)
-        problem = Problem(span, self.asked(slip), self.options, 0.0)
+        problem = program.Problem(span, self.asked(slip), self.options, 0.0)
         kappa = self._start(problem)[0] if self.constrained else min(1.0, simple)
         kappa = np.floor(kappa * 1e6) / 1e6
         return self._proved(self._assessed(span.filter(np.array([kappa])), kappa), slip)
@@ -337,7 +323,7 @@ class _Climb:
         except (DesignFailed, ValueError):
             return None
 
-    def _start(self, problem: Problem) -> Array:
+    def _start(self, problem: program.Problem) -> Array:
         """R = kappa I that keeps every constraint with room to spare. Raises DesignFailed."""
         kappa = 0.5 / max(self.bare, 0.5)
         for _ in range(20):
@@ -371,7 +357,7 @@ class _Climb:
             reason=None if requirement.certified else requirement.reason or "the sweep does not certify it",
         )
 
-    def _proved(self, found: Optimal, slip: Slip | None) -> Optimal:
+    def _proved(self, found: Optimal, slip: program.Slip | None) -> Optimal:
         """The same with its certificate, or why it has none."""
         loop, coupling = self.loop, found.coupling
         try:
@@ -386,7 +372,9 @@ class _Climb:
 def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
     """The filter times a number, in decimals for which R(1) = g I holds exactly."""
     every = np.ones((len(coupling.R) - 1, *coupling.R.shape[1:]), dtype=bool)
-    return Span(coupling.poles, coupling.pairs, every).filter(np.append(coupling.g, coupling.R[1:].ravel()), scale)
+    return program.Span(coupling.poles, coupling.pairs, every).filter(
+        np.append(coupling.g, coupling.R[1:].ravel()), scale
+    )
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -403,7 +391,7 @@ class _Spread:
     worst: float  # times the damping that there is, over the vertices
 
 
-def spread(loop: Loop, options: Options = DEFAULT, percent: float = 10.0) -> _Spread | None:
+def spread(loop: Loop, options: program.Options = program.DEFAULT, percent: float = 10.0) -> _Spread | None:
     """The design for `vertices` beside the nominal one, by sweeps: a price, not a coupling to run. None without one."""
     try:
         alone, wide = _compromise(loop, list(vertices(loop.network, percent).values()), options)
@@ -413,7 +401,7 @@ def spread(loop: Loop, options: Options = DEFAULT, percent: float = 10.0) -> _Sp
     return _Spread(mismatch, mismatch - before, wide.g, robustness(loop, wide.coupling, percent).worst)
 
 
-def robustness_parts(loop: Loop, coupling: Coupling, options: Options = DEFAULT) -> dict[str, Any]:
+def robustness_parts(loop: Loop, coupling: Coupling, options: program.Options = program.DEFAULT) -> dict[str, Any]:
     """A report's `robustness` of a coupling for this environment, and what a design for that range would cost.
 
     The latter is null with walls, with ranges, and for a coupling that is no force filter.
@@ -438,7 +426,7 @@ def widest_ranges(loop: Loop, percent: float) -> tuple[Ranges, str | None]:
     single += [Ranges(masses={node: span}) for node, span in whole.masses.items()]
     if len(single) <= _MOST_RANGES:
         return whole, None
-    small = design(loop.at(loop.network), replace(DEFAULT, ladder=DEFAULT.ladder[:1])).coupling
+    small = design(loop.at(loop.network), replace(program.DEFAULT, ladder=program.DEFAULT.ladder[:1])).coupling
 
     def most(box: Ranges) -> float:
         there = msgspec.structs.replace(loop, ranges=box)

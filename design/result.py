@@ -1,4 +1,4 @@
-"""Arguments of the functions for scripts, checked before any work: an error names the argument and what came."""
+"""What a condition asks, what a design is, and the checks of the arguments of functions for scripts."""
 
 from __future__ import annotations
 
@@ -119,7 +119,6 @@ class Infeasible(DesignFailed):
 # Figures and conditions as text.
 
 
-#: the key of a condition in files and reports -> its name in words and options
 #: what files, options and reports called the conditions before
 OLDER_NAMES = {"closed-loop": "this-environment", "theorem4": "any-environment"}  # older name
 

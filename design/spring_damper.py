@@ -18,14 +18,14 @@ from controller.coupling import MovingAverage, SpringDamper
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.conditions import any_environment, any_environment_delayed, even_damping, this_environment
-from design.frequency import peaks
+from design.frequency import peaks, too_long
 from design.gain_search import LimiterLoop, SampledLoop, SwitchingLoop, least_rms, polynomials
 from design.lmi import RESERVE, Complex, Shaping, affine_lmis, gain_lmi, least_phi, solve, solved, usable
 from design.multipliers import (
     limiter_refusal,
 )
 from design.result import Design, DesignFailed, Infeasible, Requirement
-from design.transparency import BAND_HZ
+from design.transparency import BAND_HZ, transparency
 
 if TYPE_CHECKING:  # slow to load
     import cvxpy as cp
@@ -226,6 +226,9 @@ def design(
     raise ValueError(f"condition is {condition!r}, expected 'any-environment' or 'this-environment'")
 
 
+#: Digits that gains keep in a loop of many devices, finer than RESERVE: with all of them exact proofs take minutes.
+_DIGITS = 5
+_SWEEPS = 150  # take as long as a search for gains in this environment
 #: Devices whose search ends within half a minute: matrix inequalities cost their sixth power, eigenvalues their third.
 _MOST_ANY, _MOST_LIMITED = 16, 12
 
@@ -288,6 +291,9 @@ def _for_this_environment(
     limiter: bool,
     band_hz: tuple[float, float] | None,
 ) -> Design:
+    each = np.full(loop.channels, 1000.0)  # gains do not matter to how long it takes
+    if reason := too_long(loop.F(SpringDamper(each, each / 1000)), _SWEEPS):
+        raise DesignFailed(None, (), reason)
     started, starts = time.perf_counter(), starts or _default_starts(loop)
     band = band_hz or BAND_HZ
     if band_hz and switching:
@@ -313,6 +319,9 @@ def _for_this_environment(
         )
         raise DesignFailed(None, (), line)
     coupling = SpringDamper(coupling.K, np.where(_NEGLIGIBLE * usable(loop) > coupling.B, 0.0, coupling.B))
+    if loop.channels > _MOST_LIMITED:
+        coupling = SpringDamper(*([float(f"{v:.{_DIGITS}g}") for v in gains] for gains in (coupling.K, coupling.B)))
+        rms = transparency(loop.F(coupling), loop.E(), loop.lam, band).rms_mismatch
     requirement = this_environment(loop.F(coupling), loop.delta, loop.T_max)
     return Design(coupling, "this-environment", "rms", rms, requirement, searches, time.perf_counter() - started)
 

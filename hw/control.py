@@ -27,6 +27,7 @@ from design.certificate import assess
 from design.coverage import Limits
 from design.guarantees import guarantee_of
 from design.result import Design, DesignFailed, Requirement, certificate_part
+from hw import monitor
 from hw.limits import (
     Gain,
     Heat,
@@ -39,7 +40,6 @@ from hw.limits import (
     check_speed,
     shape,
 )
-from hw.monitor import Ages, ClockMonitor, CommandMonitor, Counters, EncoderMonitor, EncoderTest, LinkSettings
 from hw.protocol import MAX_THETA, Config, State
 from sim.couplings import Chosen, choose, given, limits_of
 from sim.report import coupling_part
@@ -83,17 +83,18 @@ class _LimitedController:
 
     def __init__(self, limiter: Limiter) -> None:
         F = limiter.open
-        self.limiter, self.T, self._m = limiter, F.T, F.inputs
+        self.limiter, self.T = limiter, F.T
         self._tick = limiter.transition()
-        self._input, self._output = (np.zeros((F.order + F.inputs, 1)) for _ in range(2))
+        m = F.inputs
+        before, after = self._buffers = np.zeros((F.order + m, 1)), np.zeros((F.order + m, 1))
+        self._state, self._x, self._next, self._f = before[:-m], before[-m:, 0], after[m:], after[:m, 0]
 
     def step(self, x: Sequence[float]) -> list[float]:
         """Forces (m,) [N] within the limits for the displacements x (m,) [m]; the state moves on by one tick."""
-        m, before, after = self._m, self._input, self._output
-        before[-m:, 0] = x
-        self._tick(before, after)
-        before[:-m] = after[m:]
-        return after[:m, 0].tolist()
+        self._x[:] = x
+        self._tick(*self._buffers)
+        self._state[:] = self._next
+        return self._f.tolist()
 
 
 def host_controller(
@@ -218,8 +219,8 @@ class Drive:
         units: Units,
         config: Config,
         limits: SafetyLimits,
-        settings: LinkSettings,
-        counters: Counters,
+        settings: monitor.LinkSettings,
+        counters: monitor.Counters,
         record: Callable[[TraceRow], None],
         arming: int = 0,
         budget: SentBudget | None = None,
@@ -232,14 +233,13 @@ class Drive:
         self.reference: tuple[int, ...] | None = None  # [counts] that positions are counted from
         self._budget = budget
         self._rereference = settings.rereference
-        self._test = EncoderTest(limits.cap, T) if settings.test_encoders else None
-        self._encoders, self._heat = EncoderMonitor(units.encoder_step, units.force_step, T), Heat(limits, T)
+        self._test = monitor.EncoderTest(limits.cap, T) if settings.test_encoders else None
+        self._encoders, self._heat = monitor.EncoderMonitor(units.encoder_step, units.force_step, T), Heat(limits, T)
         self._window = max(2, round(_SPEED_SECONDS / T))  # [ticks] over which a speed is taken
-        self._recent: deque[tuple[int, tuple[float, ...]]] = deque()  # ticks since arming, and x [m]
-        self._ticks = 0  # since arming
+        self._recent = deque[tuple[float, ...]](maxlen=self._window + 1)  # [m] tick by tick
         self._before: tuple[float, ...] | None = None  # [m] of the STATE before that, where none is missing
         self._counters, self._record, self._arming = counters, record, arming
-        self._commands, self._clock = CommandMonitor(config), ClockMonitor(limits, T)
+        self._commands, self._clock = monitor.CommandMonitor(config), monitor.ClockMonitor(limits, T)
 
     def step(self, state: State, ticks: int, direction: int, now: int) -> tuple[int, ...]:
         """The force [steps] that answers `state`, which came at `now` [us], `ticks` after the one before.
@@ -288,13 +288,13 @@ class Drive:
             check_jump(x, self.x, ticks, self.limits)
             if ticks == 1 and self._before is not None:
                 check_jolt(x, self.x, self._before, self.limits)
-        self._ticks += ticks
         recent = self._recent
-        while recent and recent[0][0] < self._ticks - self._window:
-            recent.popleft()
-        if recent and (since := self._ticks - recent[0][0]) >= self._window // 2:
-            check_speed(x, recent[0][1], since * self.T, self.limits)
-        recent.append((self._ticks, x))
+        if ticks == 1 or self.x is None:
+            recent.append(x)
+        else:
+            recent.extend(fill(self.x, x, ticks))
+        if (since := len(recent) - 1) >= self._window // 2:
+            check_speed(x, recent[0], since * self.T, self.limits)
 
     def _miss(self, state: State, positions: list[tuple[float, ...]]) -> None:
         """The controller moves on through ticks of which no STATE came."""
@@ -306,14 +306,14 @@ class Drive:
 # couplings that are certified for a link
 
 
-def link_delay(ages: Ages, T_us: float, quantile: float, guard_us: float) -> int:
+def link_delay(ages: monitor.Ages, T_us: float, quantile: float, guard_us: float) -> int:
     """Ticks from a sample to its latch: what a fraction of the answers keeps, with a guard, and at least one."""
     needed = ages.quantile(quantile) + guard_us
     return max(1, int(-(-needed // T_us)))
 
 
 def timed(
-    scenario: Scenario, ages: Ages, quantile: float, guard_us: float, at_once: bool = False
+    scenario: Scenario, ages: monitor.Ages, quantile: float, guard_us: float, at_once: bool = False
 ) -> tuple[Scenario, int]:
     """The scenario with what was measured of its ticks, and the ticks that the link takes.
 
@@ -453,10 +453,11 @@ def certified_coupling(
         wanted = condition or ("this-environment" if slower.latency else None)
         chosen = choose(slower, case, name, wanted, limiter) if own is None else given(own)
     except DesignFailed as error:
-        raise SafetyStop(f"no coupling for a link of {link} ticks: {error}") from None
+        raise SafetyStop(f"no coupling for a link of {link} tick{'s' if link > 1 else ''}: {error}") from None
     requirements = assess(slower.loop(case), chosen.coupling, chosen.phi)
     limits = limits_of(slower, chosen, requirements, limiter)
-    made = CertifiedCoupling(min(slower.theta) if link else 0, slower, case, chosen, requirements, limits)
+    waits = min(MAX_THETA, *slower.theta) if link else 0  # what is longer, the host waits for
+    made = CertifiedCoupling(waits, slower, case, chosen, requirements, limits)
     if not made.certified:
         named = "the loop without coupling" if chosen.kind == "none" else f"the coupling {chosen.kind}"
         raise SafetyStop(f"{named} is not certified for theta = {list(slower.theta)}: {_shortfall(made)}")

@@ -128,9 +128,10 @@ def shape(
 
 def check_jump(x: Sequence[float], previous: Sequence[float], ticks: int, limits: SafetyLimits) -> None:
     """Raise SafetyStop where an encoder moved further in `ticks` ticks than a hand can: x, previous (m,) [m]."""
+    most = limits.jump * ticks
     for i, (now, before) in enumerate(zip(x, previous, strict=True), start=1):
-        if not abs(now - before) <= limits.jump * ticks:
-            allowed = f"{1e3 * limits.jump * ticks:g} mm in {ticks} tick{'s' if ticks > 1 else ''}"
+        if not abs(now - before) <= most:
+            allowed = f"{1e3 * most:g} mm in {ticks} tick{'s' if ticks > 1 else ''}"
             raise SafetyStop(f"encoder {i} jumped by {1e3 * abs(now - before):.3g} mm, allowed are {allowed}")
 
 
@@ -149,8 +150,10 @@ def check_jolt(x: Sequence[float], previous: Sequence[float], before: Sequence[f
 
 def check_speed(x: Sequence[float], before: Sequence[float], seconds: float, limits: SafetyLimits) -> None:
     """Raise SafetyStop where an axis moved faster than allowed: x now, `before` so many `seconds` ago, (m,) [m]."""
+    most = limits.speed * seconds
     for i, (now, then) in enumerate(zip(x, before, strict=True), start=1):
-        if not (speed := abs(now - then) / seconds) <= limits.speed:
+        if not abs(now - then) <= most:
+            speed = abs(now - then) / seconds
             raise SafetyStop(f"axis {i} moves at {speed:.3g} m/s, allowed are {limits.speed:g} m/s while forces act")
 
 

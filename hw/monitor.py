@@ -186,15 +186,17 @@ class LinkMonitor:
             self.counters.device_errors += (state.crc_errors - self.last.crc_errors) & 0xFF
         self.margin = None if state.margin_us == NO_MARGIN else state.margin_us
         late = self.margin is not None and self.margin < self.needed
-        tick = _Tick(self.margin, self.missed, ahead - 1, late)
-        self.counters.states += 1
-        self.counters.gaps += tick.gap
-        self.counters.misses += tick.missed
-        self.counters.late += tick.late
+        odd = late or self.margin is None or self.missed > 0 or ahead > 1
+        tick, counters = _Tick(self.margin, self.missed, ahead - 1, late, odd), self.counters
+        counters.states += 1
         self._window.append(tick)
-        self._add(tick, 1)
-        if len(self._window) > self.settings.window:
-            self._add(self._window.popleft(), -1)
+        if odd:
+            counters.gaps += tick.gap
+            counters.misses += tick.missed
+            counters.late += tick.late
+            self._add(tick, 1)
+        if len(self._window) > self.settings.window and (oldest := self._window.popleft()).odd:
+            self._add(oldest, -1)
         self.last = state
         return ahead
 
@@ -237,6 +239,7 @@ class _Tick(NamedTuple):
     missed: int
     gap: int  # ticks before it of which no STATE came
     late: bool
+    odd: bool  # whether it counts in any of the sums
 
 
 # the clock: two are compared with the number of the tick, the device's own and the host's, since a device that
@@ -320,6 +323,7 @@ class CommandMonitor:
         self._config = config
         self._forces: dict[int, tuple[int, ...]] = {}  # by the tick that they are for
         self._last: State | None = None
+        self._ready = False  # whether it was armed in that one
         self._run = (0, 0)  # fewest and most forces latched since arming, where STATEs were lost
         self._unlike = self._holding = 0
 
@@ -338,11 +342,11 @@ class CommandMonitor:
         self._holding = self._holding + 1 if phase == Phase.HOLDING else 0
         if self._holding > self._config.hold:
             raise SafetyStop(f"the device holds a force for {self._holding} ticks, {self._config.hold} are agreed")
-        told, last = self._forces.pop(state.tick, None), self._last
-        self._last = state
-        if last is None or phase == Phase.DISARMED:
+        told, last, ready = self._forces.pop(state.tick, None), self._last, self._ready
+        self._last, self._ready = state, phase != Phase.DISARMED
+        if last is None or not self._ready:
             return False
-        if last.phase != Phase.DISARMED:
+        if ready:
             fewest, most = self._run
             self._run = (fewest + (phase == Phase.ARMED), most + ticks)
         if ticks > 1:
@@ -359,10 +363,14 @@ class CommandMonitor:
             return state.applied == last
         if told is None:
             return False
-        could = [limited(self._config, run, last, told) for run in set(self._run)]
-        return state.applied in could or all(
-            min(either) - _ROUNDING <= force <= max(either) + _ROUNDING
-            for force, *either in zip(state.applied, *could, strict=True)
+        fewest, most = self._run
+        right = limited(self._config, most, last, told)
+        if state.applied == right:
+            return True
+        other = limited(self._config, fewest, last, told)
+        return all(
+            min(one, two) - _ROUNDING <= force <= max(one, two) + _ROUNDING
+            for force, one, two in zip(state.applied, right, other, strict=True)
         )
 
 

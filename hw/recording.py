@@ -60,8 +60,8 @@ class Recorder:
             sent, applied, margin, status = zero, zero, NO_MARGIN, 0
         else:
             sent, applied, margin, status = row.sent, state.applied, state.margin_us, state.status
-        floats, whole = (*row.x, *row.asked, *(row.test or zero), row.gain), (row.tick, row.arming, margin, status)
-        self._rows += self._form.pack(*floats, *sent, *applied, *whole, state is not None)
+        once = row.tick, row.arming, margin, status, state is not None
+        self._rows += self._form.pack(*row.x, *row.asked, *(row.test or zero), row.gain, *sent, *applied, *once)
 
     def __len__(self) -> int:
         return len(self._rows) // self._form.size

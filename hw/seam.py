@@ -162,7 +162,8 @@ class Driver:
         try:
             self._call(session)
             session.counters.host_errors = self.device.errors
-            self.do(session.poll(self.clock()))
+            if said := session.poll(self.clock()):
+                self.do(said)
             if session.stage == Stage.MEASURED:
                 self.load()
         except PortLost as lost:

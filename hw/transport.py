@@ -1,4 +1,4 @@
-"""Wire: a session in real time over a serial port, by pyserial, and one thread that waits for nothing else.
+"""A session in real time over a serial port, by pyserial, and one thread that waits for nothing else.
 
 Python holds up a loop by itself: a full garbage collection takes 40 ms with MuJoCo and cvxpy loaded. So what is loaded
 is frozen and the collector is off while forces act.
@@ -213,8 +213,9 @@ class Live(Driver):
         session = self.session
         if self._typed():
             self._pressed()
-        self.do(self._operator.look(session, now))
-        if signal.SIGUSR1 in self.signals:
+        if said := self._operator.look(session, now):
+            self.do(said)
+        if self.signals and signal.SIGUSR1 in self.signals:
             self.do(session.estop("SIGUSR1", now))
         elif self.signals:
             name = signal.Signals(self.signals[0]).name

@@ -39,8 +39,9 @@ def simulate(
 
     `coupling` None is the loop without one; `engine` is "mujoco" or "exact" (the linear loop, no Coulomb friction);
     `integrator` of MuJoCo, None for "exponential", or "RK4" where a device has Coulomb friction; `substeps` steps per
-    period, None for what the plant asks; `seed` draws delays that vary. Forces are limited as a guarantee covers it,
-    where one does (`meta["limiter"]` says); elsewhere, and with `limiter` False, they are clipped.
+    period, None for what the plant asks; `seed` draws delays, periods and latencies that vary.
+    Forces are limited as a guarantee covers it, where one does (`meta["limiter"]` says); elsewhere, and with
+    `limiter` False, they are clipped.
 
     `environment` takes the place of the scenario's: anything that answers, once a tick, where its port would be if it
     gave no force, (m,) [m], with a force fed back (m,) [N]. A shell makes it passive, which may give `energy_budget`
@@ -63,7 +64,7 @@ def simulate(
     if substeps is not None:
         substeps = whole("substeps", substeps, 1, MOST)
     alone, limits = chosen.coupling, limits_of(scenario, chosen, limiter=limiter and environment is None)
-    simulation = assemble(scenario, alone, limits.rho)
+    simulation = assemble(scenario, alone, limits.rho, seed)
     if scenario.switches:
         simulation, _ = switching(simulation, alone, seed, scenario.samples)
     integrator, substeps, remarks = settle(simulation, engine, integrator, substeps)

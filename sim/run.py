@@ -50,6 +50,7 @@ _Look = Callable[[StepBuffer, int, int], object]  # (buffer, its first tick, tic
 Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 
 _COPIES = 4  # of a trace, at most, from the run to its report
+_SMALL = 1e8  # [bytes] of a trace for which the free memory is not looked up
 _COLUMNS = 50  # numbers a tick that the report of a trace on the disk takes in memory
 _BLOCK = 1024  # ticks between two looks at the clock, the keyboard and the numbers
 _AHEAD = 8  # blocks for which outside forces are asked at once
@@ -184,7 +185,8 @@ def _room(width: int, ticks: int, T: float) -> Array:
 
     Raises InputError where the report of such a trace does not fit into memory, or the trace on the disk.
     """
-    shape, free, each = (ticks, width), _free_memory(), 8 * width
+    shape, each = (ticks, width), 8 * width
+    free = _free_memory() if each * ticks > _SMALL else np.inf
     if _COPIES * each * ticks <= free:
         return np.empty(shape)
     disk = shutil.disk_usage(tempfile.gettempdir()).free
@@ -238,6 +240,7 @@ def run_block(buffer: StepBuffer, engine: Engine, ticks: int) -> None:
         if done == ticks:
             return
         fast.back(done)
+        buffer.calm = False
     tick, advance = buffer.ticking(), engine.advance
     for k in range(done, ticks):
         tick(k)  # sample x, compute f and z+

@@ -27,9 +27,9 @@ from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Complex, Lti, Sampled, SingularLoop, as_like
 from controller.process import Process
+from design import conditions
 from design.audit import check_loop, edge
 from design.certificate import CONDITIONS, any_environment_of
-from design.conditions import any_environment_ratios, even_damping, this_environment, this_environment_ratios
 from design.coverage import covered_limits
 from design.guarantees import LATE
 from design.lmi import least_phi
@@ -66,7 +66,9 @@ class _Sweep:
             return as_like(G, theta) @ G
 
         longest = max(n + p for n, p in zip(self.loop.theta, self.loop.psi, strict=True))
-        return this_environment_ratios(at, F.poles(), self.loop.delta, longest, self.loop.T_max, self.loop.latency)
+        return conditions.this_environment_ratios(
+            at, F.poles(), self.loop.delta, longest, self.loop.T_max, self.loop.latency
+        )
 
     def _limits(self, devices: Sequence[Device]) -> tuple[Array, Array]:
         """Force limits [N] and encoder steps [m], (m,) each."""
@@ -172,10 +174,12 @@ class CouplingSweep(_Sweep):
         if reason:
             return np.full(K.size, np.inf)
         one, none = self._couplings(K, B, 1), [None] * self.loop.channels
-        damping = even_damping(self.loop.delta, self.loop.T, self.loop.T_max).tolist()
+        damping = conditions.even_damping(self.loop.delta, self.loop.T, self.loop.T_max).tolist()
         channels = set(zip(self.loop.theta, damping, none if phi is None else phi.tolist(), strict=True))
         each = [
-            any_environment_ratios(lambda z: one.sampled(z, self.loop.T), K.size, [n], [d], None if p is None else [p])
+            conditions.any_environment_ratios(
+                lambda z: one.sampled(z, self.loop.T), K.size, [n], [d], None if p is None else [p]
+            )
             for n, d, p in channels
         ]
         return np.max(each, axis=0)
@@ -185,7 +189,9 @@ class CouplingSweep(_Sweep):
         loop = self.loop
         coupling = SpringDamper([K] * loop.channels, [B] * loop.channels, self.cutoff)
         if condition == "this-environment":
-            states = [this_environment(s.F(coupling), loop.delta, loop.T_max, loop.latency) for s in self._states]
+            states = [
+                conditions.this_environment(s.F(coupling), loop.delta, loop.T_max, loop.latency) for s in self._states
+            ]
             return max(states, key=lambda requirement: requirement.ratio)
         phi, reason = self.multiplier
         return refusal("any-environment", loop.delta, reason) if reason else any_environment_of(loop, coupling, phi)
@@ -282,7 +288,7 @@ class EnvironmentSweep(_Sweep):
             return self._any_environment
         try:
             F = self._force_map(self._matrices(np.array([K]), np.array([B])), self._facing(condition))[0]
-            return this_environment(F, self.loop.delta, self.loop.T_max, self.loop.latency)
+            return conditions.this_environment(F, self.loop.delta, self.loop.T_max, self.loop.latency)
         except SingularLoop as error:
             return refusal("this-environment", self.loop.delta, str(error))
 

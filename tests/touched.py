@@ -1,9 +1,11 @@
 """The tests of what a change touches, and with `sources` the files of it: `make check` looks at these.
 
-A file of a package is tested by the file or the folder of its name under tests/; changed tests are run themselves.
+A file of a package is tested by the files of its name under tests/, else by those that import it, else by the folder of
+its package; changed tests are run themselves.
 What has changed is what git sees as different from HEAD, or the last commit where nothing does.
 """
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -22,8 +24,8 @@ def tests_of(paths: list[str]) -> list[str]:
     found = {"tests/project/test_layers.py"}
     for path in paths:
         top, _, rest = path.partition("/")
-        if top in PACKAGES and (folder := _mirror(path, top)):
-            found.add(folder)
+        if top in PACKAGES:
+            found |= _mirror(path, top)
         elif (
             top == "tests" and Path(path).name.startswith("test_") and Path(path).exists() and "benchmarks" not in rest
         ):
@@ -37,11 +39,15 @@ def sources_of(paths: list[str]) -> list[str]:
     return found or ["cli/__init__.py"]
 
 
-def _mirror(path: str, package: str) -> str | None:
-    """The file of the same name, else the folder of the package."""
-    own = Path("tests") / package / f"test_{Path(path).stem}.py"
-    folder = Path("tests") / package
-    return str(own) if own.exists() else str(folder) if folder.is_dir() else None
+def _mirror(path: str, package: str) -> set[str]:
+    """The files of the same name, else those of its package that import it, else all of its package."""
+    tests, stem = sorted(Path("tests").glob("*/test_*.py")), Path(path).stem
+    own = {str(test) for test in tests if test.name == f"test_{stem}.py"}
+    imported = re.compile(
+        rf"^from {package}(\.{stem} import| import .*\b{stem}\b)|^import {package}\.{stem}\b", re.MULTILINE
+    )
+    own = own or {str(one) for one in tests if one.parent.name == package and imported.search(one.read_text())}
+    return own or ({f"tests/{package}"} if Path("tests", package).is_dir() else set())
 
 
 def _git(*words: str) -> list[str]:

@@ -333,7 +333,7 @@ ORDINARY = {
 @pytest.mark.parametrize("name", ORDINARY)
 def test_the_optimum_over_a_basis_is_the_one_of_a_dense_cone_program(name, monkeypatch):
     """Four taps and three poles, the condition at many frequencies, by cvxpy: the same objective to 0.1 dB."""
-    monkeypatch.setattr("design.optimal.SOFT", (0.0, 0.3))  # what the cone program does not have
+    monkeypatch.setattr("design.program.SOFT", (0.0, 0.3))  # what the cone program does not have
     monkeypatch.setattr("design.program._EVEN", 0.0)
     loop = ORDINARY[name]()
     m, E = loop.channels, loop.E()

@@ -302,3 +302,7 @@ def test_what_would_take_minutes_is_refused_at_once():
         spring_damper.design_with(many, "any-environment")
     with pytest.raises(DesignFailed, match="17 devices, allowed are 12 for a spring-damper by the limiter"):
         spring_damper.design_with(many, "this-environment", limiter=True)
+    four = Network(names[:4], springs[:4])
+    late = Loop(T, (0,) * 4, (100,) * 4, (0,) * 4, (1.0,) * 4, four)
+    with pytest.raises(DesignFailed, match="some 150 sweeps over 404 states and 4 channels would take about"):
+        spring_damper.design_with(late, "this-environment")

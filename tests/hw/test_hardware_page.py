@@ -50,6 +50,12 @@ def test_the_table_of_faults_shows_what_the_rehearsal_gives(row, made):
         assert cause in outcomes[0].cause
 
 
+def test_a_dead_encoder_or_channel_is_found_as_soon_as_the_page_says(made):
+    names = ("encoder dies", "encoder 2 dies", "a channel of encoder 1 dies", "a channel of encoder 2 dies")
+    times = [rehearse_case(next(c for c in CASES if c.name == name), *made)[1].zero_force_ms for name in names]
+    assert f"forces are zero {min(times):.1f} to {max(times):.1f} ms after an encoder died" in PAGE
+
+
 def test_the_table_of_faults_is_there():
     assert len(ROWS) == 10
 

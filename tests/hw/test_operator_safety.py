@@ -228,11 +228,12 @@ def test_a_busy_machine_is_told_what_to_do():
 
 @pytest.fixture(scope="module")
 def rehearsed(tmp_path_factory):
-    """Twice the same: report and trace."""
+    """Twice the same, with an energy budget: report and trace."""
     found = []
     for name in ("one", "two"):
         out = tmp_path_factory.mktemp(name)
-        assert bridge.main(["--rehearse", "--duration", "0.5", "--out", str(out), "--json", str(out / "r.json")]) == 0
+        options = ["--rehearse", "--duration", "0.5", "--energy-budget", "0.01", "--out", str(out)]
+        assert bridge.main([*options, "--json", str(out / "r.json")]) == 0
         found.append((json.loads((out / "r.json").read_text()), (out / "trace.csv").read_text(), out))
     return found
 
@@ -249,6 +250,8 @@ def test_a_rehearsal_has_the_stages_and_files_of_a_session(rehearsed):
         "incidents.jsonl",
     }
     assert report["link"]["missed_percent"] == 0
+    (budget,) = report["energy_budget"]  # it stands by while the coupling is certified
+    assert (budget["start_J"], budget["limited_ticks"], budget["ticks"]) == (0.01, 0, report["run"]["samples"])
     assert replay.main([str(out / "trace.npz")]) == 0
 
 

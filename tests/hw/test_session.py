@@ -261,6 +261,18 @@ def test_the_host_and_the_link_share_the_delay(scenario, rungs):
     np.testing.assert_allclose(on_host, F.at(z), rtol=1e-9, atol=1e-9)  # two orders of the same sums
 
 
+def test_a_delay_that_the_protocol_cannot_carry_waits_in_the_host(scenario):
+    """Of 16 and 17 ticks, 15 are the line's: the host's forces come one and two ticks after their displacement."""
+    (made,) = certified_couplings(scenario.replace(theta=(16, 17)), "I", None, None, 1, spare=0)
+    controller = made.controller((12.0, 12.0))
+    answers = np.array([controller.step((1e-3 * (k == 0), 1e-3 * (k == 0))) for k in range(4)])
+    assert (answers != 0).tolist() == [[False, False], [True, False], [True, True], [True, True]]
+    session = rehearsal_of(scenario, [made]).run_until_armed(0.3)
+    assert session.stage == Stage.ARMED
+    assert session.config
+    assert session.config.theta == made.link == 15
+
+
 def test_nothing_uncertified_is_loaded(scenario, rungs):
     with pytest.raises(
         SafetyStop, match=r"published is not certified for theta = \[1, 2\]: any-environment needs 7.629"

@@ -18,7 +18,7 @@ from cli.run import main as run_command
 from cli.validate import main as validate_command
 from controller.coupling import NoCoupling, SpringDamper
 from design import Options, certify, design_coupling, guarantee, transparency_of
-from design.designs import KINDS, OPTIONS
+from design.designs import KINDS
 from hw import rehearse
 from models.device import RigidDevice
 from sim import InputError, Result, Scenario, load, parse, simulate, validate
@@ -66,12 +66,11 @@ def test_the_options_are_those_that_the_designs_take():
     from design import fixed_order as ccl
     from design import optimal, spring_damper
 
-    assert set(OPTIONS) == set(KINDS)
-    assert set(OPTIONS["ccl"]) < set(signature(ccl.design).parameters)
-    assert set(OPTIONS["spring-damper"]) - {"limiter"} < set(signature(spring_damper.design).parameters)
-    own = {field.name for field in fields(optimal.Options)} - {"ladder"}
-    assert set(OPTIONS["optimal"]) == {*own, "switching"}
-    assert set(Options.__annotations__) == {name for names in OPTIONS.values() for name in names}
+    assert set(KINDS["ccl"].options) < set(signature(ccl.design).parameters)
+    assert set(KINDS["spring-damper"].options) - {"limiter"} < set(signature(spring_damper.design).parameters)
+    own = {field.name for field in fields(optimal.program.Options)} - {"ladder"}
+    assert set(KINDS["optimal"].options) == {*own, "switching"}
+    assert set(Options.__annotations__) == {name for kind in KINDS.values() for name in kind.options}
 
 
 def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):
@@ -164,6 +163,15 @@ def test_delays_that_vary_are_simulated():
     assert first.meta["stability"] is None
 
 
+def test_periods_are_drawn_by_the_seed_that_is_reported():
+    scenario = load().replace(period={"min": 0.8e-3, "max": 1.6e-3}, duration=0.1)
+    for seed in (0, 1):
+        trace = simulate(scenario, SOFT, seed=seed)
+        periods = scenario.timing(seed, scenario.samples).period[: trace.t.size - 1]
+        np.testing.assert_allclose(np.diff(trace.t), periods)
+        assert trace.meta["seed"] == seed
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -202,8 +210,8 @@ LOOP = SHORT.loop("I")
         (lambda: design_coupling(SHORT), 'loop is a Scenario, expected a Loop, as scenario.loop("I") gives it'),
         (lambda: design_coupling("omega-pair"), "loop is 'omega-pair' (str), expected a Loop"),
         (
-            lambda: design_coupling(LOOP, "optimal", funtions=3),
-            "funtions is no option of kind 'optimal' (did you mean",
+            lambda: design_coupling(LOOP, "optimal", objectiv=3),
+            "objectiv is no option of kind 'optimal' (did you mean",
         ),
         (lambda: design_coupling(LOOP, order=3), "order is no option of kind 'spring-damper', allowed are switching"),
         (lambda: design_coupling(LOOP, "optimal", high_gain="x"), "high_gain is 'x' (str), expected a number"),

@@ -26,7 +26,7 @@ HOMES = {
     "mujoco": {"models/scene.py", "sim/engines.py", "sim/view/"},
     "cvxpy": {"design/lmi.py", "design/fixed_order.py", "design/spring_damper.py"},
     "distributed": {"sim/shards.py"},
-    "serial": {"hw/transport.py", "hw/port.py"},
+    "serial": {"hw/transport.py"},
     "matplotlib": {"sim/map_plot.py", "sim/plots.py"},
     "PIL": {"sim/view/"},
 }

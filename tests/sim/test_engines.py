@@ -166,6 +166,7 @@ def test_a_long_trace_lies_on_the_disk(assembly, monkeypatch, tmp_path):
     """The same numbers as in memory; refused where neither has room, with the duration that has."""
     expected, ticks = run(assembly, "exact"), assembly.scenario.samples
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(loop, "_SMALL", 0)
     monkeypatch.setattr(loop, "_free_memory", lambda: 400 * ticks)
     found = run(assembly, "exact")
     for name in ("t", "x", "f", "x_handle", "w", "z", "s"):

@@ -90,7 +90,9 @@ def test_the_command_says_what_is_missing(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(shards, "examine", fails)
     assert main([*OPTIONS, "--out", str(tmp_path)]) == 3
-    assert f"memory ran out; {BATCH} humans that were finished are kept" in " ".join(capsys.readouterr().out.split())
+    assert f"memory ran out; {BATCH} humans that were finished are kept" in " ".join(
+        capsys.readouterr().out.replace("│", " ").split()
+    )
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["humans"], report["unfinished"], report["interrupted"]) == (BATCH, "memory ran out", False)
     monkeypatch.undo()

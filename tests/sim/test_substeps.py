@@ -15,7 +15,15 @@ from sim.engines import INTEGRATORS
 from sim.run import assemble, make_engine, run
 from sim.scenario import SCENARIOS, InputError, load
 from sim.stability import exact_growth
-from sim.stepping import Pace, check_substeps, default_substeps, measured_hold, pace, simulated_growth, step_radius
+from sim.stepping import (
+    PlantSpeed,
+    check_substeps,
+    default_substeps,
+    measured_hold,
+    pace,
+    simulated_growth,
+    step_radius,
+)
 
 SCENARIO = load()
 STIFF = SCENARIO.replace(device=(CompliantDevice(transmission_stiffness=1e6),) * 2)
@@ -34,7 +42,7 @@ def test_pace_of_known_matrices():
     A[3, 4] = 1
     assert pace(A).mode == pytest.approx(3.0)
     assert pace(A).rate == pytest.approx(50.0)
-    assert pace(np.zeros((2, 2))) == Pace(0.0, 0.0)
+    assert pace(np.zeros((2, 2))) == PlantSpeed(0.0, 0.0)
 
 
 def test_the_default_scenario_needs_no_more_than_four(assembly):

@@ -468,7 +468,7 @@ def test_the_keyboard_keeps_what_is_done(stage, tmp_path, monkeypatch, capsys):
 
         return draw_map(*arguments[:-1], stop)
 
-    monkeypatch.setattr(zwidth, "draw_map", draw)
+    monkeypatch.setattr(zwidth.zwidth, "draw_map", draw)
     options = ["--rigid", "--theta", "1", "--humans", "10", "--grid", "12", "--points", "5", "--out", str(tmp_path)]
     assert zwidth.main(options) == INTERRUPTED
     report = json.loads((tmp_path / "report.json").read_text())
