@@ -134,7 +134,7 @@ def test_the_live_window_runs_it_as_the_simulator_does(files, form):
     frame = running.frame(0.25)
     ticks = round(frame.t / scenario.T)
     record = close_loop(shown.assembly, "exact", ticks=ticks + 1)
-    np.testing.assert_array_equal(frame.history, record.f[:ticks])
+    np.testing.assert_allclose(frame.history, record.f[:ticks], rtol=0, atol=1e-13)  # sums of ninety states
 
 
 @pytest.mark.parametrize("form", ["filter", "pair"])
