@@ -929,6 +929,7 @@ def main() -> int:
     for command in COMMANDS:
         import_module(f"cli.{command}")
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    os.environ["HAPTIC_LOOP_CACHE"] = "off"  # every case takes as long as the first
     if folder := os.environ.get("SHARED_DESIGNS"):
         sys.path.append(str(Path(__file__).parents[1]))
         import_module("forked").share_designs(Path(folder))

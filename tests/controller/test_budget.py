@@ -198,7 +198,7 @@ def test_coarse_encoders_keep_the_guarantee(told):
         lo, hi = ((0, 1), (0, 1)) if told == "constant" else ((0, 0), (2, 2))
         budget = EnergyBudget(DELTA, T, lo, hi, encoder_step=known, start=W0, nsim=40)
         line, seen, acted = Line(rng, lo, hi, 0, 0.0, 40), 0.0, []
-        for k in range(2500):
+        for k in range(1200):
             now = np.round(hands.x / q) * q
             wanted = force() * (1 + (k % 2))  # forces that change cost energy behind coarse encoders
             sent = budget.limit(wanted, now - seen)

@@ -713,7 +713,7 @@ def test_a_thief_under_the_bridge_is_limited_and_hands_get_no_more_than_the_budg
         recorder = Recorder(2)
         settings = LinkSettings(measure=100, test_encoders=False, energy_budget=(budget, np.inf))
         run = rehearsal_of(scenario, rungs, *faults, recorder=recorder, settings=settings)
-        run.run_to_the_end(5.0)
+        run.run_to_the_end(2.0)
         report = outcome("I", run.session, recorder, 0)
         (part,) = report["energy_budget"]
         path = save(tmp_path, run.session, recorder, report, False)[0]

@@ -15,7 +15,7 @@ from sim.scenario import load
 from sim.stability import disagree, dominant_mode, exact_loops, mujoco_loops, unstable
 
 DEVICES = ("omega-pair", "omega-pair-rigid")
-HUMANS = 1000
+HUMANS = 300
 
 
 @cache
@@ -55,7 +55,7 @@ def test_the_same_coupling_is_designed_for_both():
 
 @pytest.mark.parametrize("scenario", DEVICES)
 @pytest.mark.parametrize("lossless", [False, True], ids=["random", "lossless"])
-def test_a_thousand_hands_are_stable(scenario, lossless):
+def test_hundreds_of_hands_are_stable(scenario, lossless):
     """Exact eigenvalues. A lossless hand's own slow modes stand on the circle, to the rounding of the eigenvalues."""
     growth = exact_growth(scenario, lossless)
     assert growth.size == HUMANS
@@ -74,8 +74,8 @@ def test_the_same_hands_upset_the_loop_without_coupling(scenario):
         growth = dominant_mode(exact_loops(held(scenario, lossless), F)).growth
         upset[lossless] = int((growth > DESTABILISED).sum())
     compliant = scenario == "omega-pair"
-    assert upset[False] > 800 if compliant else upset[False] == 0
-    assert upset[True] > (900 if compliant else 20)
+    assert upset[False] > 0.8 * HUMANS if compliant else upset[False] == 0
+    assert upset[True] > (0.9 if compliant else 0.02) * HUMANS
 
 
 @pytest.mark.parametrize("scenario", DEVICES)
@@ -92,5 +92,5 @@ def test_mujoco_says_the_same(scenario, lossless):
 def test_no_adversary_succeeds(scenario):
     """A short search; `python -m sim.validate --coupling optimal --adversary` makes the long one."""
     place = load(scenario)
-    worst = search(place, assemble(place, optimal()).F, seed=3, generations=8)
+    worst = search(place, assemble(place, optimal()).F, seed=3, generations=3)
     assert not worst.destabilises
