@@ -317,11 +317,11 @@ def _ladder(args: argparse.Namespace, scenario: Scenario) -> int:
     with render.progress("designing") as move:
         rows, interrupted = compare.compare_designs(loops, LADDERS[args.ladder], move)
     report = _Ladder(scenario.name, args.seed, rows, time.perf_counter() - begin, interrupted)
-    heads = ("design", "needs N s/m", "at 10 %", "sup dB", "rms dB", "proof", "s")
+    heads = ("design", "needs N s/m", "x, 10 %", "sup dB", "rms dB", "proof", "s")
     shown = []
     for case in loops:
         cells = [_rung(row) for row in rows if row.case == case]
-        shown.append(render.grid(f"the ladder · {scenario.name}, case {case}", heads, cells, left=(0, 4)))
+        shown.append(render.grid(f"the ladder · {scenario.name}, case {case}", heads, cells, left=(0, 5)))
     lines = [f"{row.design}, case {row.case}: {row.reason}" for row in rows if row.reason]
     render.publish(args, report, shown, [*lines, f"{report.wall_s:.1f} s"], out)
     return options.INTERRUPTED if interrupted else options.DONE

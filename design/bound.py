@@ -37,14 +37,14 @@ from design.transparency import BAND_HZ, decibels
 _Indices = NDArray[np.intp]  # of points of the transform
 
 _POINTS = 65536  # of the transform
-_KNOTS = {1: 60, 2: 50}  # of h, by channels; fewer for more
+_KNOTS = {1: 60, 2: 60}  # of h, by channels; fewer for more
 _FEWEST = 24
 _EVERY = 3  # channels up to which h is any matrix
 MOST = 4  # channels for which there is a bound
 NO_BOUND = f"no bound for more than {MOST} devices: it takes minutes, and what it gives then is decibels too low"
 _NEAR_END = (0.22, 0.5)  # of a step between knots: h falls to zero at the upper end of the band
 _DEGREE = 3  # of the splines that h is made of
-_GAP = 0.003  # of the bound, relatively, that the barrier leaves
+_GAP = 0.002  # of the bound, relatively, that the barrier leaves
 _SWEEPS = 6
 _QUADRATURE = 3e-6  # of the mean square: what the sums over transform and band may differ from their integrals
 _RUNGS = LADDER[:2]  # of the design that it begins from

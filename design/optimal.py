@@ -276,7 +276,7 @@ class _Climb:
             active += missed[:2]
         if slip:
             needs.append(min(limiter_requirement(self.loop, coupling, slip.beta).requirement.ratio, 1 + _TOLERATED))
-        for limit in (1 - 0.95 * program.MARGIN, 1 - 2.5 * program.MARGIN):
+        for limit in (1 - 0.95 * program.MARGIN, 1 - 1.5 * program.MARGIN, 1 - 2.5 * program.MARGIN):
             scale = min(1.0, (1 - program.MARGIN) / max(needs)) if max(needs) > limit else 1.0
             scaled = _scaled(coupling, min(scale, limit / max(needs)))
             found = self._assessed(scaled, scaled.g)

@@ -40,10 +40,8 @@ FULL = 4  # channels up to which every force has a filter to every device
 _STATIC, _STATIC_OF_MANY = 0.22, 0.35  # weight of g - 1 beside the relative mismatch; for more than RICH channels
 HIGH_HZ = 100.0  # above it the force is kept low by a soft row, or capped
 SOFT = 0.05, 0.3  # the soft row's weight: the first number times the mismatch so far, which counts up to the second
-_EVEN, _LEAST_FORCE = (
-    0.003,
-    0.01,
-)  # weight of the error relative to the force of each motion; the least such force, of |E|
+_EVEN = 0.002  # weight of the error relative to the force of each motion, however small that is
+_LEAST_FORCE = 0.01  # of the largest: what counts as a force then
 _SMALL = 1e-5  # weight of the coefficients themselves: some have no effect where the environment has no inverse
 _DECIMALS = 10
 _GAPS = (0.05, 0.01)  # of the objective, or of what it gains over no force: gaps at which the inequalities are swept

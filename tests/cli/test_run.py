@@ -68,7 +68,7 @@ def test_the_default_is_the_design_for_this_environment_with_the_price_of_others
     # the run's own coupling comes to the same there, by the other engine
     assert here["force_error_percent"] == pytest.approx(report["ideal_force"]["error_percent"], rel=1e-6)
     # over the band 1.8 %, every octave alike; of the slow motion that the run is made of less
-    assert best["force_error_percent"] == pytest.approx(0.49, abs=0.1)
+    assert best["force_error_percent"] == pytest.approx(0.58, abs=0.1)
     assert here["force_error_percent"] < free["force_error_percent"]
     assert best["rms_mismatch_db"] == pytest.approx(-34.87, abs=0.3)
     assert (tmp_path / "out" / "couplings.png").stat().st_size > 50_000
