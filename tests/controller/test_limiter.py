@@ -6,7 +6,7 @@ from worlds import STIFF, T
 
 from controller.contact import BoxProblem, Limiter, contact, limited
 from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, Network, Wall, environment
+from controller.environment import FIGURE_4, GROUND, Network, Spring, Wall, environment
 from controller.loop import force_map
 from controller.lti import Lti, SingularLoop
 from controller.process import Process, StepBuffer
@@ -169,6 +169,48 @@ def test_many_simulations_are_as_many_runs_of_one():
     together = drive(process, x).f[:300]
     alone = np.concatenate([drive(process, x[..., i : i + 1]).f[:300] for i in range(5)], axis=2)
     np.testing.assert_allclose(together, alone, atol=1e-9)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 4])
+def test_the_short_tick_is_the_tick(channels):
+    """One simulation looks at its forces in another way than many; each channel meets both of its limits."""
+    names, limit = tuple("abcd"[:channels]), np.linspace(0.4, 1.0, channels)
+    network = Network(names, tuple(Spring((name, GROUND), 900.0, 0.3) for name in names))
+    coupling = SpringDamper([2000.0] * channels, [0.5] * channels)
+    theta = tuple(i % 2 for i in range(channels))
+    process = closed(limited(network, coupling, theta, (0,) * channels, T, limit, (5.0,) * channels))
+    phases = np.arange(400)[:, None] / 15 + np.arange(channels)
+    slow = 5e-3 * np.sin(phases)
+    x = np.stack([1e-3 * slow, slow], axis=-1)  # the first is never limited: who looks at it alone misses the second
+    together, alone = StepBuffer(process, 400, channels, nsim=2), StepBuffer(process, 400, channels)
+    for buffer, moved in ((together, x), (alone, x[:, :, 1:])):
+        tick = buffer.ticking()
+        for k, row in enumerate(moved):
+            buffer.x[k] = row
+            tick(k)
+    f = drive(process, x).f[:400]
+    np.testing.assert_allclose(together.f[:400], f, atol=1e-12)
+    np.testing.assert_allclose(alone.f[:400], f[:, :, 1:], atol=1e-12)
+    np.testing.assert_allclose(f[:, :, 1].max(axis=0), limit)
+    np.testing.assert_allclose(f[:, :, 1].min(axis=0), -limit)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+@pytest.mark.parametrize("channel", [0, 1])
+def test_the_first_tick_that_a_limiter_bends_is_found(channel, sign):
+    limiter = limited(FIGURE_4, STIFF, (1, 2), (0, 0), T, LIMITS, (10.0, 10.0))
+    buffer = StepBuffer(closed(limiter), 10, 2)
+    sent, other = (buffer.after[:, limiter.sent_rows[i], 0] for i in (channel, 1 - channel))
+    assert buffer.linear_until(10) == 10
+    sent[4] = sign * LIMITS[channel]
+    assert buffer.linear_until(10) == 10, "at the limit nothing bends yet"
+    assert buffer.linear_until(10, 0.5) == 4
+    sent[6] = sign * LIMITS[channel] * (1 + 1e-9)
+    assert (buffer.linear_until(10), buffer.linear_until(6)) == (6, 6)
+    other[8] = 100.0
+    assert buffer.linear_until(10) == 6
+    other[2] = np.nan
+    assert buffer.linear_until(10) == 2
 
 
 def test_limiter_and_environment_are_passive_without_lag():
