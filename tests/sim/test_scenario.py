@@ -227,5 +227,5 @@ def test_delays_that_make_too_many_states_are_refused_with_their_number():
 
 
 def test_a_trace_that_does_not_fit_into_memory_is_refused_before_the_run():
-    with pytest.raises(InputError, match=r"a trace of 1e\+06 s takes .* GiB, .* GiB are free: allowed are .* s"):
+    with pytest.raises(InputError, match=r"duration: 1e\+06 s need .* GiB of .*, .* are free: allowed are .* s"):
         run(assemble(load().replace(duration=1e6), NoCoupling()))
