@@ -45,7 +45,7 @@ PICTURE = re.compile(r"<!-- picture: (\S+) (\S+) -->")
 #: a design that a sentence names
 IN_SENTENCES = re.compile(r"`(python -m design -[^`]*)`")
 #: commands that take most of a minute
-SLOW = re.compile(r"--coupling optimal --(grid 10|varying-delay)|ranges")
+SLOW = re.compile(r"--coupling optimal --(grid 10|varying-delay)|ranges|--over damping --points")
 
 
 class Step(NamedTuple):

@@ -3,10 +3,7 @@
 import json
 import shutil
 import subprocess
-import sys
 from pathlib import Path
-
-import pytest
 
 from cli.main import COMMANDS, _command
 from cli.options import DOES_NOT_HOLD, DONE
@@ -61,14 +58,6 @@ def test_from_scenario_to_c(tmp_path, monkeypatch, capsys):
     said = capsys.readouterr().err
     assert "error" not in said
     assert "not possible" not in said
-
-
-@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
-def test_the_exported_tick_passes_its_own_test(tmp_path):
-    make = [sys.executable, "-m", "design", "--scenario", LAB, "--best", "--seconds", "1", "--out", "best.json"]
-    subprocess.run(make, cwd=tmp_path, check=True, capture_output=True)
-    export = [sys.executable, "-m", "design.export", "best.json", "--process", "--out", "best.c"]
-    subprocess.run(export, cwd=tmp_path, check=True, capture_output=True)
-    flag = "-DHAPTIC_LOOP_TEST"
-    subprocess.run(["cc", "-std=c99", flag, "best.c", "-lm", "-o", "best"], cwd=tmp_path, check=True)
-    subprocess.run(["./best"], cwd=tmp_path, check=True)
+    if shutil.which("cc"):  # the exported tick passes its own test
+        subprocess.run(["cc", "-std=c99", "-DHAPTIC_LOOP_TEST", "best.c", "-lm", "-o", "best"], check=True)
+        subprocess.run(["./best"], check=True)
