@@ -119,6 +119,7 @@ def design(
         return exactly
     best: Optimal | None = None
     rungs: list[_Rung] = []
+    hurried = False
     for taps, poles in options.ladder:
         if rungs and not climb.room(taps, poles):
             break
@@ -129,14 +130,16 @@ def design(
         if rung.reason is None and (best is None or climb.better(found, best)):
             gained = np.inf if best is None else decibels(climb.merit(best)) - decibels(climb.merit(found))
             best = found
-        if (gained < _SETTLED_DB and len(rungs) >= _FEWEST_RUNGS) or climb.elapsed > options.seconds:
+        settled = gained < _SETTLED_DB and len(rungs) >= _FEWEST_RUNGS
+        hurried = not settled and climb.elapsed > options.seconds
+        if settled or hurried:
             break
     if best and loop.ranges:
         best = climb.between(best)
     if best is None or climb.mismatch(best) > _HOPELESS:
         rivals = [one for one in (best, climb.scaled(), climb.spring_damper()) if one is not None]
         best = min(rivals, key=lambda one: (not one.proved, climb.merit(one)))
-    return replace(best, ladder=tuple(rungs), sdps=len(rungs), wall_s=climb.elapsed)
+    return replace(best, ladder=tuple(rungs), sdps=len(rungs), wall_s=climb.elapsed, hurried=hurried)
 
 
 def _compromise(loop: Loop, around: Sequence[Network], options: program.Options) -> tuple[Optimal, Optimal]:

@@ -160,6 +160,7 @@ class Design:
     wall_s: float
     phi: Array | None = None  # (N,) multiplier Phi_E [N s/m] of Theorem 4, None where the environment has none
     certificate: Any = field(kw_only=True, default=None)  # design.stored.Certificate, where the design has proved it
+    hurried: bool = field(kw_only=True, default=False)  # its clock ended it: more time may find a better
 
 
 COUPLING = "a coupling (controller.coupling), or a Design"

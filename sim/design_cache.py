@@ -1,7 +1,8 @@
 """Designs kept on disk, since a run asks for the same couplings again and again and a design is a pure function.
 
 In $XDG_CACHE_HOME/haptic-loop (~/.cache/haptic-loop), a stored coupling file for each question. An entry is proved
-again whenever it is read; what is not proved is designed anew. HAPTIC_LOOP_CACHE=off keeps nothing.
+again whenever it is read; what is not proved is designed anew. What a busy machine had no time to finish is not kept.
+HAPTIC_LOOP_CACHE=off keeps nothing.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ def find(loop: Loop, *question: Any) -> Stored | None:
 def keep(made: Design, loop: Loop, *question: Any) -> None:
     """Keep a design that can be proved from its coupling alone, if there is a place for it."""
     path = _place(loop, question)
-    if path is None or made.phi is not None:
+    if path is None or made.phi is not None or made.hurried:
         return
     with one_command(), suppress(OSError, ValueError, ArithmeticError):  # no place, or no proof
         certificate = made.certificate or prove(loop, made.coupling, made.condition)
@@ -53,7 +54,10 @@ def keep(made: Design, loop: Loop, *question: Any) -> None:
 def _place(loop: Loop, question: tuple[Any, ...]) -> Path | None:
     if os.environ.get("HAPTIC_LOOP_CACHE", "").lower() == "off":
         return None
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    asked = os.environ.get("XDG_CACHE_HOME", "")
+    home = Path(asked if os.path.isabs(asked) else os.path.expanduser("~/.cache"))
+    if not home.is_absolute():  # a user without a home
+        return None
     named = hashlib.sha256(repr((digest(loop), question, _code())).encode()).hexdigest()
     return Path(home, "haptic-loop", f"{named}.json")
 

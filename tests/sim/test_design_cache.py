@@ -1,5 +1,7 @@
 """Designs kept on disk: what is read is proved, and what is not proved is designed again."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
@@ -69,3 +71,20 @@ def test_nothing_is_kept_where_that_is_not_wanted_or_not_possible(asked, tmp_pat
     soft()
     assert len(asked) == 2
     assert not (tmp_path / "other").exists()
+
+
+def test_a_user_without_a_home_keeps_nothing(asked, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)  # as it is where nobody knows the user
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # which means nothing, says the standard
+    soft(), soft()
+    assert len(asked) == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_the_clock_ended_is_not_kept(asked, monkeypatch):
+    hurried = partial(couplings.design_by_kind, seconds=0.0)
+    monkeypatch.setattr(couplings, "design_by_kind", hurried)
+    for _ in range(2):
+        choose(load(), "I", "optimal")
+    assert len(asked) == 2
