@@ -38,6 +38,7 @@ _MOST_DELAYS = 1000  # of all channels together: the eigenvalues of so many stat
 _LONGEST_NAME = 200  # characters, that a table and a picture can show
 _TIMING_STREAM = 6  # keeps these draws apart from those of the humans with the same seed
 _Delays = tuple[int, ...]
+_UNSAID: Any = None  # until the number of channels is known; no file can say it
 
 
 class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -65,9 +66,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     name: str
     T: float  # sampling period [s]
     theta: _Delays  # transmission delays [samples] (4)
-    psi: _Delays = ()  # environment delays [samples] (5); none unless given
+    psi: _Delays = _UNSAID  # environment delays [samples] (5); none unless given
     device: tuple[Device, ...]
-    human: tuple[Human, ...] = ()  # who holds the devices in a run; hands that move apart unless given
+    human: tuple[Human, ...] = _UNSAID  # who holds the devices in a run; hands that move apart unless given
     environment: Network
     ranges: Ranges | None = None  # what else the environment may be
     lam: _Delays | None = None  # reference delays [samples] (7); the case decides where it is not given
@@ -85,9 +86,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError(f"name has {len(self.name)} characters, allowed are {_LONGEST_NAME}")
         require("T", self.T, 1e-6, 0.1, "s")
         require("duration", self.duration, self.T, 1e6, "s")
-        if not self.psi:
+        if self.psi is _UNSAID:
             msgspec.structs.force_setattr(self, "psi", (0,) * self.channels)
-        if not self.human:
+        if self.human is _UNSAID:
             msgspec.structs.force_setattr(self, "human", tuple(map(_usual_hand, range(self.channels))))
         for name in ("theta", "psi", "device", "human", "lam"):
             value = getattr(self, name)

@@ -62,6 +62,9 @@ springs = [{ between = ["a", "b"], stiffness = 200.0 }]
     assert hands == [0.0, np.pi / 2], "who moves apart feels the spring between"
     assert made.digest == parse(bare.replace("theta", "psi = [0, 0]\ntheta")).digest
     assert made.replace(theta=(1, 1)).human == made.human
+    for empty in ("psi = []", "human = []"):
+        with pytest.raises(InputError, match=rf"{empty[:3]}.* has 0 entries, but the environment has 2 contacts"):
+            parse(bare.replace("theta", f"{empty}\ntheta"))
     with pytest.raises(InputError, match=r"^x: missing T, theta; every scenario has name, T, theta, device, environ"):
         parse(bare.replace("T = 1e-3\ntheta = [3, 1]\n", ""), "x")
 
