@@ -92,7 +92,7 @@ def _parser() -> options.Parser:
 
 
 def _with_device(args: argparse.Namespace) -> argparse.Namespace:
-    """The options, with a catalogue device's numbers where none are given; `source` allows its gains. Raises InputError."""
+    """The options, with the catalogue's numbers where none are given; `source` allows its gains. Raises InputError."""
     if not args.device:
         return args
     try:

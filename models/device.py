@@ -99,8 +99,8 @@ def passivity_level(device: Device) -> float:
 def credible_force(device: CompliantDevice) -> float:
     """What the transmission may carry [N] before the linear model of it is doubted.
 
-    The force at which a cable slips on its capstan is not published. Assumed where a device declares none: three times what
-    its motor can push, because a transmission that is made for a motor need not hold more.
+    The force at which a cable slips on its capstan is not published. Where a device declares none, it is three times
+    what its motor can push, because a transmission that is made for a motor need not hold more.
     """
     return 3.0 * device.force_limit if device.credible_force is None else device.credible_force
 
@@ -158,7 +158,7 @@ class Listed:
 
     @property
     def known(self) -> dict[str, _Known]:
-        """The published fields of a RigidDevice. Friction is left out: its published figure is an upper bound, not a guarantee."""
+        """The published fields of a RigidDevice. Friction is left out: what is published is an upper bound."""
         least = self.damping[0] if self.damping else None
         fields = {"damping": least, "mass": self.mass, "force_limit": self.force_limit}
         fields["encoder_step"] = self.encoder_step
@@ -215,7 +215,7 @@ _NEEDED = ("damping", "force_limit")  # of a simulated device; for mass and enco
 
 
 def listed_device(name: str) -> tuple[str, Listed]:
-    """The catalogue's device of this name, and the name as the catalogue spells it. Raises ValueError that lists the names."""
+    """The catalogue's device of this name, and its spelling there. Raises ValueError that lists the names."""
     key = _OTHER_NAMES.get(name.lower(), name.lower())
     if key not in CATALOGUE:
         close = difflib.get_close_matches(key, CATALOGUE, n=1)
