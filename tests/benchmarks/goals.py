@@ -33,7 +33,6 @@ COMMANDS = {
     "design --out coupling.json": 1.2,
     "design.check coupling.json": 0.8,
     "design.audit --K 800 --B 0.5": 0.8,
-    "sim.run --no-alternatives": 2.5,
 }
 RUN = 2.5
 
