@@ -17,8 +17,9 @@ import msgspec
 
 from controller.coupling import Coupling, Strict
 from controller.delay import delay
-from controller.environment import Environment, Member, Network, Ranges, RigidWall, members, walled_force_map
+from controller.environment import Environment, Network, RigidWall, walled_force_map
 from controller.lti import Complex, Lti, Number, Sampled, rational
+from controller.ranges import Member, Ranges, members
 
 Steps = tuple[Annotated[int, msgspec.Meta(ge=0, le=100)], ...]
 Positive = Annotated[float, msgspec.Meta(gt=0)]

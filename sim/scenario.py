@@ -21,8 +21,9 @@ import msgspec
 import numpy as np
 
 from controller.delay import VaryingDelay
-from controller.environment import Network, Ranges, Spring, UncertainSpring, Wall, environment
+from controller.environment import Network, Spring, Wall, environment
 from controller.loop import DelayRange, Loop, named_first, named_today
+from controller.ranges import Ranges, UncertainSpring
 from controller.timing import Periods, Timing, drawn
 from design.files import InputError, printable, read_text, toml, write
 from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping

@@ -12,9 +12,10 @@ from worlds import PAIR, SOFT
 from cli.audit import main
 from cli.options import execute
 from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, RIGID_WALL, Network, Ranges, Spring
+from controller.environment import FIGURE_4, GROUND, RIGID_WALL, Network, Spring
 from controller.loop import Loop
 from controller.lti import Lti
+from controller.ranges import Ranges
 from design import certificate, frequency, stored
 from design.api import certify
 from design.audit import MOST_EXTRA_SAMPLES, edge, remedies, report, requirement, stiffest, tolerance

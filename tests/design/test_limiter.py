@@ -9,9 +9,10 @@ from worlds import DELTA, PAIR, T
 
 from cli.design import main as design_main
 from controller.coupling import NoCoupling, SpringDamper
-from controller.environment import Network, Ranges, Wall
+from controller.environment import Network, Wall
 from controller.loop import DelayRange
 from controller.lti import Lti, Sampled, taps
+from controller.ranges import Ranges
 from design.certificate import lag, prove, prove_limiter, verify
 from design.conditions import least_multiple, this_environment
 from design.frequency import hermitian, on_circle
