@@ -77,7 +77,7 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Environment:
-    """What a loop asks of its environment. One of your own says its `contacts` and its `E(T)`."""
+    """What a loop asks of its environment. Your own class has `contacts` and `E(T)`."""
 
     __slots__ = ()
     contacts: Any  # tuple[str, ...], one a channel
@@ -127,7 +127,7 @@ class RigidWall(Environment, enum.Enum):
         raise ValueError("a rigid wall has no E(z): its force is whatever the coupling in front of it makes")
 
     def sent(self, coupling: Coupling, psi: Sequence[int], T: Number) -> Lti:
-        """V^-1. Raises ValueError for a coupling that is no V, SingularLoop where V has no inverse."""
+        """V^-1. Raises ValueError for a coupling without a V, SingularLoop where V has no inverse."""
         V = coupling.compliance(T)
         if V is None:
             raise ValueError("a rigid wall needs a spring-damper or another V in front of it")
@@ -341,7 +341,7 @@ def _quarters(c: int) -> tuple[tuple[slice, slice], ...]:
 
 
 def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
-    """Indices of the states that reach the outputs now or later: the others need not be stored."""
+    """Indices of the states that reach the outputs, now or later; the others are dropped."""
     count = after.shape[-1]
     reads = (after.reshape(-1, count - inputs, count)[..., inputs:] != 0).any(axis=0)
     used = (force.reshape(-1, count)[:, inputs:] != 0).any(axis=0)
@@ -351,7 +351,7 @@ def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
 
 
 def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
-    """The network with the touching walls (default: all) as springs that also pull, the others as none at all."""
+    """The network with the touching walls (default: all) as two-sided springs, without the others."""
     touching = [True] * len(network.walls) if touching is None else touching
     walls = zip(network.walls, touching, strict=True)
     springs = (Spring(w.between, on * w.stiffness, on * w.damping) for w, on in walls)

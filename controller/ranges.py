@@ -24,7 +24,7 @@ _MOST_VERTICES = 128  # each is a world of the design and a proof
 
 
 class UncertainSpring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What may be of one spring; a range that is not given leaves the environment's own value."""
+    """The ranges of one spring's parameters; where no range is given the environment's own value holds."""
 
     between: tuple[str, str]
     stiffness: _Range | None = None  # [N/m]
@@ -57,7 +57,7 @@ class Member:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A part of the ranges in which nothing but numbers varies: which contacts are there is decided."""
+    """A part of the ranges in which only numbers vary: every contact is either present or absent."""
 
     low: Array  # (n,) the ends of the ranges
     high: Array  # (n,)
@@ -99,7 +99,7 @@ def inside(network: Network, ranges: Ranges, count: int, seed: int) -> tuple[Mem
 
 @dataclass(frozen=True)
 class _State:
-    """An uncertain thing that is there, or one that is absent: the ranges that it then has, and what it is in them."""
+    """One state of an uncertain part, present or absent: its ranges in that state, and the part at given values."""
 
     ranges: tuple[_Range, ...]  # those of some width
     value: Callable[[Sequence[float]], Spring | float]
@@ -107,7 +107,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _Part:
-    """One uncertain thing: what it is at each of its vertices, and somewhere in between."""
+    """One uncertain part: its values at each of its vertices, and between them."""
 
     place: str  # a spring's ends, or a node
     corners: tuple[Spring | float, ...]
@@ -174,7 +174,7 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
 
 
 def _spring_state(between: tuple[str, str], stiffness: _Range, damping: _Range) -> _State:
-    """A spring that is there; of its two ranges those without width are no coordinates."""
+    """A spring that is present; a range of no width is not a coordinate."""
     free = [low < high for low, high in (stiffness, damping)]
 
     def value(point: Sequence[float]) -> Spring:

@@ -93,7 +93,7 @@ def one_command() -> Iterator[None]:
 
 
 def _places(path: Path) -> set[Any]:
-    """What a file is known by; nothing for what is no file, such as a terminal, of which nothing can be destroyed."""
+    """What identifies a file; None for a terminal or another target in which nothing can be destroyed."""
     place = _target(path)
     if not place.exists():
         return {place}
@@ -252,7 +252,7 @@ def _try(place: Path, name: str = "") -> None:
 
 
 def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path:
-    """Write a file under a temporary name and rename it into place; what is no file, a device or a pipe, as it is.
+    """Write a file under a temporary name and rename it into place; a device or a pipe is written directly.
 
     A link stays a link: the file that it points to is written. Raises InputError where that cannot be, and where the
     command has read the file or has written it for another option.
@@ -310,7 +310,7 @@ def write_json(destination: str | Path, data: dict[str, Any]) -> None:
 
 
 def nobody_reads() -> None:
-    """What is still written to standard output goes nowhere: its reader has left."""
+    """Send what is still written to standard output to nowhere, because its reader has left."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, sys.stdout.fileno())
     os.close(nowhere)

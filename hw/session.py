@@ -135,7 +135,7 @@ class Session:
         return () if self.stage in ENDED else self._end(Stage.REFUSED, cause)
 
     def arm(self, now: int) -> Said:
-        """A person's wish to feel forces; does nothing unless the session is disarmed, and nothing hinders it."""
+        """Arm at a person's request; does nothing unless the session is disarmed and nothing forbids it."""
         self.now = now
         if self.stage == Stage.DISARMED and (hindrance := self.hindrance):
             self._log(hindrance)
@@ -200,15 +200,15 @@ class Session:
     # what the link does
 
     def met(self, info: wire.Info, now: int) -> Said:
-        """Who the device is."""
+        """The device has said what it is."""
         return self._guarded(now, self._on_info, info)
 
     def configured(self, refused: int, now: int) -> Said:
-        """The device runs as `config` says, or why not."""
+        """The device confirms `config`, or says why it refuses."""
         return self._guarded(now, self._on_answer, refused)
 
     def take(self, state: wire.State, now: int) -> Said:
-        """What answers a STATE."""
+        """Answer a STATE."""
         return self._guarded(now, self._on_state, state)
 
     def _guarded(self, now: int, understand: Callable[[Any], Said], heard: Any) -> Said:
@@ -221,7 +221,7 @@ class Session:
             return self.fail(f"{type(error).__name__} in the bridge: {error}", now)
 
     def poll(self, now: int) -> Said:
-        """Look at the time."""
+        """Act on what is due at this time."""
         self.now = now
         if self.stage in ENDED:
             return self._shutdown.again(now) if self._shutdown else ()
@@ -406,7 +406,7 @@ class _Shutdown:
         return self._stop
 
     def disobeyed(self, state: wire.State, now: int) -> str | None:
-        """Said once, of a device that goes on driving."""
+        """Say once that the device goes on driving."""
         if not self._obeys or now - self._began <= _OBEYING_US or not state.drives:
             return None
         self._obeys = False
@@ -430,7 +430,7 @@ class Operator:
     _free_at: int = 0  # [us] before which it does not arm by itself
 
     def look(self, session: Session, now: int) -> Said:
-        """What is to be said at `now` [us] because of where the session stands."""
+        """The message that is due at `now` [us] in this stage."""
         if session.stage == Stage.DISARMED:
             self._armed_at = None
             if self.auto_arm and session.hindrance:
@@ -449,7 +449,7 @@ class Operator:
         return ()
 
     def press(self, key: str, session: Session, now: int) -> Said:
-        """A key of a person, who is there then. `a` means something to a disarmed session only."""
+        """A key was pressed, so a person is there. `a` arms a disarmed session only."""
         self._seen_at = now
         match _KEYS.get(key):
             case "arm" if session.stage == Stage.DISARMED:
