@@ -46,24 +46,6 @@ class DelayRange(Strict, frozen=True):
         return all(a <= b for a, b in below) and all(a >= b for a, b in above)
 
 
-#: fields of loops and scenarios -> their names in the first files, which are still read and which digests are made of
-_FIRST_NAMES = {"ranges": "box", "varying_delay": "jitter"}
-
-
-def named_today(fields: dict[str, Any]) -> dict[str, Any]:
-    """Fields of a file by their names of today. Raises ValueError where one has both names."""
-    for name, first in _FIRST_NAMES.items():
-        if name in fields and first in fields:
-            raise ValueError(f"{name} and {first}, its older name: give one of them")
-    today = {first: name for name, first in _FIRST_NAMES.items()}
-    return {today.get(name, name): value for name, value in fields.items()}
-
-
-def named_first(fields: dict[str, Any]) -> dict[str, Any]:
-    """Fields by their names in the first files."""
-    return {_FIRST_NAMES.get(name, name): value for name, value in fields.items()}
-
-
 class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without the newer fields keeps the digest it had
     """All that enters a condition beside the coupling."""
 
