@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controller.contact import Limiter, State
+from controller.limiter import Limiter
 from controller.loop import Loop
 from controller.lti import Array, Lti
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
 from controller.timing import Timing
+from controller.walls import State
 from design.result import finite
 from models.scene import Scene, Variants
 from sim.engines import Engine, HeldPlant, MujocoBatchEngine, at_the_latch, hold, profiler_off, quiet_warnings

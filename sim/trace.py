@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.lti import Array, ReadOnly, frozen
-from controller.process import Net
+from controller.tick import Net
 from design.files import InputError, read_arrays, write
 
 _MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # axes of what files keep

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from controller.process import StepBuffer
+from controller.tick import StepBuffer
 from design.result import CASE_I
 from models.device import CompliantDevice
 from models.scene import plant, variants

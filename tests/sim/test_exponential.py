@@ -11,7 +11,7 @@ from driven import Driven, driven, tick_by_tick
 from scipy.linalg import expm
 
 from controller.coupling import NoCoupling
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
 from design.result import CASE_I
 from models.device import CompliantDevice
 from models.human import Human, Link
