@@ -152,7 +152,7 @@ def _question(
 
 
 def _findings(args: argparse.Namespace, question: Validation, table: Table) -> tuple[Findings, float]:
-    """What the humans did, and the seconds that it took."""
+    """The findings on all humans, and the seconds that they took."""
     begin = time.perf_counter()
     with render.progress("validating") as move:
         if args.dask is not None:
@@ -181,7 +181,7 @@ def _own_humans(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, ce
 def _attack(
     args: argparse.Namespace, scenario: Scenario, chosen: Chosen, outcome: dict[str, Any], drawn: bool = False
 ) -> Worst | None:
-    """The worst human, or None where the keyboard ends the search: what was found out before is kept.
+    """The worst human, or None where Ctrl-C ends the search; what was found before is kept.
 
     With `drawn` among the hands that the population draws.
     """

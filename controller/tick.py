@@ -48,7 +48,7 @@ class Net(Protocol):
         ...
 
     def part(self) -> dict[str, Any]:
-        """What it did so far, as plain data."""
+        """What it has done so far, as plain data."""
         ...
 
 
@@ -213,7 +213,7 @@ class StepBuffer:
             self.net.apply(self.first + k, self.force[k])
 
     def ticking(self) -> Callable[[int], object]:
-        """`tick` by the shortest way that does it here."""
+        """The shortest function that does `tick` for this process."""
         return self._shortest or self.tick
 
     @cached_property

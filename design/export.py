@@ -162,7 +162,7 @@ def _box_matrix(limiter: Limiter) -> Array:
 
 
 def _turns(m: int) -> int:
-    """Switches of a limit after which the box problem is solved for sure."""
+    """A bound on the number of switches after which the box problem is solved."""
     return min(3**m, _MOST_TURNS)
 
 
