@@ -53,7 +53,7 @@ class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A one-sided spring-damper: it pushes the first node back once it is `gap` beyond the second; see contact.py."""
+    """A one-sided spring-damper: it pushes the first node back once it is `gap` beyond the second; see walls.py."""
 
     between: tuple[str, str]
     stiffness: float  # [N/m]

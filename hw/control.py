@@ -18,9 +18,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from controller.budget import EPS, EnergyBudget
-from controller.contact import Limiter, limited
 from controller.coupling import Coupling
 from controller.environment import environment
+from controller.limiter import Limiter, limited
 from controller.loop import force_map
 from controller.lti import Array, Lti
 from design.certificate import assess

@@ -1,4 +1,4 @@
-"""What a run and a validation came to, as plain data in SI units: null with a "reason" where a figure does not exist.
+"""Results of a run and of a validation as plain data in SI units: null with a "reason" where a figure does not exist.
 
 The rows on the screen are made of it in the commands: cli/run.py, cli/validate.py.
 """
@@ -309,7 +309,7 @@ def validation_part(question: Validation, findings: Findings, certified: bool, w
 
 
 def varying_delays_part(findings: Findings, covered: dict[str, Any]) -> dict[str, Any]:
-    """How many humans grow under delays or ticks that vary; it holds unless certificates cover these and one grows."""
+    """How many humans grow under varying delays or ticks; False if one grows that certificates cover."""
     exact, mujoco = findings.switching, findings.switching_mujoco
     seen = ~np.isnan(exact)
     unstable, also = int((exact > 0).sum()), mujoco[~np.isnan(mujoco)]
@@ -325,7 +325,7 @@ def varying_delays_part(findings: Findings, covered: dict[str, Any]) -> dict[str
 
 
 def adversary_part(worst: Worst, ratio: float, certified: bool) -> dict[str, Any]:
-    """What the search found, and how far the loop is from its required damping."""
+    """The result of the search, and how far the loop is from its required damping."""
     return {
         "found": worst.destabilises,
         "spectral_radius": worst.spectral_radius,
@@ -354,7 +354,7 @@ def _humans(humans: tuple[Any, ...]) -> list[dict[str, Any]]:
 
 
 def _persons(persons: tuple[Person, ...]) -> list[dict[str, Any]]:
-    """Those who hold several devices."""
+    """The persons who hold several devices."""
     return [msgspec.to_builtins(person) for person in persons]
 
 
@@ -416,7 +416,7 @@ def _traces(question: Validation, findings: Findings) -> dict[str, Any] | None:
 
 
 def _energy(question: Validation, findings: Findings) -> dict[str, Any]:
-    """Forces that were clipped are covered by nothing; those of a limiter are."""
+    """Clipped forces are not covered; those of a limiter are."""
     unclipped = (findings.clipped == 0) | (question.lag is not None)
     violated = unclipped & ~(findings.energy >= -_ROUNDING * findings.audited)
     return {

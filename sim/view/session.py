@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from controller.lti import Array, SingularLoop
-from controller.process import StepBuffer
+from controller.tick import StepBuffer
 from design.result import DesignFailed, certificate_part, finite
 from models.scene import Plant, Scene, plant
 from sim.engines import ExactEngine, HeldPlant, hold

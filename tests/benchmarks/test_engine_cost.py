@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from controller.coupling import CASE_I
-from controller.process import StepBuffer
+from controller.tick import StepBuffer
 from models.device import CompliantDevice
 from models.scene import plant, variants
 from sim.crowds import crowds

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from controller.contact import BoxProblem
+from controller.complementarity import BoxProblem
 from controller.coupling import CASE_I, SpringDamper
 from sim.run import assemble, run
 from sim.scenario import load

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from controller.coupling import CASE_I, NoCoupling
-from controller.process import StepBuffer
+from controller.tick import StepBuffer
 from design.conditions import this_environment
 from models.scene import variants
 from sim.adversary import attempts

@@ -13,9 +13,9 @@ from driven import driven
 from scipy.signal import dlsim, lfilter
 from worlds import SOFT, STIFF
 
-from controller.contact import limited
 from controller.coupling import CASE_I, CASE_II, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
+from controller.limiter import limited
 from controller.loop import Loop, force_map
 from controller.lti import Lti
 from design.conditions import any_environment, this_environment

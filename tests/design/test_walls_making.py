@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from controller.contact import contact
 from controller.coupling import Compliance, InternalModel, SpringDamper
 from controller.environment import GROUND, Network, Spring, Wall
 from controller.loop import Loop
 from controller.lti import Lti
 from controller.ranges import Ranges
+from controller.walls import contact
 from design.certificate import assess, prove, verify
 from design.conditions import any_environment, this_environment
 from design.designs import design_by_kind
