@@ -12,7 +12,7 @@ any-environment    Lemma 4 of the paper for Psi = I and any passive environment 
 latency            this-environment for forces that latch a fraction of a sample after the tick, anew at every tick
 
 design/multipliers.py has those of this-environment that weigh an error with a multiplier: walls that make and break
-contact, delays that switch, forces that leave through the limiter of controller.contact.
+contact, delays that switch, forces that leave through the limiter of controller.limiter.
 
 The period may vary from tick to tick, up to T_max, in all of them: `even_damping` is where it enters.
 """

@@ -60,7 +60,7 @@ def _cut(text: str) -> str:
 
 
 def one_line(text: object) -> str:
-    """A message in one line of at most MOST_WORDS characters; of what a user gave it quotes 80, of a path the whole."""
+    """A message in one line of at most MOST_WORDS characters; user input is cut to 80 characters, a path is not."""
     words = _QUOTED.sub(lambda found: _cut(found[0]), printable(" ".join(str(text).split())))
     half = _MOST_WORDS // 2 - 3
     return words if len(words) <= _MOST_WORDS else f"{words[:half]} [..] {words[-half:]}"
@@ -151,7 +151,7 @@ def read_text(path: str | Path, named: str | None = None, hint: str = "") -> str
 
 
 def toml(text: str, named: str) -> dict[str, Any]:
-    """What TOML text says. Raises InputError."""
+    """The content of TOML text. Raises InputError."""
     if found := _DEEP_KEY.search(text):
         line = text.count("\n", 0, found.start()) + 1
         raise InputError(f"{named}: line {line}: a key of more than {_DEEPEST_KEY} names joined by dots")
@@ -164,7 +164,7 @@ def toml(text: str, named: str) -> dict[str, Any]:
 
 
 def read_arrays(path: str | Path, expected: str) -> dict[str, NDArray[Any]]:
-    """The arrays of an npz file, in which no object is unpickled. Raises InputError where it is none."""
+    """The arrays of an npz file, in which no object is unpickled. Raises InputError where it is not one."""
     content = read(path, most=_MOST_TRACE)
     try:
         with ZipFile(BytesIO(content)) as archive:

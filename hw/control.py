@@ -18,9 +18,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from controller.budget import EPS, EnergyBudget
-from controller.contact import Limiter, limited
 from controller.coupling import Coupling
 from controller.environment import environment
+from controller.limiter import Limiter, limited
 from controller.loop import force_map
 from controller.lti import Array, Lti
 from design.certificate import assess
@@ -338,7 +338,7 @@ def overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
     return sum(f * f / (4 * d) for f, d in zip(caps, delta, strict=True))
 
 
-class Program(Protocol):
+class Armable(Protocol):
     """What a session can be armed with."""
 
     @property

@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from controller.contact import limited
 from controller.coupling import SpringDamper
 from controller.environment import GROUND, Network, Spring, Wall
+from controller.limiter import limited
 from controller.loop import Loop
 from controller.lti import Array
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
 from design.conditions import any_environment, encoder_friction, this_environment
 from design.multipliers import BETA, limiter, limiter_lag, walls_of
 from models.device import RigidDevice

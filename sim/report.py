@@ -1,4 +1,4 @@
-"""What a run and a validation came to, as plain data in SI units: null with a "reason" where a figure does not exist.
+"""Results of a run and of a validation as plain data in SI units: null with a "reason" where a figure does not exist.
 
 The rows on the screen are made of it in the commands: cli/run.py, cli/validate.py.
 """
@@ -13,13 +13,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import Coupling
+from controller.coupling import PUBLISHED, Coupling
 from controller.delay import LOST, Ticks, VaryingDelay, ages
 from controller.lti import Array
+from controller.older import CONDITIONS, with_older
 from controller.timing import Timing
 from design.certificate import assess
 from design.guarantees import ANY, CAVEATS, MAKING, encoder_part
-from design.result import OLDER_NAMES, PRINTED_TAU_DB, PUBLISHED, Requirement, certificate_part, finite, listed
+from design.result import Requirement, certificate_part, finite, listed
 from design.transparency import Transparency, decibels
 from models.human import Human, Person
 from sim.adversary import Worst
@@ -38,7 +39,7 @@ from sim.trace import Trace
 def certificates_part(requirements: Mapping[str, Requirement]) -> dict[str, Any]:
     """Both conditions, each under its name and under the name that it had before: the same objects."""
     parts = {name: certificate_part(requirement) for name, requirement in requirements.items()}
-    return parts | {older: parts[name] for older, name in OLDER_NAMES.items() if name in parts}
+    return with_older(parts, CONDITIONS)
 
 
 def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
@@ -107,6 +108,10 @@ def remarks(outcome: dict[str, Any]) -> list[str]:
 
 # ----------------------------------------------------------------------------------------------------
 # What the paper prints beside what comes out here, for its own scenario.
+
+
+#: The transparency indices (25) printed beside the gains [dB]; no reading of Figure 4 that we tried gives them.
+PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
 
 
 def beside_the_paper(
@@ -304,7 +309,7 @@ def validation_part(question: Validation, findings: Findings, certified: bool, w
 
 
 def varying_delays_part(findings: Findings, covered: dict[str, Any]) -> dict[str, Any]:
-    """How many humans grow under delays or ticks that vary; it holds unless certificates cover these and one grows."""
+    """How many humans grow under varying delays or ticks; False if one grows that certificates cover."""
     exact, mujoco = findings.switching, findings.switching_mujoco
     seen = ~np.isnan(exact)
     unstable, also = int((exact > 0).sum()), mujoco[~np.isnan(mujoco)]
@@ -320,7 +325,7 @@ def varying_delays_part(findings: Findings, covered: dict[str, Any]) -> dict[str
 
 
 def adversary_part(worst: Worst, ratio: float, certified: bool) -> dict[str, Any]:
-    """What the search found, and how far the loop is from its required damping."""
+    """The result of the search, and how far the loop is from its required damping."""
     return {
         "found": worst.destabilises,
         "spectral_radius": worst.spectral_radius,
@@ -349,7 +354,7 @@ def _humans(humans: tuple[Any, ...]) -> list[dict[str, Any]]:
 
 
 def _persons(persons: tuple[Person, ...]) -> list[dict[str, Any]]:
-    """Those who hold several devices."""
+    """The persons who hold several devices."""
     return [msgspec.to_builtins(person) for person in persons]
 
 
@@ -411,7 +416,7 @@ def _traces(question: Validation, findings: Findings) -> dict[str, Any] | None:
 
 
 def _energy(question: Validation, findings: Findings) -> dict[str, Any]:
-    """Forces that were clipped are covered by nothing; those of a limiter are."""
+    """Clipped forces are not covered; those of a limiter are."""
     unclipped = (findings.clipped == 0) | (question.lag is not None)
     violated = unclipped & ~(findings.energy >= -_ROUNDING * findings.audited)
     return {

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from controller.contact import BoxProblem
-from controller.coupling import SpringDamper
-from design.result import CASE_I
+from controller.complementarity import BoxProblem
+from controller.coupling import CASE_I, SpringDamper
 from sim.run import assemble, run
 from sim.scenario import load
 

@@ -7,7 +7,7 @@ from controller.coupling import SpringDamper
 from controller.delay import LOST, HeldLine, VaryingDelay, ages, newest, packet_delays, realising
 from controller.environment import FIGURE_4, environment
 from controller.loop import force_map
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
 
 T = 1.2e-3
 COUPLING = SpringDamper([7806, 3137], [0.105, 1.68])

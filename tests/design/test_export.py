@@ -17,7 +17,7 @@ from controller.coupling import SpringDamper as Gains
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.loop import Loop, force_map
 from controller.lti import Lti
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
 from design.certificate import prove, prove_limiter
 from design.export import process_block, sequential, trial
 from design.files import InputError, one_command

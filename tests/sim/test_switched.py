@@ -11,7 +11,7 @@ from worlds import STIFF
 from cli.run import main
 from cli.validate import main as validate
 from controller.delay import VaryingDelay, ages, realising
-from controller.process import StepBuffer
+from controller.tick import StepBuffer
 from design import stored
 from models.scene import Crowd, plant, variants
 from sim.crowds import draw

@@ -10,11 +10,11 @@ import pytest
 
 from cli import zwidth
 from cli.options import BAD_INPUT, DOES_NOT_HOLD, INTERRUPTED, execute
-from controller.contact import contact
 from controller.coupling import NoCoupling, SpringDamper
 from controller.environment import GROUND, RIGID_WALL, Network, Spring, Wall, environment
 from controller.loop import Loop, force_map
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
+from controller.walls import contact
 from design.frequency import on_circle, suprema
 from models.device import CompliantDevice, RigidDevice
 from models.human import Human, Link

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from controller.contact import contact
 from controller.coupling import Compliance, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, Wall, environment
 from controller.loop import force_map
 from controller.lti import Lti
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
+from controller.walls import contact
 
 T = 1e-3
 NONE = np.zeros(1)

@@ -10,12 +10,13 @@ from worlds import SOFT
 
 from cli.accuracy import main as accuracy
 from cli.run import main
-from controller.contact import Complementarity, contact
+from controller.complementarity import Complementarity
 from controller.coupling import Coupling, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Wall, environment, held
 from controller.loop import force_map
 from controller.lti import SingularLoop
-from controller.process import Process, StepBuffer
+from controller.tick import Process, StepBuffer
+from controller.walls import contact
 from design.audit import report, requirement
 from design.certificate import assess, prove
 from design.conditions import this_environment
