@@ -23,7 +23,7 @@ from controller.loop import Loop
 from design.certificate import prove, prove_limiter, verify
 from design.files import one_command
 from design.result import Condition, Design, NotProved
-from design.stored import Certificate, Stored, digest, load, save
+from design.stored import Certificate, Stored, digest, load, save, sealed
 
 _SHIPPED = Path(__file__).with_name("designs")
 _MOST = 200  # entries; the oldest go
@@ -65,11 +65,12 @@ def keep(made: Design, loop: Loop, *question: Any) -> Certificate | None:
 
 def proved(made: Design, loop: Loop) -> Certificate:
     """The proof of a design, also while forces are limited where that can be had. Raises NotProved."""
-    limiter = None
+    certificate = prove(loop, made.coupling, made.condition)
     if made.condition == "this-environment":
         with suppress(NotProved):
             limiter = prove_limiter(loop, made.coupling)
-    return prove(loop, made.coupling, made.condition, limiter=limiter)
+            certificate = sealed(msgspec.structs.replace(certificate, limiter=limiter))
+    return certificate
 
 
 def shipped(loop: Loop, kind: str, condition: str, *options: Any) -> Path:
