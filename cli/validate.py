@@ -11,7 +11,7 @@ import numpy as np
 
 from cli import options, render
 from cli.judged import judge
-from controller.environment import Member
+from controller.ranges import Member
 from design.certificate import RangesCheck
 from design.conditions import this_environment
 from design.guarantees import ANY

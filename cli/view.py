@@ -14,8 +14,8 @@ from design.files import write_json
 from sim.scenario import InputError, require_even_ticks
 from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, Script, first_loop, parse_script
 from sim.view.film import Picture, check_film, painter, save_film
-from sim.view.session import LONGEST_LAG, Session, session_report
-from sim.view.stage import Stage, keys_help
+from sim.view.session import LONGEST_LAG, LiveLoop, session_report
+from sim.view.stage import ShownScene, keys_help
 
 _EXAMPLE = "python -m sim.view --video out.gif --script '0:none 1:theta+1 6:designed'"
 _SCRIPT = "0:none 1:theta+1 6:designed"  # of a video: an oscillation starts and dies
@@ -40,7 +40,7 @@ def main(argv: list[str]) -> int:
     prepared = first_loop(menu, scenario, label)
     executor = ThreadPoolExecutor(1)
     try:
-        session = Session(prepared, executor, script, inf if args.video else LONGEST_LAG)
+        session = LiveLoop(prepared, executor, script, inf if args.video else LONGEST_LAG)
         outcome = _film(args, session) if args.video else _window(session, args.duration)
     finally:
         executor.shutdown(cancel_futures=True)
@@ -110,7 +110,7 @@ def _names() -> list[str]:
     return list(dict.fromkeys([*LABELS, *COUPLINGS]))
 
 
-def _film(args: argparse.Namespace, session: Session) -> dict[str, Any]:
+def _film(args: argparse.Namespace, session: LiveLoop) -> dict[str, Any]:
     """The session against a clock of its own: the same film every time. Interrupted, it is as long as it got."""
     seconds = args.duration or (session.script_ends + _AFTER)
     count, interrupted = round(seconds * args.fps) + 1, False
@@ -137,10 +137,10 @@ def _film(args: argparse.Namespace, session: Session) -> dict[str, Any]:
     return {"video": video, "interrupted": interrupted, "remarks": remarks}
 
 
-def _window(session: Session, duration: float | None) -> dict[str, Any]:
+def _window(session: LiveLoop, duration: float | None) -> dict[str, Any]:
     from sim.view.window import NoWindow, show
 
-    stage = Stage(session.prepared.simulation.scene, session.prepared.simulation.process.force_limit)
+    stage = ShownScene(session.prepared.simulation.scene, session.prepared.simulation.process.force_limit)
     interrupted = False
     try:
         show(session, stage, duration)

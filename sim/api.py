@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 from controller.coupling import Coupling
 from controller.lti import Array
-from design.result import Design, number, of_kind, one_of, whole
+from design.arguments import number, of_kind, one_of, whole
+from design.result import Design
 from sim.accuracy import EngineChoice, compare_engines, pick
 from sim.couplings import given, limits_of
 from sim.engines import INTEGRATORS

@@ -109,7 +109,7 @@ class Frame:
     factor: float  # simulated over real time
 
 
-class Session:
+class LiveLoop:
     """The closed loop, advanced to wherever the clock is."""
 
     def __init__(
@@ -289,7 +289,7 @@ def _rehearsed(prepared: PreparedLoop, script: Script) -> list[tuple[int, Event,
     return made
 
 
-def session_report(session: Session) -> dict[str, Any]:
+def session_report(session: LiveLoop) -> dict[str, Any]:
     """How long it ran, what was changed when, and what could be said of each loop."""
     return {
         "scenario": session.prepared.scenario.name,
