@@ -92,7 +92,7 @@ def _parser() -> options.Parser:
 
 
 def _with_device(args: argparse.Namespace) -> argparse.Namespace:
-    """The options, with a device's numbers where none are given; `source` allows its gains. Raises InputError."""
+    """The options, with the catalogue's numbers where none are given; `source` allows its gains. Raises InputError."""
     if not args.device:
         return args
     try:
@@ -119,7 +119,7 @@ _UNITS = {"damping": 1.0, "mass": 1e3, "force_limit": 1.0, "encoder_step": 1e6, 
 
 
 def _device_part(device: Listed) -> dict[str, Any]:
-    """What is known of a device, each number with its source; null is what nobody publishes."""
+    """The published numbers of a device with their sources; null where none is published."""
     part: dict[str, Any] = {"title": device.title}
     for name in (*_UNITS, "framework_damping"):
         fact = getattr(device, name)

@@ -81,7 +81,7 @@ def _parser() -> options.Parser:
 
 
 def add_optimal_options(group: argparse._ActionsContainer) -> None:
-    """What is asked of an optimal coupling; options that are not given are None."""
+    """The options of an optimal coupling; None where not given."""
     error = "which transparency error is minimised (default rms)"
     group.add_argument("--objective", choices=OBJECTIVES, help=error)
     options.add_band_option(group)
@@ -92,7 +92,7 @@ def add_optimal_options(group: argparse._ActionsContainer) -> None:
 
 
 def optimal_options(args: argparse.Namespace) -> dict[str, Any]:
-    """What is asked of an optimal coupling."""
+    """The options of an optimal coupling, checked."""
     given = {name: getattr(args, name) for name in ("objective", "band_hz", "high_gain", "seconds")}
     given = {name: value for name, value in given.items() if value is not None}
     if getattr(args, "limiter", False):
@@ -343,7 +343,7 @@ _OBJECTIVE_WORDS = {
 
 
 def _best_rows(part: dict[str, Any]) -> render.Rows:
-    """What only an optimal coupling has."""
+    """Rows that only an optimal coupling has."""
     limit = part["bound"]
     climbed = ", ".join(f"{rung['mismatch_db']:.2f}" for rung in part["ladder"])
     bounded = f"no linear coupling can be better than {limit['rms_mismatch_db'] or 0:.2f} dB rms"
@@ -366,7 +366,7 @@ def _stored_rows(part: dict[str, Any]) -> render.Rows:
 
 @dataclass(frozen=True, eq=False)
 class _Report:
-    """What was designed; parts are null where there is none of it."""
+    """The design; parts that it does not have are null."""
 
     case: str
     seed: int

@@ -52,7 +52,7 @@ class Parser(argparse.ArgumentParser):
         )
 
     def parse_known_args(self, *args: Any, **how: Any) -> Any:  # what parse_args calls
-        """As argparse's; an empty word is no name, number or choice, whatever the option is."""
+        """As argparse's; an empty word is refused for every option."""
         found, rest = super().parse_known_args(*args, **how)
         for action in self._actions:
             if getattr(found, action.dest, None) == "":
@@ -321,14 +321,14 @@ def out_folder(args: argparse.Namespace, command: str) -> Path:
 
 
 def place(args: argparse.Namespace) -> str:
-    """The case, or of a scenario of one's own its name, for the names of files."""
+    """The case, or the name of the user's own scenario, for file names."""
     if args.scenario == DEFAULT:
         return args.case
     return Path(args.scenario).stem + ("" if args.case == "I" else f"-{args.case}")
 
 
 def as_option(error: ValueError, args: argparse.Namespace) -> str:
-    """What a design says of its argument, with the option's name where the argument has one."""
+    """The message of a design about its argument, with the option's name in the argument's place."""
     text = str(error)
     name, _, _ = text.partition(" ")
     given = getattr(args, name, None)
@@ -511,13 +511,13 @@ def _say(message: str, code: int) -> int:
 
 
 def _cannot(error: OSError) -> int:
-    """One line for what the system refused; what is still to be printed goes nowhere."""
+    """One line for a refusal of the system; later output goes nowhere."""
     nobody_reads()
     return _say(f"error: {error.filename or 'standard output'}: {error.strerror or error}", BAD_INPUT)
 
 
 def _streams() -> None:
-    """A standard stream that is closed leads nowhere, and no character is one that a terminal cannot show."""
+    """Replace closed standard streams, and characters that a terminal cannot show."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         stream = getattr(sys, name)
         if stream is None:
@@ -531,7 +531,7 @@ def _terminated(number: int, frame: Any) -> NoReturn:
 
 
 def _not_lost(unraisable: Any) -> None:
-    """Ctrl-C that comes while Python clears something away would be swallowed there: it comes again."""
+    """Repeat a Ctrl-C that came during Python's clean-up, where it would be lost."""
     if issubclass(unraisable.exc_type, KeyboardInterrupt):
         _thread.interrupt_main()
     else:

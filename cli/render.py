@@ -253,7 +253,7 @@ def channel_row(contacts: Sequence[str]) -> tuple[str, str | None]:
 
 
 def optional(value: float | None, form: str, absent: str = "-") -> str:
-    """A figure that may not exist."""
+    """A figure in this format, `absent` where there is none."""
     return absent if value is None else form.format(value)
 
 

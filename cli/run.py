@@ -223,7 +223,7 @@ def _panel_title(other: Alternative) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Report:
-    """What a run came to; parts are null where the run has none of it."""
+    """The result of a run; parts that it does not have are null."""
 
     case: str
     scenario: str
@@ -296,7 +296,7 @@ def _reported(
     environment: str,
     others: list[Alternative],
 ) -> _Report:
-    """Everything that the run came to."""
+    """The report of a run."""
     simulation, lam = run.simulation, scenario.loop(args.case).lam
     covered = any(requirement.certified for requirement in judged.requirements.values())
     delays = report.delays_part(simulation, chosen, run.period, run.trace.t.size, covered)
@@ -373,14 +373,14 @@ def _save(args: argparse.Namespace, out: Path, run: _Run, report: _Report) -> li
     files = [result.save_npz(out / "trace.npz"), result.save_csv(out / "trace.csv")]
     files.append(write(out / "scene.xml", run.simulation.scene.xml))
     if not args.no_plot and result.t.size:
-        from sim.plots import Onset, Surroundings, plot_run
+        from sim.plots import Contacts, Onset, plot_run
 
         apart, hertz = report.ideal_force["error_percent"], stability["exact_frequency_hz"]
         ideal = None if apart is None else (report.alike.ideal, apart)
         grows = stability["exact_verdict"] == "unstable" and run.exact is not None
         growth = stability["exact_growth_rate_per_s"] if grows and report.unstable is None else None
         onset = Onset(growth, report.run["steady_ticks"][0][1], report.credible["until_s"])
-        around = Surroundings(run.simulation.scenario.environment.contacts, *_walls(run))
+        around = Contacts(run.simulation.scenario.environment.contacts, *_walls(run))
         title = _title(run.simulation.scenario.title(args.case), report)
         files.append(plot_run(result, out / "figure.png", title, hertz, ideal, onset, around))
     return files

@@ -64,7 +64,7 @@ def add_pace_option(parser: argparse._ActionsContainer, what: str) -> None:
 
 
 def add_safety_options(parser: argparse.ArgumentParser) -> None:
-    """What the bridge never does, and who has to be there."""
+    """The bridge's limits, and the deadman."""
     safety = parser.add_argument_group("safety")
     cap = "largest force (default 2, for first sessions)"
     safety.add_argument("--force-cap", type=options.number(0.05, 12.0), default=2.0, metavar="NEWTON", help=cap)
@@ -100,7 +100,7 @@ def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
 
 
 def touched(path: str) -> Callable[[], bool]:
-    """Whether a file was touched since the call before; one that is not there is nobody's."""
+    """Whether a file was touched since the last call; False where there is no such file."""
     last = [_mtime(path)]
 
     def look() -> bool:
@@ -151,7 +151,7 @@ def host_clocked(args: argparse.Namespace) -> bool:
 
 @dataclass(frozen=True)
 class _Held:
-    """What came to pass beside the session: signals, and bytes that the port would not take at once."""
+    """What happens beside the session: signals, and bytes that the port did not take at once."""
 
     signals: Sequence[int] = ()
     dropped: int = 0
@@ -229,7 +229,7 @@ def _rehearsed(
     alone: Scenario | None,
     coulomb: float,
 ) -> _Held:
-    """The session in virtual time; whoever would be there arms once, and holds the deadman."""
+    """The session in virtual time; the emulated person arms once and holds the deadman."""
     faults = tuple(FaultInjection.parse(text) for text in args.fault)
     try:
         emulator = Emulator(alone or options.scenario_from(args), faults, coulomb=coulomb)

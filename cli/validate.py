@@ -127,7 +127,7 @@ def _question(args: argparse.Namespace, scenario: Scenario, chosen: Chosen, judg
 
 
 def _findings(args: argparse.Namespace, question: Validation, table: Table) -> tuple[Findings, float]:
-    """What the humans did, and the seconds that it took."""
+    """The findings on all humans, and the seconds that they took."""
     begin = time.perf_counter()
     with render.progress("validating") as move:
         if args.dask is not None:
@@ -148,7 +148,7 @@ class _Searched:
 
 
 def _searched(args: argparse.Namespace, question: Validation, chosen: Chosen, judged: Judged) -> _Searched:
-    """The worst humans, in the environment that asks most; what was found before an interrupt is kept."""
+    """The worst humans, in the environment that asks most; what was found before Ctrl-C is kept."""
     scenario, ratio = question.scenario, judged.requirements["this-environment"].ratio
     if question.environments and judged.whole:
         member, requirement = judged.whole.worst_found

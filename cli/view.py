@@ -200,8 +200,8 @@ def _film(args: argparse.Namespace, session: Session) -> _Ended:
     """The session against a clock of its own: the same film every time. Interrupted, it is as long as it got."""
     seconds = args.duration or (session.script_ends + _AFTER)
     count, interrupted = round(seconds * args.fps) + 1, False
-    assembly = session.prepared.assembly
-    artist, drawn, remarks = painter(args.draw, assembly.scene, assembly.process.force_limit)
+    simulation = session.prepared.simulation
+    artist, drawn, remarks = painter(args.draw, simulation.scene, simulation.process.force_limit)
 
     def pictures(move: render.Move) -> Iterator[Picture]:
         nonlocal interrupted
@@ -225,7 +225,7 @@ def _film(args: argparse.Namespace, session: Session) -> _Ended:
 def _window(session: Session, duration: float | None) -> _Ended:
     from sim.view.window import NoWindow, show
 
-    stage = Stage(session.prepared.assembly.scene, session.prepared.assembly.process.force_limit)
+    stage = Stage(session.prepared.simulation.scene, session.prepared.simulation.process.force_limit)
     interrupted = False
     try:
         show(session, stage, duration)

@@ -37,7 +37,7 @@ _MOST_VERTICES = 128  # each is a world of the design and a proof
 
 
 class UncertainSpring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What may be of one spring; a range that is not given leaves the environment's own value."""
+    """The ranges of one spring's parameters; where no range is given the environment's own value holds."""
 
     between: tuple[str, str]
     stiffness: _Range | None = None  # [N/m]
@@ -70,7 +70,7 @@ class Member:
 
 @dataclass(frozen=True)
 class _State:
-    """An uncertain thing that is there, or one that is absent: the ranges that it then has, and what it is in them."""
+    """One state of an uncertain part, present or absent: its ranges in that state, and the part at given values."""
 
     ranges: tuple[_Range, ...]  # those of some width
     value: Callable[[Sequence[float]], Spring | float]
@@ -78,7 +78,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _Part:
-    """One uncertain thing: what it is at each of its vertices, and somewhere in between."""
+    """One uncertain part: its values at each of its vertices, and between them."""
 
     place: str  # a spring's ends, or a node
     corners: tuple[Spring | float, ...]
@@ -96,7 +96,7 @@ class _Part:
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A part of the ranges in which nothing but numbers varies: which contacts are there is decided."""
+    """A part of the ranges in which only numbers vary: every contact is either present or absent."""
 
     low: Array  # (n,) the ends of the ranges
     high: Array  # (n,)
@@ -187,7 +187,7 @@ def _spring_part(network: Network, uncertain: UncertainSpring) -> _Part:
 
 
 def _spring_state(between: tuple[str, str], stiffness: _Range, damping: _Range) -> _State:
-    """A spring that is there; of its two ranges those without width are no coordinates."""
+    """A spring that is present; a range of no width is not a coordinate."""
     free = [low < high for low, high in (stiffness, damping)]
 
     def value(point: Sequence[float]) -> Spring:
@@ -285,7 +285,7 @@ class Spring(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A one-sided spring-damper: it pushes the first node back once it is `gap` beyond the second; see contact.py."""
+    """A one-sided spring-damper: it pushes the first node back once it is `gap` beyond the second; see walls.py."""
 
     between: tuple[str, str]
     stiffness: float  # [N/m]
@@ -309,7 +309,7 @@ class Wall(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Environment:
-    """What a loop asks of its environment. One of your own says its `contacts` and its `E(T)`."""
+    """What a loop asks of its environment. Your own class has `contacts` and `E(T)`."""
 
     __slots__ = ()
     contacts: Any  # tuple[str, ...], one a channel
@@ -359,7 +359,7 @@ class RigidWall(Environment, enum.Enum):
         raise ValueError("a rigid wall has no E(z): its force is whatever the coupling in front of it makes")
 
     def sent(self, coupling: Coupling, psi: Sequence[int], T: Number) -> Lti:
-        """V^-1. Raises ValueError for a coupling that is no V, SingularLoop where V has no inverse."""
+        """V^-1. Raises ValueError for a coupling without a V, SingularLoop where V has no inverse."""
         V = coupling.compliance(T)
         if V is None:
             raise ValueError("a rigid wall needs a spring-damper or another V in front of it")
@@ -572,7 +572,7 @@ def _quarters(c: int) -> tuple[tuple[slice, slice], ...]:
 
 
 def _remembered(after: Array, force: Array, inputs: int) -> NDArray[np.intp]:
-    """Indices of the states that reach the outputs now or later: the others need not be stored."""
+    """Indices of the states that reach the outputs, now or later; the others are dropped."""
     count = after.shape[-1]
     reads = (after.reshape(-1, count - inputs, count)[..., inputs:] != 0).any(axis=0)
     used = (force.reshape(-1, count)[:, inputs:] != 0).any(axis=0)
@@ -588,7 +588,7 @@ def frozen_states(network: Network) -> dict[tuple[bool, ...], Network]:
 
 
 def held(network: Network, touching: Sequence[bool] | None = None) -> Network:
-    """The network with the touching walls (default: all) as springs that also pull, the others as none at all."""
+    """The network with the touching walls (default: all) as two-sided springs, without the others."""
     touching = [True] * len(network.walls) if touching is None else touching
     walls = zip(network.walls, touching, strict=True)
     springs = (Spring(w.between, on * w.stiffness, on * w.damping) for w, on in walls)

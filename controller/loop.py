@@ -5,7 +5,7 @@
                               ^-               |
                               +----- V <-------+                F = Theta (I + Psi E V)^-1 Psi E     (6)
 
-No device is known but by its damping, and no human at all. It computes nothing in time: the tick is controller.process.
+No device is known but by its damping, and no human at all. It computes nothing in time: the tick is controller.tick.
 """
 
 from __future__ import annotations

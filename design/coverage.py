@@ -208,7 +208,7 @@ def search_part(searched: Searched) -> dict[str, Any]:
 
 
 def search_words(part: dict[str, Any]) -> str:
-    """What was found between the vertices, in a line."""
+    """The result of the search between the vertices, in one line."""
     found = "[red]violated[/]" if part["violated"] else "no violation found"
     ratio = "no damping is enough" if part["worst_ratio"] is None else f"worst ratio {part['worst_ratio']:.4f}"
     return f"searched, not proved: {found}, {ratio} in {part['environments']} points, at {part['worst']}"

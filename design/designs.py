@@ -47,7 +47,7 @@ KINDS = {
 
 
 def usual_condition(loop: Loop, kind: str = "spring-damper") -> str:
-    """What a coupling is designed for where nobody says it: a spring-damper for this environment, which feels best.
+    """The default condition of a design: a spring-damper is designed for this environment, which feels best.
 
     For any environment where this-environment covers less than the loop: limited forces before walls, ranges, delays
     that vary. Other kinds for their own condition.
@@ -93,7 +93,7 @@ _UNUSED, _MOST_ROUNDS = 0.005, 6
 
 
 def _with_less_damping(loop: Loop, made: Callable[[Loop], Design]) -> Design:
-    """The design for so much less damping that late forces, or walls that make and break contact, need what there is.
+    """The design for less damping, so that late forces, or walls that make and break, need no more than is available.
 
     It is made for forces that latch at the tick, and walls that all touch.
     """

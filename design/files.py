@@ -61,7 +61,7 @@ def _cut(text: str) -> str:
 
 
 def one_line(text: object) -> str:
-    """A message in one line of at most MOST_WORDS characters; of what a user gave it quotes 80, of a path the whole."""
+    """A message in one line of at most MOST_WORDS characters; user input is cut to 80 characters, a path is not."""
     words = _QUOTED.sub(lambda found: _cut(found[0]), printable(" ".join(str(text).split())))
     half = _MOST_WORDS // 2 - 3
     return words if len(words) <= _MOST_WORDS else f"{words[:half]} [..] {words[-half:]}"
@@ -94,7 +94,7 @@ def one_command() -> Iterator[None]:
 
 
 def _places(path: Path) -> set[Any]:
-    """What a file is known by; nothing for what is no file, such as a terminal, of which nothing can be destroyed."""
+    """What identifies a file; None for a terminal or another target in which nothing can be destroyed."""
     place = _target(path)
     if not place.exists():
         return {place}
@@ -152,7 +152,7 @@ def read_text(path: str | Path, named: str | None = None, hint: str = "") -> str
 
 
 def toml(text: str, named: str) -> dict[str, Any]:
-    """What TOML text says. Raises InputError."""
+    """The content of TOML text. Raises InputError."""
     if found := _DEEP_KEY.search(text):
         line = text.count("\n", 0, found.start()) + 1
         raise InputError(f"{named}: line {line}: a key of more than {_DEEPEST_KEY} names joined by dots")
@@ -165,7 +165,7 @@ def toml(text: str, named: str) -> dict[str, Any]:
 
 
 def read_arrays(path: str | Path, expected: str) -> dict[str, NDArray[Any]]:
-    """The arrays of an npz file, in which no object is unpickled. Raises InputError where it is none."""
+    """The arrays of an npz file, in which no object is unpickled. Raises InputError where it is not one."""
     content = read(path, most=_MOST_TRACE)
     try:
         with ZipFile(BytesIO(content)) as archive:
@@ -253,7 +253,7 @@ def _try(place: Path, name: str = "") -> None:
 
 
 def write(path: Path, content: Callable[[BinaryIO], None] | bytes | str) -> Path:
-    """Write a file under a temporary name and rename it into place; what is no file, a device or a pipe, as it is.
+    """Write a file under a temporary name and rename it into place; a device or a pipe is written directly.
 
     A link stays a link: the file that it points to is written. Raises InputError where that cannot be, and where the
     command has read the file or has written it for another option.
@@ -337,7 +337,7 @@ def write_json(destination: str | Path, report: Any) -> None:
 
 
 def nobody_reads() -> None:
-    """What is still written to standard output goes nowhere: its reader has left."""
+    """Send what is still written to standard output to nowhere, because its reader has left."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, sys.stdout.fileno())
     os.close(nowhere)

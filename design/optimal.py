@@ -386,7 +386,7 @@ def _scaled(coupling: ForceFilter, scale: float) -> ForceFilter:
 
 @dataclass(frozen=True)
 class _Spread:
-    """What it costs to keep the condition over `vertices`, too: two designs over one small basis."""
+    """The price of keeping the condition over `vertices`, too: two designs over one small basis."""
 
     mismatch_db: float  # of the design for the vertices, in the nominal environment
     price_db: float  # beside the design for the nominal environment alone

@@ -50,7 +50,7 @@ class SwitchingProof(Strict, frozen=True):
 
 
 class LimiterCertificate(Strict, frozen=True):
-    """What proves this-environment also while forces are limited, by the limiter of controller.contact."""
+    """What proves this-environment also while forces are limited, by the limiter of controller.limiter."""
 
     beta: float  # rho = beta delta/T, to six digits
     rho: tuple[float, ...]  # (m,) lag of the limiter [N/m]; the tick must use these
@@ -61,7 +61,7 @@ class LimiterCertificate(Strict, frozen=True):
 
 
 class Certificate(Strict, frozen=True):
-    """What is claimed of a coupling in its loop, and what proves it."""
+    """The claim about a coupling in its loop, and its proof."""
 
     condition: Condition
     required: tuple[float, ...]  # (m,) [N s/m], from a refined sweep
@@ -90,7 +90,7 @@ class Stored(Strict, frozen=True):
 
     @classmethod
     def of(cls, loop: Loop, coupling: Coupling, certificate: Certificate | None = None) -> Stored:
-        """What a file keeps of a coupling in its loop."""
+        """The stored form of a coupling in its loop."""
         return cls(loop, coupling.form(), certificate)
 
     def built(self) -> Coupling:
@@ -155,11 +155,11 @@ def _renamed(content: bytes) -> bytes:
 
 
 class _Twice(Exception):
-    """A name that an object of a file gives two values."""
+    """An object of a file has two values for one name."""
 
 
 def _once(pairs: list[tuple[str, Any]]) -> None:
-    """Of the last value JSON readers speak, of the first one a person who reads the file."""
+    """Refuse a repeated name: a JSON reader would take the last value, a person may read the first."""
     names: set[str] = set()
     for name, _ in pairs:
         if name in names:

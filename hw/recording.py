@@ -177,7 +177,7 @@ def _first(wrong: Array) -> int:
 
 
 class IncidentLog:
-    """A file that is true up to the last second, however the process ended: appended to, never kept in memory.
+    """A log that is complete up to the last second however the process ends: it is appended to, not kept in memory.
 
     One JSON object a line: every change of the stage at once, and every second where things stand. What was written
     survives SIGKILL, though not a power failure.
@@ -193,12 +193,12 @@ class IncidentLog:
         self._told = 0  # [us]
 
     def attach(self, session: Session) -> None:
-        """From now on, follow this session."""
+        """Record this session from now on."""
         self._write({"at": time.strftime("%Y-%m-%dT%H:%M:%S%z"), "scenario": session.scenario.name, "pid": os.getpid()})
         session.listen = lambda event: self._write({"t_us": event.t_us, "stage": event.stage, "cause": event.cause})
 
     def glance(self, session: Session) -> None:
-        """Where things stand, once a second."""
+        """Write the session's state, once a second."""
         if session.now - self._told < 1_000_000:
             return
         self._told, drive = session.now, session.drive
@@ -342,7 +342,7 @@ def save(out: Path, session: Session, recorder: Recorder, report: SessionReport,
 
 
 def _recipe_of(session: Session, program: Program, config: Config) -> dict[str, Any]:
-    """All that hw.replay needs of one arming."""
+    """What hw.replay needs to repeat one arming."""
     assert isinstance(program, CertifiedCoupling)
     return {
         "scenario": json.loads(msgspec.json.encode(program.scenario)),
@@ -371,7 +371,7 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lag: tuple[float, ...] | None = None  # (m,) [N/m] rho of the limiter, where there was one
 
     def __post_init__(self) -> None:
-        """Raises ValueError naming what no session can have written."""
+        """Raises ValueError naming a value that no session can have written."""
         m, least = self.scenario.channels, min(self.scenario.theta)
         for name, given in (("limits.cap", self.limits.cap), ("force_step", self.force_step), ("cap", self.cap)):
             if len(given) != m:
@@ -385,7 +385,7 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"link_delay is {self.link_delay}, allowed are {allowed}")
 
     def controller(self) -> Controller:
-        """F as the host ran it. Raises InputError where nothing can have run."""
+        """F as the host ran it. Raises InputError where the recipe is impossible."""
         try:
             coupling = self.coupling.build(self.scenario.T)
             return host_controller(self.scenario, coupling, self.link_delay, self.lag, self.limits.cap)
@@ -393,7 +393,7 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise InputError(f"the trace cannot be replayed: {error}") from None
 
     def budget(self) -> SentBudget | None:
-        """The energy budget at its start, where there was one. Raises InputError where none can be so."""
+        """The energy budget at its start, where there was one. Raises InputError where it is impossible."""
         if self.energy_budget is None:
             return None
         try:

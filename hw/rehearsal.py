@@ -47,7 +47,7 @@ class _Moment(NamedTuple):
 
 @dataclass
 class Rehearsal:
-    """What happens, in order of time: a port whose other end is the emulator, and the session at it.
+    """A session and its emulated device in virtual time: the session's port leads to the emulator.
 
     `actions` are what a person does: (seconds after arming, call).
     """
@@ -223,7 +223,7 @@ class Rehearsal:
 
 @dataclass(frozen=True, eq=False)
 class Rehearsed:
-    """What a session came to."""
+    """The result of a session."""
 
     stage: str  # "finished" where all went well; else "refused", "stopped", "lost", "e-stop"
     cause: str  # of the end

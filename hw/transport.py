@@ -202,7 +202,7 @@ class Live(Driver):
         return session
 
     def turn(self) -> None:
-        """Then what is no answer: keys, arming and the planned end, signals."""
+        """Everything but the answer: keys, arming, the planned end, signals."""
         super().turn()
         try:
             self._steer(self.clock())

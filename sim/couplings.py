@@ -114,7 +114,7 @@ def limits_of(
 
 
 def read_coupling(path: str | Path) -> Stored:
-    """A stored coupling. Raises InputError where there is none that can be read."""
+    """A stored coupling. Raises InputError where it cannot be read."""
     stored = load(path)
     try:
         stored.built()
@@ -135,7 +135,7 @@ def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
 
 @dataclass(frozen=True)
 class _FileCheck:
-    """What a coupling's file is worth in a loop."""
+    """Whether a coupling's file proves anything in this loop."""
 
     notes: tuple[str, ...]  # what a reader should know of it
     switching: DelayRange | None = None  # the file proves that any switching of the delays within it is safe here

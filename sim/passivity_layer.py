@@ -17,12 +17,13 @@ from typing import Any
 import numpy as np
 
 from controller.budget import EPS, EnergyBounding, EnergyBudget, PassivityControl, Shell
-from controller.contact import Limiter, contact, limited
 from controller.coupling import Coupling
 from controller.delay import LOST, Ticks, ages
+from controller.limiter import Limiter, limited
 from controller.loop import DelayRange
 from controller.lti import Array, Lti
-from controller.process import Net, Process
+from controller.tick import Net, Process
+from controller.walls import contact
 from design.result import Requirement
 from sim.run import Simulation
 from sim.scenario import Scenario

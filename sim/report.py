@@ -1,6 +1,6 @@
-"""What a run and a validation came to, as plain data in SI units: null with a "reason" where a figure does not exist.
+"""Results of a run as plain data in SI units: null with a "reason" where a figure does not exist.
 
-The rows on the screen are made of it in the commands: cli/run.py, cli/validate.py.
+The rows on the screen are made of it in cli/run.py.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ class _Tap(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def _usual_hand(i: int) -> Human:
-    """Who holds device i where a scenario does not say it: .3 kg that swings 15 mm at .6 Hz, a quarter turn apart."""
+    """The default hand of device i: .3 kg that swings 15 mm at .6 Hz, a quarter turn apart."""
     return Human((Link(0.3, 3.0, 200.0),), Voluntary(0.015, 0.6, phase=0.5 * np.pi * i))
 
 
@@ -147,7 +147,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def delay_range(self) -> DelayRange:
-        """What the delay of a force may be; of one that is lost nothing is said."""
+        """The range of the delay of a force that is not lost."""
         varying = self.varying_delay
         return DelayRange(varying.lo, varying.hi) if varying else DelayRange(self.theta, self.theta)
 
@@ -162,7 +162,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def longest_period(self) -> float | None:
-        """What certificates are for: T_max, or the longest of the periods that are simulated; None where all are T."""
+        """The period that certificates must cover: T_max, or the longest simulated one; None where all are T."""
         if self.T_max is not None or self.period is None:
             return self.T_max
         return max(self.period.longest, self.T)
@@ -201,7 +201,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return tuple(t + p for t, p in zip(self.theta, self.psi, strict=True))
 
     def title(self, case: str) -> str:
-        """What reports and pictures are headed with: the paper's cases have names for its own loop only."""
+        """The title of reports and pictures; the paper's cases have names for the paper's loop only."""
         if (case == "none" or self.varying_delay is None) and self.loop(case) == load().loop(case):
             return f"{self.name}, case {case}"
         return self.name + {"none": ", no coupling", "II": ", reference without delay"}.get(case, "")
@@ -281,14 +281,14 @@ def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
 
 
 def require_constant_delay(scenario: Scenario, what: str) -> None:
-    """Raises InputError where a scenario's delays vary, for what would not make them vary."""
+    """Raises InputError where delays vary, for commands that cannot simulate this."""
     if scenario.varying_delay is not None:
         instead = "sim.run simulates it"
         raise InputError(f"varying_delay: {what} takes the delays that its link has; take the table out, {instead}")
 
 
 def require_even_ticks(scenario: Scenario, what: str) -> None:
-    """Raises InputError where periods are drawn or forces latch between ticks, for what would do neither."""
+    """Raises InputError where ticks are uneven or late, for commands that cannot simulate this."""
     for name in ("period", "latency"):
         if getattr(scenario, name) is not None:
             raise InputError(f"{name}: {what} takes the ticks that it has; take the key out, sim.run simulates it")
@@ -400,7 +400,7 @@ def _converted(text: str, kind: Any, source: str) -> Any:
 
 
 def _whole(raw: dict[str, Any]) -> dict[str, Any]:
-    """The file, if it has every key that a scenario needs; of an unknown key it is told first. Raises ValueError."""
+    """The file, if it has every key that a scenario needs. An unknown key is reported first. Raises ValueError."""
     missing = [name for name in _NEEDED if name not in raw]
     if missing and set(raw) <= set(Scenario.__struct_fields__):
         raise ValueError(f"missing {', '.join(missing)}; every scenario has {', '.join(_NEEDED)}")
@@ -488,7 +488,7 @@ def _kept(value: Any) -> Any:
 
 
 def _contents(part: Any) -> Any:
-    """What a user's own human or population is made of."""
+    """The contents of a user's own human or population."""
     return part.tolist() if isinstance(part, np.ndarray | np.generic) else [type(part).__qualname__, vars(part)]
 
 
@@ -512,7 +512,7 @@ def _located(message: str, raw: dict[str, Any]) -> str:
 
 
 def _hint(what: str) -> str:
-    """What would have been allowed, where the message does not say it."""
+    """What is allowed, where the message does not say it."""
     unknown = re.search(r"unknown field `(.*)`", what)
     if unknown:
         known = {name for struct in _STRUCTS for name in struct.__struct_fields__}

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from controller.lti import Array
-from controller.process import StepBuffer
+from controller.tick import StepBuffer
 from models.scene import plant
 from sim.engines import EXPONENTIAL, LEAST, HeldPlant, default_integrator, quiet_warnings
 from sim.run import Simulation, make_engine

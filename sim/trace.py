@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.lti import Array, ReadOnly, frozen
-from controller.process import Net
+from controller.tick import Net
 from design.files import InputError, read_arrays, write
 
 _MEASURED = {"t": 1, "x": 2, "f": 2, "x_handle": 2, "v_handle": 2, "w": 2}  # axes of what files keep
@@ -41,7 +41,7 @@ def _real(name: str, values: NDArray[Any]) -> Array:
 
 
 def _is_frozen(value: Any, ndim: int) -> bool:
-    """Whether nobody can write to it, so that a long run needs no second copy."""
+    """Whether it is read-only, so that a long run needs no second copy."""
     own = isinstance(value, np.ndarray) and value.dtype == np.float64 and value.ndim == ndim
     return own and not value.flags.writeable and not (isinstance(value.base, np.ndarray) and value.base.flags.writeable)
 
@@ -108,12 +108,12 @@ class Trace(ReadOnly):
 
     @classmethod
     def load_npz(cls, path: Path) -> Self:
-        """A trace written by `save_npz`. Raises InputError where it is none."""
+        """A trace written by `save_npz`. Raises InputError where the file is not one."""
         return cls.of_arrays(path, read_arrays(path, "a trace of this program"))
 
     @classmethod
     def of_arrays(cls, path: Path, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """A trace from the arrays of its file. Raises InputError where they are none."""
+        """A trace from the arrays of its file. Raises InputError where they are not those of a trace."""
         try:
             measured: dict[str, Any] = {name: _real(name, arrays[name]) for name in _MEASURED}
             return cls(**measured, meta=json.loads(str(arrays["meta"])))

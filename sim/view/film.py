@@ -40,7 +40,7 @@ _PROBE = "from mujoco.{} import GLContext; c = GLContext(8, 8); c.make_current()
 
 
 def painter(draw: str, scene: Scene, force_limit: Array) -> tuple[Flat | Offscreen, str, list[str]]:
-    """Who draws ("auto", "gl" or "flat"), under which name, and why not OpenGL where that is not there.
+    """The painter ("auto", "gl" or "flat"), its name, and the reason where OpenGL is not used.
 
     Raises InputError where it is not there and "gl" asks for it.
     """
@@ -165,7 +165,7 @@ class Flat:
         return np.asarray(image)
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Nothing to free."""
 
     def _bodies(self, pen: ImageDraw.ImageDraw, frame: Frame, top: int, bottom: int) -> None:
         steps = max(self._places) + 2

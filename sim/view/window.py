@@ -82,7 +82,7 @@ def loop(
 
 
 def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Grip | None:
-    """Show a frame, and return what the mouse holds by then."""
+    """Show a frame, and return what the mouse holds afterwards."""
     with window.lock():
         stage.show(frame.q)
         grip = stage.grip(window.perturb)
@@ -100,7 +100,7 @@ def _shown(stage: Stage, window: viewer.Handle, frame: Frame) -> Grip | None:
 
 
 def typed(session: Session) -> Callable[[int], None]:
-    """What the viewer calls, in its own thread, when a key is pressed."""
+    """The viewer's callback for a key, in the viewer's own thread."""
 
     def key(code: int) -> None:
         if code in KEYS:

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from controller.contact import contact
 from controller.coupling import Compliance, InternalModel, SpringDamper
 from controller.environment import GROUND, Network, Ranges, Spring, Wall, frozen_states
 from controller.loop import Loop
 from controller.lti import Lti
+from controller.walls import contact
 from design.certificate import assess, prove, verify
 from design.conditions import any_environment, this_environment
 from design.designs import design_by_kind

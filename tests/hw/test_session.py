@@ -218,10 +218,10 @@ def test_the_same_to_the_last_bit_but_for_rounded_forces(scenario, rungs):
     rehearsal.run_until_armed(1.5)
     link = recorder.link()
     first = int(np.argmax(link["tick"] == rehearsal.emulator.begun_at))
-    assembly = assemble(scenario, rungs[0].chosen.coupling)
-    held = hold(plant(assembly.scene.model), scenario.T)
+    simulation = assemble(scenario, rungs[0].chosen.coupling)
+    held = hold(plant(simulation.scene.model), scenario.T)
     n = len(recorder) - first
-    w, law = outside_forces(scenario, assembly.scene, 0, n), LinearController(assembly.F)
+    w, law = outside_forces(scenario, simulation.scene, 0, n), LinearController(simulation.F)
     s, counts, applied = np.zeros(held.A.shape[0]), [], []
     for k in range(n):
         x = np.round(s[:2] / 1e-6)
@@ -434,8 +434,8 @@ def test_the_replay_command(trace, capsys):
 
 
 def test_a_trace_of_sim_run_is_no_session(scenario, rungs, tmp_path):
-    assembly = assemble(scenario, rungs[0].chosen.coupling)
-    path = run(assembly, "exact", ticks=10).save_npz(tmp_path / "trace.npz")
+    simulation = assemble(scenario, rungs[0].chosen.coupling)
+    path = run(simulation, "exact", ticks=10).save_npz(tmp_path / "trace.npz")
     with pytest.raises(InputError, match="not of a bridge's session"):
         load(path)
 
@@ -599,8 +599,8 @@ def test_a_trace_tells_the_growth_of_the_loop(scenario, tmp_path, capsys, name, 
     if settles:
         assert part["reason"].startswith("nothing oscillates")
         return
-    assembly = assemble(scenario, made.chosen.coupling)
-    exact = dominant_mode(close(assembly.plant, assembly.F))
+    simulation = assemble(scenario, made.chosen.coupling)
+    exact = dominant_mode(close(simulation.plant, simulation.F))
     assert part["growth_rate_per_s"] == pytest.approx(exact.growth, abs=2e-3)
     assert part["frequency_hz"] == pytest.approx(exact.frequency_hz, abs=1.0)
     assert part["trend"] == "grows"

@@ -200,8 +200,8 @@ def test_its_verdicts_are_those_of_each_hand_alone():
     found = validate(scenario, CASE_I, humans=6, duration=0.0, engine="exact")
     for i in (0, 5):
         hands = Validation(scenario, CASE_I, 0, 20, 1, "exact", 0.0).crowd(i).humans(0)
-        assembly = assemble(scenario.replace(human=hands), CASE_I)
-        assert found.exact[i] == pytest.approx(dominant_mode(close(assembly.plant, assembly.F)).growth, abs=1e-9)
+        simulation = assemble(scenario.replace(human=hands), CASE_I)
+        assert found.exact[i] == pytest.approx(dominant_mode(close(simulation.plant, simulation.F)).growth, abs=1e-9)
 
 
 def test_a_person_may_hold_with_such_hands():

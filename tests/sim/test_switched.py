@@ -11,7 +11,7 @@ from worlds import STIFF
 from cli.run import main
 from cli.validate import main as validate
 from controller.delay import VaryingDelay, ages, realising
-from controller.process import StepBuffer
+from controller.tick import StepBuffer
 from design import stored
 from models.scene import Crowd, plant, variants
 from sim.crowds import draw
@@ -54,23 +54,23 @@ def test_the_product_of_mode_matrices_is_the_simulated_map():
     G = without_theta(ASSEMBLY, STIFF)
     moved = with_delays(ASSEMBLY, STIFF, realising(wanted)[:, :, None])
     states = moved.plant.A.shape[0]
-    tape = StepBuffer(unlimited(moved.process), ticks, states, moved.scene.outside)
-    tape.s[0, :, 0] = rng.normal(size=states)
+    buffer = StepBuffer(unlimited(moved.process), ticks, states, moved.scene.outside)
+    buffer.s[0, :, 0] = rng.normal(size=states)
     engine = ExactEngine(moved.plant, np.full(2, np.inf))
-    engine.start(tape)
+    engine.start(buffer)
     for k in range(ticks):
-        tape.tick(k)
+        buffer.tick(k)
         engine.advance(k)
 
     xi = np.zeros(states + G.order + sum(depth))
-    xi[:states] = tape.s[0, :, 0]
+    xi[:states] = buffer.s[0, :, 0]
     held = own_hold()
     for row in wanted:
         xi = mode_matrix(held, G, depth, row) @ xi
-    size = np.abs(tape.s[:, :, 0]).max()
+    size = np.abs(buffer.s[:, :, 0]).max()
     # both are products of the same 60 matrices up to rounding, 1e-16 each, of numbers up to `size`
-    np.testing.assert_allclose(xi[:states], tape.s[ticks, :, 0], atol=1e-11 * size)
-    np.testing.assert_allclose(xi[states:][: G.order], tape.z[ticks, :, 0], atol=1e-11 * size)
+    np.testing.assert_allclose(xi[:states], buffer.s[ticks, :, 0], atol=1e-11 * size)
+    np.testing.assert_allclose(xi[states:][: G.order], buffer.z[ticks, :, 0], atol=1e-11 * size)
 
 
 def test_constant_delays_give_the_trace_of_the_constant_loop():
