@@ -249,8 +249,9 @@ class _Drawn:
     @classmethod
     def of(cls, question: Validation, index: int) -> _Drawn:
         crowd, member = question.crowd(index), question.environment(index)
-        met = (member.name, msgspec.to_builtins(member.network)) if member else ()
-        return cls(question.seed, index, _humans(crowd.humans(0)), msgspec.to_builtins(crowd.persons(0)), *met)
+        humans, persons = _humans(crowd.humans(0)), msgspec.to_builtins(crowd.persons(0))
+        where, network = (member.name, msgspec.to_builtins(member.network)) if member else (None, None)
+        return cls(question.seed, index, humans, persons, where, network)
 
 
 @dataclass(frozen=True)
@@ -265,8 +266,8 @@ class _Slowest:
     @classmethod
     def of(cls, question: Validation, findings: Findings) -> _Slowest:
         k = int(np.argmax(findings.radius))
-        figures = (float(of[k]) for of in (findings.radius, findings.exact, findings.frequency))
-        return cls(*figures, _Drawn.of(question, int(findings.index[k])))
+        radius, growth, frequency = (float(of[k]) for of in (findings.radius, findings.exact, findings.frequency))
+        return cls(radius, growth, frequency, _Drawn.of(question, int(findings.index[k])))
 
     def __str__(self) -> str:
         growth = f"{self.growth_rate_per_s:+.4g} 1/s at {self.frequency_hz:.2f} Hz (index {self.who.index})"
