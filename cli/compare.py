@@ -19,13 +19,14 @@ from rich.table import Table
 
 from cli import options, render
 from cli.design import add_optimal_options, optimal_options
+from controller import older
 from controller.loop import Loop
 from controller.lti import Array
 from design import compare
 from design.certificate import CONDITIONS
 from design.compare import AXES, FEEL_HZ, LADDERS, Demands, LadderRow, Limit, Perceived, Point, optimum, points_along
 from design.program import Options
-from design.result import OLDER_NAMES, DesignFailed, certificate_part, finite
+from design.result import DesignFailed, certificate_part, finite
 from design.robustness import robustness_part
 from design.transparency import transparency
 from sim import baselines, report
@@ -223,7 +224,7 @@ def _shown(loop: Loop, name: str, chosen: Chosen, judged: Demands, hz: Array) ->
         lines.sigma_M,
         lines.perceived,
         report.coupling_part(chosen.kind, chosen.coupling, loop.T),
-        conditions | {older: conditions[name] for older, name in OLDER_NAMES.items() if name in conditions},
+        older.with_older(conditions, older.CONDITIONS),
     )
 
 

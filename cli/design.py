@@ -24,7 +24,7 @@ from design.gain_search import STIFFEST
 from design.guarantees import ANY, HERE, switching_guarantee
 from design.optimal import Optimal, robustness_parts, widest_ranges
 from design.program import DEFAULT, OBJECTIVES, Options
-from design.result import METHODS, Design, DesignFailed, NotProved, listed
+from design.result import Design, DesignFailed, NotProved, listed
 from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, transparency
 from sim import report as parts
@@ -70,7 +70,8 @@ def _parser() -> options.Parser:
     options.add_limiter_option(one_of, "design and prove as if forces were never at their limits")
     ccl = parser.add_argument_group("ccl: a state-space coupling of fixed order, by the procedure of Remark 5")
     ccl.add_argument("--order", type=options.whole(1, 10), metavar="N", help="states per channel (default 1)")
-    ccl.add_argument("--method", choices=METHODS, help="complementarity is as printed (default inner)")
+    ways = "complementarity (as printed), inner or fixed-poles (default inner)"
+    ccl.add_argument("--method", metavar="NAME", help=ways)
     optimal = parser.add_argument_group("optimal: the best filter of the environment's forces")
     add_optimal_options(optimal)
     samples = f"random points in the ranges, beside the search (default {SAMPLES})"

@@ -23,15 +23,16 @@ from typing import Any, NoReturn, TypeVar
 import msgspec
 from threadpoolctl import threadpool_limits
 
+from controller import older
 from controller.delay import LOST, VaryingDelay
 from controller.environment import RIGID_WALL
 from controller.loop import Loop
 from controller.lti import SingularLoop
 from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
-from design.result import OLDER_NAMES, DesignFailed
+from design.result import DesignFailed
 from models.device import MOST_DAMPING
-from sim.scenario import CASES, DEFAULT, OLDER_SCENARIOS, InputError, Scenario, built_in, load, load_humans
+from sim.scenario import CASES, DEFAULT, InputError, Scenario, built_in, load, load_humans
 
 DONE, DOES_NOT_HOLD, BAD_INPUT, UNFINISHED, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -145,9 +146,9 @@ def _latency_ranges(text: str) -> tuple[tuple[float, float], ...]:
 
 def condition(text: str) -> str:
     """A condition by its name, or by the name that it had before."""
-    name = OLDER_NAMES.get(text, text)
-    if name not in OLDER_NAMES.values():
-        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(OLDER_NAMES.values())}")
+    name = older.CONDITIONS.get(text, text)
+    if name not in older.CONDITIONS.values():
+        raise argparse.ArgumentTypeError(f"is {text!r}, allowed are {', '.join(older.CONDITIONS.values())}")
     return name
 
 
@@ -226,7 +227,7 @@ def add_loop_options(parser: argparse.ArgumentParser) -> None:
 def scenario_from(args: argparse.Namespace) -> Scenario:
     """The scenario that the loop options describe. Raises InputError."""
     scenario = load(args.scenario)
-    if args.scenario in OLDER_SCENARIOS:
+    if args.scenario in older.SCENARIOS:
         print(f"scenario {args.scenario} is called {scenario.name} now", file=sys.stderr)
     given = {name: getattr(args, name) for name in ("theta", "psi", "lam") if getattr(args, name) is not None}
     changes: dict[str, Any] = {name: per_channel(f"--{name}", n, scenario.channels) for name, n in given.items()}
@@ -270,8 +271,8 @@ def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: s
 
 def add_condition_option(parser: argparse._ActionsContainer, what: str = "that the certificate is about") -> None:
     """--condition."""
-    names = ",".join(OLDER_NAMES.values())
-    help_ = f"{what}: {' or '.join(OLDER_NAMES.values())} (default: the coupling's own)"
+    names = ",".join(older.CONDITIONS.values())
+    help_ = f"{what}: {' or '.join(older.CONDITIONS.values())} (default: the coupling's own)"
     parser.add_argument("--condition", type=condition, metavar=f"{{{names}}}", help=help_)
 
 

@@ -22,6 +22,7 @@ from rich.table import Table
 from rich.text import Text
 
 from controller.loop import Loop
+from controller.older import REPORTS, with_older
 from design.files import nobody_reads, plain, printable, write_json
 from design.result import DesignFailed, listed
 
@@ -121,10 +122,6 @@ def designing(loop: Loop | None = None, kind: str | None = None, condition: str 
 # A whole report: files, tables, lines below them, JSON.
 
 
-#: parts of reports -> their other name in JSON, an older one but for the last
-_OTHER_NAMES = {"ranges": "set", "varying_delay": "jitter", "promise": "guarantee"}
-
-
 def publish(
     args: argparse.Namespace,
     report: Any,
@@ -137,8 +134,7 @@ def publish(
 
     `files` are those written before; the report names them and its own. A part stands there by its older name, too.
     """
-    outcome = plain(report)
-    outcome |= {other: outcome[name] for name, other in _OTHER_NAMES.items() if name in outcome}
+    outcome = with_older(plain(report), REPORTS)
     if folder:
         kept = folder / "report.json"
         outcome["files"] = [*map(str, files), str(kept)]

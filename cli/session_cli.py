@@ -17,7 +17,7 @@ from typing import Any
 from cli import options
 from cli.dashboard import Dashboard
 from cli.render import console, progress
-from hw.control import Program
+from hw.control import Armable
 from hw.emulator import Emulator, FaultInjection, spawned
 from hw.force_dimension import FORCE_DIMENSION, ForceDimension
 from hw.monitor import Ages, LinkSettings
@@ -160,7 +160,7 @@ class _Held:
 def hold_session(
     args: argparse.Namespace,
     session: Session,
-    plan: Callable[[Ages], Sequence[Program]],
+    plan: Callable[[Ages], Sequence[Armable]],
     seconds: float,
     out: Path,
     alone: Scenario | None = None,
@@ -223,7 +223,7 @@ def hold_session(
 def _rehearsed(
     args: argparse.Namespace,
     session: Session,
-    plan: Callable[[Ages], Sequence[Program]],
+    plan: Callable[[Ages], Sequence[Armable]],
     seconds: float,
     incidents: IncidentLog,
     alone: Scenario | None,
@@ -237,7 +237,7 @@ def _rehearsed(
         raise InputError(f"the scenario cannot stand behind a serial link: {error}") from None
     with progress("rehearsing") as move:
 
-        def planned(ages: Ages) -> Sequence[Program]:
+        def planned(ages: Ages) -> Sequence[Armable]:
             move(0, 1, "designing the coupling")
             return plan(ages)
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from cli import options, render
 from cli.judged import Judged, judge
-from controller.environment import Member
 from controller.lti import Array
+from controller.ranges import Member
 from design.certificate import RangesCheck
 from design.conditions import this_environment
 from design.guarantees import ANY

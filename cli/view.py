@@ -16,8 +16,8 @@ from design.result import certificate_part
 from sim.scenario import InputError, require_even_ticks
 from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, PreparedLoop, Script, first_loop, parse_script
 from sim.view.film import Picture, check_film, painter, save_film
-from sim.view.session import LONGEST_LAG, Session
-from sim.view.stage import Stage, keys_help
+from sim.view.session import LONGEST_LAG, LiveLoop
+from sim.view.stage import ShownScene, keys_help
 
 _EXAMPLE = "python -m sim.view --video out.gif --script '0:none 1:theta+1 6:designed'"
 _SCRIPT = "0:none 1:theta+1 6:designed"  # of a video: an oscillation starts and dies
@@ -42,7 +42,7 @@ def main(argv: list[str]) -> int:
     prepared = first_loop(menu, scenario, label)
     executor = ThreadPoolExecutor(1)
     try:
-        session = Session(prepared, executor, script, inf if args.video else LONGEST_LAG)
+        session = LiveLoop(prepared, executor, script, inf if args.video else LONGEST_LAG)
         ended = _film(args, session) if args.video else _window(session, args.duration)
     finally:
         executor.shutdown(cancel_futures=True)
@@ -196,7 +196,7 @@ def _names() -> list[str]:
     return list(dict.fromkeys([*LABELS, *COUPLINGS]))
 
 
-def _film(args: argparse.Namespace, session: Session) -> _Ended:
+def _film(args: argparse.Namespace, session: LiveLoop) -> _Ended:
     """The session against a clock of its own: the same film every time. Interrupted, it is as long as it got."""
     seconds = args.duration or (session.script_ends + _AFTER)
     count, interrupted = round(seconds * args.fps) + 1, False
@@ -222,10 +222,10 @@ def _film(args: argparse.Namespace, session: Session) -> _Ended:
     return _Ended(interrupted, remarks, _Film(args.video, made, args.fps, drawn))
 
 
-def _window(session: Session, duration: float | None) -> _Ended:
+def _window(session: LiveLoop, duration: float | None) -> _Ended:
     from sim.view.window import NoWindow, show
 
-    stage = Stage(session.prepared.simulation.scene, session.prepared.simulation.process.force_limit)
+    stage = ShownScene(session.prepared.simulation.scene, session.prepared.simulation.process.force_limit)
     interrupted = False
     try:
         show(session, stage, duration)

@@ -452,7 +452,7 @@ def _coupling(args: argparse.Namespace, scenario: Scenario, chosen: Chosen) -> d
             "certificates": judged.certificates,
             "promise": judged.promise,
             "ranges": judged.ranges,
-            "set": judged.ranges,  # its older name
+            "set": judged.ranges,
         },
         "limiter": judged.limiter,
         "remarks": list(chosen.notes),

@@ -162,6 +162,13 @@ def _scalar(value: Any) -> Any:
     return np.asarray(value)[..., None, None]
 
 
+#: The gains that the paper prints, by case: (27) for Lambda = Theta Psi and (28) for Lambda = I. Neither satisfies the
+#: paper's own condition.
+CASE_I = SpringDamper(K=[2870.0, 2320.0], B=[5.47, 5.55])
+CASE_II = SpringDamper(K=[1810.0, 120.0], B=[5.78, 3.81])
+PUBLISHED = {"I": CASE_I, "II": CASE_II}
+
+
 @dataclass(frozen=True, eq=False)
 class MovingAverage(ReadOnly, Coupling):
     """V_i = weight_i (1 + 1/z + ... + z^-(terms_i - 1)) + constant_i: the sum of the last forces, and a plain spring.

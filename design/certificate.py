@@ -18,9 +18,9 @@ from controller.coupling import (
     Coupling,
 )
 from controller.delay import delay
-from controller.environment import Member, inside
 from controller.loop import Loop
 from controller.lti import Array, Lti, SingularLoop, TooLong, rational, within
+from controller.ranges import Member, inside
 from design import conditions, multipliers
 from design.environments import Progress, Searched, in_each, search_ranges, worst
 from design.exact import LARGEST, Matrix, definiteness, find_storage, refuted_rows, rows_of, too_large

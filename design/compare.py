@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.coupling import Coupling, NoCoupling
+from controller.coupling import PUBLISHED, Coupling, NoCoupling
 from controller.delay import delay
 from controller.loop import Loop
 from controller.lti import Array, Lti
@@ -23,7 +23,7 @@ from design.certificate import any_environment_of, prove
 from design.designs import design_by_kind
 from design.frequency import Response, frequencies, on_circle
 from design.program import LADDER, Options
-from design.result import PUBLISHED, Condition, Design, DesignFailed, NotProved, Requirement, finite
+from design.result import Condition, Design, DesignFailed, NotProved, Requirement, finite
 from design.robustness import robustness_part
 from design.stored import digest
 from design.transparency import decibels, transparency

@@ -8,9 +8,10 @@ from typing import Any
 
 from controller.coupling import Coupling
 from controller.delay import delay
-from controller.environment import Member, environment
+from controller.environment import environment
 from controller.loop import DelayRange, Loop, force_map
 from controller.lti import Lti
+from controller.ranges import Member
 from design.certificate import RangesCheck, check_limiter, prove_limiter
 from design.conditions import this_environment
 from design.environments import SEARCH, Searched, worst

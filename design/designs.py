@@ -23,7 +23,7 @@ class Kind(NamedTuple):
     module: str  # loaded when it is asked for: cvxpy takes a second
     function: str  # from a loop to a Design
     takes: tuple[str, ...] = ()  # besides the loop and its options: condition, progress
-    options: tuple[str, ...] = ()  # in words of design.api.Options
+    options: tuple[str, ...] = ()  # in words of design.api.DesignOptions
 
 
 KINDS = {
@@ -64,7 +64,7 @@ def design_by_kind(
     **options: Any,
 ) -> Design:
     """Design and verify a coupling; `options` are those of the design's own function: order, method, diagonal for ccl,
-    those of design.optimal.Options for optimal. `progress` hears what takes long: (what, steps done, of how many).
+    those of design.program.Options for optimal. `progress` hears what takes long: (what, steps done, of how many).
     Without a condition it is the usual one. A spring-damper for this environment is covered also while forces are
     limited, unless `limiter` is False or no such one is found; with `limiter` True it is that or none.
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from controller.coupling import Coupling, ForceFilter
 from controller.delay import delay
-from controller.environment import Member, Region, regions
 from controller.loop import Loop
 from controller.lti import Array, Sampled, SingularLoop
+from controller.ranges import Member, Region, regions
 from design.conditions import least_multiple, this_environment, this_environment_demand
 from design.frequency import frequencies, hermitian, on_circle, supremum
 from design.result import Requirement, refusal

@@ -28,7 +28,7 @@ from controller.loop import Loop
 from controller.lti import Array, Lti
 from design.conditions import even_damping, regular_part, uncovered
 from design.frequency import frequencies, hermitian, on_circle, supremum
-from design.result import Attempt, DesignFailed, Infeasible
+from design.result import DesignFailed, Infeasible
 
 if TYPE_CHECKING:  # most of a second: loaded where it is used
     import cvxpy as cp
@@ -115,6 +115,17 @@ LADDER = (
     _Settings("loose", "CLARABEL", {**_LOOSE, "static_regularization_constant": 1e-7}),
 )
 CROSS_CHECK = _Settings("splitting", "SCS", {"eps_abs": 1e-7, "eps_rel": 1e-7, "max_iters": 200_000})
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What one rung of the ladder gave."""
+
+    settings: str
+    status: str
+    value: float | None  # the objective, None where the attempt was refused
+    wall_s: float
+    reason: str | None = None  # why it was refused
 
 
 def solve(

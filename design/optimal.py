@@ -16,9 +16,10 @@ import msgspec
 import numpy as np
 
 from controller.coupling import NO_PAIRS, Coupling, ForceFilter, NoCoupling
-from controller.environment import Network, Ranges
+from controller.environment import Network
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
+from controller.ranges import Ranges
 from design import program
 from design.certificate import prove, prove_limiter
 from design.conditions import this_environment as requirement_of

@@ -15,16 +15,10 @@ from typing import Annotated, Any, Literal, TypeVar
 import msgspec
 
 from controller.coupling import Coupling, Form, Strict, require_channels
-from controller.loop import Loop, named_first, named_today
+from controller.loop import Loop
+from controller.older import CONDITIONS, GUARANTEES, named_first, named_today
 from design.files import InputError, read, write
-from design.result import OLDER_NAMES, Condition
-
-# ----------------------------------------------------------------------------------------------------
-# The file in which a coupling is kept: the loop it was made for, its coefficients and its certificate, as JSON.
-#
-# Numbers are plain decimals, rationals are strings "p/q". Reading is strict: an unknown or ill-typed field is an
-# error that names it.
-
+from design.result import Condition
 
 _Rows = tuple[tuple[float, ...], ...]
 
@@ -34,7 +28,7 @@ _Rational = Annotated[str, msgspec.Meta(pattern=r"^-?[0-9]+(/[0-9]+)?$", max_len
 
 #: for which environments a certificate holds
 Guarantee = Literal["any passive environment", "these ranges", "this environment"]
-_OLDER_GUARANTEES = {"a set": "these ranges"}
+_OLDER = CONDITIONS | GUARANTEES
 
 
 _Part = TypeVar("_Part", bound=msgspec.Struct)
@@ -114,7 +108,7 @@ def _canonical(part: Any) -> bytes:
 
 def sealed(certificate: Certificate) -> Certificate:
     """The certificate with the digest of all its other fields, named as in the first files."""
-    older: dict[str, Any] = {name: before for before, name in (OLDER_NAMES | _OLDER_GUARANTEES).items()}
+    older: dict[str, Any] = {name: before for before, name in _OLDER.items()}
     plain = _read_back(msgspec.structs.replace(certificate, seal=""))
     guarantee = older.get(plain.guarantee, plain.guarantee)
     first = msgspec.structs.replace(plain, condition=older[plain.condition], guarantee=guarantee)
@@ -144,10 +138,9 @@ def _renamed(content: bytes) -> bytes:
         whole = msgspec.json.decode(content)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return content
-    older = OLDER_NAMES | _OLDER_GUARANTEES
     match whole:
         case {"certificate": dict() as claim}:
-            claim |= {key: older[word] for key, word in claim.items() if isinstance(word, str) and word in older}
+            claim |= {key: _OLDER[word] for key, word in claim.items() if isinstance(word, str) and word in _OLDER}
     match whole:
         case {"loop": dict() as loop}:
             whole["loop"] = named_today(loop)

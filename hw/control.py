@@ -338,7 +338,7 @@ def overlong_tick(caps: Sequence[float], delta: Sequence[float]) -> float:
     return sum(f * f / (4 * d) for f, d in zip(caps, delta, strict=True))
 
 
-class Program(Protocol):
+class Armable(Protocol):
     """What a session can be armed with."""
 
     @property

@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.coupling import Form
-from controller.loop import named_today
 from controller.lti import Array
+from controller.older import named_today
 from design.files import plain, read_arrays, write, write_json
-from hw.control import BudgetPlan, CertifiedCoupling, Controller, Program, SentBudget, TraceRow, host_controller
+from hw.control import Armable, BudgetPlan, CertifiedCoupling, Controller, SentBudget, TraceRow, host_controller
 from hw.limits import SafetyLimits, SafetyStop, Units, shape
 from hw.protocol import NO_MARGIN, Config
 from hw.session import Session
@@ -341,7 +341,7 @@ def save(out: Path, session: Session, recorder: Recorder, report: SessionReport,
     return files
 
 
-def _recipe_of(session: Session, program: Program, config: Config) -> dict[str, Any]:
+def _recipe_of(session: Session, program: Armable, config: Config) -> dict[str, Any]:
     """What hw.replay needs to repeat one arming."""
     assert isinstance(program, CertifiedCoupling)
     return {

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from hw import protocol as wire
-from hw.control import Program
+from hw.control import Armable
 from hw.limits import SafetyStop, Stage
 from hw.monitor import Ages
 from hw.session import Said, Session
@@ -51,7 +51,7 @@ class HapticDevice(Protocol):
         ...
 
 
-class Port(Protocol):
+class BytePort(Protocol):
     """A port for bytes. Every method raises PortLost where the port is gone."""
 
     def wait(self, seconds: float) -> bool:
@@ -71,7 +71,7 @@ class Port(Protocol):
 class SerialDevice:
     """A device at a serial port, which has the clock."""
 
-    def __init__(self, port: Port, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, port: BytePort, clock: Callable[[], float] = time.monotonic) -> None:
         self._port, self._clock = port, clock
         self._decoder, self._waiting = wire.Decoder(), list[wire.Message]()
         self._question: wire.Hello | wire.Config | None = None
@@ -140,7 +140,7 @@ class Driver:
         self,
         session: Session,
         device: HapticDevice,
-        plan: Callable[[Ages], Sequence[Program]],
+        plan: Callable[[Ages], Sequence[Armable]],
         clock: Callable[[], int],
     ) -> None:
         """`plan` gives couplings for the delay that was measured, `clock` the time [us]."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from hw import protocol as wire
-from hw.control import BudgetPlan, Drive, Program, SentBudget, TraceRow
+from hw.control import Armable, BudgetPlan, Drive, SentBudget, TraceRow
 from hw.limits import (
     DRIVING,
     ENDED,
@@ -68,10 +68,10 @@ class Session:
         self.log: list[_Event] = []
         self.info: wire.Info | None = None  # what the device is; None before it said so
         self.config: wire.Config | None = None  # how the device was asked to run, last
-        self.programs: tuple[Program, ...] = ()
-        self.program: Program | None = None
+        self.programs: tuple[Armable, ...] = ()
+        self.program: Armable | None = None
         self.drive: Drive | None = None  # the coupling at work, from one arming to the next end
-        self.armings: list[tuple[Program, wire.Config]] = []  # what forces came from, arming by arming
+        self.armings: list[tuple[Armable, wire.Config]] = []  # what forces came from, arming by arming
         self.budgets: list[SentBudget] = []  # arming by arming, where the settings ask for one
         self.record: Callable[[TraceRow], None] = lambda row: None
         self.listen: Callable[[_Event], None] = lambda event: None
@@ -119,7 +119,7 @@ class Session:
         self.now = now
         self._enter(Stage.CONNECTING, "HELLO")
 
-    def load(self, programs: Sequence[Program], now: int) -> Said:
+    def load(self, programs: Sequence[Armable], now: int) -> Said:
         """Take the couplings for the measured delay, the fastest first; the device is told its theta."""
         self.now = now
         if self.stage != Stage.MEASURED:

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 from controller.coupling import Coupling
 from controller.lti import Array
-from design.result import Design, number, of_kind, one_of, whole
+from design.arguments import number, of_kind, one_of, whole
+from design.result import Design
 from sim import crowds
 from sim.couplings import given, limits_of
 from sim.engines import INTEGRATORS

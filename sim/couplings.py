@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from controller.coupling import Coupling, NoCoupling
+from controller.coupling import PUBLISHED, Coupling, NoCoupling
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
+from design.api import COUPLING, bare
 from design.certificate import assess, verify
 from design.coverage import Limits, covered_limits
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.guarantees import switching_guarantee
-from design.result import COUPLING, PUBLISHED, Design, DesignFailed, Requirement, bare
+from design.result import Design, DesignFailed, Requirement
 from design.stored import Certificate, LimiterCertificate, Stored, load
 from sim import design_cache
 from sim.scenario import InputError, Scenario

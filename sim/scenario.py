@@ -21,8 +21,11 @@ import msgspec
 import numpy as np
 
 from controller.delay import VaryingDelay
-from controller.environment import Network, Ranges, Spring, UncertainSpring, Wall, environment
-from controller.loop import DelayRange, Loop, named_first, named_today
+from controller.environment import Network, Spring, Wall, environment
+from controller.loop import DelayRange, Loop
+from controller.older import SCENARIOS as OLDER_SCENARIOS
+from controller.older import named_first, named_today
+from controller.ranges import Ranges, UncertainSpring
 from controller.timing import Periods, Timing, drawn
 from design.files import InputError, printable, read_text, toml, write
 from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
@@ -31,7 +34,6 @@ from models.human import Cross, Human, Link, MeasuredHand, Person, Population, P
 CASES = ("none", "I", "II")
 SCENARIOS = Path(__file__).parent / "scenarios"
 DEFAULT = "omega-pair"
-OLDER_SCENARIOS = {"omega-pair-box": "omega-pair-ranges"}  # older name -> the name of today
 
 LONGEST_DELAY = 1000  # [samples]; every one is a state
 _MOST_DELAYS = 1000  # of all channels together: the eigenvalues of so many states take ten seconds, of 2000 a minute

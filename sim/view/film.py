@@ -52,7 +52,7 @@ def painter(draw: str, scene: Scene, force_limit: Array) -> tuple[Flat | Offscre
         if draw == "gl":
             raise InputError(f"--draw gl: {error}") from None
         return Flat(scene, force_limit), "flat", [f"{error}: the bodies are drawn flat"]
-    return Offscreen(drawn.Stage(scene, force_limit), name), name, []
+    return Offscreen(drawn.ShownScene(scene, force_limit), name), name, []
 
 
 class NoOffscreen(Exception):
@@ -77,7 +77,7 @@ def backend() -> str:
 class Offscreen:
     """Renders frames of a stage."""
 
-    def __init__(self, stage: drawn.Stage, name: str) -> None:
+    def __init__(self, stage: drawn.ShownScene, name: str) -> None:
         """`name` is what backend() gave."""
         self.stage = stage
         width, height = drawn.SIZE

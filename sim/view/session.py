@@ -108,7 +108,7 @@ class Frame:
     factor: float  # simulated over real time
 
 
-class Session:
+class LiveLoop:
     """The closed loop, advanced to wherever the clock is."""
 
     def __init__(

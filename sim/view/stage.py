@@ -147,7 +147,7 @@ def _list(values: tuple[int, ...]) -> str:
     return ", ".join(map(str, values))
 
 
-class Stage:
+class ShownScene:
     """A scene that can be looked at, and pushed with the mouse."""
 
     def __init__(self, scene: Scene, force_limit: Array, size: tuple[int, int] = SIZE) -> None:

@@ -19,8 +19,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from controller.coupling import CASE_I
 from controller.lti import Array
-from design.result import CASE_I
 from models.scene import actuation, tendon_jacobian
 from sim.engines import EXPONENTIAL
 from sim.run import Simulation, assemble, make_engine, outside_forces, run

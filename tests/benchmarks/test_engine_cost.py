@@ -13,8 +13,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from controller.coupling import CASE_I
 from controller.tick import StepBuffer
-from design.result import CASE_I
 from models.device import CompliantDevice
 from models.scene import plant, variants
 from sim.crowds import crowds

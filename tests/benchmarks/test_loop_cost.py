@@ -11,8 +11,7 @@ import pytest
 from msgspec.structs import replace
 
 from controller.complementarity import BoxProblem
-from controller.coupling import SpringDamper
-from design.result import CASE_I
+from controller.coupling import CASE_I, SpringDamper
 from sim.run import assemble, run
 from sim.scenario import load
 

@@ -8,10 +8,9 @@ import time
 import numpy as np
 import pytest
 
-from controller.coupling import NoCoupling
+from controller.coupling import CASE_I, NoCoupling
 from controller.tick import StepBuffer
 from design.conditions import this_environment
-from design.result import CASE_I
 from models.scene import variants
 from sim.adversary import attempts
 from sim.crowds import crowds

@@ -11,15 +11,15 @@ from worlds import PAIR, SOFT
 
 from cli.audit import main
 from cli.options import execute
-from controller.coupling import Compliance, Coupling, NoCoupling, SpringDamper
-from controller.environment import FIGURE_4, GROUND, RIGID_WALL, Network, Ranges, Spring
+from controller.coupling import CASE_I, Compliance, Coupling, NoCoupling, SpringDamper
+from controller.environment import FIGURE_4, GROUND, RIGID_WALL, Network, Spring
 from controller.loop import Loop
 from controller.lti import Lti
+from controller.ranges import Ranges
 from design import certificate, frequency, stored
 from design.api import certify
 from design.audit import MOST_EXTRA_SAMPLES, edge, remedies, report, requirement, stiffest, tolerance
 from design.guarantees import ANY, CAVEATS, guarantee_of
-from design.result import CASE_I
 
 CONDITIONS = ("this-environment", "any-environment")
 T = 1.2e-3

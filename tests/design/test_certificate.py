@@ -9,7 +9,7 @@ import pytest
 from worlds import PAIR, SOFT, SOFT_NETWORK, STIFF
 
 from controller import coupling as controller_coupling
-from controller.coupling import Compliance, ComplianceForm, InternalModelForm, NoCoupling, SpringDamper
+from controller.coupling import PUBLISHED, Compliance, ComplianceForm, InternalModelForm, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, Network, Spring, Wall
 from controller.loop import DelayRange, Loop
 from controller.lti import Lti, SingularLoop, rational
@@ -19,7 +19,7 @@ from design.certificate import Verdict, prove, required_damping, verify
 from design.conditions import this_environment
 from design.files import InputError
 from design.frequency import frequencies, on_circle, rounding
-from design.result import PUBLISHED, NotProved, from_ratio
+from design.result import NotProved, from_ratio
 from design.stored import Stored, digest, load, save, sealed
 from sim.random_loops import proofs
 from sim.scenario import load as scenario

@@ -13,7 +13,7 @@ from driven import driven
 from scipy.signal import dlsim, lfilter
 from worlds import SOFT, STIFF
 
-from controller.coupling import NoCoupling, SpringDamper
+from controller.coupling import CASE_I, CASE_II, NoCoupling, SpringDamper
 from controller.environment import FIGURE_4, GROUND, Network, Spring, environment
 from controller.limiter import limited
 from controller.loop import Loop, force_map
@@ -21,10 +21,10 @@ from controller.lti import Lti
 from design.conditions import any_environment, this_environment
 from design.lmi import Infeasible, Shaping, least_multiplier
 from design.multipliers import limiter_lag
-from design.result import CASE_I, CASE_II, PRINTED_TAU_DB
 from design.spring_damper import step
 from models.device import RigidDevice
 from models.human import Human, Link, Population
+from sim.report import PRINTED_TAU_DB
 from sim.run import assemble, make_engine, run
 from sim.scenario import load
 from sim.stability import close, dominant_mode

@@ -8,13 +8,13 @@ import pytest
 
 from cli import compare as command
 from cli.compare import main
+from controller.coupling import CASE_I
 from controller.environment import environment
 from controller.loop import force_map
 from design import compare as limit_curve
 from design.compare import AXES, LADDERS, SHORT, Point, ladder_row, measured, optimum, points_along, remembered
 from design.conditions import this_environment
 from design.program import LADDER, Options
-from design.result import CASE_I
 from sim.plots import plot_limits
 from sim.scenario import InputError, load
 

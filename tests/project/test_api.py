@@ -17,7 +17,7 @@ import sim
 from cli.run import main as run_command
 from cli.validate import main as validate_command
 from controller.coupling import NoCoupling, SpringDamper
-from design import Options, certify, design_coupling, guarantee, transparency_of
+from design import DesignOptions, certify, design_coupling, guarantee, transparency_of
 from design.designs import KINDS
 from hw import rehearse
 from models.device import RigidDevice
@@ -70,7 +70,7 @@ def test_the_options_are_those_that_the_designs_take():
     assert set(KINDS["spring-damper"].options) - {"limiter"} < set(signature(spring_damper.design).parameters)
     own = {field.name for field in fields(optimal.program.Options)} - {"ladder"}
     assert set(KINDS["optimal"].options) == {*own, "switching"}
-    assert set(Options.__annotations__) == {name for kind in KINDS.values() for name in kind.options}
+    assert set(DesignOptions.__annotations__) == {name for kind in KINDS.values() for name in kind.options}
 
 
 def test_guarantee_and_transparency_are_those_of_the_commands(tmp_path):

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from driven import driven
 
-from controller.coupling import NoCoupling
-from design.result import CASE_I
+from controller.coupling import CASE_I, NoCoupling
 from models.scene import plant
 from sim import engines as mujoco_engine
 from sim import run as loop

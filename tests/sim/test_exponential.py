@@ -10,9 +10,8 @@ import pytest
 from driven import Driven, driven, tick_by_tick
 from scipy.linalg import expm
 
-from controller.coupling import NoCoupling
+from controller.coupling import CASE_I, NoCoupling
 from controller.tick import Process, StepBuffer
-from design.result import CASE_I
 from models.device import CompliantDevice
 from models.human import Human, Link
 from models.scene import Crowd, Plant, plant, variants

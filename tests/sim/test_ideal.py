@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cli.run import main
-from controller.coupling import NoCoupling, SpringDamper
-from design.result import CASE_I
+from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from sim.accuracy import ForceError, force_error, response
 from sim.run import Simulation, assemble, run
 from sim.scenario import load

@@ -130,7 +130,7 @@ class _Never(Executor):
 def test_the_live_window_runs_it_as_the_simulator_does(files, form):
     scenario, _, path = files[form]
     shown = first_loop(Menu("I", given=str(path)), scenario, GIVEN)
-    running = live.Session(shown, _Never(), (), np.inf)
+    running = live.LiveLoop(shown, _Never(), (), np.inf)
     frame = running.frame(0.25)
     ticks = round(frame.t / scenario.T)
     record = close_loop(shown.simulation, "exact", ticks=ticks + 1)

@@ -8,9 +8,8 @@ import pytest
 
 from cli.run import main
 from cli.validate import main as validate_command
-from controller.coupling import NoCoupling
+from controller.coupling import CASE_I, NoCoupling
 from design import design_coupling
-from design.result import CASE_I
 from models.human import Human, Link, Person, Port, state_space
 from models.scene import variants
 from sim import load, simulate, validate

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from design.result import CASE_I
+from controller.coupling import CASE_I
 from sim.run import assemble, outside_forces
 from sim.scenario import load
 

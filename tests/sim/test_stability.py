@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from controller.coupling import NoCoupling
-from design.result import CASE_I, CASE_II
+from controller.coupling import CASE_I, CASE_II, NoCoupling
 from sim.run import assemble, run
 from sim.scenario import load
 from sim.stability import NOT_EXCITED, Mode, close, dominant_mode, left_eigenvector, measured_growth, verdict

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cli.run import main
-from controller.coupling import NoCoupling
-from design.result import CASE_I
+from controller.coupling import CASE_I, NoCoupling
 from models.device import CompliantDevice
 from models.human import Human, Link, Person
 from models.scene import plant

@@ -14,8 +14,7 @@ from driven import driven
 
 from cli import run as run_command
 from cli.validate import _Traces, main
-from controller.coupling import NoCoupling, SpringDamper
-from design.result import CASE_I
+from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from models.device import RigidDevice
 from models.human import Person
 from models.scene import Crowd, build, plant, variants

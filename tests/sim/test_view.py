@@ -26,8 +26,8 @@ from sim.stability import close, dominant_mode
 from sim.view import film
 from sim.view.events import GIVEN, KEYS, Delay, Menu, Push, Restart, changed, first_loop, parse_script, words
 from sim.view.film import Flat
-from sim.view.session import DAMPING, STIFFNESS, Grip, Pace, Session, gripped
-from sim.view.stage import COLUMNS, Stage, apart, channels, dressed, envelope, keys_help, overlay, places, scale
+from sim.view.session import DAMPING, STIFFNESS, Grip, LiveLoop, Pace, gripped
+from sim.view.stage import COLUMNS, ShownScene, apart, channels, dressed, envelope, keys_help, overlay, places, scale
 from sim.view.window import loop, typed
 
 SCENARIO = load()
@@ -68,7 +68,7 @@ def published():
 
 
 def session(prepared, script="", patience=np.inf):
-    return Session(prepared, Inline(), parse_script(script, 2) if script else (), patience)
+    return LiveLoop(prepared, Inline(), parse_script(script, 2) if script else (), patience)
 
 
 def press(running, *names):
@@ -182,7 +182,7 @@ def test_keys_that_cannot_be_met_leave_the_loop_running(none):
 
 def test_the_loop_goes_on_while_a_coupling_is_made(none):
     later = Later()
-    running = Session(none, later)
+    running = LiveLoop(none, later)
     press(running, "7", "Up")
     frame = running.frame(0.1)
     assert (frame.t > 0.09, frame.prepared.label, frame.note) == (True, "none", "theta+1: being made")
@@ -261,7 +261,7 @@ def test_the_mouse_draws_the_handle_and_lets_it_go():
 
 
 def test_the_viewer_s_selection_is_a_grip(none):
-    stage = Stage(none.simulation.scene, none.simulation.process.force_limit)
+    stage = ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     q = np.array([0.001, 0.002, 0.003, 0.004])
     stage.show(q)
     perturb = mujoco.MjvPerturb()
@@ -380,8 +380,8 @@ class FakeWindow:
 
 def test_the_window_s_loop_without_the_window(none):
     """Frames come at 60 Hz of an injected clock, the mouse reaches the session, the words reach the window."""
-    running = Session(none, Inline())
-    stage = Stage(none.simulation.scene, none.simulation.process.force_limit)
+    running = LiveLoop(none, Inline())
+    stage = ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     window, time = FakeWindow(40, stage), [100.0]
 
     def sleep(seconds):
@@ -407,13 +407,13 @@ def test_the_window_s_loop_without_the_window(none):
 
 
 def test_the_window_s_loop_ends_when_it_should(none):
-    stage = Stage(none.simulation.scene, none.simulation.process.force_limit)
+    stage = ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     window, time = FakeWindow(1000, stage), [0.0]
 
     def sleep(seconds):
         time[0] += 0.1
 
-    loop(Session(none, Inline()), stage, window, lambda: time[0], sleep, until=0.55)
+    loop(LiveLoop(none, Inline()), stage, window, lambda: time[0], sleep, until=0.55)
     assert window.synced == 7
 
 
@@ -477,7 +477,7 @@ def backend():
 
 def test_pictures_by_opengl(backend, none):
     """The scene above, the forces below; the handles move with the positions."""
-    stage = Stage(none.simulation.scene, none.simulation.process.force_limit)
+    stage = ShownScene(none.simulation.scene, none.simulation.process.force_limit)
     painter = film.Offscreen(stage, backend)
     try:
         frame = session(none).frame(0.05)
