@@ -185,7 +185,7 @@ def test_periods_are_drawn_by_the_seed_that_is_reported():
         (lambda: validate(SHORT, engine="magic"), "engine is 'magic', allowed are exact, mujoco, both"),
         (lambda: validate(SHORT, duration=1e-3), "duration is 0.001, allowed are 0 and 0.0048 s or more"),
         (lambda: validate(SHORT, shards=0), "shards is 0"),
-        (lambda: validate(SHORT.replace(device=(RigidDevice(friction=0.2),) * 2)), r"device\[0\].friction is 0.2 N"),
+        (lambda: validate(SHORT.replace(device=(RigidDevice(friction=0.2),) * 2)), r"device #1.friction is 0.2 N"),
         (lambda: design_coupling(SHORT.loop("I"), "rubber"), "kind is 'rubber', allowed are spring-damper"),
         (lambda: rehearse(SHORT.replace(delta=(0.0, 0.0))), r"delta is \[0.0, 0.0\]: a device without damping"),
         (lambda: rehearse(SHORT, case="none"), "case is 'none', allowed are I, II"),
