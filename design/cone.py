@@ -16,7 +16,7 @@ import numpy as np
 import scipy  # its parts load when they are used
 
 from controller.lti import Array, Complex
-from design.result import Attempt, DesignFailed, Infeasible
+from design.result import DesignFailed, Infeasible
 
 #: Largest negative eigenvalue that is taken for rounding; problems are posed in units where 1 is large.
 _TOLERANCE = 1e-4
@@ -39,6 +39,17 @@ LADDER = (
     _Settings("as given", {"equilibrate_enable": False, "chordal_decomposition_enable": False}),
     _Settings("loose", {**_LOOSE, "static_regularization_constant": 1e-7}),
 )
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What one rung of the ladder gave."""
+
+    settings: str
+    status: str
+    value: float | None  # the objective, None where the attempt was refused
+    wall_s: float
+    reason: str | None = None  # why it was refused
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,9 +22,10 @@ from controller.coupling import Compliance, SpringDamper
 from controller.loop import Loop
 from controller.lti import Array, Lti
 from design import lmi, spring_damper
+from design.arguments import of_kind, one_of, whole
 from design.cone import Block, Problem
 from design.frequency import on_circle
-from design.result import METHODS, Design, DesignFailed, Requirement, of_kind, one_of, whole
+from design.result import Design, DesignFailed, Requirement
 
 # ----------------------------------------------------------------------------------------------------
 # State-space couplings of fixed order, in a realisation where both conditions are affine.
@@ -34,6 +35,9 @@ from design.result import METHODS, Design, DesignFailed, Requirement, of_kind, o
 # are all affine in (A, B, V1). That loses nothing where F has full row rank: any such F is reached by a change of
 # state.
 
+
+#: How such a coupling may be sought.
+_METHODS = ("complementarity", "inner", "fixed-poles")
 
 #: Poles given to states beyond the first of a channel, which a spring-damper does not have.
 _MOST_STATES = 10  # per channel: each adds a row and a column to every cone
@@ -454,7 +458,7 @@ def design(
     """
     whole("order", order, 1, _MOST_STATES)
     of_kind("diagonal", diagonal, bool, "True or False")
-    one_of("method", method, METHODS)
+    one_of("method", method, _METHODS)
     if method == "fixed-poles" and (order, diagonal) != (1, True):
         raise ValueError("method 'fixed-poles' is for one state per channel, diagonal")
     started = time.perf_counter()

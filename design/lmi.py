@@ -28,12 +28,12 @@ from design.cone import Block, Problem
 from design.frequency import frequencies, hermitian, on_circle, supremum
 from design.result import DesignFailed, Infeasible
 
-#: Designs ask for (1 - RESERVE) of the damping that there is, so that they are certified as stored.
+#: Designs ask for (1 - RESERVE) of the available damping, so that they are certified as stored.
 RESERVE = 1e-4
 
 
 def usable(loop: Loop) -> Array:
-    """(m,) the damping that a design may spend [N s/m], where periods are even. Raises ValueError where it is none."""
+    """(m,) the damping that a design may spend [N s/m], in even periods. Raises ValueError where there is none."""
     if min(loop.delta) <= 0:
         raise ValueError(f"delta is {list(loop.delta)}, expected positive dampings in N s/m")
     return (1 - RESERVE) * even_damping(loop.delta, loop.T, loop.T_max)

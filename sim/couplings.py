@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from controller.coupling import Coupling, NoCoupling
+from controller.coupling import PUBLISHED, Coupling, NoCoupling
 from controller.loop import DelayRange, Loop
 from controller.lti import Array
+from design.api import COUPLING, bare
 from design.certificate import assess, verify
 from design.coverage import Limits, covered_limits
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.guarantees import switching_guarantee
-from design.result import COUPLING, PUBLISHED, Design, DesignFailed, Requirement, bare
+from design.result import Design, DesignFailed, Requirement
 from design.stored import Certificate, LimiterCertificate, Stored, load
 from sim import design_cache
 from sim.scenario import InputError, Scenario
@@ -114,7 +115,7 @@ def limits_of(
 
 
 def read_coupling(path: str | Path) -> Stored:
-    """A stored coupling. Raises InputError where there is none that can be read."""
+    """A stored coupling. Raises InputError where it cannot be read."""
     stored = load(path)
     try:
         stored.built()
@@ -135,7 +136,7 @@ def fitted(stored: Stored, path: str, channels: int, T: float) -> Coupling:
 
 @dataclass(frozen=True)
 class _FileCheck:
-    """What a coupling's file is worth in a loop."""
+    """Whether a coupling's file proves anything in this loop."""
 
     notes: tuple[str, ...]  # what a reader should know of it
     switching: DelayRange | None = None  # the file proves that any switching of the delays within it is safe here

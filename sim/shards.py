@@ -38,7 +38,7 @@ _AHEAD = 4  # batches in hand for every worker: results are put away before othe
 
 
 class Table:
-    """What is known of every human, a column each: in memory, or in a file that is mapped only while it is used."""
+    """The findings, a column for each figure: in memory, or in a file that is mapped only while it is used."""
 
     def __init__(self, question: Validation, folder: Path | None = None, resume: bool = False) -> None:
         """With `resume` the unfinished file of the same question goes on. Raises InputError where there is none."""
@@ -171,7 +171,7 @@ def _pool(question: Validation, table: Table, missing: list[int], shards: int, p
 
 
 def _finished(running: dict[Future[Findings], int], table: Table) -> int:
-    """Put away what is done besides; how many batches that were."""
+    """Store the other batches that are finished, and return their number."""
     ready = [future for future in running if future.done() and not future.cancelled() and not future.exception()]
     for future in ready:
         table.put(running[future], future.result())
@@ -179,7 +179,7 @@ def _finished(running: dict[Future[Findings], int], table: Table) -> int:
 
 
 def as_worker() -> None:
-    """Ctrl-C reaches every process of a terminal, and only the one that merges may act on it; a worker ends with it."""
+    """Ignore Ctrl-C, which reaches every process of a terminal and is the parent's; end with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

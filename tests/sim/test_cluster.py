@@ -15,7 +15,7 @@ import pytest
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed (extra `dask`)")
 
-from design.result import CASE_I  # noqa: E402
+from controller.coupling import CASE_I  # noqa: E402
 from sim.crowds import BATCH, MIXED, Findings, Validation  # noqa: E402
 from sim.scenario import (  # noqa: E402
     InputError,
