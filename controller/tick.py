@@ -169,8 +169,8 @@ class StepBuffer:
             bounds += zip(limiter.sent_rows.tolist(), limiter.limit.tolist(), strict=True)
         within = limiter and self.net is None and (limiter.limit <= process.force_limit).all()
         #: whether a force may leave the tick that is more than the actuators have
-        self._clips = not within and bool((process.force_limit < np.inf).any())
-        if self._clips:
+        self.clips = not within and bool((process.force_limit < np.inf).any())
+        if self.clips:
             bounds += enumerate(process.force_limit.tolist())
         self._bounds = bounds if self._straight else []
 
@@ -227,7 +227,7 @@ class StepBuffer:
             self._line.carry(self.first + k, self.force[k])
         if self.net is not None:
             self.net.apply(self.first + k, self.force[k])
-        if self._clips:
+        if self.clips:
             self.process.applied(self.force[k], self.force[k])
 
     def ticking(self) -> Callable[[int], object]:
@@ -241,11 +241,11 @@ class StepBuffer:
             return None
         transition, seen, after, process = self._transition, self.law_input, self.law_output, self.process
         if not self._bounds:
-            if self._clips:
+            if self.clips:
                 return None
             return lambda k: transition(seen[k], after[k])
         # a single simulation spends its time in calls: its forces are looked at without numpy, of two channels by name
-        linear, force, clips = process.linear.dot, self.force, self._clips
+        linear, force, clips = process.linear.dot, self.force, self.clips
         first = self._width - process.channels
         asked = [(self._memory[first + i :: self._width, 0].data, -limit, limit) for i, limit in self._bounds]
         (one, low, high), (other, lowest, highest), *others = asked if len(asked) > 1 else 2 * asked

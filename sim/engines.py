@@ -68,9 +68,9 @@ class ExactEngine(_Exact):
         def advance(k: int) -> None:
             product(rows[k], states[k + 1])
 
-        self.advance, self.stretch = advance, None
-        if buffer.calm and self._plant.ndim == 2:
-            self.stretch = self._fused(buffer)
+        # what clips does so in long runs, and then bit for bit as tick by tick
+        straight = buffer.calm and not buffer.clips and self._plant.ndim == 2
+        self.advance, self.stretch = advance, self._fused(buffer) if straight else None
 
     def _fused(self, buffer: StepBuffer) -> Stretch:
         A, B = np.split(self._plant, [len(self._plant)], axis=1)
