@@ -23,7 +23,7 @@ from sim import passivity_layer as layer
 from sim.alternatives import Alternative, alternatives
 from sim.api import ScenarioRun, run_scenario
 from sim.couplings import NAMES, Chosen, choose
-from sim.engines import INTEGRATORS
+from sim.mujoco_engines import INTEGRATORS
 from sim.run import ENGINES, beginnings
 from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, ExactVerdict, Stability, stability_of

@@ -20,8 +20,10 @@ from controller.tick import Process, StepBuffer
 from controller.timing import Timing
 from controller.walls import State
 from design.files import unseen
+from models.hold import HeldPlant, at_the_latch, hold
 from models.scene import Scene, Variants
-from sim.engines import Engine, HeldPlant, MujocoBatchEngine, at_the_latch, hold, profiler_off, quiet_warnings
+from sim.engines import Engine
+from sim.mujoco_engines import MujocoBatchEngine, profiler_off, quiet_warnings
 from sim.run import Simulation, beginnings, make_engine, run_blocks
 from sim.trace import Trace
 

@@ -13,21 +13,13 @@ from scipy.linalg import expm
 from controller.coupling import CASE_I, NoCoupling
 from controller.tick import Process, StepBuffer
 from models.device import CompliantDevice
+from models.hold import expm_each, hold
 from models.human import Human, Link
 from models.scene import Crowd, Plant, plant, variants
-from sim import engines
+from sim import mujoco_engines
 from sim.accuracy import compare_engines, cross_check, pick
-from sim.engines import (
-    EXPONENTIAL,
-    INTEGRATORS,
-    Engine,
-    ExactBatchEngine,
-    MujocoBatchEngine,
-    MujocoEngine,
-    default_integrator,
-    expm_each,
-    hold,
-)
+from sim.engines import Engine, ExactEngine
+from sim.mujoco_engines import EXPONENTIAL, INTEGRATORS, MujocoBatchEngine, MujocoEngine, default_integrator
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, load
 from sim.stability import exact_growth
@@ -210,7 +202,7 @@ def test_many_hands_are_each_their_own_scene(substeps):
         own = assemble(SCENARIO.replace(human=crowd.humans(i)), CASE_I)
         alone = knocked(own, make_engine(own, "mujoco", EXPONENTIAL, substeps), 300, start[:, [i]]).s
         np.testing.assert_allclose(together[:, :, [i]], alone, rtol=1e-9, atol=1e-13)
-    exact = ExactBatchEngine(hold(held_by.plants(), SCENARIO.T), loop.process.force_limit)
+    exact = ExactEngine(hold(held_by.plants(), SCENARIO.T))
     np.testing.assert_allclose(together, knocked(loop, exact, 300, start).s, rtol=1e-9, atol=1e-13)
 
 
@@ -332,7 +324,7 @@ def test_runge_kutta_beside_the_run_finds_a_wrong_matrix(monkeypatch):
     assert (sound.integrator, sound.substeps, sound.agrees) == ("RK4", 4, True)
     assert sound.position_relative_rms < 1e-6  # of RK4 x 4 here
     assert abs(sound.growth_rate_difference_per_s) < 1e-3
-    monkeypatch.setattr(engines, "_rates", lambda scene, fields: 1.001 * plant(scene.model).A[None])
+    monkeypatch.setattr(mujoco_engines, "_rates", lambda scene, fields: 1.001 * plant(scene.model).A[None])
     wrong = cross_check(loop, run(loop, make_engine(loop, "mujoco", EXPONENTIAL, 1)), EXPONENTIAL, 1)
     assert wrong.position_relative_rms > 30 * sound.position_relative_rms
     assert abs(wrong.growth_rate_difference_per_s) > 1e-3
