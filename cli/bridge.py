@@ -26,7 +26,6 @@ from cli.session_cli import (
     limits_from,
     steady_scenario,
 )
-from design.certificate import CONDITIONS
 from design.files import plain, write_json
 from design.guarantees import CAVEATS, LATE
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
@@ -95,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     add_safety_options(parser)
     names = ", ".join(NAMES)
     parser.add_argument("--coupling", metavar="NAME|FILE", help=f"{names} or FILE.json (default spring-damper)")
-    parser.add_argument("--condition", choices=CONDITIONS, help="the condition that the certificate is about")
+    options.add_condition_option(parser)
     latch = "when forces act: at whole ticks (default), or as soon as they arrive, certified for the latency measured"
     parser.add_argument("--latch", choices=("tick", "arrival"), default="tick", help=latch)
     options.add_energy_budget_option(parser)
@@ -148,11 +147,12 @@ def _link(link: int, scenario: Scenario) -> str:
 
 def _ticks(ages: Ages, scenario: Scenario, caps: Sequence[float]) -> str:
     """How long ticks are, and what one longer than the certificate counts with may cost."""
-    least, most = (1e-3 * side(ages.ticks, default=1e6 * scenario.T) for side in (min, max))
+    least, most = (f"{1e-3 * side(ages.ticks, default=1e6 * scenario.T):.4g}" for side in (min, max))
+    span = least if least == most else f"{least} to {most}"
     longest = 1e3 * (scenario.T_max or scenario.T)
     cost = overlong_tick(caps, scenario.delta)
     return (
-        f"ticks of the device last {least:.4g} to {most:.4g} ms, certified are up to {longest:.4g} ms; one longer tick "
+        f"ticks of the device last {span} ms, certified up to {longest:.4g} ms; one longer tick "
         f"may give a hand at most {cost:.3g} mJ for every ms that it lasts (at the force cap)"
     )
 

@@ -269,7 +269,7 @@ def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: s
     add_condition_option(parser)
 
 
-def add_condition_option(parser: argparse._ActionsContainer, what: str = "that the certificate is about") -> None:
+def add_condition_option(parser: argparse._ActionsContainer, what: str = "the condition of the certificate") -> None:
     """--condition."""
     names = ",".join(older.CONDITIONS.values())
     help_ = f"{what}: {' or '.join(older.CONDITIONS.values())} (default: the coupling's own)"

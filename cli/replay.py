@@ -18,12 +18,12 @@ class _Compared:
 
     trace: str = render.figure("trace")
     ticks: int = render.figure("ticks")
-    filled_in: int = render.figure("filled in")
-    asked_differ: int = render.figure("asked differ")
-    sent_differ: int = render.figure("sent differ")
+    filled_in: int = render.figure("without an answer")
+    asked_differ: int = render.figure("other forces asked for")
+    sent_differ: int = render.figure("other forces sent")
     largest_difference_n: float = render.figure("largest difference [N]")
     first_difference_s: float | None = render.figure("first difference [s]")
-    identical: bool = render.figure("identical")
+    identical: bool = render.figure("identical", lambda same: "yes, bit by bit" if same else "no")
 
 
 def main(argv: list[str]) -> int:

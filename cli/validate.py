@@ -61,29 +61,25 @@ def _parser() -> options.Parser:
         "Test a loop with random passive humans in both engines, and search for the worst one.",
         "python -m sim.validate --case I --humans 200 --adversary",
     )
+    add, whole = parser.add_argument, options.whole
     options.add_loop_options(parser)
     options.add_varying_delay_options(parser)
     options.add_coupling_options(parser, ", ".join(NAMES))
     options.add_human_option(parser, " and `population`, whose draw(rng, n) gives n hands,")
     options.add_limiter_option(parser)
-    humans, count = "random humans per device (default 1000)", options.whole(1, 1_000_000)
-    parser.add_argument("--humans", type=count, default=1000, metavar="N", help=humans)
-    parser.add_argument("--links", choices=tuple(_LINKS), help="of each human (default: the scenario's population)")
-    parser.add_argument("--engine", choices=ENGINES, default="both", help="default both")
-    seconds = "of the traces (default 2; 0 for none)"
-    parser.add_argument("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)
-    shards = "local processes (default 1); the result is the same"
-    parser.add_argument("--shards", type=options.whole(1, 256), default=1, metavar="K", help=shards)
-    parser.add_argument("--dask", metavar="HOST:PORT", help="work on an existing Dask cluster; the result is the same")
-    again = "go on with what a run of the same words left unfinished in the folder"
-    parser.add_argument("--resume", action="store_true", help=again)
-    parser.add_argument("--adversary", action="store_true", help="also search for the worst passive human")
-    generations = "of the adversary's search (default 150)"
-    parser.add_argument("--generations", type=options.whole(1, 10_000), metavar="N", help=generations)
+    count = "random humans per device (default 1000)"
+    add("--humans", type=whole(1, 1_000_000), default=1000, metavar="N", help=count)
+    add("--links", choices=tuple(_LINKS), help="masses in each human (default: the scenario's population)")
+    add("--engine", choices=ENGINES, default="both", help="who decides (default both)")
+    seconds = "length of the traces (default 2; 0 for none)"
+    add("--duration", type=options.number(), default=2.0, metavar="SECONDS", help=seconds)
+    add("--shards", type=whole(1, 256), default=1, metavar="K", help="local processes, for the same result (default 1)")
+    add("--dask", metavar="HOST:PORT", help="work on an existing Dask cluster; the result is the same")
+    add("--resume", action="store_true", help="go on with what a run of the same words left unfinished in the folder")
+    add("--adversary", action="store_true", help="also search for the worst passive human")
+    add("--generations", type=whole(1, 10_000), metavar="N", help="length of that search (default 150)")
     met = "nominal (default), or ranges: in turn all vertices of the scenario's ranges and as many others inside"
-    parser.add_argument(
-        "--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met
-    )
+    add("--environments", choices=_ENVIRONMENTS, default="nominal", metavar="{nominal,ranges}", help=met)
     options.add_output_options(parser, picture=True)
     return parser
 
