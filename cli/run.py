@@ -138,12 +138,11 @@ def _alternatives(args: argparse.Namespace, scenario: Scenario, run: ScenarioRun
 def _side_by_side(others: list[Alternative], path: Path, names: tuple[str, ...]) -> Path:
     from sim.plots import Panel, plot_side_by_side
 
-    shown = [other for other in others if other.trace is not None and other.coupling != "published"]
-    panels = []
-    for other in shown:
-        assert other.trace is not None
-        assert other.ideal is not None
-        panels.append(Panel(_panel_title(other), other.trace, other.ideal, other.until_s))
+    panels = [
+        Panel(_panel_title(other), other.trace, other.ideal, other.until_s)
+        for other in others
+        if other.trace is not None and other.ideal is not None and other.coupling != "published"
+    ]
     return plot_side_by_side(panels, path, names)
 
 

@@ -34,7 +34,8 @@ def main(argv: list[str]) -> int:
     options.check_json(args)
     if args.video:
         check_film(Path(args.video))
-        _check_speed(args)
+        if args.video.endswith(".gif") and 100 % args.fps:  # GIF counts in hundredths of a second
+            raise InputError(f"--fps is {args.fps}, allowed for a .gif are the numbers that divide 100")
     label, script = _beginning(args, scenario.channels)
     # --case none begins without a coupling; those that keys bring are for case I
     given = args.coupling if label == GIVEN else None
@@ -157,12 +158,6 @@ def _parser() -> options.Parser:
     drawn = "by OpenGL, or flat without it (default: by what works)"
     add("--draw", choices=_DRAWN, default="auto", help=drawn)
     return parser
-
-
-def _check_speed(args: argparse.Namespace) -> None:
-    """Raises InputError; GIF counts in hundredths of a second."""
-    if args.video.endswith(".gif") and 100 % args.fps:
-        raise InputError(f"--fps is {args.fps}, allowed for a .gif are the numbers that divide 100")
 
 
 def _beginning(args: argparse.Namespace, channels: int) -> tuple[str, Script]:
