@@ -10,7 +10,7 @@ from cli import options, render
 from controller.coupling import NoCoupling
 from sim.accuracy import SETTINGS, Row, mark_front, measure, reference
 from sim.couplings import NAMES, choose, limits_of
-from sim.engines import EXPONENTIAL
+from sim.mujoco_engines import EXPONENTIAL
 from sim.run import Simulation, assemble
 from sim.scenario import InputError, require_even_ticks, require_linear
 from sim.stepping import NEUTRAL, default_substeps, step_radius

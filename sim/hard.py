@@ -7,8 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from controller.coupling import Coupling, SpringDamper
-from design.result import CASE_I
+from controller.coupling import CASE_I, Coupling, SpringDamper
 from models.device import CompliantDevice
 from models.human import Human, Link
 from sim.accuracy import position_error
@@ -103,8 +102,8 @@ def faults(loop: Simulation, integrator: str, substeps: int) -> dict[str, float]
     found = {"verdict": own - exact} if (own > 0) != (exact > 0) else {}
     if abs(own - exact) > GROWTH:
         found["growth"] = own - exact
-    if (error["position_relative_rms"] or 0.0) > POSITION:
-        found["position"] = error["position_relative_rms"]
+    if (apart := error.position_relative_rms) is not None and apart > POSITION:
+        found["position"] = apart
     return found
 
 

@@ -17,15 +17,16 @@ from typing import Any
 import numpy as np
 
 from controller.budget import EPS, EnergyBounding, EnergyBudget, PassivityControl, Shell
-from controller.contact import Limiter, contact, limited
 from controller.coupling import Coupling
 from controller.delay import LOST, Ticks, ages
+from controller.limiter import Limiter, limited
 from controller.loop import DelayRange
 from controller.lti import Array, Lti
-from controller.process import Net, Process
+from controller.tick import Net, Process
+from controller.walls import contact
 from design.result import Requirement
 from sim.run import Simulation
-from sim.scenario import Scenario
+from sim.scenario import InputError, Scenario
 from sim.switching import with_delays
 
 _HELD = 4  # ticks for which a device goes on holding a force, beyond the largest delay, where packets are lost
@@ -69,18 +70,18 @@ class Plugged:
     start: float = 0.0  # W0 [J]
 
 
-_Wanted = EnergyNet | Classic | Plugged
+Wanted = EnergyNet | Classic | Plugged
 
 
-def netted(simulation: Simulation, coupling: Coupling, wanted: _Wanted, ticks: int | None = None) -> Simulation:
+def netted(simulation: Simulation, coupling: Coupling, wanted: Wanted, ticks: int | None = None) -> Simulation:
     """The same loop with a net under it, for runs of up to `ticks` (default: the scenario's).
 
     What is linear about a loop, such as certificates and modes, ask the simulation without. Delays that vary are those
-    that it has. Raises ValueError for numbers that no budget can have.
+    that it has. Raises InputError for numbers that no budget can have.
     """
     scenario, process = simulation.scenario, simulation.process
     if scenario.latency:
-        raise ValueError("latency: a net counts forces that latch at ticks; count a whole sample of theta")
+        raise InputError("latency: a net counts forces that latch at ticks; count a whole sample of theta")
     delays, spans = process.delays, DelayRange(scenario.theta, scenario.theta)
     if delays is None:
         samples = scenario.samples if ticks is None else ticks
@@ -110,17 +111,20 @@ def _budget(wanted: EnergyNet, scenario: Scenario, process: Process, spans: Dela
     given: dict[str, Any] = {"eps": EPS, "start": wanted.start, "cap": wanted.cap, "nsim": nsim, "hold": hold}
     given["encoder_step"] = process.encoder_step
     longest = scenario.longest_period or scenario.T  # the most that a held force can lose grows with the period
-    budget = EnergyBudget(delta, longest, spans.lo, spans.hi, **given)
+    try:
+        budget = EnergyBudget(delta, longest, spans.lo, spans.hi, **given)
+    except ValueError as error:
+        raise InputError(f"energy budget: {error}") from None
     late = ages(process.delays) if lost else None
-    return _Budgeted(budget, wanted, process.force_limit, late, np.array(spans.hi) + hold)
+    return _Budgeted(budget, wanted, process, late, np.array(spans.hi) + hold)
 
 
 def _classic(wanted: Classic, scenario: Scenario, process: Process, spans: DelayRange, nsim: int) -> Net:
-    delta, limit = np.array(scenario.delta), process.force_limit
+    delta = np.array(scenario.delta)
     if wanted.name == "eba":
-        return _Bounded(EnergyBounding(delta, scenario.T, nsim=nsim), wanted.name, limit)
+        return _Bounded(EnergyBounding(delta, scenario.T, nsim=nsim), wanted.name, process)
     credit = delta if wanted.name.endswith(":delta") else None
-    return _Damped(PassivityControl(len(delta), scenario.T, delta=credit, nsim=nsim), wanted.name, limit)
+    return _Damped(PassivityControl(len(delta), scenario.T, delta=credit, nsim=nsim), wanted.name, process)
 
 
 def _shelled(wanted: Plugged, V: Lti | None, process: Process, nsim: int) -> Net:
@@ -128,7 +132,7 @@ def _shelled(wanted: Plugged, V: Lti | None, process: Process, nsim: int) -> Net
         raise ValueError("an environment of your own needs a coupling with a compliance V before it")
     if (process.encoder_step > 0).any():
         raise ValueError("an environment of your own needs ideal encoders: no shell is known for coarse ones")
-    return _Shelled(Shell(V, start=wanted.start, nsim=nsim), wanted, process.force_limit)
+    return _Shelled(Shell(V, start=wanted.start, nsim=nsim), wanted, process)
 
 
 def idle(simulation: Simulation, any_environment: Requirement, part: dict[str, Any]) -> str | None:
@@ -150,8 +154,8 @@ def idle(simulation: Simulation, any_environment: Requirement, part: dict[str, A
 class _InLoop:
     """What the nets have in common: forces within the actuators' limits, and how far the devices went meanwhile."""
 
-    def __init__(self, limit: Array) -> None:
-        self._limit = limit[:, None]
+    def __init__(self, process: Process) -> None:
+        self._within = process.applied
         self._before: Array | None = None
 
     def _moved(self, x: Array) -> Array:
@@ -159,15 +163,14 @@ class _InLoop:
         self._before = x.copy()
         return dx
 
-    def _within(self, force: Array) -> Array:
-        return np.clip(force, -self._limit, self._limit)
-
 
 class _Budgeted(_InLoop):
     """The budget; behind it devices that let go of a force that is too old."""
 
-    def __init__(self, budget: EnergyBudget, asked: EnergyNet, limit: Array, late: Ticks | None, oldest: Array) -> None:
-        super().__init__(limit)
+    def __init__(
+        self, budget: EnergyBudget, asked: EnergyNet, process: Process, late: Ticks | None, oldest: Array
+    ) -> None:
+        super().__init__(process)
         self._budget, self._asked, self._late, self._oldest = budget, asked, late, oldest[:, None]
         self._acted: Array | None = None
         self._dropped = 0
@@ -202,8 +205,8 @@ class _Budgeted(_InLoop):
 class _Shelled(_InLoop):
     """An environment of the user's own, its force within the actuators' limits, and the shell."""
 
-    def __init__(self, shell: Shell, asked: Plugged, limit: Array) -> None:
-        super().__init__(limit)
+    def __init__(self, shell: Shell, asked: Plugged, process: Process) -> None:
+        super().__init__(process)
         self._shell, self._asked = shell, asked
 
     def send(self, x: Array, force: Array, /) -> None:
@@ -232,8 +235,8 @@ class _Shelled(_InLoop):
 class _Bounded(_InLoop):
     """Energy bounding, at the computer."""
 
-    def __init__(self, bounding: EnergyBounding, name: str, limit: Array) -> None:
-        super().__init__(limit)
+    def __init__(self, bounding: EnergyBounding, name: str, process: Process) -> None:
+        super().__init__(process)
         self._net, self._name = bounding, name
 
     def send(self, x: Array, force: Array, /) -> None:
@@ -249,8 +252,8 @@ class _Bounded(_InLoop):
 class _Damped(_InLoop):
     """The passivity controller, at the devices."""
 
-    def __init__(self, control: PassivityControl, name: str, limit: Array) -> None:
-        super().__init__(limit)
+    def __init__(self, control: PassivityControl, name: str, process: Process) -> None:
+        super().__init__(process)
         self._net, self._name = control, name
         self._dx: Array = np.zeros(())
 

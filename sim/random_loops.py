@@ -22,7 +22,7 @@ from models.device import CompliantDevice, RigidDevice
 from models.human import Human, Population, Voluntary
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, Scenario
-from sim.stability import NOT_EXCITED, disagree, stability_part
+from sim.stability import NOT_EXCITED, disagree, stability_of
 from sim.stepping import settle
 
 _TOO_CLOSE = 1e-4  # of the damping: a proof needs some room
@@ -65,7 +65,7 @@ class _Proof:
     """One network, with half as much to one and a half times the damping that its loop asks for."""
 
     number: int
-    required: float  # of the damping that there is
+    required: float  # over the available damping
     proved: bool
     reason: str | None
 
@@ -92,7 +92,7 @@ def proofs(seed: int, count: int = 500) -> Iterator[_Proof]:
 
 
 @dataclass(frozen=True)
-class _Told:
+class _TraceVerdict:
     """What one run says of its stability, and what its eigenvalues say."""
 
     number: int
@@ -135,7 +135,7 @@ def _scenario(rng: np.random.Generator) -> Scenario:
     ).replace(tap=tap)
 
 
-def traces(seed: int, count: int = 460) -> Iterator[_Told]:
+def traces(seed: int, count: int = 460) -> Iterator[_TraceVerdict]:
     """Whether so many runs, half of them MuJoCo's, tell of their stability what their eigenvalues tell."""
     rng, number = np.random.default_rng(seed), 0
     while number < count:
@@ -146,9 +146,9 @@ def traces(seed: int, count: int = 460) -> Iterator[_Told]:
             trace = run(simulation, make_engine(simulation, engine, *settle(simulation, engine)[:2]))
         except InputError:  # no number of steps does, which is said
             continue
-        part = stability_part(simulation, trace)
-        growth, exact = part["growth_rate_per_s"], part["exact_growth_rate_per_s"]
-        silent, other = part.get("reason") == NOT_EXCITED, growth is not None and bool(disagree(exact, growth))
-        opposite = other or (growth is None and part["verdict"] not in (None, part["exact_verdict"]))
-        yield _Told(number, engine, exact, growth, part["verdict"], part.get("reason"), silent, not opposite)
+        part = stability_of(simulation, trace)
+        growth, exact = part.growth_rate_per_s, part.exact_growth_rate_per_s
+        silent, other = part.reason == NOT_EXCITED, growth is not None and bool(disagree(exact, growth))
+        opposite = other or (growth is None and part.verdict not in (None, part.exact_verdict))
+        yield _TraceVerdict(number, engine, exact, growth, part.verdict, part.reason, silent, not opposite)
         number += 1

@@ -1,33 +1,29 @@
-"""What a run and a validation came to, as plain data in SI units: null with a "reason" where a figure does not exist.
+"""Results of a run as plain data in SI units: null with a "reason" where a figure does not exist.
 
-The rows on the screen are made of it in the commands: cli/run.py, cli/validate.py.
+The rows on the screen are made of it in cli/run.py.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
-import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from controller.coupling import Coupling
+from controller.coupling import PUBLISHED, Coupling
 from controller.delay import LOST, Ticks, VaryingDelay, ages
-from controller.lti import Array
+from controller.older import CONDITIONS, with_older
 from controller.timing import Timing
 from design.certificate import assess
-from design.guarantees import ANY, CAVEATS, MAKING, encoder_part
-from design.result import OLDER_NAMES, PRINTED_TAU_DB, PUBLISHED, Requirement, certificate_part, finite, listed
+from design.guarantees import encoder_part
+from design.result import Requirement, certificate_part, finite, listed
 from design.transparency import Transparency, decibels
-from models.human import Human, Person
-from sim.adversary import Worst
 from sim.couplings import Chosen
-from sim.crowds import MIXED, Findings, Validation
 from sim.run import Simulation
 from sim.scenario import Scenario, load
-from sim.stability import close, dominant_mode, eigenvalue_part, linear_growth, unstable
+from sim.stability import Stability, close, dominant_mode, eigenvalues, linear_growth
 from sim.switching import Period, certified_part
 from sim.trace import Trace
 
@@ -38,7 +34,7 @@ from sim.trace import Trace
 def certificates_part(requirements: Mapping[str, Requirement]) -> dict[str, Any]:
     """Both conditions, each under its name and under the name that it had before: the same objects."""
     parts = {name: certificate_part(requirement) for name, requirement in requirements.items()}
-    return parts | {older: parts[name] for older, name in OLDER_NAMES.items() if name in parts}
+    return with_older(parts, CONDITIONS)
 
 
 def coupling_part(kind: str, coupling: Coupling, T: float) -> dict[str, Any]:
@@ -73,93 +69,66 @@ def encoder_steps(scenario: Scenario, case: str, coupling: Coupling) -> dict[str
 
 
 # ----------------------------------------------------------------------------------------------------
-# What a run was worth: one dictionary for machines, and the same as tables for people.
-
-
-def remarks(outcome: dict[str, Any]) -> list[str]:
-    """What a reader must know to read the figures rightly."""
-    lines = []
-    certificates = {name: outcome["certificates"][name] for name in ("any-environment", "this-environment")}
-    name = "any-environment" if outcome["certificate"]["condition"] == "any-environment" else "this-environment"
-    part = certificates[name]
-    if not part["certified"] and "reason" not in part:
-        worst = max(n / a for n, a in zip(part["required_damping"], part["available_damping"], strict=True))
-        condition = f"the {name} condition" + (" (the paper's Theorem 4)" if name == "any-environment" else "")
-        what = "The loop without coupling fails" if outcome["coupling"]["kind"] == "none" else "This coupling fails"
-        lines.append(f"{what} {condition}: it needs {worst:.3g} times the damping that the devices guarantee.")
-    if "contact" in outcome["stability"]:
-        covered = {ANY: "any-environment", MAKING: "this-environment"}.get(outcome["promise"], "no certificate")
-        slopes = listed(outcome["stability"]["contact"]["slopes_n_per_m"])
-        softer = f", and any walls with K + 2 B/T up to {slopes} N/m" if outcome["promise"] == MAKING else ""
-        lines.append(f"Contact that makes and breaks: {covered} covers it in this loop{softer}.")
-    for name in ("stability", "error", "transparency", "credible"):
-        if "reason" in outcome[name]:
-            lines.append(f"{name}: {outcome[name]['reason']}.")
-    for name, part in certificates.items():
-        if "reason" in part:
-            lines.append(f"{name}: {part['reason']}.")
-    if outcome.get("varying_delay"):
-        lines.append(f"Delays that vary: {outcome['varying_delay']['covers']}.")
-    if part := outcome.get("encoder"):
-        lines.append(f"{part['words'][0].upper()}{part['words'][1:]}.")
-    return [*lines, CAVEATS]
-
-
-# ----------------------------------------------------------------------------------------------------
 # What the paper prints beside what comes out here, for its own scenario.
 
 
+#: The transparency indices (25) printed beside the gains [dB]; no reading of Figure 4 that we tried gives them.
+PRINTED_TAU_DB = {"I": -4.15, "II": -3.09}
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """A figure of the paper, and what it is here."""
+
+    what: str
+    paper: str
+    here: str
+    why: str
+
+
 def beside_the_paper(
-    scenario: Scenario, case: str, stability: dict[str, Any], coupling: dict[str, Any]
-) -> list[dict[str, str]]:
-    """Rows of {what, paper, here, why}; empty where the loop is not the paper's."""
+    scenario: Scenario, case: str, stability: Stability, coupling: dict[str, Any]
+) -> tuple[PaperRow, ...]:
+    """Every figure that the paper prints of its loop; none where the loop is another."""
     if scenario.varying_delay or scenario.loop(case) != load().loop(case):
-        return []
+        return ()
     figure = _figure(case, stability)
-    return [figure] if case == "none" else [*_printed_gains(scenario, case, coupling), _tau(case), figure]
+    return (figure,) if case == "none" else (*_printed_gains(scenario, case, coupling), _tau(case), figure)
 
 
-def _printed_gains(scenario: Scenario, case: str, got: dict[str, Any]) -> list[dict[str, str]]:
+def _printed_gains(scenario: Scenario, case: str, got: dict[str, Any]) -> tuple[PaperRow, ...]:
     printed = PUBLISHED[case]
     need = assess(scenario.loop(case), printed)
     any_environment, this_environment = (need[name].required for name in ("any-environment", "this-environment"))
-    here = "none" if got["K"] is None else f"K = {listed(got['K'], 5)}, B = {listed(got['B'], 5)}"
-    return [
-        {
-            "what": "gains [N/m], [N s/m]",
-            "paper": f"K = {listed(printed.K, 5)}, B = {listed(printed.B, 5)}",
-            "here": here,
-            "why": "the printed gains are no solution of the paper's own problem (next row)",
-        },
-        {
-            "what": "damping that the printed gains need [N s/m]",
-            "paper": f"at most {listed(scenario.delta, 5)}",
-            "here": f"{listed(any_environment, 5)} by Theorem 4; {listed(this_environment, 5)} in this environment",
-            "why": "Theorem 4 as printed is strictly infeasible (E-hat has a pole at z = 1); mended, it refuses them",
-        },
-    ]
+    gains = PaperRow(
+        "gains [N/m], [N s/m]",
+        f"K = {listed(printed.K, 5)}, B = {listed(printed.B, 5)}",
+        "none" if got["K"] is None else f"K = {listed(got['K'], 5)}, B = {listed(got['B'], 5)}",
+        "the printed gains are no solution of the paper's own problem (next row)",
+    )
+    damping = PaperRow(
+        "damping that the printed gains need [N s/m]",
+        f"at most {listed(scenario.delta, 5)}",
+        f"{listed(any_environment, 5)} by Theorem 4; {listed(this_environment, 5)} in this environment",
+        "Theorem 4 as printed is strictly infeasible (E-hat has a pole at z = 1); mended, it refuses them",
+    )
+    return gains, damping
 
 
-def _tau(case: str) -> dict[str, str]:
-    return {
-        "what": "transparency index tau (25)",
-        "paper": f"{PRINTED_TAU_DB[case]} dB",
-        "here": "infinite",
-        "why": "inf sigma_min(E) = 0: moving both contacts together costs no static force",
-    }
+def _tau(case: str) -> PaperRow:
+    why = "inf sigma_min(E) = 0: moving both contacts together costs no static force"
+    return PaperRow("transparency index tau (25)", f"{PRINTED_TAU_DB[case]} dB", "infinite", why)
 
 
-def _figure(case: str, stability: dict[str, Any]) -> dict[str, str]:
-    growth = f"{stability['exact_growth_rate_per_s']:+.2f} 1/s at {stability['exact_frequency_hz']:.1f} Hz"
-    return {
-        "what": "Figure 5: no coupling" if case == "none" else "Figure 6: with a coupling",
-        "paper": "self-sustained oscillation" if case == "none" else "no oscillation",
-        "here": f"{stability['exact_verdict']}: {growth}",
-        "why": "agrees; masses and transmission of the devices are assumed: the paper's own first-order device is "
-        "stable with each of 200 pairs of hands"
-        if case == "none"
-        else "agrees; masses and stiffness of the devices are assumed",
-    }
+def _figure(case: str, stability: Stability) -> PaperRow:
+    growth = f"{stability.exact_growth_rate_per_s:+.2f} 1/s at {stability.exact_frequency_hz:.1f} Hz"
+    here = f"{stability.exact_verdict}: {growth}"
+    if case != "none":
+        why = "agrees; masses and stiffness of the devices are assumed"
+        return PaperRow("Figure 6: with a coupling", "no oscillation", here, why)
+    why = "agrees; masses and transmission of the devices are assumed: the paper's own first-order device is "
+    why += "stable with each of 200 pairs of hands"
+    return PaperRow("Figure 5: no coupling", "self-sustained oscillation", here, why)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -238,191 +207,23 @@ def timing_part(timing: Timing | None, scenario: Scenario) -> dict[str, Any] | N
     }
 
 
-def switched_stability_part(simulation: Simulation, trace: Trace, delays: dict[str, Any]) -> dict[str, Any]:
-    """As report.stability_part, for a loop that switches: it has no eigenvalue of its own but over a period."""
+def switched_stability(simulation: Simulation, trace: Trace, delays: dict[str, Any]) -> Stability:
+    """As stability_of, for a loop that switches: it has no eigenvalue of its own but over a period."""
     worst = delays["period"] or delays
-    constant = eigenvalue_part(dominant_mode(close(simulation.plant, simulation.F)))
-    verdict = "unstable" if trace.diverged or "unstable" in (worst["verdict"], delays["verdict"]) else "stable"
-    return {
-        "verdict": verdict,
-        "clipped_ticks": int(trace.clipped(simulation.process.force_limit).sum()),
-        "growth_rate_per_s": worst["growth_rate_per_s"],
-        "frequency_hz": trace.dominant_frequency_hz(),
-        **constant,
-        "reason": _how(delays)
-        + f"; the eigenvalues are those of the constant delay theta = {listed(simulation.scenario.theta)}",
-    }
+    constant = eigenvalues(dominant_mode(close(simulation.plant, simulation.F)))
+    grows = trace.diverged or "unstable" in (worst["verdict"], delays["verdict"])
+    theta = listed(simulation.scenario.theta)
+    return Stability(
+        **vars(constant),
+        verdict="unstable" if grows else "stable",
+        clipped_ticks=int(trace.clipped(simulation.process.force_limit).sum()),
+        growth_rate_per_s=worst["growth_rate_per_s"],
+        frequency_hz=trace.dominant_frequency_hz(),
+        reason=f"{_how(delays)}; the eigenvalues are those of the constant delay theta = {theta}",
+    )
 
 
 def _how(delays: dict[str, Any]) -> str:
     if delays["period"]:
         return f"growth by the eigenvalues of the product over the {delays['period']['ticks']} ticks of a period"
     return f"growth of the linear loop after an impulse, over {delays['judged_s']:.3g} s under the run's delays"
-
-
-# ----------------------------------------------------------------------------------------------------
-# What a validation found: one dictionary for machines, and the same as a table for people.
-
-
-_SETTLING = 4  # decay times of the slowest mode in a trace whose hands must be slower in its last quarter than before
-_ROUNDING = 1e-9  # W(N) may be this far below zero, beside the magnitudes that it adds up
-
-
-def validation_part(question: Validation, findings: Findings, certified: bool, wall: float) -> dict[str, Any]:
-    """The contract of `sim.validate --json`."""
-    bad, mujoco = unstable(findings.exact), question.engine != "exact"
-    disagreements = int(findings.disagreements.sum())
-    wrong = int((bad | (mujoco & unstable(findings.mujoco) & (findings.mujoco > 1e-3))).sum())
-    part: dict[str, Any] = {
-        "humans": int(findings.index.size),
-        "links": "mixed" if question.links == MIXED else question.links,
-        "seed": question.seed,
-        "engine": question.engine,
-        "unstable": {
-            "exact": int(bad.sum()),
-            "mujoco": int(unstable(findings.mujoco).sum()) if mujoco else None,
-        },
-        "disagreements": disagreements,
-        "disagreeing": [_identified(question, int(i)) for i in findings.index[findings.disagreements]],
-        "worst": _worst(question, findings),
-        "largest_difference_per_s": _largest(np.abs(findings.mujoco - findings.exact)),
-        "traces": _traces(question, findings),
-        "environments": _environments(question, findings, bad),
-        "certified": certified,
-        "holds": disagreements == 0 and not (certified and wrong),
-        "interrupted": findings.interrupted,
-        "unfinished": findings.lost or None,
-        "wall_s": wall,
-        "simulated_s_per_s": findings.simulated / wall,
-    }
-    if certified and question.ticks:
-        part["energy_audit"] = _energy(question, findings)
-        part["holds"] = part["holds"] and part["energy_audit"]["holds"]
-    if not findings.index.size:
-        part |= {"holds": None, "reason": "no batch of humans was done"}
-    return part
-
-
-def varying_delays_part(findings: Findings, covered: dict[str, Any]) -> dict[str, Any]:
-    """How many humans grow under delays or ticks that vary; it holds unless certificates cover these and one grows."""
-    exact, mujoco = findings.switching, findings.switching_mujoco
-    seen = ~np.isnan(exact)
-    unstable, also = int((exact > 0).sum()), mujoco[~np.isnan(mujoco)]
-    worst = int(np.nanargmax(exact)) if seen.any() else None
-    return covered | {
-        "unstable": {"exact": unstable, "mujoco": int((also > 0).sum()) if also.size else None},
-        "humans": int(seen.sum()),
-        "mujoco_unclipped": int(also.size),
-        "largest_growth_per_s": None if worst is None else finite(float(exact[worst])),
-        "worst_index": None if worst is None else int(findings.index[worst]),
-        "holds": not (covered["covered"] and unstable),
-    }
-
-
-def adversary_part(worst: Worst, ratio: float, certified: bool) -> dict[str, Any]:
-    """What the search found, and how far the loop is from its required damping."""
-    return {
-        "found": worst.destabilises,
-        "spectral_radius": worst.spectral_radius,
-        "growth_rate_per_s": finite(worst.growth),
-        "frequency_hz": worst.frequency_hz,
-        "evaluated": worst.evaluated,
-        "required_over_available_damping": finite(ratio),
-        "human": _humans(worst.humans),
-        "person": _persons(worst.persons),
-        "holds": not (certified and worst.destabilises),
-    }
-
-
-def _humans(humans: tuple[Any, ...]) -> list[dict[str, Any]]:
-    """Links of each channel's human."""
-    names = ("mass", "damping", "stiffness")
-
-    def plain(human: Any) -> dict[str, Any]:
-        if isinstance(human, Human):
-            return {"links": [{name: getattr(link, name) for name in names} for link in human.links]}
-        port = human.port()  # a user's own class: what the handle feels of it
-        parts = ("mass", "across", "damping", "stiffness")
-        return {"class": type(human).__name__} | {name: getattr(port, name).tolist() for name in parts}
-
-    return [plain(human) for human in humans]
-
-
-def _persons(persons: tuple[Person, ...]) -> list[dict[str, Any]]:
-    """Those who hold several devices."""
-    return [msgspec.to_builtins(person) for person in persons]
-
-
-def _identified(question: Validation, index: int) -> dict[str, Any]:
-    crowd = question.crowd(index)
-    who = {"human": _humans(crowd.humans(0)), "person": _persons(crowd.persons(0))}
-    member = question.environment(index)
-    where = {"environment": member.name, "network": msgspec.to_builtins(member.network)} if member else {}
-    return {"seed": question.seed, "index": index} | who | where
-
-
-def _environments(question: Validation, findings: Findings, bad: NDArray[np.bool_]) -> dict[str, Any]:
-    """Which environments the loops had, and in which of them a loop was unstable."""
-    if not question.environments:
-        return {"of": "the nominal environment", "count": 1}
-    unstable_in = sorted({int(i) % len(question.environments) for i in findings.index[bad]})
-    return {
-        "of": "the ranges",
-        "count": len(question.environments),
-        "names": [member.name for member in question.environments],
-        "unstable_in": [question.environments[i].name for i in unstable_in],
-    }
-
-
-def _worst(question: Validation, findings: Findings) -> dict[str, Any] | None:
-    if not findings.index.size:
-        return None
-    k = int(np.argmax(findings.radius))
-    figures = {
-        "spectral_radius": float(findings.radius[k]),
-        "growth_rate_per_s": finite(float(findings.exact[k])),
-        "frequency_hz": float(findings.frequency[k]),
-    }
-    return figures | _identified(question, int(findings.index[k]))
-
-
-def _traces(question: Validation, findings: Findings) -> dict[str, Any] | None:
-    if not question.ticks or not findings.index.size:
-        return None
-    measured, stable = np.isfinite(findings.trace), ~unstable(findings.exact)
-    duration = question.ticks * question.scenario.T
-    decay = _largest(-1 / findings.exact[findings.exact < 0])
-    decides = decay is None or duration >= _SETTLING * decay
-    part = {
-        "duration_s": duration,
-        "clipped_runs": int((findings.clipped > 0).sum()),
-        "contacts": int(findings.contacts.sum()),
-        "measured": int(measured.sum()),
-        "largest_difference_per_s": _largest(np.abs(findings.trace - findings.exact)),
-        "stable_and_settling": int((stable & (findings.settling < 1)).sum()),
-        "stable": int(stable.sum()),
-        "slowest_settling": _largest(findings.settling[stable]),
-        "slowest_decay_s": decay,
-        "settling_decides": decides,
-    }
-    if not decides:
-        part["reason"] = f"the slowest mode decays in {decay:.3g} s: in {duration:g} s its hands need not be slower"
-    return part
-
-
-def _energy(question: Validation, findings: Findings) -> dict[str, Any]:
-    """Forces that were clipped are covered by nothing; those of a limiter are."""
-    unclipped = (findings.clipped == 0) | (question.lag is not None)
-    violated = unclipped & ~(findings.energy >= -_ROUNDING * findings.audited)
-    return {
-        "audited": int(unclipped.sum()),
-        "clipped": int((~unclipped).sum()),
-        "violated": int(violated.sum()),
-        "least_J": float(findings.energy[unclipped].min()) if unclipped.any() else None,
-        "holds": not violated.any(),
-    }
-
-
-def _largest(values: Array) -> float | None:
-    values = values[np.isfinite(values)]
-    return float(values.max()) if values.size else None

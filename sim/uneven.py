@@ -21,8 +21,8 @@ from controller.environment import GROUND, Network, Spring
 from controller.loop import Loop
 from controller.lti import Array, SingularLoop
 from design.multipliers import this_environment_of
+from models.hold import at_the_latch, hold
 from models.scene import Plant
-from sim.engines import at_the_latch, hold
 from sim.stability import close
 
 T, _LONG = 1e-3, 1.6e-3  # [s]
@@ -33,7 +33,7 @@ _GROWN = 100.0  # times the energy at the start
 
 @dataclass(frozen=True)
 class _UnevenTicks:
-    """What became of one loop under one kind of uneven ticks."""
+    """The result of one loop under one kind of uneven ticks."""
 
     loop: str
     ticks: str

@@ -11,7 +11,7 @@ from controller.coupling import NoCoupling
 from sim.random_loops import traces
 from sim.run import assemble, make_engine, run
 from sim.scenario import InputError, load
-from sim.stability import close, dominant_mode, stability_part
+from sim.stability import close, dominant_mode, stability_of
 from sim.stepping import settle
 from sim.trace import Trace, growth, growths
 
@@ -75,10 +75,10 @@ def test_a_limit_cycle_neither_grows_nor_decays():
 
 def test_the_exact_engines_growth_without_its_states():
     """The loop without coupling, people moving: its eigenvalue, to the 1e-3 1/s that sim.stability is held to."""
-    assembly = assemble(load().replace(duration=6.0), NoCoupling())
-    exact = dominant_mode(close(assembly.plant, assembly.F)).growth
-    record = run(assembly, "exact")
-    ticks = record.ticks_before_clipping(assembly.process.force_limit)
+    simulation = assemble(load().replace(duration=6.0), NoCoupling())
+    exact = dominant_mode(close(simulation.plant, simulation.F)).growth
+    record = run(simulation, "exact")
+    ticks = record.ticks_before_clipping(simulation.process.force_limit)
     found = growth(record.x[:ticks], T, STEP)
     assert found.growth_rate_per_s == pytest.approx(exact, abs=1e-3)
 
@@ -169,13 +169,13 @@ def alike(duration=2.0):
 def test_a_mode_that_nothing_excites_is_called_so_and_the_verdict_is_the_exact_one(engine):
     """By symmetry the hands, which move alike, do no work on the mode in which the devices move against each other."""
     scenario = alike()
-    quiet = stability_part(*ran(scenario, engine))
-    assert quiet["exact_verdict"] == quiet["verdict"] == "unstable"
-    assert quiet["growth_rate_per_s"] is None
-    assert "not excited" in quiet["reason"]
-    loud = stability_part(*ran(scenario.replace(tap=load("omega-pair").tap), engine))
-    assert loud["verdict"] == "unstable"
-    assert loud["growth_rate_per_s"] == pytest.approx(quiet["exact_growth_rate_per_s"], rel=1e-2)
+    quiet = stability_of(*ran(scenario, engine))
+    assert quiet.exact_verdict == quiet.verdict == "unstable"
+    assert quiet.growth_rate_per_s is None
+    assert "not excited" in quiet.reason
+    loud = stability_of(*ran(scenario.replace(tap=load("omega-pair").tap), engine))
+    assert loud.verdict == "unstable"
+    assert loud.growth_rate_per_s == pytest.approx(quiet.exact_growth_rate_per_s, rel=1e-2)
 
 
 def ran(scenario, engine):

@@ -1,0 +1,288 @@
+"""Linear matrix inequalities: minimise c'x where every block constant + sum_a x_a slope_a is positive semidefinite.
+
+A solver's status is a claim. A result is used only if it is finite, the blocks are semidefinite when they are evaluated
+again, and the caller's own `accept` agrees; otherwise the next settings of the ladder are tried. Settings change what
+the solver does to the data, so one that breaks down seldom takes the others with it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import scipy  # its parts load when they are used
+
+from controller.lti import Array, Complex
+from design.result import DesignFailed, Infeasible
+
+#: Largest negative eigenvalue that is taken for rounding; problems are posed in units where 1 is large.
+_TOLERANCE = 1e-4
+#: Entries of a triangle, and how many times the unknowns of its block, from which on Clarabel is the slower one.
+_LARGE, _MANY = 300, 4
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Options of Clarabel that differ from its own."""
+
+    name: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+
+_TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
+_LOOSE = {"tol_gap_abs": 1e-6, "tol_gap_rel": 1e-6, "tol_feas": 1e-6}
+
+LADDER = (
+    _Settings("default"),
+    _Settings("tight", {**_TIGHT, "max_step_fraction": 0.95}),
+    _Settings("as given", {"equilibrate_enable": False, "chordal_decomposition_enable": False}),
+    _Settings("loose", {**_LOOSE, "static_regularization_constant": 1e-7}),
+)
+INTERIOR = _Settings("interior")  # our own method, for large blocks in few unknowns
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """What one rung of the ladder gave."""
+
+    settings: str
+    status: str
+    value: float | None  # the objective, None where the attempt was refused
+    wall_s: float
+    reason: str | None = None  # why it was refused
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """constant + sum_a x[unknowns[a]] slopes[a] >= 0, k Hermitian matrices."""
+
+    constant: Array | Complex  # (k, n, n)
+    slopes: Array | Complex  # (q, k, n, n)
+    unknowns: Sequence[int]  # (q,) those of the problem that take part
+
+    @classmethod
+    def of(cls, function: Callable[[Array], Array], unknowns: Sequence[int]) -> Block:
+        """function(x[unknowns]) >= 0, affine to a symmetric matrix, from its values at 0 and the unit vectors."""
+        constant = function(np.zeros(len(unknowns)))
+        return cls(constant[None], np.stack([function(e) - constant for e in np.eye(len(unknowns))])[:, None], unknowns)
+
+    def at(self, x: Array) -> Array | Complex:
+        return self.constant + np.tensordot(x[list(self.unknowns)], self.slopes, axes=1)
+
+    @property
+    def large(self) -> bool:
+        """Whether Clarabel, whose work grows with the square of a triangle's entries, is slower than `_interior`."""
+        rows = self.constant.shape[-1] * (2 if np.iscomplexobj(self.constant) else 1)
+        return rows * (rows + 1) // 2 > max(_LARGE, _MANY * len(self.unknowns))
+
+    def rows(self) -> tuple[Array, Array]:
+        """(k, r) and (q, k, r) real: the lower triangles row by row, such that inner products stay the same."""
+        constant, slopes = (_real(part) for part in (self.constant, self.slopes))
+        i, j = np.tril_indices(constant.shape[-1])
+        weight = np.where(i == j, 1.0, np.sqrt(2))
+        return constant[..., i, j] * weight, slopes[..., i, j] * weight
+
+
+def _real(H: Array | Complex) -> Array:
+    """[[X, -Y], [Y, X]] of H = X + jY, (..., n, n) -> (..., 2n, 2n): Hermitian >= 0 iff symmetric >= 0."""
+    if not np.iscomplexobj(H):
+        return np.asarray(H, dtype=float)
+    top, low = np.concatenate([H.real, -H.imag], axis=-1), np.concatenate([H.imag, H.real], axis=-1)
+    return np.concatenate([top, low], axis=-2)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """minimise cost'x under the blocks."""
+
+    cost: Array  # (p,)
+    blocks: Sequence[Block]
+
+    def solve(
+        self, what: str, accept: Callable[[Array], bool] | None = None, ladder: Sequence[_Settings] | None = None
+    ) -> Array:
+        """The optimal x (p,), verified. `what` names the problem in the message of an error.
+
+        Raises Infeasible when two settings agree that there is no solution and none found one, DesignFailed otherwise.
+        """
+        attempts: list[Attempt] = []
+        if ladder is None:
+            ladder = (INTERIOR,) if any(block.large for block in self.blocks) else LADDER
+        for settings in ladder:
+            x, attempt = self._attempt(settings, accept)
+            if attempt.reason is None:
+                return x
+            attempts.append(attempt)
+            if sum(a.status == "PrimalInfeasible" for a in attempts) >= 2:
+                break
+        statuses = ", ".join(f"{a.settings}: {a.status}" for a in attempts)
+        if sum(a.status == "PrimalInfeasible" for a in attempts) >= 2:
+            raise Infeasible(self, attempts, f"{what} has no solution ({statuses})")
+        advice = "try fewer delays, a larger damping or a lower order; the error carries the problem"
+        raise DesignFailed(self, attempts, f"{what} could not be solved ({statuses}); {advice}")
+
+    def violation(self, x: Array) -> float:
+        """How negative the least eigenvalue of a block is."""
+        least = (np.linalg.eigvalsh(block.at(x)).min(initial=np.inf) for block in self.blocks)
+        return float(-min(least, default=np.inf))
+
+    def _attempt(self, settings: _Settings, accept: Callable[[Array], bool] | None) -> tuple[Array, Attempt]:
+        started = time.perf_counter()
+        x, status, reason = np.full(len(self.cost), np.nan), "panic", None
+        try:
+            x, status = _interior(self) if settings is INTERIOR else _clarabel(self, settings.options)
+        except BaseException as error:  # Clarabel's Rust panics are not Exceptions
+            if type(error).__name__ != "PanicException":
+                raise
+            reason = str(error)
+        reason = reason or self._doubt(x, status, accept)
+        value = None if reason else float(self.cost @ x)
+        return x, Attempt(settings.name, status, value, time.perf_counter() - started, reason)
+
+    def _doubt(self, x: Array, status: str, accept: Callable[[Array], bool] | None) -> str | None:
+        """Why x may not be used, or None."""
+        if status not in ("Solved", "AlmostSolved"):  # in Clarabel's words
+            return f"the solver reports {status}"
+        if not np.isfinite(x).all():
+            return "an unknown has no finite value"
+        if not (worst := self.violation(x)) <= _TOLERANCE:
+            return f"a constraint is violated by {worst:.1e}"
+        return None if accept is None or accept(x) else "the result does not pass the caller's verification"
+
+
+def _clarabel(problem: Problem, options: Mapping[str, Any]) -> tuple[Array, str]:
+    """(x, the status that Clarabel reports): minimise cost'x with constant - s = -slopes x and every s in its cone."""
+    import clarabel
+
+    constants, slopes, cones = [], [], []
+    for block in problem.blocks:
+        constant, by_x = block.rows()
+        constants.append(constant.ravel())
+        every = scipy.sparse.coo_matrix(by_x.reshape(len(by_x), -1).T)
+        columns = np.asarray(block.unknowns)[every.col]
+        slopes.append(scipy.sparse.csc_matrix((every.data, (every.row, columns)), (constant.size, len(problem.cost))))
+        size = round((np.sqrt(8 * constant.shape[1] + 1) - 1) / 2)
+        if size == 1:
+            cones.append(clarabel.NonnegativeConeT(len(constant)))
+        else:
+            cones += [clarabel.PSDTriangleConeT(size)] * len(constant)
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    for name, value in options.items():
+        setattr(settings, name, value)
+    p = len(problem.cost)
+    nothing, rows = scipy.sparse.csc_matrix((p, p)), scipy.sparse.vstack(slopes, format="csc")
+    found = clarabel.DefaultSolver(nothing, problem.cost, -rows, np.concatenate(constants), cones, settings).solve()
+    return np.array(found.x), str(found.status)
+
+
+# ----------------------------------------------------------------------------------------------------
+# A primal-dual interior-point method for large blocks in few unknowns.
+#
+# The S = constant + slopes x >= 0 have multipliers Z >= 0 with <slope_a, Z> = cost_a, and S Z = 0 at the optimum. S Z =
+# mu I is linearised to dZ = mu/S - Z - Z dS/S, made Hermitian (Helmberg, Kojima, Monteiro), and <slope_a, Z + dZ> =
+# cost_a leaves as many equations as there are unknowns. A first direction with mu = 0 says how small mu may become, and
+# what the product dZ dS leaves (Mehrotra). Neither S nor Z need satisfy its equation at the start.
+
+_GAP = 1e-9  # relative gap and violations at which the iteration ends
+_ENOUGH = 1e-6  # .. and at which its best point counts where rounding ends it before
+_MOST_STEPS = 60
+_KEPT = 0.98  # of the way to the boundary
+
+
+_Parts = list[Any]  # a stack of Hermitian matrices for each block
+
+
+def _interior(problem: Problem) -> tuple[Array, str]:
+    """(x, status in Clarabel's words)."""
+    blocks, cost, x = problem.blocks, problem.cost, np.zeros(len(problem.cost))
+    size = max(np.abs(part).max(initial=1.0) for block in blocks for part in (block.constant, block.slopes, cost))
+    S: _Parts = [10 * size * (np.zeros_like(block.constant) + np.eye(block.constant.shape[-1])) for block in blocks]
+    Z, best, least = S, x, np.inf
+    for _ in range(_MOST_STEPS):
+        missing = [block.at(x) - s for block, s in zip(blocks, S, strict=True)]
+        wrong = cost - _inner(problem, Z)
+        gap = abs(cost @ x + sum(_product(block.constant, z) for block, z in zip(blocks, Z, strict=True)))
+        far = max(np.abs(part).max() / size for part in (wrong, *missing))
+        if (error := max(far, gap / (1 + abs(cost @ x)))) < least:
+            best, least = x, error
+        if not _GAP < error < least / _ENOUGH:
+            break
+        try:
+            newton = _Newton(problem, S, Z, missing, wrong)
+        except np.linalg.LinAlgError:  # rounding
+            break
+        mu = sum(map(_product, S, Z)) / sum(s.shape[0] * s.shape[1] for s in S)
+        _, dS, dZ, of_S, of_Z = newton.direction(0.0, [0.0] * len(S))
+        gains = (_product(s + of_S * ds, z + of_Z * dz) for s, ds, z, dz in zip(S, dS, Z, dZ, strict=True))
+        left = np.clip(sum(gains) / sum(map(_product, S, Z)), 0.0, 1.0)
+        dx, dS, dZ, of_S, of_Z = newton.direction(left**3 * mu, [dz @ ds for dz, ds in zip(dZ, dS, strict=True)])
+        x = x + of_S * dx
+        S = [_hermitian(s + of_S * ds) for s, ds in zip(S, dS, strict=True)]
+        Z = [_hermitian(z + of_Z * dz) for z, dz in zip(Z, dZ, strict=True)]
+    return best, "Solved" if least < _ENOUGH else "NumericalError"
+
+
+class _Newton:
+    """The linearised equations at (S, Z), which miss the blocks' values and the costs by `missing` and `wrong`.
+
+    Raises LinAlgError where S, Z or the equations are singular to rounding.
+    """
+
+    def __init__(self, problem: Problem, S: _Parts, Z: _Parts, missing: _Parts, wrong: Array) -> None:
+        self._problem, self._Z, self._missing, self._wrong = problem, Z, missing, wrong
+        self._roots = [[np.linalg.inv(np.linalg.cholesky(part)) for part in parts] for parts in (S, Z)]
+        self._inverse = [_adjoint(root) @ root for root in self._roots[0]]
+        normal = np.zeros((wrong.size, wrong.size))
+        for block, z, inverse in zip(problem.blocks, Z, self._inverse, strict=True):
+            slopes = block.slopes.reshape(len(block.slopes), -1)
+            turned = (z @ block.slopes @ inverse).reshape(slopes.shape)
+            normal[np.ix_(block.unknowns, block.unknowns)] += np.real(slopes.conj() @ turned.T)
+        self._scale = 1 / np.sqrt(np.where(np.diag(normal) > 0, np.diag(normal), 1.0))
+        unit = self._scale[:, None] * (normal + normal.T) / 2 * self._scale
+        self._factor = scipy.linalg.cho_factor(unit + 1e-14 * np.eye(wrong.size))
+
+    def direction(self, mu: float, left: _Parts) -> tuple[Array, _Parts, _Parts, float, float]:
+        """(dx, dS, dZ, the longest steps in S and Z, up to 1) towards S Z = mu I, where dZ dS will be `left`."""
+        right = _inner(self._problem, self._change(self._missing, mu, left)) - self._wrong
+        dx = self._scale * scipy.linalg.cho_solve(self._factor, self._scale * right)
+        blocks = zip(self._problem.blocks, self._missing, strict=True)
+        dS = [missing + np.tensordot(dx[list(block.unknowns)], block.slopes, axes=1) for block, missing in blocks]
+        dZ = self._change(dS, mu, left)
+        return dx, dS, dZ, _longest(self._roots[0], dS), _longest(self._roots[1], dZ)
+
+    def _change(self, dS: _Parts, mu: float, left: _Parts) -> _Parts:
+        """dZ, from dS."""
+        parts = zip(self._Z, dS, left, self._inverse, strict=True)
+        return [_hermitian(mu * inverse - z - (z @ ds + more) @ inverse) for z, ds, more, inverse in parts]
+
+
+def _inner(problem: Problem, Z: _Parts) -> Array:
+    """<slope_a, Z> of every unknown."""
+    total = np.zeros(len(problem.cost))
+    for block, z in zip(problem.blocks, Z, strict=True):
+        total[list(block.unknowns)] += np.real(block.slopes.reshape(len(block.slopes), -1).conj() @ z.ravel())
+    return total
+
+
+def _longest(roots: _Parts, steps: _Parts) -> float:
+    """The share of the steps, up to 1, that leaves every matrix positive; `roots` are their inverse roots."""
+    pairs = zip(roots, steps, strict=True)
+    least = min(np.linalg.eigvalsh(root @ step @ _adjoint(root)).min() for root, step in pairs)
+    return min(1.0, _KEPT / max(-least, 1e-300))
+
+
+def _adjoint(X: Any) -> Any:
+    return np.conj(np.swapaxes(X, -1, -2))
+
+
+def _hermitian(X: Any) -> Any:
+    return (X + _adjoint(X)) / 2
+
+
+def _product(X: Any, Y: Any) -> float:
+    """<X, Y> of Hermitian matrices."""
+    return float(np.real(np.vdot(X, Y)))
