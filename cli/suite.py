@@ -28,7 +28,7 @@ from cli import options, render, suite_report
 from controller.coupling import NoCoupling
 from controller.lti import SingularLoop
 from design.files import folder, write, write_json
-from design.result import DesignFailed, finite
+from design.result import CONDITIONS, DesignFailed, finite
 from hw.control import certified_couplings
 from hw.emulator import Emulator
 from hw.faults import person, rehearse_faults
@@ -209,7 +209,7 @@ def accuracy(report: dict[str, Any]) -> list[_Part]:
 
 def _gain_map(report: dict[str, Any]) -> list[_Part]:
     """Of sim.zwidth."""
-    contradicted = sum(report[name]["contradicted_cells"] for name in render.ORDER)
+    contradicted = sum(report[name]["contradicted_cells"] for name in CONDITIONS)
     return [_Part("", (), (), f"{contradicted} certified cells that a hand destabilises")]
 
 

@@ -534,9 +534,6 @@ def _multiplier(loop: Loop, certificate: Certificate) -> list[Fraction] | None:
         raise NotProved(f"{name} is no row of rational numbers") from None
 
 
-CONDITIONS: tuple[Condition, ...] = ("any-environment", "this-environment")
-
-
 def assess(
     loop: Loop, coupling: Coupling, phi: Array | None = None, known: Certificate | None = None
 ) -> dict[str, Requirement]:

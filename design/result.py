@@ -14,6 +14,12 @@ from controller.lti import Array
 
 Condition = Literal["this-environment", "any-environment"]
 
+#: the conditions in the order of tables, each with the environments for which it holds
+CONDITIONS: dict[Condition, str] = {
+    "this-environment": "this environment",
+    "any-environment": "any passive environment",
+}
+
 
 C = TypeVar("C", bound=str)  # a Condition, "switching" or "limiter"
 
