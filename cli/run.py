@@ -27,7 +27,7 @@ from sim.mujoco_engines import INTEGRATORS
 from sim.run import ENGINES, beginnings
 from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, ExactVerdict, Stability, stability_of
-from sim.stepping import MOST
+from sim.step_choice import MOST
 
 
 def main(argv: list[str]) -> int:

@@ -37,15 +37,15 @@ from hw.monitor import LinkSettings
 from hw.rehearsal import Rehearsal
 from hw.session import session_for
 from sim.adversary import Attack, attempts
-from sim.challenges import challenges
+from sim.checks.challenges import challenges
+from sim.checks.hard import cases, measure
+from sim.checks.random_loops import proofs, traces
+from sim.checks.uneven import HANDS, uneven_ticks
 from sim.couplings import choose
 from sim.crowds import Validation
-from sim.hard import cases, measure
-from sim.random_loops import proofs, traces
 from sim.scenario import InputError, load
 from sim.shards import as_worker, validate
 from sim.stability import unstable
-from sim.uneven import HANDS, uneven_ticks
 
 # ----------------------------------------------------------------------------------------------------
 # Checks of our own: what they measure, row by row.
