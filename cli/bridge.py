@@ -28,6 +28,7 @@ from cli.session_cli import (
 )
 from design.files import plain, write_json
 from design.guarantees import CAVEATS, LATE
+from design.result import CONDITIONS
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages
