@@ -37,9 +37,7 @@ def main(argv: list[str]) -> int:
     seconds = scenario.duration if args.duration is None else args.duration
     if args.case == "none":
         raise InputError("--case none has no coupling, so there is nothing that could be certified")
-    at_once = args.latch == "arrival" or session_cli.host_clocked(
-        args
-    )  # a host that is the clock writes a force when it has it
+    at_once = args.latch == "arrival" or session_cli.host_clocked(args)  # a host that is the clock sends at once
     if at_once and args.condition == "any-environment":
         raise InputError(f"--latch arrival with --condition {args.condition}: {LATE}")
     if args.energy_budget and at_once:
