@@ -28,7 +28,7 @@ from controller.tick import Net, Process, StepBuffer
 from controller.timing import Timing
 from controller.walls import contact
 from models.hold import HeldPlant, hold
-from models.scene import Scene, build, plant
+from models.scene import Scene, build
 from sim.engines import Engine, ExactEngine, ExactTimedEngine
 from sim.mujoco_engines import EXPONENTIAL, LEAST, MujocoEngine, default_integrator, profiler_off, quiet_warnings
 from sim.scenario import InputError, Scenario
@@ -78,7 +78,7 @@ class Simulation:
         """The same in periods T, with forces that latch at ticks: what integrators and their steps are judged on."""
         if self.timing is None:
             return self
-        return replace(self, plant=hold(plant(self.scene.model), self.scenario.T), timing=None)
+        return replace(self, plant=hold(self.scene.plant, self.scenario.T), timing=None)
 
     @property
     def felt(self) -> Lti:
@@ -104,7 +104,7 @@ def assemble(scenario: Scenario, coupling: Coupling, lag: Sequence[float] | None
         walled = contact(network, coupling, *delays, scenario.T) if network.walls else None
     F = walled.open if walled else force_map(E, coupling, *delays)
     scene = build(scenario.device, scenario.human, scenario.person)
-    usual = hold(plant(scene.model), scenario.T, scenario.usual_latency)
+    usual = hold(scene.plant, scenario.T, scenario.usual_latency)
     timing = scenario.timing(seed, scenario.samples)
     return Simulation(scenario, E, F, Process(F, limits, steps, walled), scene, usual, timing)
 
@@ -150,7 +150,7 @@ def run(
         run_blocks(process, engine, outside, ticks, start, keep, _BLOCK)
     except KeyboardInterrupt:  # what was finished is kept
         interrupted = True
-    n, m, handles = simulation.scene.model.nq, process.channels, list(simulation.scene.handles)
+    n, m, handles = simulation.scene.model.nq, process.channels, simulation.scene.handles
     z, s, w, f = np.split(record[:done], np.cumsum(widths)[:3], axis=1)
     for part in (record, z, s, w, f):
         part.setflags(write=False)
@@ -158,8 +158,8 @@ def run(
         t=beginnings(scenario.T, simulation.timing, 0, done),
         x=process.measured(s[:, :m]),
         f=f,
-        x_handle=s[:, handles],
-        v_handle=s[:, n:][:, handles],
+        x_handle=_columns(s, handles),
+        v_handle=_columns(s[:, n:], handles),
         w=w,
         z=z,
         s=s,
@@ -167,6 +167,12 @@ def run(
         interrupted=interrupted,
         net=net,
     )
+
+
+def _columns(rows: Array, which: tuple[int, ...]) -> Array:
+    """These columns, which are no copy where they lie side by side."""
+    together = slice(which[0], which[-1] + 1)
+    return rows[:, together] if which == tuple(range(which[0], which[-1] + 1)) else rows[:, list(which)]
 
 
 def _room(width: int, ticks: int, T: float) -> Array:
@@ -278,7 +284,7 @@ def make_engine(
         if simulation.friction:
             raise ValueError("the devices have Coulomb friction, which the exact engine, being linear, does not model")
         if simulation.timing and T is None:
-            return ExactTimedEngine(plant(simulation.scene.model), simulation.timing)
+            return ExactTimedEngine(simulation.scene.plant, simulation.timing)
         return ExactEngine(simulation.plant)
     integrator = integrator or default_integrator(simulation.scene)
     count = substeps if substeps is not None else 1 if integrator == EXPONENTIAL else LEAST
