@@ -173,6 +173,7 @@ class StepBuffer:
         if self.clips:
             bounds += enumerate(process.force_limit.tolist())
         self._bounds = bounds if self._straight else []
+        self._asked = [(self.after[:, row, 0], limit) for row, limit in self._bounds]
 
     @cached_property
     def _transition(self) -> Callable[[Array, Array], object]:
@@ -215,10 +216,11 @@ class StepBuffer:
 
         Not a number counts as such.
         """
-        asked = [(self.after[:ticks, row, 0], most * limit) for row, limit in self._bounds]
-        for forces, limit in asked:
-            if not (forces.max() <= limit and forces.min() >= -limit):
-                return int(np.all([np.abs(forces) <= limit for forces, limit in asked], axis=0).argmin())
+        for forces, limit in self._asked:
+            sent, limit = forces[:ticks], most * limit
+            if not (sent.max() <= limit and sent.min() >= -limit):
+                within = [np.abs(forces[:ticks]) <= most * limit for forces, limit in self._asked]
+                return int(np.all(within, axis=0).argmin())
         return ticks
 
     def tick(self, k: int) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -43,8 +44,8 @@ Progress = Callable[[int, int], None]  # (ticks done, ticks in all)
 _COPIES = 4  # of a trace, at most, from the run to its report
 _SMALL = 1e8  # [bytes] of a trace for which the free memory is not looked up
 _COLUMNS = 50  # numbers a tick that the report of a trace on the disk takes in memory
-_BLOCK = 1024  # ticks between two looks at the clock, the keyboard and the numbers
-_AHEAD = 8  # blocks for which outside forces are asked at once
+_BLOCK = 512  # ticks between two looks at the keyboard and the numbers: what a block needs stays in the cache
+_AHEAD = 16  # blocks for which outside forces are asked at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,9 +261,9 @@ def outside_forces(
         for human, column in zip(scenario.human, scene.pushed, strict=True):
             w[:, column] += human.voluntary_force(t)
     if tap := scenario.tap:
-        begin, end = (np.round(time / scenario.T, 9) for time in (tap.start, tap.start + tap.duration))
-        k = np.round(t / scenario.T, 9) if timing else np.arange(first, first + ticks)
-        w[(k >= begin) & (k < end), scene.tapped[tap.channel - 1]] += tap.force
+        places = np.round(t / scenario.T, 9) if timing else range(first, first + ticks)
+        ends = [bisect_left(places, round(time / scenario.T, 9)) for time in (tap.start, tap.start + tap.duration)]
+        w[slice(*ends), scene.tapped[tap.channel - 1]] += tap.force
     return w
 
 
