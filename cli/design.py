@@ -250,7 +250,10 @@ def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[s
     elif best.objective == 0:
         limit["reason"] = "the mismatch is zero: there is nothing to bound"
     else:
-        limit["rms_mismatch_db"] = bound(loop, args.band_hz or BAND_HZ, near=best.coupling).rms_db
+        least = bound(loop, args.band_hz or BAND_HZ)
+        gap = best.figures.rms_mismatch_db - least.rms_db
+        found = {"rms_mismatch_db": least.rms_db, "gap_db": gap}
+        limit |= found if least.rms else {"reason": "the bound is zero: nothing is known to be lost"}
     return {
         "bound": limit,
         "rendered_stiffness": best.g,
@@ -347,8 +350,8 @@ def _best_rows(part: dict[str, Any]) -> render.Rows:
     """Rows that only an optimal coupling has."""
     limit = part["bound"]
     climbed = ", ".join(f"{rung['mismatch_db']:.2f}" for rung in part["ladder"])
-    bounded = f"no linear coupling can be better than {limit['rms_mismatch_db'] or 0:.2f} dB rms"
-    yield "bound", limit.get("reason") or bounded
+    bounded = "no linear coupling can be better than {rms_mismatch_db:.2f} dB rms, {gap_db:.2f} dB less than this one"
+    yield "bound", limit.get("reason") or bounded.format(**limit)
     yield "rendered stiffness", render.optional(part["rendered_stiffness"], "{:.3f} of the environment's")
     yield "ladder [dB]", climbed or None
 
