@@ -146,8 +146,6 @@ def _loop(args: argparse.Namespace, scenario: Scenario) -> Loop:
             loop = loop.switching(DelayRange(lo, hi))
         except ValueError as error:
             raise InputError(f"--varying-delay is {asked}: {error}") from None
-    if args.coupling == "optimal" and loop.environment.walls:
-        raise InputError("environment.walls: an optimal coupling holds a linear model, so it cannot face walls")
     return loop
 
 

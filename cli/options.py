@@ -16,7 +16,8 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
@@ -171,6 +172,17 @@ def _within(value: _Number, least: float, most: float, unit: str) -> _Number:
     span = f"{low} to {high}" if most < math.inf else f"numbers from {low}" if least > -math.inf else "finite numbers"
     unit = f" {unit}" if unit and not unit.startswith(",") else unit
     raise argparse.ArgumentTypeError(f"is {shown}, allowed are {span}{unit}")
+
+
+@contextmanager
+def refused(name: str = "") -> Iterator[None]:
+    """What is refused within is bad input: InputError, with this name in front of what was said."""
+    try:
+        yield
+    except (InputError, DesignFailed):
+        raise
+    except ValueError as error:
+        raise InputError(f"{name}{error}") from None
 
 
 def per_channel(option: str, values: tuple[_Number, ...], channels: int) -> tuple[_Number, ...]:
