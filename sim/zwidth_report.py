@@ -159,9 +159,7 @@ class MapReport:
             {"K": drawn.grid.K, "B": drawn.grid.B, "scale": drawn.grid.scale},
             _population(drawn, humans, seed),
             simulation,
-            certified
-            and not simulation.contradicts
-            and not any(ratios[name].contradicted_cells for name in CONDITIONS),
+            certified and not contradicted,
             drawn.interrupted,
             drawn.seconds,
             ratios,

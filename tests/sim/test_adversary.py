@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 
 from cli import run as run_command
-from cli.suite import Check, rates, shortages, tightness
+from cli.suite import Check
 from cli.suite import main as suite
+from cli.suite_report import tightness
 from cli.validate import main
 from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from design.conditions import this_environment as real
 from models.device import RigidDevice
 from models.scene import build, plant
 from sim import adversary
-from sim.adversary import DESTABILISED, attempts, search
+from sim.adversary import DESTABILISED, attempts, search, shortages
 from sim.engines import hold
 from sim.run import assemble
 from sim.scenario import load
@@ -132,9 +133,9 @@ def test_a_certified_coupling_that_someone_destabilises_fails(tmp_path, monkeypa
 
 def test_the_rate_by_shortage():
     rows = list(shortages(("none", "spring-damper"), (0, 0.2), 10)(1))
-    assert rates(rows) == [{"short": 0, "attempts": 2, "rate": 0.0}, {"short": 0.2, "attempts": 2, "rate": 1.0}]
-    assert {row["loop"] for row in rows} == {"no coupling", "spring-damper, case I"}
-    assert all(row["holds"] for row in rows)
+    assert tightness({"rows": [vars(row) for row in rows]})[0].rows == (("0.0%", "2", "0%"), ("20.0%", "2", "100%"))
+    assert {row.loop for row in rows} == {"no coupling", "spring-damper, case I"}
+    assert all(row.holds for row in rows)
 
 
 def test_a_human_who_destabilises_a_loop_with_enough_damping_fails_the_check(tmp_path, monkeypatch):
