@@ -17,7 +17,7 @@ from typing import Any
 from cli import options
 from cli.dashboard import Dashboard
 from cli.render import console, progress
-from hw.control import Armable, link_delay
+from hw.control import Armable
 from hw.emulator import Emulator, FaultInjection, spawned
 from hw.force_dimension import FORCE_DIMENSION, ForceDimension
 from hw.monitor import Ages, LinkSettings
@@ -26,7 +26,7 @@ from hw.rehearsal import Rehearsal
 from hw.seam import HapticDevice, SerialDevice
 from hw.session import Operator, Session
 from hw.transport import Live, SerialPort, preflight
-from sim.scenario import InputError, Scenario
+from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear
 
 _USUAL_BAUD = 921_600
 _SPARE = 600.0  # [s] beside the run, after which an orphan of --emulate would end by itself
@@ -79,6 +79,14 @@ def add_safety_options(parser: argparse.ArgumentParser) -> None:
     who = "forces act only while a key is pressed, or FILE is touched, once a second, or the device's own one is held"
     safety.add_argument("--deadman", metavar="key|device|FILE", help=who)
     safety.add_argument("--no-preflight", action="store_true", help="do not look at this machine for two seconds first")
+
+
+def steady_scenario(args: argparse.Namespace, command: str) -> Scenario:
+    """The scenario, which a serial link wants linear, with even ticks and constant delays. Raises InputError."""
+    scenario = options.scenario_from(args)
+    for require in (require_linear, require_constant_delay, require_even_ticks):
+        require(scenario, command)
+    return scenario
 
 
 def limits_from(args: argparse.Namespace, scenario: Scenario) -> dict[str, Any]:
@@ -139,11 +147,6 @@ def _baud_or_none(text: str) -> int:
 def host_clocked(args: argparse.Namespace) -> bool:
     """Whether the device has no clock, so that the host is it."""
     return (args.port or "").split(":")[0] == FORCE_DIMENSION
-
-
-def measured_link(args: argparse.Namespace, ages: Ages, T: float) -> int:
-    """Ticks of delay for the ages that were measured, by --quantile and --guard."""
-    return link_delay(ages, 1e6 * T, args.quantile, 1e6 * args.guard)
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import errno
 import json
+import math
 import os
 import re
 import sys
 import tempfile
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from io import BytesIO
 from math import prod
 from pathlib import Path
@@ -296,9 +297,35 @@ def _fill(file: BinaryIO, content: Callable[[BinaryIO], None] | bytes | str) -> 
         file.write(content.encode(errors="backslashreplace") if isinstance(content, str) else content)
 
 
-def write_json(destination: str | Path, data: dict[str, Any]) -> None:
-    """JSON to a file, or to standard output for '-'. Not-a-number and infinity are refused by construction."""
-    text = json.dumps(data, indent=2, allow_nan=False) + "\n"
+def plain(report: Any) -> Any:
+    """A report as JSON takes it: dataclasses by their fields, null for what is infinite or no number."""
+    if is_dataclass(report) and not isinstance(report, type):
+        return _part(report)
+    if isinstance(report, Mapping):
+        return {name: plain(value) for name, value in report.items()}
+    if isinstance(report, np.ndarray | np.generic):
+        return plain(report.tolist())
+    if isinstance(report, list | tuple):
+        return [plain(value) for value in report]
+    if isinstance(report, float):
+        return report if math.isfinite(report) else None
+    return str(report) if isinstance(report, Path) else report
+
+
+def _part(report: Any) -> dict[str, Any]:
+    part: dict[str, Any] = {}
+    for one in fields(report):
+        value, how = getattr(report, one.name), one.metadata.get("json", "key")
+        if how == "beside":
+            part |= plain(value) or {}
+        elif how == "key" or (how == "given" and value is not None):
+            part[one.name.removesuffix("_")] = plain(value)  # from_, for Python has its own `from`
+    return part
+
+
+def write_json(destination: str | Path, report: Any) -> None:
+    """A report as JSON to a file, or to standard output for '-'."""
+    text = json.dumps(plain(report), indent=2, allow_nan=False) + "\n"
     if str(destination) == "-":
         try:
             sys.stdout.write(text)

@@ -16,13 +16,12 @@ from __future__ import annotations
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
-from typing import Any
 
 import numpy as np
 
 from controller.lti import Array, SingularLoop
 from controller.tick import StepBuffer
-from design.result import DesignFailed, certificate_part, finite
+from design.result import DesignFailed
 from models.scene import Plant, Scene, plant
 from sim.engines import ExactEngine, HeldPlant, hold
 from sim.run import outside_forces, run_block
@@ -287,26 +286,3 @@ def _rehearsed(prepared: PreparedLoop, script: Script) -> list[tuple[int, Event,
             into = prepared = changed(prepared, event)
         made.append((round(time / prepared.scenario.T), event, into))
     return made
-
-
-def session_report(session: LiveLoop) -> dict[str, Any]:
-    """How long it ran, what was changed when, and what could be said of each loop."""
-    return {
-        "scenario": session.prepared.scenario.name,
-        "simulated_s": session.t,
-        "clipped_ticks": session.clipped,
-        "events": [{"t_s": t, "event": what, **_facts(prepared)} for t, what, prepared in session.log],
-    }
-
-
-def _facts(prepared: PreparedLoop) -> dict[str, Any]:
-    return {
-        "coupling": prepared.label,
-        "theta": list(prepared.scenario.theta),
-        "psi": list(prepared.scenario.psi),
-        "exact_growth_rate_per_s": finite(float(prepared.mode.growth)),
-        "exact_frequency_hz": float(prepared.mode.frequency_hz),
-        "certificates": {name: certificate_part(need) for name, need in prepared.requirements.items()},
-        "promise": prepared.guarantee,
-        "limiter": prepared.limits.part([device.force_limit for device in prepared.scenario.device]),
-    }

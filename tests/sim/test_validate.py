@@ -13,13 +13,12 @@ import pytest
 from driven import driven
 
 from cli import run as run_command
-from cli.validate import main
+from cli.validate import _Traces, main
 from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from models.device import RigidDevice
 from models.human import Person
 from models.scene import Crowd, build, plant, variants
 from sim import crowds as examine_module
-from sim import report as verdict_report
 from sim import shards
 from sim.couplings import choose
 from sim.crowds import BATCH, MIXED, Findings, Validation, crowds, draw
@@ -289,10 +288,9 @@ def test_hands_that_had_no_time_to_rest_are_no_verdict(duration):
     """Against the slowest eigenvalue of the same humans, by the exact engine."""
     question = Validation(load("omega-pair"), SpringDamper([500, 500], [0.4, 0.4]), 0, 6, 1, "exact", duration)
     found = validate(question)
-    traces = verdict_report.validation_part(question, found, True, 1.0)["traces"]
-    assert traces["slowest_decay_s"] == pytest.approx(-1 / found.exact.max())
-    assert traces["settling_decides"] == (duration > 30)
-    assert ("reason" in traces) == (duration < 30)
+    traces = _Traces.of(question, found)
+    assert traces.slowest_decay_s == pytest.approx(-1 / found.exact.max())
+    assert traces.settling_decides == (traces.reason is None) == (duration > 30)
 
 
 @pytest.mark.parametrize(
