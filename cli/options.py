@@ -27,7 +27,7 @@ from threadpoolctl import threadpool_limits
 from controller import older
 from controller.delay import LOST, VaryingDelay
 from controller.environment import RIGID_WALL
-from controller.loop import Loop
+from controller.loop import DelayRange, Loop
 from controller.lti import SingularLoop
 from controller.timing import Periods
 from design.files import check_file, folder, nobody_reads, one_command, one_line, read_text
@@ -202,6 +202,15 @@ def ranges_per_channel(
         raise InputError(f"{option} has {len(pairs)} ranges, expected {channels} (one per channel) or 1")
     lo, hi = zip(*(pairs * channels if len(pairs) == 1 else pairs), strict=True)
     return lo, hi
+
+
+def delay_range(pairs: tuple[tuple[int, int], ...], channels: int, most: int) -> DelayRange:
+    """What --varying-delay says, as a range of delays on every channel. Raises InputError."""
+    lo, hi = ranges_per_channel("--varying-delay", pairs, channels)
+    if any(not 0 <= a <= b <= most for a, b in zip(lo, hi, strict=True)):
+        asked = ",".join(f"{a}-{b}" for a, b in pairs)
+        raise InputError(f"--varying-delay is {asked}, expected 0 <= LO <= HI <= {most} samples")
+    return DelayRange(lo, hi)
 
 
 def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) -> tuple[_Number, ...]:

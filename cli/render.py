@@ -179,6 +179,12 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
     return table
 
 
+def columns(title: str, cells: Mapping[str, _Form], records: Iterable[Any], left: Sequence[int] = (0,)) -> Table:
+    """A table of records: under each head a format of the record `r`, or what a function says of it."""
+    rows = [[str(form(r)) if callable(form) else form.format(r=r) for form in cells.values()] for r in records]
+    return grid(title, list(cells), rows, left)
+
+
 def figure(name: str, form: _Form = "{}", default: Any = MISSING, json: str = "key", absent: str | None = None) -> Any:
     """A field that a report's table shows under this name, in this format: of the value, and of the whole report `r`.
 

@@ -9,13 +9,12 @@ from typing import Any
 from controller.coupling import Coupling
 from controller.delay import delay
 from controller.environment import environment
-from controller.loop import DelayRange, Loop, force_map
-from controller.lti import Lti
+from controller.loop import Loop, force_map
 from controller.ranges import Member
-from design.certificate import RangesCheck, check_limiter, prove_limiter
+from design.certificate import RangesCheck, check_limiter, prove_limiter, switching_requirement
 from design.conditions import this_environment
 from design.environments import SEARCH, Searched, worst
-from design.multipliers import BETA, SwitchingSweep, limiter_refusal, limiter_requirement
+from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.result import NotProved, Requirement, certificate_part, finite
 from design.stored import LimiterCertificate
 from design.transparency import decibels, transparency
@@ -103,15 +102,18 @@ _NOT_COVERED = (
 )
 
 
-def switching_part(found: SwitchingSweep, G: Lti, span: DelayRange, T_max: float | None = None) -> dict[str, Any]:
-    """The requirement with its multiplier, and what a playout buffer to the constant delay hi would need.
+def switching_part(loop: Loop, coupling: Coupling) -> dict[str, Any]:
+    """What any switching within the loop's range asks, and what a playout buffer to the constant delay hi would need.
 
-    G is the force map without Theta.
+    Only the requirement where there is none: its reason says why.
     """
-    buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available, T_max)
-    return certificate_part(found.requirement) | {
-        "lo": list(span.lo),
-        "hi": list(span.hi),
+    found, span = switching_requirement(loop, coupling), loop.delays
+    part = certificate_part(found.requirement) | {"lo": list(span.lo), "hi": list(span.hi)}
+    if found.requirement.reason:
+        return part
+    G = loop.sent(coupling)
+    buffered = this_environment(delay(span.hi, G.T) @ G, found.requirement.available, loop.T_max)
+    return part | {
         "alpha": [finite(a) for a in found.alpha],
         "playout": {
             "theta": list(span.hi),
