@@ -69,7 +69,7 @@ class Suite:
 
 def machine() -> dict[str, str]:
     """What figures of speed, and the last digits of all others, depend on."""
-    packages = {name: version(name) for name in ("mujoco", "numpy", "scipy", "cvxpy", "clarabel")}
+    packages = {name: version(name) for name in ("mujoco", "numpy", "scipy", "clarabel")}
     return {
         "Python": platform.python_version(),
         **packages,

@@ -86,10 +86,10 @@ class Loop(Strict, frozen=True, omit_defaults=True):  # so that a loop without t
     def _check_latency(self, latency: tuple[tuple[float, float], ...]) -> None:
         if len(latency) != len(self.theta):
             raise ValueError(f"latency has {len(latency)} ranges for {len(self.theta)} channels")
-        for i, (least, most) in enumerate(latency):
+        for i, (least, most) in enumerate(latency, start=1):
             if not 0 <= least <= most < self.T:
                 raise ValueError(
-                    f"latency[{i}] is {least:g} to {most:g} s, expected 0 <= least <= most < T = {self.T:g} s"
+                    f"latency #{i} is {least:g} to {most:g} s, expected 0 <= least <= most < T = {self.T:g} s"
                 )
         if self.varying_delay or self.environment.walls:
             other = "varying_delay" if self.varying_delay else "environment.walls"

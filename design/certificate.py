@@ -143,6 +143,7 @@ def prove_limiter(
     loop: Loop, coupling: Coupling, beta: float = multipliers.BETA, c: multipliers.Lags | None = None
 ) -> LimiterCertificate:
     """An exact proof with the multiplier `c` or the best one. Raises NotProved with the reason."""
+    _require_limits(loop, coupling, "this-environment")
     found = multipliers.limiter_requirement(loop, coupling, beta, c)
     requirement = found.requirement
     if not requirement.certified:

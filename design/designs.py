@@ -20,7 +20,7 @@ class Kind(NamedTuple):
     """One design: what it promises, where it is made, and what can be asked of it."""
 
     conditions: tuple[str, ...]  # that it can be made for, its own first
-    module: str  # loaded when it is asked for: cvxpy takes a second
+    module: str  # loaded when it is asked for
     function: str  # from a loop to a Design
     takes: tuple[str, ...] = ()  # besides the loop and its options: condition, progress
     options: tuple[str, ...] = ()  # in words of design.api.DesignOptions

@@ -71,6 +71,11 @@ def one_line(text: object) -> str:
 # Which files a command has read, and which its options name as output.
 
 
+def counted(path: str) -> str:
+    """The place of a value in a file, entries of lists counted from 1: human[0].mass as human #1.mass."""
+    return re.sub(r"\[(\d+)\]", lambda match: f" #{int(match[1]) + 1}", path)
+
+
 @dataclass
 class _Ledger:
     """By device and inode where a file exists, and by its path without links."""

@@ -124,8 +124,8 @@ class Design:
     figure: str  # what was minimised: "loop-norm" (23), "rms" (mismatch), "stiffness" (maximised)
     objective: float  # its value, of the coupling as returned
     requirement: Requirement  # by `condition`, on a refined sweep
-    sdps: int  # convex problems solved (local searches count their runs)
-    wall_s: float
+    sdps: int = 0  # convex problems solved (local searches count their runs)
+    wall_s: float = 0.0
     phi: Array | None = None  # (N,) multiplier Phi_E [N s/m] of Theorem 4, None where the environment has none
     certificate: Any = field(kw_only=True, default=None)  # design.stored.Certificate, where the design has proved it
     hurried: bool = field(kw_only=True, default=False)  # its clock ended it: more time may find a better

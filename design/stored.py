@@ -17,7 +17,7 @@ import msgspec
 from controller.coupling import Coupling, Form, Strict, require_channels
 from controller.loop import Loop
 from controller.older import CONDITIONS, GUARANTEES, named_first, named_today
-from design.files import InputError, read, write
+from design.files import InputError, counted, read, write
 from design.result import Condition
 
 _Rows = tuple[tuple[float, ...], ...]
@@ -127,7 +127,7 @@ def load(path: str | Path) -> Stored:
     except _Twice as error:
         raise InputError(f"{path}: names {str(error)!r} twice in one object") from None
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: is no stored coupling: {' '.join(str(error).split())}") from None
+        raise InputError(f"{path}: is no stored coupling: {counted(' '.join(str(error).split()))}") from None
     except (msgspec.DecodeError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: {_place(content, str(error))}{' '.join(str(error).split())}") from None
 

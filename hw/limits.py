@@ -64,8 +64,8 @@ class SafetyLimits:
     thermal: float = 10.0  # [s] time constant of the motors
 
     def __post_init__(self) -> None:
-        for i, cap in enumerate(self.cap):
-            require(f"cap[{i}]", cap, 1e-3, 12.0, "N")
+        for i, cap in enumerate(self.cap, start=1):
+            require(f"cap #{i}", cap, 1e-3, 12.0, "N")
         require("slew", self.slew, 1.0, 2000.0, "N/s")
         require("jump", self.jump, 1e-6, 3e-3, "m")
         require("watchdog_us", self.watchdog_us, 1000, 20000, "us")
@@ -75,8 +75,8 @@ class SafetyLimits:
         require("thermal", self.thermal, 0.1, 1000.0, "s")
         if self.continuous and len(self.continuous) != len(self.cap):
             raise ValueError(f"continuous has {len(self.continuous)} entries, cap {len(self.cap)}")
-        for i, (most, cap) in enumerate(zip(self.continuous, self.cap, strict=False)):
-            require(f"continuous[{i}]", most, 1e-3, cap, "N")
+        for i, (most, cap) in enumerate(zip(self.continuous, self.cap, strict=False), start=1):
+            require(f"continuous #{i}", most, 1e-3, cap, "N")
 
 
 class _Shaped(NamedTuple):

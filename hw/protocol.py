@@ -305,8 +305,8 @@ def _check(message: Message) -> None:
             axes = len(value) if axes is None else axes
             if len(value) != axes or not 1 <= axes <= _MAX_AXES:
                 raise ValueError(f"{name}.{field}: {len(value)} entries; 1 to {_MAX_AXES} axes, every field the same")
-            for axis, entry in enumerate(value):
-                _check_integer(f"{name}.{field}[{axis}]", entry, limits)
+            for axis, entry in enumerate(value, start=1):
+                _check_integer(f"{name}.{field} #{axis}", entry, limits)
 
 
 def _check_integer(name: str, value: Any, limits: tuple[int, int]) -> None:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from controller.coupling import Form
 from controller.lti import Array
 from controller.older import named_today
-from design.files import plain, read_arrays, write, write_json
+from design.files import counted, plain, read_arrays, write, write_json
 from hw.control import Armable, BudgetPlan, CertifiedCoupling, Controller, SentBudget, TraceRow, host_controller
 from hw.limits import SafetyLimits, SafetyStop, Units, shape
 from hw.protocol import NO_MARGIN, Config
@@ -377,8 +377,8 @@ class _Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if len(given) != m:
                 raise ValueError(f"{name} has {len(given)} entries, the scenario {m} channels")
         for i in range(m):
-            require(f"force_step[{i}]", self.force_step[i], 1e-9, 1.0, "N")
-            require(f"cap[{i}]", self.cap[i], 1, 0x7FFF, "steps")
+            require(f"force_step #{i + 1}", self.force_step[i], 1e-9, 1.0, "N")
+            require(f"cap #{i + 1}", self.cap[i], 1, 0x7FFF, "steps")
         soonest = 0 if self.scenario.latency else 1
         if not soonest <= self.link_delay <= least:
             allowed = f"{soonest} to {least}, the scenario's least theta"
@@ -427,7 +427,7 @@ def recipes_of(result: Trace) -> list[_Recipe]:
                 recipe["scenario"] = named_today(scenario)
         return msgspec.convert(raw, Annotated[list[_Recipe], msgspec.Meta(min_length=1)])
     except (msgspec.ValidationError, ValueError) as error:
-        raise InputError(f"the trace cannot be replayed: {error}") from None
+        raise InputError(f"the trace cannot be replayed: {counted(str(error))}") from None
 
 
 def _require_limits(raw: object) -> None:

@@ -1,6 +1,6 @@
 """A session in real time over a serial port, by pyserial, and one thread that waits for nothing else.
 
-Python holds up a loop by itself: a full garbage collection takes 40 ms with MuJoCo and cvxpy loaded. So what is loaded
+Python holds up a loop by itself: a full garbage collection takes 30 ms with MuJoCo and SciPy loaded. So what is loaded
 is frozen and the collector is off while forces act.
 """
 

@@ -259,9 +259,9 @@ class Human(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     voluntary: Voluntary | None = None
 
     def __post_init__(self) -> None:
-        for i, link in enumerate(self.links[1:], start=1):
+        for i, link in enumerate(self.links[1:], start=2):
             if link.mass == 0:
-                raise ValueError(f"links[{i}].mass is 0: only the mass at the handle may be missing")
+                raise ValueError(f"links #{i}.mass is 0: only the mass at the handle may be missing")
 
     def port(self) -> Port:
         """The chain as the handle feels it."""
@@ -341,12 +341,12 @@ class Person(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def check_holds(held_by: Sequence[tuple[int, ...]], channels: int) -> None:
     """Raise ValueError where a person holds a channel that does not exist or that another person holds."""
     held: set[int] = set()
-    for i, holds in enumerate(held_by):
+    for i, holds in enumerate(held_by, start=1):
         for channel in holds:
             if channel > channels:
-                raise ValueError(f"person[{i}].holds has channel {channel}, allowed are 1 to {channels}")
+                raise ValueError(f"person #{i}.holds has channel {channel}, allowed are 1 to {channels}")
             if channel in held:
-                raise ValueError(f"person[{i}].holds has channel {channel}, which somebody else holds already")
+                raise ValueError(f"person #{i}.holds has channel {channel}, which somebody else holds already")
         held.update(holds)
 
 
@@ -361,8 +361,8 @@ class Population(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         for name, unit in (("mass", "kg"), ("damping", "N s/m"), ("stiffness", "N/m")):
             low, high = getattr(self, name)
-            require(f"{name}[0]", low, 1e-9, 1e9, unit)
-            require(f"{name}[1]", high, low, 1e9, unit)
+            require(f"{name} #1", low, 1e-9, 1e9, unit)
+            require(f"{name} #2", high, low, 1e9, unit)
         require("links", self.links, 1, 8, "links")
 
     def draw(self, rng: np.random.Generator, n: int) -> list[Human]:

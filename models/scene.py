@@ -292,13 +292,13 @@ def _placed(
     placed = []
     for i, port in enumerate(ports, start=1):
         if port.handles > 1:
-            raise ValueError(f"human[{i - 1}] has {port.handles} handles, expected one: a person holds several")
+            raise ValueError(f"human #{i} has {port.handles} handles, expected one: a person holds several")
         own = (f"human_{i}_{j}" for j in range(2, port.mass.shape[-1] + 1))
         placed.append(_place(port, (handles[i - 1], *own), body.get(i), f"link_{i}"))
     for p, (holds, port) in enumerate(held, start=1):
         extra = port.mass.shape[-1] - len(holds)
         if port.handles != len(holds) or extra < 1:
-            raise ValueError(f"person[{p - 1}] has {port.handles} handles and {extra} bodies, expected {len(holds)}, 1")
+            raise ValueError(f"person #{p} has {port.handles} handles and {extra} bodies, expected {len(holds)}, 1")
         own = (f"body_{p}_{j}" for j in range(1, extra))
         hands = (handles[channel - 1] for channel in holds)
         placed.append(_place(port, (*hands, *own, f"body_{p}"), None, f"cross_{p}"))

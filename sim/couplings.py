@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -73,12 +73,12 @@ def choose(
                 proof = kept.certificate.limiter or None
                 return Chosen(name, kept.built(), condition, limiter=proof, known=kept.certificate)
             design = design_by_kind(loop, name, condition, progress, **asked)
-            design_cache.keep(design, *question)
+            known = design_cache.keep(design, *question)
         except DesignFailed:
             raise
         except ValueError as error:
             raise InputError(str(error)) from None
-        return given(design, name)
+        return replace(given(design, name), known=known, limiter=(known and known.limiter) or None)
     if Path(name).suffix != ".json":
         raise InputError(f"--coupling is {name!r}, allowed are {', '.join(NAMES)} or a FILE.json")
     stored = read_coupling(name)

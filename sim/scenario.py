@@ -27,7 +27,7 @@ from controller.older import SCENARIOS as OLDER_SCENARIOS
 from controller.older import named_first, named_today
 from controller.ranges import Ranges, UncertainSpring
 from controller.timing import Periods, Timing, drawn
-from design.files import InputError, printable, read_text, toml, write
+from design.files import InputError, counted, printable, read_text, toml, write
 from models.device import MOST_DAMPING, Device, fields_of, passivity_level, require, with_damping
 from models.human import Cross, Human, Link, MeasuredHand, Person, Population, Port, Voluntary, check_holds
 
@@ -97,8 +97,8 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             if value is not None and len(value) != self.channels:
                 contacts = f"the environment has {self.channels} contacts ({', '.join(self.environment.contacts)})"
                 raise ValueError(f"{name} has {len(value)} entries, but {contacts}")
-            for i, n in enumerate(value if name in ("theta", "psi", "lam") and value else ()):
-                require(f"{name}[{i}]", n, 0, LONGEST_DELAY, "samples")
+            for i, n in enumerate(value if name in ("theta", "psi", "lam") and value else (), start=1):
+                require(f"{name} #{i}", n, 0, LONGEST_DELAY, "samples")
         if (total := sum((*self.theta, *self.psi))) > _MOST_DELAYS:
             many = f"theta and psi are {total} samples in all, allowed are {_MOST_DELAYS}"
             seconds = f"each is a state, and their eigenvalues would take about {1e-8 * total**3:.0f} s"
@@ -106,7 +106,7 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         for i, lam in enumerate(self.lam or ()):
             if lam > self.theta[i] + self.psi[i]:
                 total = self.theta[i] + self.psi[i]
-                raise ValueError(f"lam[{i}] is {lam}, allowed are 0 to theta + psi = {total} samples")
+                raise ValueError(f"lam #{i + 1} is {lam}, allowed are 0 to theta + psi = {total} samples")
         check_holds([person.holds for person in self.person], self.channels)
         if self.varying_delay:
             self._check_varying_delay(self.varying_delay)
@@ -121,9 +121,9 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         if self.period and self.T_max is not None and self.period.longest > self.T_max:
             raise ValueError(f"period is up to {self.period.longest:g} s, above T_max = {self.T_max:g} s")
         shortest = self.period.shortest if self.period else self.T
-        for i, (_, most) in enumerate(self.latency or ()):
+        for i, (_, most) in enumerate(self.latency or (), start=1):
             if most >= shortest:
-                raise ValueError(f"latency[{i}] is up to {most:g} s, expected less than every period, {shortest:g} s")
+                raise ValueError(f"latency #{i} is up to {most:g} s, expected less than every period, {shortest:g} s")
 
     def _check_varying_delay(self, varying: VaryingDelay) -> None:
         if varying.channels != self.channels:
@@ -132,11 +132,11 @@ class Scenario(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             raise ValueError("varying_delay and ranges: switching delays are judged in one environment; give one")
         if self.environment.walls:
             raise ValueError("varying_delay and environment.walls: switching delays are judged in linear loops only")
-        for i, (n, lo, hi) in enumerate(zip(self.theta, varying.lo, varying.hi, strict=True)):
+        for i, (n, lo, hi) in enumerate(zip(self.theta, varying.lo, varying.hi, strict=True), start=1):
             if varying.playout and n != hi:
-                raise ValueError(f"theta[{i}] is {n}, but varying_delay.playout makes it the largest delay, {hi}")
+                raise ValueError(f"theta #{i} is {n}, but varying_delay.playout makes it the largest delay, {hi}")
             if not lo <= n <= hi:
-                raise ValueError(f"theta[{i}] is {n}, outside of its varying_delay, {lo} to {hi} samples")
+                raise ValueError(f"theta #{i} is {n}, outside of its varying_delay, {lo} to {hi} samples")
 
     @property
     def channels(self) -> int:
@@ -274,10 +274,10 @@ def built_in() -> list[str]:
 
 def require_linear(scenario: Scenario, what: str, walls: bool = False) -> None:
     """Raises InputError where a loop has Coulomb friction or, unless `walls` are decided too, walls."""
-    for i, device in enumerate(scenario.device):
+    for i, device in enumerate(scenario.device, start=1):
         if device.friction:
             instead = "sim.run and sim.zwidth simulate it"
-            raise InputError(f"device[{i}].friction is {device.friction:g} N: {what} decides linear loops; {instead}")
+            raise InputError(f"device #{i}.friction is {device.friction:g} N: {what} decides linear loops; {instead}")
     if scenario.environment.walls and not walls:
         raise InputError(f"environment.walls: {what} decides linear loops; sim.run closes the loop with walls")
 
@@ -331,16 +331,16 @@ def _humans_of(text: str, source: str) -> _HumanFile:
     """A file of humans; a [[human]] with A, B, C and D is a measured transfer function, any other a chain."""
     people: _HumanFile = _converted(text, _HumanFile, source)
     made = []
-    for i, human in enumerate(people.human):
+    for i, human in enumerate(people.human, start=1):
         kind = MeasuredHand if isinstance(human, dict) and "A" in human else Human
         try:
             made.append(msgspec.convert(human, kind))
         except msgspec.ValidationError as error:
             joint = "." if re.search(r" - at `\$\.", str(error)) else ": "
             place = _located(str(error), human if isinstance(human, dict) else {})
-            raise InputError(f"{source}: human[{i}]{joint}{place}") from None
+            raise InputError(f"{source}: human #{i}{joint}{place}") from None
         except ValueError as error:
-            raise InputError(f"{source}: human[{i}]: {error}") from None
+            raise InputError(f"{source}: human #{i}: {error}") from None
     return _HumanFile(tuple(made), people.person)
 
 
@@ -354,9 +354,9 @@ def _run_file(path: str | Path) -> _HumanFile:
             names = runpy.run_path(str(path))
         sys.stderr.write(printable(heard.getvalue()))
         hands, persons = _kept(tuple(names.get("humans", ()))), tuple(names.get("persons", ()))
-        for i, person in enumerate(persons):
+        for i, person in enumerate(persons, start=1):
             if not isinstance(person, Person):
-                raise ValueError(f"persons[{i}] is {person!r}, expected a models.human.Person")
+                raise ValueError(f"persons #{i} is {person!r}, expected a models.human.Person")
         population = names.get("population")
         if population is not None and len(_kept(tuple(population.draw(np.random.default_rng(0), 2)))) != 2:
             raise ValueError("population.draw(rng, 2) gives not two humans")
@@ -418,13 +418,13 @@ def _with_catalogue(raw: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(devices, list):
         return raw
     made = []
-    for i, one in enumerate(devices):
+    for i, one in enumerate(devices, start=1):
         given = {"device": one} if isinstance(one, str) else one
         if isinstance(given, dict) and isinstance(name := given.get("device"), str):
             try:
                 given = fields_of(name, {key: value for key, value in given.items() if key != "device"})
             except ValueError as error:
-                raise InputError(f"device[{i}]: {error}") from None
+                raise InputError(f"device #{i}: {error}") from None
         made.append(given)
     return raw | {"device": made}
 
@@ -433,8 +433,8 @@ class _Damping(msgspec.Struct, frozen=True):
     delta: tuple[float, ...]  # [N s/m]
 
     def __post_init__(self) -> None:
-        for i, damping in enumerate(self.delta):
-            require(f"delta[{i}]", damping, 0.0, MOST_DAMPING, "N s/m")
+        for i, damping in enumerate(self.delta, start=1):
+            require(f"delta #{i}", damping, 0.0, MOST_DAMPING, "N s/m")
 
 
 def _strictly(fields: dict[str, Any], kind: Any) -> Any:
@@ -477,15 +477,15 @@ def _kept(value: Any) -> Any:
     """A user's own population as it is, or humans, each of which must be able to hold a device. Raises ValueError."""
     if not isinstance(value, list | tuple):
         return value
-    for i, human in enumerate(value):
+    for i, human in enumerate(value, start=1):
         if not (callable(getattr(human, "port", None)) and callable(getattr(human, "voluntary_force", None))):
-            raise ValueError(f"human[{i}] is {human!r}, expected a Human, or what has port() and voluntary_force(t)")
+            raise ValueError(f"human #{i} is {human!r}, expected a Human, or what has port() and voluntary_force(t)")
         if not isinstance(port := human.port(), Port):  # which raises ValueError where it is not passive
-            raise ValueError(f"human[{i}].port() is {port!r}, expected a models.human.Port")
+            raise ValueError(f"human #{i}.port() is {port!r}, expected a models.human.Port")
         with np.errstate(all="ignore"):
             force = np.asarray(human.voluntary_force(_TIMES))
         if force.shape != _TIMES.shape or force.dtype.kind not in "fiu" or not np.isfinite(force).all():
-            raise ValueError(f"human[{i}].voluntary_force(t) is {force!r} for two times, expected as many forces in N")
+            raise ValueError(f"human #{i}.voluntary_force(t) is {force!r} for two times, expected as many forces in N")
     return tuple(value)
 
 
@@ -495,7 +495,7 @@ def _contents(part: Any) -> Any:
 
 
 def _located(message: str, raw: dict[str, Any]) -> str:
-    """'Expected `int`, got `float` - at `$.theta[0]`' as 'theta[0] = 1.5: expected `int`, got `float`'."""
+    """'Expected `int`, got `float` - at `$.theta[0]`' as 'theta #1 = 1.5: expected `int`, got `float`'."""
     match = re.fullmatch(r"(.*?)(?: - at `(?:key in )?\$\.?(.*)`)?", message, flags=re.DOTALL)
     assert match
     what, path = match[1], match[2] or ""
@@ -510,7 +510,7 @@ def _located(message: str, raw: dict[str, Any]) -> str:
     shown = f" = {value!r}" if isinstance(value, int | float | str) else ""
     if what[1:2].islower():  # a word of msgspec's, not a symbol of ours
         what = what[0].lower() + what[1:]
-    return f"{path}{shown}: {what}" if path else what
+    return f"{counted(path)}{shown}: {what}" if path else what
 
 
 def _hint(what: str) -> str:

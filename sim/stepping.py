@@ -67,6 +67,13 @@ def settle(
     Raises InputError where they cannot be had.
     """
     if engine == "exact":
+        for name, asked in (("integrator", integrator), ("substeps", substeps)):
+            if asked is not None:
+                raise InputError(f"--{name} with --engine exact: it takes no steps; leave it out")
+        if simulation.friction:
+            raise InputError(
+                "--engine exact is linear and has no Coulomb friction, the devices have; use --engine mujoco"
+            )
         return None, None, []
     integrator = integrator or default_integrator(simulation.scene)
     if substeps is None:

@@ -332,9 +332,6 @@ def growths(trace: Trace) -> list[Growth]:
     return [growth(trace.x[first:stop], T, steps, first) for first, stop in ends.tolist()]
 
 
-Result = Trace  # its name in earlier versions
-
-
 if __name__ == "__main__":
     from cli.main import door
 

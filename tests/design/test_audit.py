@@ -324,7 +324,7 @@ BAD = [
     ("--K 1 --B 1 --delta=-1", "--delta is -1, allowed are 0 to 10000"),
     ("--K 1 --B 1 --delta nan", "--delta is nan, allowed"),
     ("--K 1 --B 1 --T 0", "T is 0, allowed"),
-    ("--K 1 --B 1 --theta=-1", "theta[0] is -1, allowed"),
+    ("--K 1 --B 1 --theta=-1", "theta #1 is -1, allowed"),
     ("--K 1 --B 1 --theta 101", "theta is 101, 101, allowed are 0 to 100 samples"),
     ("--K 1 --B 1 --theta 0.5", "--theta is '0.5', expected whole numbers"),
     ("--K 1 --B 1 --seed x", "--seed is 'x'"),

@@ -316,7 +316,7 @@ def test_bad_calls(options, message, tmp_path):
 def test_a_negative_range_is_refused(tmp_path):
     text = (load.__globals__["SCENARIOS"] / "omega-pair.toml").read_text() + "\n[population]\nmass = [-1.0, 3.0]\n"
     (tmp_path / "s.toml").write_text(text)
-    with pytest.raises(InputError, match=r"mass\[0\] is -1, allowed are"):
+    with pytest.raises(InputError, match=r"mass #1 is -1, allowed are"):
         main(["--scenario", str(tmp_path / "s.toml")])
 
 
