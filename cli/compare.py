@@ -461,7 +461,8 @@ def _plan(args: argparse.Namespace, loop: Loop, wish: Options) -> dict[str, list
         low, colon, high = text.partition(":")
         if given and not colon:
             raise InputError(f"--over {part}: expected LOW:HIGH in {AXES[name].unit}")
-        span = options.numbers(f"--over {name}", f"{low},{high}", float, 2) if given else None
+        ends = (options.numbers(f"--over {name}", end, float, 1)[0] for end in (low, high))
+        span = (next(ends), next(ends)) if given else None
         with options.refused(f"--over {part}: "):
             plan[name] = points_along(name, loop, wish, args.points, span, args.keep)
     return plan
