@@ -56,19 +56,14 @@ def main(argv: list[str]) -> int:
     with render.progress("measuring") as move:
         measured = measure_all(coupled, uncoupled, default, move)
     report = _Report(args.case, scenario.name, chosen.kind, args.seed, default, *measured)
-    files = []
-    if report.rows and not args.no_plot:
-        from sim.plots import plot_accuracy
-
-        files.append(plot_accuracy(render.plain(report.rows), out / "accuracy.png"))
+    drawn = {"accuracy.png": "plot_accuracy"} if report.rows else {}
+    files = render.pictures(args, report.rows, out, drawn)
     table = render.columns(f"speed against error · {scenario.title(args.case)}, {chosen.kind}", _CELLS, report.rows)
     lines = [*(f"not measured: {reason}" for reason in report.skipped), *_LEGEND]
     render.publish(args, report, [table], lines, out, files)
-    if report.interrupted:
-        return options.INTERRUPTED
     defaults = ((EXPONENTIAL, 1), ("RK4", default))
     right = all(row.verdict_correct for row in report.rows if (row.integrator, row.substeps) in defaults)
-    return options.DONE if right else options.DOES_NOT_HOLD
+    return options.exit_code(right, report.interrupted)
 
 
 def _parser() -> options.Parser:

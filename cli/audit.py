@@ -78,8 +78,7 @@ def main(argv: list[str]) -> int:
         time.perf_counter() - begin,
     )
     render.publish(args, with_older(render.plain(report), AUDITS), _tables(found), _remarks(report), out)
-    holds = found.certified and (found.switching is None or found.switching["certified"])
-    return options.DONE if holds else options.DOES_NOT_HOLD
+    return options.exit_code(found.certified and (found.switching is None or found.switching["certified"]))
 
 
 def _parser() -> options.Parser:

@@ -58,7 +58,7 @@ def _parser() -> options.Parser:
     parser = options.Parser("design.compare", what, example)
     options.add_loop_options(parser)
     given = f"{', '.join(NAMES)} or FILE.json, separated by commas; NAME:CONDITION asks for a condition"
-    parser.add_argument("--coupling", metavar="NAME,FILE,..", help=f"{given} (default none,spring-damper)")
+    parser.add_argument("--coupling", type=_names, metavar="NAME,FILE,..", help=f"{given} (default none,spring-damper)")
     options.add_condition_option(parser, "of designs that name none")
     short = "every design side by side, cases I and II (full: minutes)"
     parser.add_argument("--ladder", nargs="?", const="short", choices=tuple(LADDERS), help=short)
@@ -149,7 +149,8 @@ class _Couplings:
 
 
 def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
-    names, out = _names(args), options.out_folder(args, "compare")
+    names = args.coupling or (("none",) if args.case == "none" else ("none", "spring-damper"))
+    out = options.out_folder(args, "compare")
     chosen, failed = _chosen(scenario, args, names)
     loop = scenario.loop(args.case)
     judged = {name: compare.judge(loop, c.coupling, c.phi) for name, c in chosen.items()}
@@ -160,35 +161,30 @@ def _couplings(args: argparse.Namespace, scenario: Scenario) -> int:
     notes += [f"{name}, {condition}: {part['reason']}" for name, condition, part in parts if "reason" in part]
     about = args.case, scenario.name, args.seed, loop.T, loop.theta, loop.psi, loop.lam, loop.delta
     report = _Couplings(*about, hz, *compare.ideal(loop, hz), shown, notes)
-    files = []
-    if not args.no_plot:
-        from sim import plots
-
-        outcome = render.plain(report)
-        files = [
-            plots.plot_singular_values(outcome, out / "singular-values.png"),
-            plots.plot_required_damping(outcome, out / "required-damping.png"),
-            plots.plot_perceived(outcome, out / "perceived.png"),
-        ]
+    files = render.pictures(args, report, out, _PICTURES)
     render.publish(args, report, [_guarantees(report), _feel(report)], notes, out, files)
-    return options.DOES_NOT_HOLD if failed else options.DONE
+    return options.exit_code(not failed)
 
 
-def _names(args: argparse.Namespace) -> list[str]:
-    """The couplings that were asked for. Raises InputError."""
-    usual = "none" if args.case == "none" else "none,spring-damper"
-    asked: str = usual if args.coupling is None else args.coupling
-    names = asked.split(",")
+_PICTURES = {
+    "singular-values.png": "plot_singular_values",
+    "required-damping.png": "plot_required_damping",
+    "perceived.png": "plot_perceived",
+}
+
+
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(text.split(","))
     if "" in names:
-        raise InputError(f"--coupling is {args.coupling!r}, expected names separated by commas")
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected names separated by commas")
     if len(set(names)) < len(names):
-        raise InputError(f"--coupling is {args.coupling!r}: a name stands there twice")
+        raise argparse.ArgumentTypeError(f"is {text!r}: a name stands there twice")
     if len(names) > _MOST:
-        raise InputError(f"--coupling has {len(names)} entries, allowed are 1 to {_MOST}")
+        raise argparse.ArgumentTypeError(f"has {len(names)} entries, allowed are 1 to {_MOST}")
     return names
 
 
-def _chosen(scenario: Scenario, args: argparse.Namespace, names: list[str]) -> tuple[dict[str, Chosen], list[str]]:
+def _chosen(scenario: Scenario, args: argparse.Namespace, names: Sequence[str]) -> tuple[dict[str, Chosen], list[str]]:
     """The couplings by name, and why designs failed. Raises DesignFailed where all of them did."""
     chosen: dict[str, Chosen] = {}
     failures: dict[str, DesignFailed] = {}
@@ -240,16 +236,22 @@ def _guarantees(report: _Couplings) -> Table:
     alike = len(set(available)) == 1
     damping = "required damping" if alike else "required share of the damping"
     title = f"{damping} of {_list(available)} N s/m · {report.scenario}, case {report.case}"
-    heads = ("coupling", "this-env.", "at Hz", "at 10 %", "any-env.", "at Hz", "sup dB", "rms dB")  # render.ORDER
-    rows = []
-    for coupling in report.couplings:
-        parts = [coupling.conditions[condition] for condition in render.ORDER]
-        needs = [(_needs(p, available[0] if alike else 1.0), p["binding_frequency_hz"]) for p in parts]
-        asked = [cell for need, hz in needs for cell in (need, render.optional(hz, "{:.4g}"))]
-        asked.insert(2, _robust(coupling.robustness, available[0] if alike else 1.0))
-        errors = [coupling.transparency[f"{which}_mismatch_db"] for which in ("relative", "rms")]
-        rows.append([coupling.name, *asked, *(render.optional(e, "{:.2f}", "-inf") for e in errors)])
-    return render.grid(title, heads, rows)
+    scale = available[0] if alike else 1.0
+    cells: dict[str, Callable[[_Shown], str]] = {
+        "coupling": lambda c: c.name,
+        "this-env.": lambda c: _needs(c.conditions["this-environment"], scale),
+        "at Hz": lambda c: _binds(c.conditions["this-environment"]),
+        "at 10 %": lambda c: _robust(c.robustness, scale),
+        "any-env.": lambda c: _needs(c.conditions["any-environment"], scale),
+        "at Hz ": lambda c: _binds(c.conditions["any-environment"]),
+        "sup dB": lambda c: render.optional(c.transparency["relative_mismatch_db"], "{:.2f}", "-inf"),
+        "rms dB": lambda c: render.optional(c.transparency["rms_mismatch_db"], "{:.2f}", "-inf"),
+    }
+    return render.columns(title, cells, report.couplings)
+
+
+def _binds(part: dict[str, Any]) -> str:
+    return render.optional(part["binding_frequency_hz"], "{:.4g}")
 
 
 def _needs(part: dict[str, Any], scale: float) -> str:
@@ -312,7 +314,7 @@ def _ladder(args: argparse.Namespace, scenario: Scenario) -> int:
         shown.append(render.columns(f"the ladder · {scenario.name}, case {case}", _LADDER, some, left=(0, 5)))
     lines = [f"{row.design}, case {row.case}: {row.reason}" for row in rows if row.reason]
     render.publish(args, report, shown, [*lines, f"{report.wall_s:.1f} s"], out)
-    return options.INTERRUPTED if interrupted else options.DONE
+    return options.exit_code(True, interrupted)
 
 
 def _decibels(value: float | None) -> str:
@@ -371,18 +373,14 @@ def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
         except KeyboardInterrupt:
             interrupted = True
     report = _Baselines(scenario.name, args.case, args.seed, rows, time.perf_counter() - begin, interrupted)
-    files = []
-    if rows and not args.no_plot:
-        from sim.plots import plot_baselines
-
-        files.append(plot_baselines(render.plain(report), out / "baselines.png"))
+    files = render.pictures(args, report, out, {"baselines.png": "plot_baselines"} if rows else {})
     shown = [render.columns(f"on the same runs · {scenario.title(args.case)}", _RIVALS, rows, left=(0, 7))]
     lines = [f"* baseline {row.name}: {row.source}." for row in rows if row.source]
     began = f"{baselines.SLOW:g} m/s they began with"
     lines.append(f"hands: of {baselines.PAIRS} lossless pairs, faster after {baselines.SECONDS:g} s than the {began}.")
     lines += sorted({f"error: {row.reason}." for row in rows if row.reason})
     render.publish(args, report, shown, [*lines, f"{report.wall_s:.1f} s"], out, files)
-    return options.INTERRUPTED if interrupted else options.DONE
+    return options.exit_code(True, interrupted)
 
 
 _RIVALS: dict[str, str | Callable[[baselines.Rival], str]] = {
@@ -435,20 +433,13 @@ def _limits(args: argparse.Namespace, scenario: Scenario) -> int:
     wall, gains = time.perf_counter() - begin, compare.gains(plan, sweeps, loop, wish)
     report = _Limits(*about, sweeps, gains, wall, interrupted)
     points = [(name, row) for name, sweep in sweeps.items() for row in sweep.curves["optimal"]]
-    files = []
-    if not args.no_plot and points:
-        from sim.plots import plot_limits
-
-        files.append(plot_limits(render.plain(report), out / "limits.png"))
+    files = render.pictures(args, report, out, {"limits.png": "plot_limits"} if points else {})
     names = " and by ".join(args.beside)
     lines = [f"beside the optimum: the designed spring-damper by {names}"] if names else []
     lines += [f"{name} {row.value:.4g}: {row.reason}" for name, row in points if row.reason]
     tables = [_limit_table(report, name, args.beside) for name in sweeps]
     render.publish(args, report, tables, [*lines, *gains, f"{wall:.1f} s"], out, files)
-    if interrupted:
-        return options.INTERRUPTED
-    found = any(row.rms_mismatch_db is not None for _, row in points)
-    return options.DONE if found else options.DOES_NOT_HOLD
+    return options.exit_code(any(row.rms_mismatch_db is not None for _, row in points), interrupted)
 
 
 def _plan(args: argparse.Namespace, loop: Loop, wish: Options) -> dict[str, list[Point]]:

@@ -47,7 +47,7 @@ def main(argv: list[str]) -> int:
     report = _reported(args, loop, design, judged, stored)
     render.publish(args, report, _tables(scenario, report), (report.best or {}).get("notes", args.notes))
     holds = report.certificate["certified"] and (judged.promise == ANY or not judged.whole or judged.proved)
-    return options.DONE if holds and (report.switching or report.certificate)["certified"] else options.DOES_NOT_HOLD
+    return options.exit_code(holds and (report.switching or report.certificate)["certified"])
 
 
 def _parser() -> options.Parser:

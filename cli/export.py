@@ -94,7 +94,7 @@ def main(argv: list[str]) -> int:
     )
     title = f"{block.name} as {args.format}"
     render.publish(args, exported, [render.facts(title, render.rows_of(exported), left=True)])
-    return options.DOES_NOT_HOLD if stored.certificate and not verdict.proved else options.DONE
+    return options.exit_code(verdict.proved or not stored.certificate)
 
 
 def _parser() -> options.Parser:

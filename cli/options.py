@@ -180,7 +180,7 @@ def refused(name: str = "") -> Iterator[None]:
         yield
     except (InputError, DesignFailed):
         raise
-    except ValueError as error:
+    except (ValueError, ArithmeticError) as error:
         raise InputError(f"{name}{error}") from None
 
 
@@ -451,6 +451,11 @@ def _rows(
 
 # ----------------------------------------------------------------------------------------------------
 # Running a command.
+
+
+def exit_code(holds: bool, interrupted: bool = False) -> int:
+    """Of a command that has reported what it found."""
+    return INTERRUPTED if interrupted else DONE if holds else DOES_NOT_HOLD
 
 
 def execute(main: Callable[[list[str]], int], argv: list[str] | None = None) -> NoReturn:

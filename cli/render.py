@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, field, fields
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -148,6 +149,14 @@ def publish(
         screen.print("files: " + ", ".join(outcome["files"]), soft_wrap=True)
     if args.json:
         write_json(args.json, outcome)
+
+
+def pictures(args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping[str, str]) -> list[Path]:
+    """Pictures of a report: by file the function of sim.plots that draws it; none with --no-plot."""
+    if args.no_plot:
+        return []
+    plots, outcome = import_module("sim.plots"), plain(report)
+    return [getattr(plots, function)(outcome, folder / file) for file, function in drawn.items()]
 
 
 # ----------------------------------------------------------------------------------------------------

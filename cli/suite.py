@@ -127,9 +127,7 @@ def _measured(check: Check, place: Path, seed: int) -> int:
         getattr(plots, check.picture)(rows, place / f"{check.name}.png")
     holds = all(row["holds"] for row in rows)
     write_json(place / "report.json", {"rows": rows, "holds": holds, "seed": seed, "interrupted": interrupted})
-    if interrupted:
-        return options.INTERRUPTED
-    return options.DONE if holds else options.DOES_NOT_HOLD
+    return options.exit_code(holds, interrupted)
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -168,9 +166,7 @@ def main(argv: list[str]) -> int:
     if len(checks) == 1 and answers:
         _show(answers[0], screen)
     render.publish(args, report, (), (), out, [write(out / "report.md", reports.markdown(report))])
-    if interrupted:
-        return options.INTERRUPTED
-    return options.DONE if report.holds else options.DOES_NOT_HOLD
+    return options.exit_code(report.holds, interrupted)
 
 
 def _parser() -> options.Parser:

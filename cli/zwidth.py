@@ -65,9 +65,7 @@ def main(argv: list[str]) -> int:
     title = f"{_span(grid.K)} N/m, B {_span(grid.B)} N s/m, {report.cells} couplings"
     table = render.facts(f"K {title}", _rows(report), left=True)
     render.publish(args, report, [table], [*_marked(report), *_remarks(report)], out, files)
-    if drawn.interrupted:
-        return options.INTERRUPTED
-    return options.DONE if report.holds else options.DOES_NOT_HOLD
+    return options.exit_code(report.holds, drawn.interrupted)
 
 
 def _parser() -> options.Parser:
