@@ -22,14 +22,14 @@ import design
 from controller.loop import Loop
 from design.certificate import prove, prove_limiter, verify
 from design.files import one_command
-from design.result import Condition, Design, NotProved
+from design.result import Design, NotProved
 from design.stored import Certificate, Stored, digest, load, save, sealed
 
 _SHIPPED = Path(__file__).with_name("designs")
 _MOST = 200  # entries; the oldest go
 
 
-def find(loop: Loop, kind: str, condition: Condition, *options: Any) -> Stored | None:
+def find(loop: Loop, kind: str, condition: Any, *options: Any) -> Stored | None:
     """What is kept of the same loop, question and code, or came with the package; it has just been proved again."""
     if _off():
         return None
