@@ -31,7 +31,7 @@ from design.robustness import robustness_part
 from design.transparency import transparency
 from sim import baselines, report
 from sim.couplings import NAMES, Chosen, choose
-from sim.scenario import InputError, Scenario, require_even_ticks
+from sim.scenario import InputError, Scenario
 
 _MOST = 6  # curves that can be told apart in one panel
 
@@ -306,7 +306,7 @@ def _ladder(args: argparse.Namespace, scenario: Scenario) -> int:
     out, begin = options.out_folder(args, "compare"), time.perf_counter()
     loops = {case: scenario.loop(case) for case in ("I", "II")}
     with render.progress("designing") as move:
-        rows, interrupted = compare.compare_designs(loops, LADDERS[args.ladder], move)
+        rows, interrupted = options.until_interrupted(compare.compare_designs(loops, LADDERS[args.ladder], move))
     report = _Ladder(scenario.name, args.seed, rows, time.perf_counter() - begin, interrupted)
     shown = []
     for case in loops:
@@ -359,19 +359,10 @@ class _Baselines:
 
 
 def _baselines(args: argparse.Namespace, scenario: Scenario) -> int:
-    require_even_ticks(scenario, "--baselines")
-    if scenario.ranges or scenario.switches:
-        given = "[ranges]" if scenario.ranges else "[varying_delay]"
-        raise InputError(f"--baselines compares in one environment with constant delays: leave out {given}")
-    if any(device.friction for device in scenario.device):
-        raise InputError("--baselines runs in the exact plant, which has no Coulomb friction; the devices have")
-    out, rows, interrupted = options.out_folder(args, "compare"), [], False
-    begin = time.perf_counter()
     with render.progress("comparing") as move:
-        try:
-            rows.extend(baselines.rivals(scenario, args.case, move, args.limiter))
-        except KeyboardInterrupt:
-            interrupted = True
+        all_of_them = baselines.rivals(scenario, args.case, move, args.limiter)
+        out, begin = options.out_folder(args, "compare"), time.perf_counter()
+        rows, interrupted = options.until_interrupted(all_of_them)
     report = _Baselines(scenario.name, args.case, args.seed, rows, time.perf_counter() - begin, interrupted)
     files = render.pictures(args, report, out, {"baselines.png": "plot_baselines"} if rows else {})
     shown = [render.columns(f"on the same runs · {scenario.title(args.case)}", _RIVALS, rows, left=(0, 7))]

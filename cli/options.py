@@ -16,7 +16,7 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn, TypeVar
@@ -451,6 +451,16 @@ def _rows(
 
 # ----------------------------------------------------------------------------------------------------
 # Running a command.
+
+
+def until_interrupted(rows: Iterable[_Given]) -> tuple[list[_Given], bool]:
+    """What was done until the keyboard ended it, and whether it did."""
+    done: list[_Given] = []
+    try:
+        done.extend(rows)
+    except KeyboardInterrupt:
+        return done, True
+    return done, False
 
 
 def exit_code(holds: bool, interrupted: bool = False) -> int:

@@ -114,13 +114,9 @@ def _called(command: str, place: Path, printed: StringIO) -> int:
 
 def _measured(check: Check, place: Path, seed: int) -> int:
     """Rows of our own; what is done when the keyboard interrupts is kept."""
-    rows, interrupted = [], False
     assert callable(check.answer)
-    try:
-        for row in check.answer(seed):
-            rows.append(row if isinstance(row, dict) else render.plain(row) | {"holds": row.holds})
-    except KeyboardInterrupt:
-        interrupted = True
+    found, interrupted = options.until_interrupted(check.answer(seed))
+    rows = [row if isinstance(row, dict) else render.plain(row) | {"holds": row.holds} for row in found]
     if check.picture and rows:
         from sim import plots
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Literal
@@ -432,20 +432,12 @@ _FULL = (
 LADDERS = {"short": SHORT, "full": _FULL}
 
 
-def compare_designs(
-    loops: Mapping[str, Loop], entries: Sequence[_Entry], progress: _Progress
-) -> tuple[list[LadderRow], bool]:
-    """The rows of every case, and whether the keyboard ended it; what was done before is kept."""
-    rows: list[LadderRow] = []
-    total = len(loops) * len(entries)
-    try:
-        for case, loop in loops.items():
-            for entry in entries:
-                progress(len(rows), total)
-                rows.append(ladder_row(case, loop, entry))
-    except KeyboardInterrupt:
-        return rows, True
-    return rows, False
+def compare_designs(loops: Mapping[str, Loop], entries: Sequence[_Entry], progress: _Progress) -> Iterator[LadderRow]:
+    """The rows of every case."""
+    jobs = [(case, loop, entry) for case, loop in loops.items() for entry in entries]
+    for done, (case, loop, entry) in enumerate(jobs):
+        progress(done, len(jobs))
+        yield ladder_row(case, loop, entry)
 
 
 def ladder_row(case: str, loop: Loop, entry: _Entry) -> LadderRow:

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import textwrap
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from string import Template
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from controller.complementarity import GROUNDED, PIVOT_ROUNDING
+from controller.coupling import SpringDamperForm
 from controller.delay import delay
 from controller.limiter import Limiter
 from controller.loop import Loop
 from controller.lti import Array, Lti
-from design.certificate import lag
+from design.certificate import Verdict, lag
+from design.guarantees import HERE, RANGES, switching_guarantee
+from design.result import listed
 from design.stored import Stored
 
 # ----------------------------------------------------------------------------------------------------
@@ -299,58 +303,6 @@ def main():
     error = float(abs(found - expected).max() / abs(expected).max())
     print("$name: largest difference %.1e of the largest output, allowed %.0e" % (error, TOLERANCE))
     return int(not error <= TOLERANCE)
-
-# ----------------------------------------------------------------------------------------------------
-# A file: its format, and what stands above the block.
-
-
-SUFFIXES = {"c": ".c", "json": ".json", "npz": ".npz", "control": ".py"}  # by format
-
-
-def with_origin(block: ExportedBlock, file: str, stored: Stored, verdict: Verdict) -> ExportedBlock:
-    """The block with lines on the file that it comes from, and on what is proved there."""
-    written = f"Written by python -m design.export from {file}: {_gains(stored)}"
-    return replace(block, about=(written, *block.about, _guarantee(stored, verdict, block.limiter is not None)))
-
-
-def _gains(stored: Stored) -> str:
-    coupling = stored.coupling
-    if isinstance(coupling, SpringDamperForm):
-        return f"spring-damper, K = {listed(coupling.K)} N/m, B = {listed(coupling.B)} N s/m"
-    return f"coupling of kind {coupling.__struct_config__.tag}"
-
-
-def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
-    claim = stored.certificate
-    if claim is None or not verdict.proved:
-        return f"NOT CERTIFIED: {verdict.reason}"
-    needs = f"needs {listed(claim.required)} of {listed(claim.available)} N s/m of device damping"
-    delays = f"; {switching_guarantee(stored.loop.varying_delay)}, in {HERE}" if stored.loop.varying_delay else ""
-    how = f"{claim.condition}, proof: {claim.proof}"
-    if claim.guarantee == RANGES:
-        how += "; at the vertices, between them nothing is proved: design.check searches there"
-    return f"Certified for {claim.guarantee}{delays} ({how}): {needs}; " + (
-        "also while forces are limited." if limited else "linear forces only."
-    )
-
-
-def content(kind: str, block: ExportedBlock, test: Trial, file: str) -> Any:
-    """A file in this format, as `design.files.write` takes it."""
-    if kind == "c":
-        return c_source(block, test, file)
-    if kind == "control":
-        return control_source(block, test)
-    plain = data(block, test)
-    if kind == "json":
-        return json.dumps(plain, indent=1, allow_nan=False) + "\n"
-
-    arrays: dict[str, Any] = {name: np.array(value) for name, value in plain.items()}
-
-    def archive(destination: BinaryIO) -> None:
-        np.savez(destination, **arrays)
-
-    return archive
-
 
 if __name__ == "__main__":
     sys.exit(main())
@@ -639,6 +591,58 @@ def _table(head: str, values: Array) -> str:
 def _row(values: Array) -> str:
     text = ", ".join(float(v).hex() for v in values)
     return "\n".join(textwrap.wrap(f"{{{text}}}", 112, initial_indent="    ", subsequent_indent="     "))
+
+
+# ----------------------------------------------------------------------------------------------------
+# A file: its format, and what stands above the block.
+
+
+SUFFIXES = {"c": ".c", "json": ".json", "npz": ".npz", "control": ".py"}  # by format
+
+
+def with_origin(block: ExportedBlock, file: str, stored: Stored, verdict: Verdict) -> ExportedBlock:
+    """The block with lines on the file that it comes from, and on what is proved there."""
+    written = f"Written by python -m design.export from {file}: {_gains(stored)}"
+    return replace(block, about=(written, *block.about, _guarantee(stored, verdict, block.limiter is not None)))
+
+
+def _gains(stored: Stored) -> str:
+    coupling = stored.coupling
+    if isinstance(coupling, SpringDamperForm):
+        return f"spring-damper, K = {listed(coupling.K)} N/m, B = {listed(coupling.B)} N s/m"
+    return f"coupling of kind {coupling.__struct_config__.tag}"
+
+
+def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
+    claim = stored.certificate
+    if claim is None or not verdict.proved:
+        return f"NOT CERTIFIED: {verdict.reason}"
+    needs = f"needs {listed(claim.required)} of {listed(claim.available)} N s/m of device damping"
+    delays = f"; {switching_guarantee(stored.loop.varying_delay)}, in {HERE}" if stored.loop.varying_delay else ""
+    how = f"{claim.condition}, proof: {claim.proof}"
+    if claim.guarantee == RANGES:
+        how += "; at the vertices, between them nothing is proved: design.check searches there"
+    return f"Certified for {claim.guarantee}{delays} ({how}): {needs}; " + (
+        "also while forces are limited." if limited else "linear forces only."
+    )
+
+
+def content(kind: str, block: ExportedBlock, test: Trial, file: str) -> Any:
+    """A file in this format, as `design.files.write` takes it."""
+    if kind == "c":
+        return c_source(block, test, file)
+    if kind == "control":
+        return control_source(block, test)
+    plain = data(block, test)
+    if kind == "json":
+        return json.dumps(plain, indent=1, allow_nan=False) + "\n"
+
+    arrays: dict[str, Any] = {name: np.array(value) for name, value in plain.items()}
+
+    def archive(destination: BinaryIO) -> None:
+        np.savez(destination, **arrays)
+
+    return archive
 
 
 if __name__ == "__main__":
