@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -14,9 +15,8 @@ from cli import options, render
 from cli.judged import Judged
 from controller.loop import Loop
 from design import coverage
-from design.api import Filed, store
+from design.api import Filed, bound_part, price, store
 from design.audit import LONGEST_DELAY
-from design.bound import MOST, NO_BOUND, bound
 from design.certificate import SAMPLES, assess, check_ranges
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.files import out_file
@@ -183,7 +183,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         design.objective,
         design.wall_s,
         judged.certificates[design.condition],
-        _robustness_loss(args, loop, design) if judged.whole else None,
+        price(loop, design, args.coupling, asked_of(args, args.coupling)) if judged.whole else None,
         judged.coupling,
         judged.certificates,
         loop.varying_delay and coverage.switching_part(loop, design.coupling),
@@ -201,42 +201,16 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
 
 def _worth(args: argparse.Namespace, loop: Loop, design: Design) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """What a wrong model of the environment costs, and what only an optimal coupling is reported with."""
-    robust, best = {"robustness": None}, design if isinstance(design, Optimal) else None
+    best = design if isinstance(design, Optimal) else None
     with render.progress("working out robustness and its price, and the bound"):
+        robust = {"robustness": None}
         if design.condition == "this-environment":
             asked = Options(**asked_of(args, "optimal")) if best else DEFAULT
             robust = robustness_parts(loop, design.coupling, asked)
-        return robust, best and _best_figures(args, loop, best)
-
-
-def _best_figures(args: argparse.Namespace, loop: Loop, best: Optimal) -> dict[str, Any]:
-    """What an optimal coupling is reported with: how it was found, and how it stands to what is possible."""
-    limit: dict[str, Any] = {"rms_mismatch_db": None}
-    if loop.channels > MOST:
-        limit["reason"] = NO_BOUND
-    elif best.objective == 0:
-        limit["reason"] = "the mismatch is zero: there is nothing to bound"
-    else:
-        limit["rms_mismatch_db"] = bound(loop, args.band_hz or BAND_HZ, near=best.coupling).rms_db
-    return {
-        "bound": limit,
-        "rendered_stiffness": best.g,
-        "ladder": [asdict(rung) for rung in best.ladder],
-        "notes": args.notes,
-    }
-
-
-def _robustness_loss(args: argparse.Namespace, loop: Loop, design: Design) -> list[dict[str, Any]]:
-    """The coupling over the ranges; an optimal one beside the one for the nominal environment alone."""
-    couplings = {args.coupling: design.coupling}
-    if args.coupling == "optimal":
-        couplings = {"whole ranges": design.coupling}
-        try:
-            alone = design_by_kind(loop.at(loop.environment), "optimal", None, **asked_of(args, "optimal"))
-            couplings = {"nominal only": alone.coupling, **couplings}
-        except DesignFailed:  # ranges are given another basis by default
-            pass
-    return [coverage.cost_part(row) for row in coverage.price(loop, couplings)]
+        limit = best and bound_part(loop, best, args.band_hz or BAND_HZ)
+    if best is None:
+        return robust, None
+    return robust, {"bound": limit, "rendered_stiffness": best.g, "ladder": best.ladder, "notes": args.notes}
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -263,7 +237,7 @@ _OBJECTIVE_WORDS = {
 def _best_rows(part: dict[str, Any]) -> render.Rows:
     """Rows that only an optimal coupling has."""
     limit = part["bound"]
-    climbed = ", ".join(f"{rung['mismatch_db']:.2f}" for rung in part["ladder"])
+    climbed = ", ".join(f"{rung.mismatch_db:.2f}" for rung in part["ladder"])
     bounded = f"no linear coupling can be better than {limit['rms_mismatch_db'] or 0:.2f} dB rms"
     yield "bound", limit.get("reason") or bounded
     yield "rendered stiffness", render.optional(part["rendered_stiffness"], "{:.3f} of the environment's")
@@ -322,11 +296,15 @@ def _tables(scenario: Scenario, report: _Report) -> list[Table]:
 
 def _over_the_ranges(rows: list[dict[str, Any]]) -> Table:
     """Each figure in the nominal environment, and the worst of the ranges."""
-    names = ("required_over_available", "rms_mismatch_db", "relative_mismatch_db")
-    cells = []
-    for row in rows:
-        forms = zip(names, ("{:.4f}", "{:.2f}", "{:.2f}"), strict=True)
-        needs, rms, sup = (" / ".join(render.optional(v, form) for v in row[name].values()) for name, form in forms)
-        cells.append((row["coupling"], needs, str(row["violated"]), f"{rms} dB", f"{sup} dB"))
-    heads = ("coupling", "needs of its damping", "vertices violated", "rms error", "largest error")
-    return render.grid("in the nominal environment / at the worst vertex", heads, cells, left=range(5))
+
+    def both(name: str, form: str) -> Callable[[dict[str, Any]], str]:
+        return lambda row: " / ".join(render.optional(value, form) for value in row[name].values())
+
+    cells: dict[str, str | Callable[[dict[str, Any]], str]] = {
+        "coupling": "{r[coupling]}",
+        "needs of its damping": both("required_over_available", "{:.4f}"),
+        "vertices violated": "{r[violated]}",
+        "rms error": lambda row: both("rms_mismatch_db", "{:.2f}")(row) + " dB",
+        "largest error": lambda row: both("relative_mismatch_db", "{:.2f}")(row) + " dB",
+    }
+    return render.columns("in the nominal environment / at the worst vertex", cells, rows, left=range(5))
