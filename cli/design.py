@@ -15,8 +15,9 @@ from cli import options, render
 from cli.judged import Judged
 from controller.loop import Loop
 from design import coverage
-from design.api import Filed, bound_part, price, store
+from design.api import Filed, store
 from design.audit import LONGEST_DELAY
+from design.bound import bound_part
 from design.certificate import SAMPLES, assess, check_ranges
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.files import out_file
@@ -183,7 +184,7 @@ def _reported(args: argparse.Namespace, loop: Loop, design: Design, judged: Judg
         design.objective,
         design.wall_s,
         judged.certificates[design.condition],
-        price(loop, design, args.coupling, asked_of(args, args.coupling)) if judged.whole else None,
+        coverage.price(loop, design, args.coupling, asked_of(args, args.coupling)) if judged.whole else None,
         judged.coupling,
         judged.certificates,
         loop.varying_delay and coverage.switching_part(loop, design.coupling),

@@ -12,7 +12,6 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, field, fields
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -123,6 +122,9 @@ def designing(loop: Loop | None = None, kind: str | None = None, condition: str 
 # A whole report: files, tables, lines below them, JSON.
 
 
+_Drawing = Callable[[Any], Callable[[Any, Path], Path]]  # from sim.plots the function that draws
+
+
 def publish(
     args: argparse.Namespace,
     report: Any,
@@ -151,12 +153,14 @@ def publish(
         write_json(args.json, outcome)
 
 
-def pictures(args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping[str, str]) -> list[Path]:
-    """Pictures of a report: by file the function of sim.plots that draws it; none with --no-plot."""
+def pictures(args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping[str, _Drawing]) -> list[Path]:
+    """Pictures of a report, by file what draws it; with --no-plot none, and matplotlib is not loaded."""
     if args.no_plot:
         return []
-    plots, outcome = import_module("sim.plots"), plain(report)
-    return [getattr(plots, function)(outcome, folder / file) for file, function in drawn.items()]
+    from sim import plots
+
+    outcome = plain(report)
+    return [drawing(plots)(outcome, folder / file) for file, drawing in drawn.items()]
 
 
 # ----------------------------------------------------------------------------------------------------

@@ -44,7 +44,7 @@ class Check:
     asks: str
     answer: str | Callable[[int], Iterable[Any]]  # a command ({humans}, {seed} are filled in), or rows by the seed
     figures: reports.Figures
-    picture: str | None = None  # of rows: the function of sim.plots that draws them
+    picture: Callable[[Any], Callable[..., Path]] | None = None  # of rows: from sim.plots the function that draws them
 
     def command(self, humans: int, seed: int) -> str:
         """What repeats this check."""
@@ -70,8 +70,10 @@ CHECKS = (
     _meets("optimal", "The best linear coupling for this environment", "--case I --coupling optimal"),
     _meets("published", "The gains that the paper prints", "--case I --coupling published"),
     _meets("three", "Three people, rigid devices, unequal delays", "--scenario three-rigid --case I"),
-    Check("tightness", "How tight is the condition?", _SHORT, reports.tightness, "plot_tightness"),
-    Check("delayed", "How tight is it with long delays?", _DELAYED, reports.tightness, "plot_tightness"),
+    Check("tightness", "How tight is the condition?", _SHORT, reports.tightness, lambda plots: plots.plot_tightness),
+    Check(
+        "delayed", "How tight is it with long delays?", _DELAYED, reports.tightness, lambda plots: plots.plot_tightness
+    ),
     Check("map", "Which springs and dampers may a device render against a wall?", _MAP, reports.gain_map),
     Check("accuracy", "Is MuJoCo right, and at what cost?", "sim.accuracy --duration 6", reports.accuracy),
     Check("hard", "Numerically hard loops", lambda seed: (measure(case) for case in cases()), reports.hard),
@@ -120,7 +122,7 @@ def _measured(check: Check, place: Path, seed: int) -> int:
     if check.picture and rows:
         from sim import plots
 
-        getattr(plots, check.picture)(rows, place / f"{check.name}.png")
+        check.picture(plots)(rows, place / f"{check.name}.png")
     holds = all(row["holds"] for row in rows)
     write_json(place / "report.json", {"rows": rows, "holds": holds, "seed": seed, "interrupted": interrupted})
     return options.exit_code(holds, interrupted)

@@ -12,11 +12,9 @@ from controller.loop import Loop
 from controller.lti import Lti
 from design.arguments import known, of_kind, one_of, shown
 from design.certificate import RangesCheck, assess, check_ranges, lag, prove, switching_requirement
-from design.coverage import cost_part
-from design.coverage import price as costs
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.guarantees import HERE, guarantee_of, switching_guarantee
-from design.result import Condition, Design, DesignFailed, NotProved, Requirement
+from design.result import Condition, Design, NotProved, Requirement
 from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
@@ -199,30 +197,6 @@ def _proved(loop: Loop, design: Design, limiter: LimiterCertificate | None) -> t
         return prove(loop, design.coupling, design.condition, phi, limiter), None
     except NotProved as error:
         return None, str(error)
-
-
-def price(loop: Loop, design: Design, kind: str, asked: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """A coupling over the ranges; an optimal one beside the one for the nominal environment alone, `asked` the same."""
-    couplings = {kind: design.coupling}
-    if kind == "optimal":
-        couplings = {"whole ranges": design.coupling}
-        try:
-            alone = design_by_kind(loop.at(loop.environment), kind, None, **asked)
-            couplings = {"nominal only": alone.coupling, **couplings}
-        except DesignFailed:  # ranges are given another basis by default
-            pass
-    return [cost_part(row) for row in costs(loop, couplings)]
-
-
-def bound_part(loop: Loop, best: Design, band_hz: tuple[float, float]) -> dict[str, Any]:
-    """What no linear coupling can be better than, or why that is not worked out."""
-    from design.bound import MOST, NO_BOUND, bound  # for an optimal coupling only
-
-    if loop.channels > MOST:
-        return {"rms_mismatch_db": None, "reason": NO_BOUND}
-    if best.objective == 0:
-        return {"rms_mismatch_db": None, "reason": "the mismatch is zero: there is nothing to bound"}
-    return {"rms_mismatch_db": bound(loop, band_hz, near=best.coupling).rms_db}
 
 
 COUPLING = "a coupling (controller.coupling), or a Design"

@@ -19,6 +19,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 import scipy  # its parts load when they are used
@@ -32,6 +33,7 @@ from design.barrier import Block, Program, centre, towards
 from design.designs import design_by_kind
 from design.frequency import frequencies, hermitian, on_circle
 from design.program import LADDER
+from design.result import Design
 from design.transparency import BAND_HZ, decibels
 
 _Indices = NDArray[np.intp]  # of points of the transform
@@ -307,3 +309,12 @@ def _worst(lacking: Array) -> _Indices:
     padded = np.concatenate([[np.inf], lacking, [np.inf]])
     local = np.flatnonzero((lacking <= padded[:-2]) & (lacking <= padded[2:]) & (lacking < 0))
     return local[np.argsort(lacking[local])[:96]]
+
+
+def bound_part(loop: Loop, best: Design, band_hz: tuple[float, float]) -> dict[str, Any]:
+    """What no linear coupling can be better than, or why that is not worked out."""
+    if loop.channels > MOST:
+        return {"rms_mismatch_db": None, "reason": NO_BOUND}
+    if best.objective == 0:
+        return {"rms_mismatch_db": None, "reason": "the mismatch is zero: there is nothing to bound"}
+    return {"rms_mismatch_db": bound(loop, band_hz, near=best.coupling).rms_db}

@@ -240,7 +240,7 @@ class Limit:
     proof_reason: str | None = None  # why there is no exact proof
 
 
-Designer = Callable[[Point], Limit]
+_Designer = Callable[[Point], Limit]
 
 
 def optimum(point: Point) -> Limit:
@@ -248,7 +248,7 @@ def optimum(point: Point) -> Limit:
     return measured(point, "optimal", None, vars(point.options))
 
 
-def spring_damper(condition: Condition) -> Designer:
+def spring_damper(condition: Condition) -> _Designer:
     """The designed spring-damper of a point."""
     return lambda point: measured(point, "spring-damper", condition, {})
 
@@ -295,7 +295,7 @@ def _damping(requirement: Requirement) -> tuple[float | None, ...]:
     return tuple(finite(b) for b in requirement.required)
 
 
-def remembered(designer: Designer, whole: bool) -> Designer:
+def remembered(designer: _Designer, whole: bool) -> _Designer:
     """A designer that does not repeat a design; `whole` where the options matter to the design."""
     known: dict[tuple[str, Options | None], Limit] = {}
 

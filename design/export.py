@@ -66,7 +66,7 @@ class ExportedBlock:
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
+class _Trial:
     """A test vector."""
 
     inputs: Array  # (TICKS, m)
@@ -129,14 +129,14 @@ def _with_a_state(system: Lti) -> Lti:
     return Lti(np.zeros((1, 1)), np.zeros((1, m)), np.zeros((system.outputs, 1)), system.D, system.T)
 
 
-def trial(block: ExportedBlock, seed: int = 0) -> Trial:
+def trial(block: ExportedBlock, seed: int = 0) -> _Trial:
     """Normally distributed inputs, with a limiter such that a third of the ticks are limited, and the outputs."""
     rng = np.random.default_rng(seed)
     inputs = block.input.size * rng.standard_normal((_TICKS, block.system.inputs))
     if block.limiter:
         share = np.abs(sequential(block.system, inputs)) / block.limiter.limit
         inputs = inputs / np.quantile(share.max(axis=1), 2 / 3)
-    return Trial(inputs, sequential(block.system, inputs, block.limiter))
+    return _Trial(inputs, sequential(block.system, inputs, block.limiter))
 
 
 def sequential(system: Lti, inputs: Array, limiter: Limiter | None = None) -> Array:
@@ -214,7 +214,7 @@ def _boxed(M: list[list[float]], limit: list[float], q: list[float]) -> tuple[li
     return e, f
 
 
-def data(block: ExportedBlock, test: Trial) -> dict[str, Any]:
+def data(block: ExportedBlock, test: _Trial) -> dict[str, Any]:
     """The block as plain data, for JSON."""
     system = block.system
     return {
@@ -309,7 +309,7 @@ if __name__ == "__main__":
 ''')
 
 
-def control_source(block: ExportedBlock, test: Trial) -> str:
+def _control_source(block: ExportedBlock, test: _Trial) -> str:
     """The file's text; numbers are decimals that read back to the same doubles."""
     system = block.system
     return SOURCE.substitute(
@@ -537,7 +537,7 @@ _LIMITED = """    {
 """
 
 
-def c_source(block: ExportedBlock, test: Trial, file: str) -> str:
+def _c_source(block: ExportedBlock, test: _Trial, file: str) -> str:
     """The file's text; numbers are hexadecimal, so that no compiler's decimal conversion matters."""
     system, name = block.system, block.name
     words = {
@@ -627,12 +627,12 @@ def _guarantee(stored: Stored, verdict: Verdict, limited: bool) -> str:
     )
 
 
-def content(kind: str, block: ExportedBlock, test: Trial, file: str) -> Any:
+def content(kind: str, block: ExportedBlock, test: _Trial, file: str) -> Any:
     """A file in this format, as `design.files.write` takes it."""
     if kind == "c":
-        return c_source(block, test, file)
+        return _c_source(block, test, file)
     if kind == "control":
-        return control_source(block, test)
+        return _control_source(block, test)
     plain = data(block, test)
     if kind == "json":
         return json.dumps(plain, indent=1, allow_nan=False) + "\n"

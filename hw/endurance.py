@@ -27,7 +27,7 @@ from sim.stability import unstable
 
 
 @dataclass(frozen=True)
-class Endured:
+class _Endured:
     """How long work ended, and the most memory that its process had [MiB]."""
 
     what: str
@@ -74,7 +74,7 @@ _LONG: tuple[tuple[str, _Work, float], ...] = (
 )
 
 
-def endurance(seed: int) -> Iterator[Endured]:
+def endurance(seed: int) -> Iterator[_Endured]:
     """Whether memory stays flat over an hour of a session and 100,000 hands, each in a process of its own."""
     context = multiprocessing.get_context("spawn")  # a fork would begin with the memory of all checks before
     for what, work, allowed in _LONG:
@@ -85,7 +85,7 @@ def endurance(seed: int) -> Iterator[Endured]:
         try:
             yield replace(here.recv(), what=what)
         except EOFError:
-            yield Endured(what, "broke off", None, None, allowed, False)
+            yield _Endured(what, "broke off", None, None, allowed, False)
         finally:
             worker.terminate()
             worker.join()
@@ -97,7 +97,7 @@ def _alone(work: _Work, allowed: float, there: Connection) -> None:
     there.send(endure(work, allowed))
 
 
-def endure(work: _Work, allowed: float) -> Endured:
+def endure(work: _Work, allowed: float) -> _Endured:
     """Do it, and look at this process's peak of memory after a tenth and at the end [MiB]."""
     peaks: list[float] = []
 
@@ -108,7 +108,7 @@ def endure(work: _Work, allowed: float) -> Endured:
     good, result = work(mark)
     tenth, end = peaks[0], _peak()
     flat = end - tenth <= allowed
-    return Endured("", result, tenth, end, allowed, good and flat)
+    return _Endured("", result, tenth, end, allowed, good and flat)
 
 
 def _peak() -> float:

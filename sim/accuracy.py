@@ -56,7 +56,7 @@ def position_error(
 
 
 #: (engine, integrator, substeps) that are compared; the first is the reference
-SETTINGS = (
+_SETTINGS = (
     ("exact", None, None),
     ("mujoco", EXPONENTIAL, 1),
     *(("mujoco", "RK4", n) for n in (1, 2, 3, 4, 8)),
@@ -116,7 +116,7 @@ def measure_all(
     """
     rows: list[Row] = []
     skipped: list[str] = []
-    settings = list(dict.fromkeys((*SETTINGS, ("mujoco", "RK4", default))))
+    settings = list(dict.fromkeys((*_SETTINGS, ("mujoco", "RK4", default))))
     try:
         truth = reference(coupled, uncoupled)
         for done, (engine, integrator, substeps) in enumerate(settings):

@@ -156,7 +156,7 @@ def _ranked(scenario: Scenario, F: Lti, sets: Sequence[tuple[Hand, ...]]) -> lis
 
 
 @dataclass(frozen=True)
-class Attack:
+class _Attack:
     """A search against a loop placed short of its required damping."""
 
     name: str
@@ -169,9 +169,9 @@ def attempts(
     shortages: Array,
     seed: int = 0,
     generations: int = 150,
-    attempted: Callable[[Attack], None] = lambda attempt: None,
-) -> list[Attack]:
-    """Attack every loop at every shortage: devices get (1 - short) times the damping that `this_environment` requires.
+    attempted: Callable[[_Attack], None] = lambda attempt: None,
+) -> list[_Attack]:
+    """_Attack every loop at every shortage: devices get (1 - short) times the damping that `this_environment` requires.
 
     A negative shortage gives the devices more than required: there the search must fail. `attempted` is called
     with each.
@@ -182,7 +182,7 @@ def attempts(
         required = np.array(this_environment(F, scenario.delta, scenario.longest_period, scenario.latency).required)
         for short in shortages:
             placed = scenario.replace(delta=tuple((required * (1 - short)).tolist()))
-            rows.append(Attack(name, float(short), search(placed, F, seed, generations=generations, first=True)))
+            rows.append(_Attack(name, float(short), search(placed, F, seed, generations=generations, first=True)))
             attempted(rows[-1])
     return rows
 
@@ -232,7 +232,7 @@ def _worst(scenario: Scenario, F: Lti, crowd: Crowd | HumanSets, evaluated: int)
 
 
 @dataclass(frozen=True)
-class Shortage:
+class _Shortage:
     """Whether a passive human destabilises a loop whose devices lack a share of the damping that is required."""
 
     loop: str
@@ -251,13 +251,13 @@ class Shortage:
 
 def shortages(
     couplings: Sequence[str], short: Sequence[float], generations: int, **changes: Any
-) -> Callable[[int], Iterator[Shortage]]:
+) -> Callable[[int], Iterator[_Shortage]]:
     """From a seed: the search against the default loop with these couplings, by name, at these shortages.
 
     Where it succeeds close to the required damping, the condition is tight.
     """
 
-    def rows(seed: int) -> Iterator[Shortage]:
+    def rows(seed: int) -> Iterator[_Shortage]:
         scenario = load().replace(**changes)
         for name in couplings:
             coupling = NoCoupling() if name == "none" else choose(scenario, "I", name).coupling
@@ -266,6 +266,6 @@ def shortages(
                 (attempt,) = attempts(loop, np.array([share]), seed, generations)
                 worst, found = attempt.worst, (attempt.worst.destabilises, attempt.worst.growth)
                 about = worst.frequency_hz, bool(worst.persons), worst.evaluated
-                yield Shortage(attempt.name, attempt.short, *found, *about)
+                yield _Shortage(attempt.name, attempt.short, *found, *about)
 
     return rows

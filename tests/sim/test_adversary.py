@@ -146,7 +146,9 @@ def test_a_human_who_destabilises_a_loop_with_enough_damping_fails_the_check(tmp
         return replace(real(F, delta), required=(0.5, 0.5))
 
     monkeypatch.setattr("sim.adversary.this_environment", third)
-    check = Check("tightness", "How tight?", shortages(("none",), (0,), 5), tightness, "plot_tightness")
+    check = Check(
+        "tightness", "How tight?", shortages(("none",), (0,), 5), tightness, lambda plots: plots.plot_tightness
+    )
     monkeypatch.setattr("cli.suite.CHECKS", (check,))
     assert suite(["--out", str(tmp_path)]) == 1
     assert (tmp_path / "tightness" / "tightness.png").stat().st_size > 10_000
