@@ -9,7 +9,7 @@ from cli import options, render
 from controller.coupling import NoCoupling
 from sim.accuracy import Row, measure_all
 from sim.couplings import NAMES, choose, limits_of
-from sim.engines import EXPONENTIAL
+from sim.mujoco_engines import EXPONENTIAL
 from sim.run import assemble
 from sim.scenario import InputError, require_even_ticks, require_linear
 from sim.stepping import default_substeps

@@ -45,10 +45,10 @@ class _Sitting:
 
     axes: list[Estimate]  # none where there is a reason
     reason: str | None
-    report: SessionReport = render.unseen("table")
-    session: Session = render.unseen("table")
-    trace: Path | None = render.unseen("table")
-    signals: Sequence[int] = render.unseen("table")
+    report: SessionReport = render.unseen("no")
+    session: Session = render.unseen("no")
+    trace: Path | None = render.unseen("no")
+    signals: Sequence[int] = render.unseen("no")
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,9 +22,9 @@ from sim.scenario import Scenario
 class Judged:
     """The parts that every report of a coupling begins with."""
 
-    whole: RangesCheck | None = render.unseen("table")
-    requirements: dict[str, Requirement] = render.unseen("table")
-    limits: Limits = render.unseen("table")
+    whole: RangesCheck | None = render.unseen("no")
+    requirements: dict[str, Requirement] = render.unseen("no")
+    limits: Limits = render.unseen("no")
     coupling: dict[str, Any] = render.unseen()
     certificates: dict[str, Any] = render.unseen()
     promise: str | None = render.unseen()  # the guarantee, by its older name

@@ -24,6 +24,7 @@ from rich.text import Text
 from controller.loop import Loop
 from controller.older import REPORTS, with_older
 from design.files import nobody_reads, plain, printable, write_json
+from design.files import unseen as unseen
 from design.result import DesignFailed, listed
 
 # ----------------------------------------------------------------------------------------------------
@@ -210,11 +211,6 @@ def figure(name: str, form: _Form = "{}", default: Any = MISSING, json: str = "k
 def several(rows: Callable[[Any], Rows], json: str = "key") -> Any:
     """A field that a report's table shows as these rows."""
     return field(metadata={"rows": rows, "json": json})
-
-
-def unseen(json: str = "key", default: Any = MISSING) -> Any:
-    """A field that no table shows."""
-    return field(default=default, metadata={"json": json})
 
 
 def rows_of(report: Any) -> Rows:

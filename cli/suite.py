@@ -52,6 +52,10 @@ class Check:
         return (self.answer if isinstance(self.answer, str) else own).format(humans=humans, seed=seed)
 
 
+def _drawn(plots: Any) -> Callable[..., Path]:
+    return plots.plot_tightness
+
+
 _MEET = "--humans {humans} --links mixed --duration 1 --adversary --generations 60 --seed {seed}"
 _MAP = "sim.zwidth --rigid --T 1e-3 --theta 0 --grid 30 --points 8 --seed {seed}"
 _SHORT = shortages(("none", "spring-damper"), (0, 0.01, 0.02, 0.05, 0.1, 0.2), 25)
@@ -70,10 +74,8 @@ CHECKS = (
     _meets("optimal", "The best linear coupling for this environment", "--case I --coupling optimal"),
     _meets("published", "The gains that the paper prints", "--case I --coupling published"),
     _meets("three", "Three people, rigid devices, unequal delays", "--scenario three-rigid --case I"),
-    Check("tightness", "How tight is the condition?", _SHORT, reports.tightness, lambda plots: plots.plot_tightness),
-    Check(
-        "delayed", "How tight is it with long delays?", _DELAYED, reports.tightness, lambda plots: plots.plot_tightness
-    ),
+    Check("tightness", "How tight is the condition?", _SHORT, reports.tightness, _drawn),
+    Check("delayed", "How tight is it with long delays?", _DELAYED, reports.tightness, _drawn),
     Check("map", "Which springs and dampers may a device render against a wall?", _MAP, reports.gain_map),
     Check("accuracy", "Is MuJoCo right, and at what cost?", "sim.accuracy --duration 6", reports.accuracy),
     Check("hard", "Numerically hard loops", lambda seed: (measure(case) for case in cases()), reports.hard),

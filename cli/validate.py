@@ -28,7 +28,7 @@ from sim.crowds import ENGINES, MIXED, Findings, Validation
 from sim.run import assemble
 from sim.scenario import InputError, Scenario, require_linear, save_humans
 from sim.shards import Table, validate, validate_on_cluster
-from sim.stability import eigenvalue_part, unstable, worst_mode
+from sim.stability import Eigenvalues, eigenvalues, unstable, worst_mode
 from sim.switching import certified_part
 
 _ENVIRONMENTS = ("nominal", "ranges", "box")  # the last is the older name of the second
@@ -279,13 +279,12 @@ class _Own:
     """What the exact loop does in the hands of the scenario, or of --human FILE."""
 
     from_: str
-    mode: Mapping[str, Any] = render.unseen("beside")
+    exact: Eigenvalues = render.unseen("beside")
     holds: bool = render.unseen()
 
     def rows(self) -> render.Rows:
-        mode = self.mode
-        growth = f"{mode['exact_growth_rate_per_s']:+.4g} 1/s at {mode['exact_frequency_hz']:.2f} Hz"
-        yield f"hands of {self.from_}", f"{growth}: {mode['exact_verdict']}"
+        growth = f"{self.exact.exact_growth_rate_per_s:+.4g} 1/s at {self.exact.exact_frequency_hz:.2f} Hz"
+        yield f"hands of {self.from_}", f"{growth}: {self.exact.exact_verdict}"
 
 
 @dataclass(frozen=True)
@@ -465,7 +464,7 @@ def _reported(
     guarantee = judged.promise
     certified = guarantee is not None and (not question.environments or guarantee == ANY or judged.proved)
     mode = worst_mode(assemble(scenario, chosen.coupling))
-    own = _Own(args.human or scenario.name, eigenvalue_part(mode), not (certified and unstable(mode.growth)))
+    own = _Own(args.human or scenario.name, eigenvalues(mode), not (certified and unstable(mode.growth)))
     energy = _Energy.of(question, findings) if certified and question.ticks else None
     switching = timing = None
     if scenario.varying_delay:

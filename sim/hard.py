@@ -102,8 +102,8 @@ def faults(loop: Simulation, integrator: str, substeps: int) -> dict[str, float]
     found = {"verdict": own - exact} if (own > 0) != (exact > 0) else {}
     if abs(own - exact) > GROWTH:
         found["growth"] = own - exact
-    if (error["position_relative_rms"] or 0.0) > POSITION:
-        found["position"] = error["position_relative_rms"]
+    if (apart := error.position_relative_rms) is not None and apart > POSITION:
+        found["position"] = apart
     return found
 
 

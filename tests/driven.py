@@ -23,7 +23,6 @@ def driven(process: Process, engine: Engine, outside: Outside, ticks: int, start
     kept = []
 
     def look(buffer: StepBuffer, first: int, count: int) -> None:
-        buffer.saturate(count)
         kept.append([rows[:count].copy() for rows in (buffer.z, buffer.s, buffer.f)])
 
     run_blocks(process, engine, outside, ticks, start, look, 1000)

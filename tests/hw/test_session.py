@@ -26,9 +26,9 @@ from hw.recording import Recorder, digest, load, outcome, recipes_of, replay, re
 from hw.rehearsal import Rehearsal
 from hw.seam import Driver, SerialDevice
 from hw.session import Session
+from models.hold import hold
 from models.scene import plant
 from sim.couplings import choose, limits_of
-from sim.engines import hold
 from sim.run import assemble, outside_forces, run
 from sim.scenario import InputError
 from sim.scenario import load as scenario_of

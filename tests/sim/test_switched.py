@@ -13,9 +13,10 @@ from cli.validate import main as validate
 from controller.delay import VaryingDelay, ages, realising
 from controller.tick import StepBuffer
 from design import stored
+from models.hold import HeldPlant
 from models.scene import Crowd, plant, variants
 from sim.crowds import draw
-from sim.engines import ExactBatchEngine, ExactEngine, HeldPlant
+from sim.engines import ExactEngine
 from sim.run import assemble
 from sim.run import run as close_loop
 from sim.scenario import SCENARIOS, InputError, load, parse
@@ -56,7 +57,7 @@ def test_the_product_of_mode_matrices_is_the_simulated_map():
     states = moved.plant.A.shape[0]
     buffer = StepBuffer(unlimited(moved.process), ticks, states, moved.scene.outside)
     buffer.s[0, :, 0] = rng.normal(size=states)
-    engine = ExactEngine(moved.plant, np.full(2, np.inf))
+    engine = ExactEngine(moved.plant)
     engine.start(buffer)
     for k in range(ticks):
         buffer.tick(k)
@@ -112,7 +113,7 @@ def test_greedy_ages_repeat_the_trajectory_that_chose_them():
     rates = []
     for each in (delays, drawn):
         free = replace(unlimited(process), delays=each)
-        engine = ExactBatchEngine(held, free.force_limit)
+        engine = ExactEngine(held)
         rates.append(impulse_growth(free, engine, ASSEMBLY.scene, held.A.shape[1], ticks)[0][0])
     assert rates[0] > 0 > rates[1]
 

@@ -16,13 +16,14 @@ from cli import run as run_command
 from cli.validate import _Traces, main
 from controller.coupling import CASE_I, NoCoupling, SpringDamper
 from models.device import RigidDevice
+from models.hold import hold
 from models.human import Person
 from models.scene import Crowd, build, plant, variants
 from sim import crowds as examine_module
 from sim import shards
 from sim.couplings import choose
 from sim.crowds import BATCH, MIXED, Findings, Validation, crowds, draw
-from sim.engines import ExactBatchEngine, ExactEngine, hold
+from sim.engines import ExactEngine
 from sim.run import assemble, run
 from sim.scenario import InputError, load
 from sim.shards import validate
@@ -147,11 +148,11 @@ def test_batch_engine_is_the_exact_engine(devices):
     def outside(first, ticks):
         return impulse_forces(held_by.scene, SCENARIO.T, first, ticks)
 
-    together = driven(process, ExactBatchEngine(plants, process.force_limit), outside, 400, rest)
+    together = driven(process, ExactEngine(plants), outside, 400, rest)
     assert (np.abs(together.f) == 0.2).any()
     for i in range(len(people)):
         one = hold(plant(build(devices, people.humans(i)).model), SCENARIO.T)
-        alone = driven(process, ExactEngine(one, process.force_limit), outside, 400, rest[:, :1])
+        alone = driven(process, ExactEngine(one), outside, 400, rest[:, :1])
         # sums in another order, and a clipped unstable loop multiplies rounding
         np.testing.assert_allclose(together.s[:, :, i], alone.s[:, :, 0], rtol=1e-6, atol=1e-11)
 

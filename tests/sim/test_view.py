@@ -16,10 +16,10 @@ from PIL import Image
 
 from cli import view as command
 from controller.coupling import SpringDamper
+from models.hold import hold
 from models.human import Human, Link, Person
 from models.scene import build, plant
 from sim.couplings import Chosen
-from sim.engines import hold
 from sim.run import run as close_loop
 from sim.scenario import InputError, load
 from sim.stability import close, dominant_mode
