@@ -135,7 +135,8 @@ def _list_devices(args: argparse.Namespace) -> int:
     def cell(fact: dict[str, Any] | None, scale: float) -> str:
         if fact is None:
             return "unknown"
-        return f"{fact.get('value', fact.get('least')) * scale:g}[{numbered[fact['source']]}]"
+        value: float = fact["value"] if "value" in fact else fact["least"]
+        return f"{value * scale:g}[{numbered[fact['source']]}]"
 
     heads = ("device", "damping N s/m", "mass g", "force N", "encoder um", "friction N", "CHAI3D N/m")
     rows = [(name, *(cell(part[field], scale) for field, scale in _UNITS.items())) for name, part in parts.items()]

@@ -193,14 +193,13 @@ def per_channel(option: str, values: tuple[_Given, ...], channels: int, what: st
     return values
 
 
-def delay_range(pairs: tuple[tuple[int, int], ...], channels: int, most: float = math.inf) -> DelayRange:
+def delay_range(pairs: tuple[tuple[int, int], ...], channels: int, most: int) -> DelayRange:
     """What --varying-delay says, as a range of delays on every channel. Raises InputError."""
     lo, hi = zip(*per_channel("--varying-delay", pairs, channels, "ranges"), strict=True)
-    if most < math.inf and any(not 0 <= a <= b <= most for a, b in zip(lo, hi, strict=True)):
+    if any(not 0 <= a <= b <= most for a, b in zip(lo, hi, strict=True)):
         asked = ",".join(f"{a}-{b}" for a, b in pairs)
         raise InputError(f"--varying-delay is {asked}, expected 0 <= LO <= HI <= {most} samples")
-    with refused("--varying-delay: "):
-        return DelayRange(lo, hi)
+    return DelayRange(lo, hi)
 
 
 def numbers(option: str, text: str, kind: Callable[[str], _Number], count: int) -> tuple[_Number, ...]:
@@ -398,8 +397,8 @@ def with_varying_delays(args: argparse.Namespace, scenario: Scenario) -> Scenari
     if args.pattern is not None:
         changes |= _pattern(args.pattern, scenario.channels)
     if args.varying_delay is not None:
-        span = delay_range(args.varying_delay, scenario.channels)
-        changes |= {"lo": span.lo, "hi": span.hi}
+        pairs = per_channel("--varying-delay", args.varying_delay, scenario.channels, "ranges")
+        changes["lo"], changes["hi"] = zip(*pairs, strict=True)
     if args.loss is not None:
         changes["loss"] = args.loss
     if args.playout:
@@ -422,7 +421,8 @@ def _periods(text: str) -> Periods:
     """Of two numbers, or of a file of one column [s]. Raises InputError."""
     with refused("--period: "):
         if "," in text and not Path(text).is_file():
-            return Periods(*numbers("--period", text, float, 2))
+            least, most = numbers("--period", text, float, 2)
+            return Periods(least, most)
         rows = _rows("--period", text, float, 1, "; give MIN,MAX in seconds or a file")
         return Periods(recorded=tuple(row[0] for row in rows))
 

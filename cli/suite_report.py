@@ -295,7 +295,7 @@ def _verdict_table(suite: Suite) -> list[str]:
         for check in suite.checks
     ]
     rows += [("not run", name, "", "") for name in suite.left_out]
-    return _table(("verdict", "check", "answer", "reproduce with"), rows)
+    return _cells(("verdict", "check", "answer", "reproduce with"), rows)
 
 
 def _section(check: Answer) -> list[str]:
@@ -309,13 +309,13 @@ def _section(check: Answer) -> list[str]:
         lines += ["```text", check.printed.rstrip(), "```", ""]
     for part in check.parts if not check.printed else ():
         lines += [f"### {part.title}", ""] if part.title else []
-        lines += [*_table(part.columns, part.rows), ""]
+        lines += [*_cells(part.columns, part.rows), ""]
     for picture in check.pictures:
         lines += [f"![{check.asks}]({picture})", ""]
     return lines
 
 
-def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+def _cells(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     rule = "|" + "---|" * len(columns)
     return [f"| {' | '.join(columns)} |", rule, *(f"| {' | '.join(cells)} |" for cells in rows)]
 

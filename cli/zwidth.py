@@ -46,7 +46,7 @@ def main(argv: list[str]) -> int:
     if chosen:
         fixed = _fixed(args, scenario, chosen)
         sweep = replace(sweep, lag=fixed["limiter"]["rho"])
-    marks = tuple(args.mark or ())
+    marks: tuple[tuple[float, float], ...] = tuple(args.mark or ())
     grid = zwidth.make_grid(sweep, args.grid, args.K_range, args.B_range, marks)
     plan, out = _plan(args, sweep), options.out_folder(args, "zwidth")
 
@@ -55,7 +55,7 @@ def main(argv: list[str]) -> int:
     )
     with render.progress("certificates") as move:
         drawn = zwidth.draw_map(sweep, grid, crowd, plan, lambda stage, k, of: move(k, of, stage))
-    found = [] if drawn.interrupted else [zwidth.evaluate_point(sweep, crowd, *mark, grid.K) for mark in marks]
+    found = [] if drawn.interrupted else [zwidth.evaluate_point(sweep, crowd, K, B, grid.K) for K, B in marks]
     report = MapReport.of(scenario, sweep, drawn, plan, fixed, found, args.humans, args.seed)
     files = [save_csv(drawn, out / "map.csv")]
     if not args.no_plot:
@@ -257,7 +257,7 @@ def _needs(part: Mapping[str, Any]) -> str:
     """Of the worst channel."""
     required = max(np.inf if d is None else d for d in part["required_damping"])
     least = min(part["available_damping"])
-    return f"needs {required:.6g} of {least:.6g} N s/m ({render.certified(part | {'proof': None})})"
+    return f"needs {required:.6g} of {least:.6g} N s/m ({render.certified({**part, 'proof': None})})"
 
 
 def _remarks(report: MapReport) -> Iterator[str]:
