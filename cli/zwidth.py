@@ -46,7 +46,7 @@ def main(argv: list[str]) -> int:
     if chosen:
         fixed = _fixed(args, scenario, chosen)
         sweep = replace(sweep, lag=fixed["limiter"]["rho"])
-    marks: tuple[tuple[float, float], ...] = tuple(args.mark or ())
+    marks = tuple(args.mark)
     grid = zwidth.make_grid(sweep, args.grid, args.K_range, args.B_range, marks)
     plan, out = _plan(args, sweep), options.out_folder(args, "zwidth")
 
@@ -84,7 +84,7 @@ def _parser() -> options.Parser:
     of_map.add_argument("--K-range", type=options.pair, metavar="LOW,HIGH", help=K)
     of_map.add_argument("--B-range", type=options.pair, metavar="LOW,HIGH", help=B)
     mark = "where does this coupling lie? (repeatable)"
-    of_map.add_argument("--mark", type=_mark, action="append", metavar="K,B", help=mark)
+    of_map.add_argument("--mark", type=_mark, action="append", default=[], metavar="K,B", help=mark)
     humans = "random humans per device (default 200)"
     of_map.add_argument("--humans", type=options.whole(1, 100_000), default=200, metavar="N", help=humans)
     _add_points(parser.add_argument_group("the points simulated in MuJoCo, and what they have beside the linear loop"))

@@ -56,7 +56,7 @@ def test_good_words():
     assert args.mark == [(5000.0, 0.0), (1.0, 2.0)]
     assert options.per_channel("--theta", args.theta, 3) == (0, 0, 0)
     assert options.delay_range(args.varying_delay, 2, 9) == DelayRange((1, 0), (2, 3))
-    assert options.ranges_per_channel("--varying-delay", options.delay_ranges("1,2"), 2) == ((1, 1), (2, 2))
+    assert options.delay_range(options.delay_ranges("1,2"), 2, 9) == DelayRange((1, 1), (2, 2))
     with pytest.raises(InputError, match="--K has 2 entries, expected 3"):
         options.per_channel("--K", args.K, 3)
 
