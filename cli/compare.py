@@ -176,7 +176,7 @@ _PICTURES = {
 def _names(text: str) -> tuple[str, ...]:
     names = tuple(text.split(","))
     if "" in names:
-        raise argparse.ArgumentTypeError(f"is {text!r}, expected names separated by commas")
+        raise argparse.ArgumentTypeError(f"is {text!r}, expected names separated by commas" if text else "is empty")
     if len(set(names)) < len(names):
         raise argparse.ArgumentTypeError(f"is {text!r}: a name stands there twice")
     if len(names) > _MOST:
