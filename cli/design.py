@@ -208,7 +208,7 @@ def _worth(args: argparse.Namespace, loop: Loop, design: Design) -> tuple[dict[s
         if design.condition == "this-environment":
             asked = Options(**asked_of(args, "optimal")) if best else DEFAULT
             robust = robustness_parts(loop, design.coupling, asked)
-        limit = best and bound_part(loop, best, args.band_hz or BAND_HZ)
+        limit = best and bound_part(loop, best, best.figures.rms_mismatch_db, args.band_hz or BAND_HZ)
     if best is None:
         return robust, None
     return robust, {"bound": limit, "rendered_stiffness": best.g, "ladder": best.ladder, "notes": args.notes}
@@ -239,8 +239,8 @@ def _best_rows(part: dict[str, Any]) -> render.Rows:
     """Rows that only an optimal coupling has."""
     limit = part["bound"]
     climbed = ", ".join(f"{rung.mismatch_db:.2f}" for rung in part["ladder"])
-    bounded = f"no linear coupling can be better than {limit['rms_mismatch_db'] or 0:.2f} dB rms"
-    yield "bound", limit.get("reason") or bounded
+    bounded = "no linear coupling can be better than {rms_mismatch_db:.2f} dB rms, {gap_db:.2f} dB less than this one"
+    yield "bound", limit.get("reason") or bounded.format(**limit)
     yield "rendered stiffness", render.optional(part["rendered_stiffness"], "{:.3f} of the environment's")
     yield "ladder [dB]", climbed or None
 

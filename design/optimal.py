@@ -40,7 +40,7 @@ _HOPELESS = 0.9  # relative mismatch from which on the climb is compared with ot
 _TOLERATED = 0.02  # by which a further environment may be short before it enters the design: scaling does the rest
 _MOST_STATES = 200  # of the loop, up to which a rung is tried: half a minute with five devices
 _MOST_PROOFS = 30 * 112**2.7  # and (environments) states^2.7: a minute
-_MOST_WORK = 7e6  # (channels x unknowns)^2 up to which a rung is tried
+_MOST_WORK = 1.2e7  # (channels x unknowns)^2 up to which a rung is tried
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def _compromise(loop: Loop, around: Sequence[Network], options: program.Options)
 
     By sweeps, without proofs: what it costs, not a coupling to run. Raises DesignFailed where there is none.
     """
-    taps, poles = options.ladder[: 2 if loop.channels <= program.RICH else 1][-1]
+    taps, poles = options.ladder[: 2 if loop.channels <= 2 else 1][-1]
     climb = _Climb.of(loop.at(loop.environment), options)
     others = [at(loop, network) for network in around]
     more = tuple(program.Case(there, there.E(), (program.this_environment(there),), 0.0) for there in others)
