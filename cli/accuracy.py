@@ -12,7 +12,7 @@ from sim.couplings import NAMES, choose, limits_of
 from sim.mujoco_engines import EXPONENTIAL
 from sim.run import assemble
 from sim.scenario import InputError, require_even_ticks, require_linear
-from sim.stepping import default_substeps
+from sim.step_choice import default_substeps
 
 _MOST_STEPS = 3_000_000  # of a row: a minute or two
 _LEGEND = (

@@ -20,7 +20,7 @@ from design.audit import LONGEST_DELAY, Audit, Help, Judged, audit
 from design.certificate import check_ranges
 from design.coverage import ranges_rows
 from design.designs import KINDS
-from design.result import listed
+from design.result import CONDITIONS, listed
 from models.device import CATALOGUE, listed_device
 from sim.couplings import check_stored, fitted, read_coupling
 from sim.report import encoder_steps
@@ -198,8 +198,8 @@ def _notes(args: argparse.Namespace, scenario: Scenario, switching: DelayRange |
 
 
 def _tables(found: Audit) -> list[Table]:
-    parts = [found.conditions[condition] for condition in render.ORDER]
-    table = Table("", *render.ORDER, title=_verdict(found), title_justify="left")
+    parts = [found.conditions[condition] for condition in CONDITIONS]
+    table = Table("", *CONDITIONS, title=_verdict(found), title_justify="left")
     for name, cell in _ROWS.items():
         table.add_row(name, *map(cell, parts))
     if not found.ranges:
@@ -244,7 +244,7 @@ _ROWS: dict[str, Callable[[Judged], str]] = {
 def _remarks(report: _Report) -> Iterator[str]:
     found = report.audit
     yield from (f"{note}." for note in report.notes)
-    for condition in render.ORDER:
+    for condition in CONDITIONS:
         part = found.conditions[condition]
         sensitivity = part.sensitivity.reason if part.certificate["certified"] else None
         reasons = {

@@ -26,9 +26,9 @@ from cli.session_cli import (
     limits_from,
     steady_scenario,
 )
-from design.certificate import CONDITIONS
 from design.files import plain, write_json
 from design.guarantees import CAVEATS, LATE
+from design.result import CONDITIONS
 from hw.control import CertifiedCoupling, certified_couplings, overlong_tick, timed
 from hw.limits import Stage
 from hw.monitor import Ages

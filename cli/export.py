@@ -15,6 +15,7 @@ import numpy as np
 from cli import options, render
 from controller.lti import Array
 from design.certificate import Verdict, verify
+from design.coupling_file import Stored
 from design.export import (
     SUFFIXES,
     ExportedBlock,
@@ -27,7 +28,6 @@ from design.export import (
 )
 from design.files import out_file, write
 from design.result import listed
-from design.stored import Stored
 from sim.couplings import read_coupling
 from sim.scenario import InputError
 

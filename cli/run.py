@@ -16,7 +16,7 @@ from controller.lti import Array
 from design.files import write
 from design.guarantees import ANY, CAVEATS, MAKING
 from design.optimal import robustness_parts
-from design.result import finite, listed
+from design.result import CONDITIONS, finite, listed
 from design.transparency import BAND_HZ, transparency
 from sim import accuracy, report
 from sim import passivity_layer as layer
@@ -27,7 +27,7 @@ from sim.mujoco_engines import INTEGRATORS
 from sim.run import ENGINES, beginnings
 from sim.scenario import InputError, Scenario
 from sim.stability import MARGINAL, ExactVerdict, Stability, stability_of
-from sim.stepping import MOST
+from sim.step_choice import MOST
 
 
 def main(argv: list[str]) -> int:
@@ -450,7 +450,7 @@ def _beside(report: _Report) -> Any:
             cells.append((other.name, "", "", f"not possible: {other.reason}", "", ""))
             continue
         same = own == (other.coupling, other.condition) or own[0] == other.coupling != "spring-damper"
-        needs = (_share(other.needs(condition), "never") for condition in render.ORDER)
+        needs = (_share(other.needs(condition), "never") for condition in CONDITIONS)
         grows = other.growth_rate_per_s is None or other.growth_rate_per_s > MARGINAL
         error = "grows" if grows else render.optional(other.force_error_percent, "{:.3g} %")
         felt = _share(other.dc_ratio, "-")

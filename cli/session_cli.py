@@ -20,10 +20,10 @@ from cli.render import console, progress
 from hw.control import Armable
 from hw.emulator import Emulator, FaultInjection, spawned
 from hw.force_dimension import FORCE_DIMENSION, ForceDimension
+from hw.haptic_device import HapticDevice, SerialDevice
 from hw.monitor import Ages, LinkSettings
 from hw.recording import IncidentLog
 from hw.rehearsal import Rehearsal
-from hw.seam import HapticDevice, SerialDevice
 from hw.session import Operator, Session
 from hw.transport import Live, SerialPort, preflight
 from sim.scenario import InputError, Scenario, require_constant_delay, require_even_ticks, require_linear

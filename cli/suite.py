@@ -26,11 +26,11 @@ from design.result import DesignFailed
 from hw.endurance import endurance
 from hw.faults import rehearse_faults
 from sim.adversary import shortages
-from sim.challenges import challenges
-from sim.hard import cases, measure
-from sim.random_loops import proofs, traces
+from sim.checks.challenges import challenges
+from sim.checks.hard import cases, measure
+from sim.checks.random_loops import proofs, traces
+from sim.checks.uneven import uneven_ticks
 from sim.scenario import InputError
-from sim.uneven import uneven_ticks
 
 # ----------------------------------------------------------------------------------------------------
 # The checks, and how one is run.

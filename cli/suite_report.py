@@ -10,8 +10,9 @@ from importlib.metadata import version
 from typing import Any
 
 from cli import render
+from design.result import CONDITIONS
+from sim.checks.uneven import HANDS
 from sim.stability import unstable
-from sim.uneven import HANDS
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ def accuracy(report: dict[str, Any]) -> list[Part]:
 
 def gain_map(report: dict[str, Any]) -> list[Part]:
     """Of sim.zwidth."""
-    contradicted = sum(report[name]["contradicted_cells"] for name in render.ORDER)
+    contradicted = sum(report[name]["contradicted_cells"] for name in CONDITIONS)
     return [Part(f"{contradicted} certified cells that a hand destabilises")]
 
 

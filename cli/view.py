@@ -12,7 +12,7 @@ from typing import Any
 
 from cli import options, render
 from design.files import write_json
-from design.result import certificate_part
+from design.result import CONDITIONS, certificate_part
 from sim.scenario import InputError, require_even_ticks
 from sim.view.events import COUPLINGS, GIVEN, LABELS, Couple, Menu, PreparedLoop, Script, first_loop, parse_script
 from sim.view.film import Picture, check_film, painter, save_film
@@ -79,7 +79,7 @@ class _Event:
         return cls(t, what, *loop, certificates, prepared.guarantee, limiter)
 
     def line(self) -> str:
-        held = [name for name in render.ORDER if self.certificates[name]["certified"]]
+        held = [name for name in CONDITIONS if self.certificates[name]["certified"]]
         growth = f"{self.exact_growth_rate_per_s:+.3g} 1/s at {self.exact_frequency_hz:.1f} Hz"
         grows = growth if isfinite(self.exact_growth_rate_per_s) else "no growth"
         proved = f"certified ({', '.join(held)})" if held else "NOT certified"

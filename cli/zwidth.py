@@ -17,6 +17,7 @@ from cli import options, render
 from cli.judged import judge
 from controller.lti import Array
 from controller.older import with_older
+from design.result import CONDITIONS
 from sim import zwidth
 from sim.couplings import NAMES, Chosen, choose
 from sim.limit_cycles import DECIDED, UNDECIDED, Effects, HeldDevices, Plan
@@ -216,7 +217,7 @@ def _designed_rows(fixed: Mapping[str, Any], limited: list[float] | None) -> ren
     """The fixed coupling in the environment that it was designed for."""
     designed = fixed["designed_for"]
     each = (f"{' - '.join(s['between'])} {s['K']:g} N/m, {s['B']:g} N s/m" for s in designed["contact_springs"])
-    asked = [(name, designed["certificates"][name]) for name in render.ORDER]
+    asked = [(name, designed["certificates"][name]) for name in CONDITIONS]
     needs = "; ".join(
         f"{name} needs {100 / part['margin']:.4g} % of the damping ({part['proof']})"
         for name, part in asked

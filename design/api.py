@@ -12,10 +12,10 @@ from controller.loop import Loop
 from controller.lti import Lti
 from design.arguments import known, of_kind, one_of, shown
 from design.certificate import RangesCheck, assess, check_ranges, lag, prove, switching_requirement
+from design.coupling_file import Certificate, LimiterCertificate, Stored, digest, save
 from design.designs import KINDS, design_by_kind, usual_condition
 from design.guarantees import HERE, guarantee_of, switching_guarantee
 from design.result import Condition, Design, NotProved, Requirement
-from design.stored import Certificate, LimiterCertificate, Stored, digest, save
 from design.transparency import BAND_HZ, Transparency, decibels, transparency
 
 _Kind = Literal["spring-damper", "moving-average", "ccl", "optimal"]

@@ -13,11 +13,11 @@ from controller.loop import Loop, force_map
 from controller.ranges import Member
 from design.certificate import RangesCheck, check_limiter, prove_limiter, switching_requirement
 from design.conditions import this_environment
+from design.coupling_file import LimiterCertificate
 from design.designs import design_by_kind
 from design.environments import SEARCH, Searched, worst
 from design.multipliers import BETA, limiter_refusal, limiter_requirement
 from design.result import Design, DesignFailed, NotProved, Requirement, certificate_part, finite
-from design.stored import LimiterCertificate
 from design.transparency import decibels, transparency
 
 _OWN_PROOF = "by a proof of its own, for this environment"

@@ -13,10 +13,9 @@ import numpy as np
 
 from controller.environment import RIGID_WALL
 from controller.lti import Array
-from design.certificate import CONDITIONS
 from design.files import write
 from design.guarantees import CAVEATS
-from design.result import certificate_part
+from design.result import CONDITIONS, certificate_part
 from sim.limit_cycles import UNDECIDED, Plan
 from sim.scenario import Scenario
 from sim.stability import MARGINAL
