@@ -279,7 +279,7 @@ def add_coupling_options(parser: argparse.ArgumentParser, names: str, default: s
     add_condition_option(parser)
 
 
-def add_condition_option(parser: argparse._ActionsContainer, what: str = "that the certificate is about") -> None:
+def add_condition_option(parser: argparse._ActionsContainer, what: str = "the condition of the certificate") -> None:
     """--condition."""
     names = ",".join(CONDITIONS)
     help_ = f"{what}: {' or '.join(CONDITIONS)} (default: the coupling's own)"
