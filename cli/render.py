@@ -25,7 +25,7 @@ from controller.loop import Loop
 from controller.older import REPORTS, with_older
 from design.files import nobody_reads, plain, printable, write_json
 from design.files import unseen as unseen
-from design.result import DesignFailed, listed
+from design.result import CONDITIONS, DesignFailed, listed
 
 # ----------------------------------------------------------------------------------------------------
 # The terminal that reports are printed on: no number of a table is ever cut, no name is taken for a colour.
@@ -123,6 +123,9 @@ def designing(loop: Loop | None = None, kind: str | None = None, condition: str 
 # A whole report: files, tables, lines below them, JSON.
 
 
+_Drawing = Callable[[Any], Callable[[Any, Path], Path]]  # from sim.plots the function that draws
+
+
 def publish(
     args: argparse.Namespace,
     report: Any,
@@ -149,6 +152,16 @@ def publish(
         screen.print("files: " + ", ".join(outcome["files"]), soft_wrap=True)
     if args.json:
         write_json(args.json, outcome)
+
+
+def pictures(args: argparse.Namespace, report: Any, folder: Path, drawn: Mapping[str, _Drawing]) -> list[Path]:
+    """Pictures of a report, by file what draws it; with --no-plot none, and matplotlib is not loaded."""
+    if args.no_plot:
+        return []
+    from sim import plots
+
+    outcome = plain(report)
+    return [drawing(plots)(outcome, folder / file) for file, drawing in drawn.items()]
 
 
 # ----------------------------------------------------------------------------------------------------
@@ -178,6 +191,12 @@ def grid(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], left: 
     for row in rows:
         table.add_row(*row)
     return table
+
+
+def columns(title: str, cells: Mapping[str, _Form], records: Iterable[Any], left: Sequence[int] = (0,)) -> Table:
+    """A table of records: under each head a format of the record `r`, or what a function says of it."""
+    rows = [[str(form(r)) if callable(form) else form.format(r=r) for form in cells.values()] for r in records]
+    return grid(title, list(cells), rows, left)
 
 
 def figure(name: str, form: _Form = "{}", default: Any = MISSING, json: str = "key", absent: str | None = None) -> Any:
@@ -215,9 +234,6 @@ def rows_of(report: Any) -> Rows:
 # Phrases that several reports share.
 
 
-ORDER = ("this-environment", "any-environment")  # of conditions in a table
-
-
 def certified(part: Mapping[str, Any]) -> str:
     """Whether it is, and whether that is proved in exact arithmetic."""
     if not part["certified"]:
@@ -234,7 +250,7 @@ def needs(part: Mapping[str, Any], digits: int = 6) -> str:
 def certificate_rows(certificates: Mapping[str, dict[str, Any]], digits: int = 6, proof: bool = True) -> Rows:
     """What each condition needs, and whether that is proved exactly, where no other row says it."""
     for name, part in certificates.items():
-        if name in ORDER:
+        if name in CONDITIONS:
             word = certified(part) if proof else certified(part | {"proof": None})
             yield f"damping, {name}", f"needs {needs(part, digits)}: {word}"
 
