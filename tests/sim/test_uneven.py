@@ -68,7 +68,7 @@ def test_time_adds_up_and_the_blocks_of_a_run_do_not_matter():
     assert trace.t[:5] == pytest.approx([0, 1e-3, 3e-3, 3.5e-3, 4.5e-3])
     assert len(trace.t) == pytest.approx(3.0 / (3.5e-3 / 3), abs=1)
     assert trace.t[-1] == pytest.approx(3.0, abs=3e-3)
-    again = run(simulation, "exact", ticks=1500)  # a run is cut into blocks of 1024 ticks
+    again = run(simulation, "exact", ticks=1500)  # a run is cut into blocks
     np.testing.assert_array_equal(again.s, trace.s[:1500])
 
 
