@@ -29,13 +29,14 @@ def share_designs(folder: Path, patch=setattr) -> None:
     What makes them, design.designs and the modules behind it, is as it was.
     """
     import cli.design
-    from design import api, bound, compare, designs
+    from design import api, bound, compare, coverage, designs
     from sim import couplings
 
-    for module in (cli.design, api, compare, couplings):
+    for module in (cli.design, api, compare, coverage, couplings):
         patch(module, "design_by_kind", _remembering(folder, designs.design_by_kind))
-    for module in (cli.design, compare):
-        patch(module, "bound", _remembering(folder, bound.bound))
+    remembered = _remembering(folder, bound.bound)
+    for module in (bound, compare):
+        patch(module, "bound", remembered)
 
 
 def _remembering(folder: Path, make):
